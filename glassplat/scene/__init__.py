@@ -1,0 +1,1 @@
+"""Plain data: Gaussians, cameras, planes and the scene that holds them. Nothing here renders."""

@@ -1,0 +1,85 @@
+"""A set of 3D Gaussians, as raw (unactivated) tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+SH_ZERO = 0.28209479177387814  # value of the constant spherical harmonic
+PER_GAUSSIAN = ("means", "quats", "log_scales", "logit_opacities", "sh")
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N anisotropic Gaussians in world space; every tensor is a raw, trainable value.
+
+    Attributes:
+        means: [N, 3] centres, world units.
+        quats: [N, 4] orientation `wxyz`, not necessarily unit; normalised where used.
+        log_scales: [N, 3] logarithm of the standard deviation along each principal axis.
+        logit_opacities: [N] opacity before the sigmoid.
+        sh: [N, K, 3] spherical-harmonic colour coefficients, K in {0, 1, 4, 9, 16}; K = 0 for
+            Gaussians without a colour of their own (glass).
+        channels: named raw per-Gaussian values, each [N] (`log_intensity`, `logit_mark`, ...).
+        active_sh_degree: highest degree in use; grows during training.
+    """
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    logit_opacities: Tensor
+    sh: Tensor
+    channels: Mapping[str, Tensor] = field(default_factory=dict)
+    active_sh_degree: int = 0
+
+    def __post_init__(self) -> None:
+        count = self.means.shape[0]
+        for name, tensor in self.tensors().items():
+            if tensor.shape[0] != count:
+                raise ValueError(f"{name} has {tensor.shape[0]} rows where means has {count}; every tensor needs one row per Gaussian")
+        if not 0 <= self.active_sh_degree <= max(self.max_sh_degree, 0):
+            raise ValueError(f"active_sh_degree is {self.active_sh_degree}, but sh holds degrees up to {self.max_sh_degree}")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def max_sh_degree(self) -> int:
+        """Highest degree the coefficients can hold; -1 when there are none."""
+        return round(self.sh.shape[1] ** 0.5) - 1
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All per-Gaussian tensors by name, channels included."""
+        return {name: getattr(self, name) for name in PER_GAUSSIAN} | dict(self.channels)
+
+    def with_tensors(self, tensors: Mapping[str, Tensor]) -> Gaussians:
+        """The same set with some tensors, channels included, replaced by name."""
+        unknown = set(tensors) - set(self.tensors())
+        if unknown:
+            raise ValueError(f"unknown tensors {sorted(unknown)}; this set has {sorted(self.tensors())}")
+        merged = self.tensors() | dict(tensors)
+        channels = {name: merged.pop(name) for name in self.channels}
+        return replace(self, **merged, channels=channels)
+
+    def select(self, index: Tensor) -> Gaussians:
+        """The Gaussians at `index` (a boolean mask [N] or integer indices)."""
+        return self.with_tensors({name: tensor[index] for name, tensor in self.tensors().items()})
+
+    def to(self, device: torch.device | str) -> Gaussians:
+        """The same set on another device."""
+        return self.with_tensors({name: tensor.to(device) for name, tensor in self.tensors().items()})
+
+    @staticmethod
+    def empty(sh_coefficients: int = 0, channels: tuple[str, ...] = ()) -> Gaussians:
+        """A set of no Gaussians."""
+        return Gaussians(
+            means=torch.zeros(0, 3),
+            quats=torch.zeros(0, 4),
+            log_scales=torch.zeros(0, 3),
+            logit_opacities=torch.zeros(0),
+            sh=torch.zeros(0, sh_coefficients, 3),
+            channels={name: torch.zeros(0) for name in channels},
+        )

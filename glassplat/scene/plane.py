@@ -1,0 +1,78 @@
+"""Learnable rectangular reflection planes (TR-Gaussians, Section III-A2)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+TRAINABLE = ("centers", "raw_normals", "logit_reflectances")
+
+
+@dataclass(frozen=True)
+class Planes:
+    """K rectangles that reflect, one per pane.
+
+    The rectangle's size and in-plane orientation get no gradient (the hit mask is piecewise
+    constant in them); they are set large enough to cover the pane, and the rendered mask cuts
+    the exact shape.
+
+    Attributes:
+        centers: [K, 3] a point on each plane, the rectangle's middle; world units.
+        raw_normals: [K, 3] normals before normalisation.
+        logit_reflectances: [K] base reflectance R0 before the sigmoid.
+        tangents: [K, 3] direction of the rectangle's first side; made orthogonal to the normal in use.
+        half_sizes: [K, 2] half the side lengths along tangent and bitangent; world units.
+        labels: pane label of each plane, as found in the masks.
+    """
+
+    centers: Tensor
+    raw_normals: Tensor
+    logit_reflectances: Tensor
+    tangents: Tensor
+    half_sizes: Tensor
+    labels: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        for name, tensor in self.tensors().items():
+            if tensor.shape[0] != len(self.labels):
+                raise ValueError(f"{name} has {tensor.shape[0]} rows for {len(self.labels)} plane labels; expected one row per plane")
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    @property
+    def normals(self) -> Tensor:
+        """[K, 3] unit normals."""
+        return torch.nn.functional.normalize(self.raw_normals, dim=-1)
+
+    @property
+    def base_reflectances(self) -> Tensor:
+        """[K] reflectance at normal incidence R0, in (0, 1)."""
+        return torch.sigmoid(self.logit_reflectances)
+
+    def axes(self) -> tuple[Tensor, Tensor]:
+        """Unit in-plane axes (tangent, bitangent), each [K, 3]; right-handed with the normal."""
+        normals = self.normals
+        flat = self.tangents - (self.tangents * normals).sum(-1, keepdim=True) * normals
+        tangent = torch.nn.functional.normalize(flat, dim=-1)
+        return tangent, torch.linalg.cross(normals, tangent)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+        return {name: getattr(self, name) for name in (*TRAINABLE, "tangents", "half_sizes")}
+
+    def with_tensors(self, tensors: Mapping[str, Tensor]) -> Planes:
+        """The same planes with some tensors replaced by name."""
+        return replace(self, **tensors)
+
+    def to(self, device: torch.device | str) -> Planes:
+        """The same planes on another device."""
+        return self.with_tensors({name: tensor.to(device) for name, tensor in self.tensors().items()})
+
+    @staticmethod
+    def empty() -> Planes:
+        """No planes at all."""
+        return Planes(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3), torch.zeros(0, 2), ())

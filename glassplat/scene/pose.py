@@ -1,0 +1,35 @@
+"""Rotations and mirror matrices."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def rotation_from_quat(quats: Tensor) -> Tensor:
+    """Rotation matrices [..., 3, 3] of quaternions [..., 4] in `wxyz` order, normalised here."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).reshape(*quats.shape[:-1], 3, 3)
+
+
+def mirror_matrices(centers: Tensor, normals: Tensor) -> Tensor:
+    """Householder reflections [K, 4, 4] about planes through `centers` with unit `normals`.
+
+    Maps a world point x to x - 2 ((x - c) . n) n (TR-Gaussians, Eq. 8). Its own inverse.
+    Differentiable in both arguments.
+
+    Args:
+        centers: [K, 3] a point on each plane, world frame.
+        normals: [K, 3] unit normals; the sign does not matter.
+    """
+    outer = normals[:, :, None] * normals[:, None, :]
+    linear = torch.eye(3, dtype=normals.dtype, device=normals.device) - 2 * outer
+    offset = 2 * (centers * normals).sum(-1, keepdim=True) * normals
+    top = torch.cat([linear, offset[:, :, None]], dim=2)
+    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=normals.dtype, device=normals.device)
+    return torch.cat([top, bottom.expand(normals.shape[0], 1, 4)], dim=1)
