@@ -1,0 +1,53 @@
+# Every target sets itself up in .venv; nothing but Python 3.11 (or newer) and make has to be there.
+# Another interpreter: make test PYTHON=/path/to/python
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check --no-input
+
+.PHONY: help setup demo test lint format bench clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make demo    train both methods on the bundled showcase and say where the pictures are"
+	@echo "make test    style, types and tests, as the continuous integration runs them"
+	@echo "make lint    style and types only"
+	@echo "make format  rewrite the sources in the project's format"
+	@echo "make bench   measure the kernels and the methods"
+	@echo "make setup   only create .venv"
+	@echo "make clean   remove .venv and every cache"
+
+setup: $(STAMP)
+
+# The stamp is written last, so an interrupted installation starts over.
+$(STAMP): pyproject.toml constraints.txt
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "glassplat needs Python 3.11 or newer; '$(PYTHON)' is not. Try: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	@echo "Setting up $(VENV) (downloads PyTorch, takes a few minutes the first time) ..."
+	@"$(PYTHON)" -m venv --clear $(VENV)
+	@$(PIP) install --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+demo: $(STAMP)
+	$(BIN)/glassplat demo
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+test: lint
+	$(BIN)/python -m pytest --durations=15
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(STAMP)
+	$(BIN)/python -m bench
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,46 @@
+"""Makes every test deterministic, and counts skipped tests aloud."""
+
+from __future__ import annotations
+
+import os
+
+# Numba reads this once, when it is imported. Two threads are enough to find a result that depends on their number.
+os.environ.setdefault("NUMBA_NUM_THREADS", "2")
+
+import random
+from collections.abc import Iterator
+
+import hypothesis
+import numba
+import numpy as np
+import pytest
+import torch
+from _pytest.terminal import TerminalReporter
+
+hypothesis.settings.register_profile("deterministic", derandomize=True, deadline=None, max_examples=30, database=None)
+hypothesis.settings.load_profile("deterministic")
+
+
+@pytest.fixture(autouse=True)
+def fixed_state() -> Iterator[None]:
+    """Each test starts from the same random state and thread count, whatever ran before it."""
+    random.seed(0)
+    np.random.seed(0)  # noqa: NPY002  # Third-party code may still draw from the global state.
+    torch.manual_seed(0)
+    threads = torch.get_num_threads()
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    yield
+    torch.set_num_threads(threads)
+    torch.set_default_dtype(torch.float32)
+
+
+def pytest_terminal_summary(terminalreporter: TerminalReporter) -> None:
+    """Ends the run with the tests that did not run, so that a green line hides nothing."""
+    skipped = terminalreporter.stats.get("skipped", [])
+    if not skipped:
+        terminalreporter.write_line("skipped tests: none", green=True)
+        return
+    terminalreporter.section(f"{len(skipped)} TESTS WERE SKIPPED, their subject is unchecked", yellow=True, bold=True)
+    for report in skipped:
+        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+        terminalreporter.write_line(f"  {report.nodeid}: {reason}", yellow=True)
