@@ -25,7 +25,7 @@ hypothesis.settings.load_profile("deterministic")
 def fixed_state() -> Iterator[None]:
     """Each test starts from the same random state and thread count, whatever ran before it."""
     random.seed(0)
-    np.random.seed(0)  # noqa: NPY002  # Third-party code may still draw from the global state.
+    np.random.seed(0)  # Third-party code may still draw from the global state.
     torch.manual_seed(0)
     threads = torch.get_num_threads()
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)

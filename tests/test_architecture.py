@@ -1,0 +1,247 @@
+"""The tree keeps the shape that docs/architecture.md draws: who may import whom, and how large things may grow."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGE = "glassplat"
+DIAGRAM = ROOT / "docs" / "architecture.md"
+CHECKED_FOLDERS = (PACKAGE, "tests", "tools", "bench")
+
+MOST_FILE_LINES = 400
+MOST_TEST_FILE_LINES = 600
+MOST_FUNCTION_LINES = 60
+MOST_KERNEL_LINES = 120
+MOST_PARAMETERS = 8
+MEANINGLESS_NAMES = {"utils", "util", "helpers", "helper", "common", "misc"}
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How large one file and its functions may be; `parameters` is None where the count is free."""
+
+    file_lines: int
+    function_lines: int
+    parameters: int | None
+
+
+def limits_of(path: Path) -> Limits:
+    """The limits for a file, by its path relative to the repository."""
+    if path.parts[0] == "tests":
+        return Limits(MOST_TEST_FILE_LINES, MOST_FUNCTION_LINES, None)
+    if path.parts[:2] == (PACKAGE, "kernels"):
+        return Limits(MOST_FILE_LINES, MOST_KERNEL_LINES, None)
+    return Limits(MOST_FILE_LINES, MOST_FUNCTION_LINES, MOST_PARAMETERS)
+
+
+def rows_of(diagram: str) -> dict[str, int]:
+    """Row of every layer in the first code block of the architecture page; row 0 is the top."""
+    block = diagram.split("```")[1].strip("\n")
+    rows: dict[str, int] = {}
+    for row, line in enumerate(block.splitlines()):
+        names = line.split("(")[0].replace("└──", " ")
+        rows |= dict.fromkeys(names.split(), row)
+    return rows
+
+
+def module_of(path: Path) -> str:
+    """Dotted name of the module in a file, by its path relative to the repository."""
+    parts = path.with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def layer_of(module: str) -> str | None:
+    """The part of the package a module belongs to; None for the package itself and for foreign modules."""
+    parts = module.split(".")
+    if parts[0] != PACKAGE or len(parts) == 1 or parts[1].startswith("__"):
+        return None
+    return parts[1]
+
+
+def imported_modules(tree: ast.Module, path: Path) -> Iterator[tuple[str, int]]:
+    """Every module that a file imports, at any depth and under TYPE_CHECKING too, with the line."""
+    package = path.with_suffix("").parts[:-1]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) - node.level + 1] if node.level else ()
+            base = ".".join([*above, *([node.module] if node.module else [])])
+            names = [alias.name for alias in node.names] if base == PACKAGE else []
+            yield from ((f"{base}.{name}", node.lineno) for name in names)
+            yield base, node.lineno
+
+
+def import_violations(tree: ast.Module, path: Path, rows: Mapping[str, int]) -> Iterator[str]:
+    """Imports that do not point downwards in the diagram."""
+    layer = layer_of(module_of(path))
+    if layer is None:
+        return
+    if layer not in rows:
+        yield f"{path}: `{layer}` is not in the diagram of docs/architecture.md; draw it there on its row"
+        return
+    for module, line in imported_modules(tree, path):
+        target = layer_of(module)
+        if target not in rows or target == layer or rows[target] > rows[layer]:
+            continue
+        yield (
+            f"{path}:{line}: `{layer}` imports {module}, but imports point downwards only and `{target}` is on "
+            f"row {rows[target]}, `{layer}` on row {rows[layer]}; move what is shared to a lower layer"
+        )
+
+
+def code_lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Lines of a function without its decorators and without its docstring, which may be a manual page."""
+    last = function.end_lineno or function.lineno
+    lines = last - function.lineno + 1
+    if ast.get_docstring(function, clean=False) is not None:
+        docstring = function.body[0]
+        lines -= (docstring.end_lineno or docstring.lineno) - docstring.lineno + 1
+    return lines
+
+
+def parameter_count(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Number of parameters, without `self` and `cls`."""
+    arguments = function.args
+    named = [*arguments.posonlyargs, *arguments.args]
+    bound = bool(named) and named[0].arg in ("self", "cls")
+    return (
+        len(named) - bound + len(arguments.kwonlyargs) + sum(a is not None for a in (arguments.vararg, arguments.kwarg))
+    )
+
+
+def size_violations(tree: ast.Module, path: Path, source: str) -> Iterator[str]:
+    """Files and functions that are too long, and functions that take too much."""
+    limits = limits_of(path)
+    if (lines := source.count("\n")) > limits.file_lines:
+        yield f"{path}: {lines} lines where {limits.file_lines} are the most; split it by what it holds"
+    for node in ast.walk(tree):
+        if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            continue
+        where = f"{path}:{node.lineno}: {node.name}()"
+        if (lines := code_lines(node)) > limits.function_lines:
+            yield f"{where} has {lines} lines of code where {limits.function_lines} are the most; name its parts"
+        if limits.parameters is not None and (count := parameter_count(node)) > limits.parameters:
+            yield f"{where} takes {count} parameters where {limits.parameters} are the most; group them"
+
+
+def name_violations(path: Path) -> Iterator[str]:
+    """File and folder names that say nothing about what is inside."""
+    for part in path.with_suffix("").parts:
+        if part.lower() in MEANINGLESS_NAMES:
+            yield f"{path}: `{part}` says nothing; name it after what it holds"
+
+
+def violations(path: Path, source: str, rows: Mapping[str, int]) -> list[str]:
+    """Everything wrong with one file, given its path relative to the repository."""
+    tree = ast.parse(source)
+    return [*import_violations(tree, path, rows), *size_violations(tree, path, source), *name_violations(path)]
+
+
+def source_files() -> list[Path]:
+    """All Python files of the project, relative to the repository."""
+    return sorted(file.relative_to(ROOT) for folder in CHECKED_FOLDERS for file in (ROOT / folder).rglob("*.py"))
+
+
+@pytest.fixture(scope="module")
+def rows() -> dict[str, int]:
+    return rows_of(DIAGRAM.read_text())
+
+
+def test_every_file_keeps_the_architecture(rows: dict[str, int]) -> None:
+    found = [line for path in source_files() for line in violations(path, (ROOT / path).read_text(), rows)]
+    assert not found, "\n" + "\n".join(found)
+
+
+def test_the_diagram_names_only_what_exists(rows: dict[str, int]) -> None:
+    package = ROOT / PACKAGE
+    missing = [name for name in rows if not (package / name).is_dir() and not (package / f"{name}.py").is_file()]
+    assert not missing, f"docs/architecture.md draws {missing}, which {package} does not hold"
+
+
+def test_the_diagram_has_kernels_and_scene_side_by_side_at_the_bottom(rows: dict[str, int]) -> None:
+    assert rows["kernels"] == rows["scene"] == max(rows.values())
+    assert rows["cli"] == 0
+
+
+SMALL_ROWS = {"cli": 0, "train": 1, "render": 2, "files": 2, "kernels": 3, "scene": 3}
+
+
+@pytest.mark.parametrize(
+    ("path", "statement", "blamed"),
+    [
+        ("glassplat/render/splat.py", "from glassplat.train.trainer import train", "train"),
+        ("glassplat/render/splat.py", "import glassplat.cli", "cli"),
+        ("glassplat/render/splat.py", "from glassplat.files.ply import read_ply", "files"),
+        ("glassplat/kernels/project.py", "from glassplat.scene.camera import Camera", "scene"),
+        ("glassplat/kernels/project.py", "from glassplat import scene", "scene"),
+        ("glassplat/kernels/cpu/project.py", "from ...scene import camera", "scene"),
+        ("glassplat/scene/camera.py", "def late():\n    import glassplat.render.splat", "render"),
+    ],
+)
+def test_an_import_that_does_not_point_downwards_is_found(path: str, statement: str, blamed: str) -> None:
+    (message,) = violations(Path(path), statement + "\n", SMALL_ROWS)
+    assert path in message
+    assert f"`{blamed}` is on row" in message
+
+
+@pytest.mark.parametrize(
+    ("path", "statement"),
+    [
+        ("glassplat/render/splat.py", "from glassplat.scene.camera import Camera"),
+        ("glassplat/render/splat.py", "from glassplat.render.frame import Frame"),
+        ("glassplat/render/splat.py", "from . import frame"),
+        ("glassplat/cli.py", "from glassplat import __version__"),
+        ("glassplat/__main__.py", "from glassplat.cli import main"),
+        ("glassplat/scene/camera.py", "import torch"),
+        ("tests/test_x.py", "from glassplat.cli import main"),
+    ],
+)
+def test_an_import_that_points_downwards_is_allowed(path: str, statement: str) -> None:
+    assert violations(Path(path), statement + "\n", SMALL_ROWS) == []
+
+
+def test_a_folder_outside_the_diagram_is_found() -> None:
+    (message,) = violations(Path("glassplat/extras/video.py"), "", SMALL_ROWS)
+    assert "`extras` is not in the diagram" in message
+
+
+def long_function(lines: int) -> str:
+    return 'def work():\n    """Counts.\n\n    At length.\n    """\n' + "    x = 1\n" * (lines - 1)
+
+
+def test_a_function_is_measured_without_its_docstring() -> None:
+    assert violations(Path("tools/a.py"), long_function(MOST_FUNCTION_LINES), SMALL_ROWS) == []
+    (message,) = violations(Path("tools/a.py"), long_function(MOST_FUNCTION_LINES + 1), SMALL_ROWS)
+    assert "work() has 61 lines of code" in message
+
+
+def test_kernels_may_be_longer_and_take_more() -> None:
+    source = long_function(MOST_KERNEL_LINES) + "def many(a, b, c, d, e, f, g, h, i): ...\n"
+    assert violations(Path("glassplat/kernels/cpu/x.py"), source, SMALL_ROWS) == []
+    assert len(violations(Path("glassplat/render/x.py"), source, SMALL_ROWS)) == 2
+
+
+def test_parameters_are_counted_without_self() -> None:
+    body = "class A:\n    def f(self, a, b, c, d, *, e, f, g, {}): ...\n"
+    assert violations(Path("glassplat/render/x.py"), body.format("h"), SMALL_ROWS) == []
+    (message,) = violations(Path("glassplat/render/x.py"), body.format("h, **rest"), SMALL_ROWS)
+    assert "f() takes 9 parameters" in message
+
+
+def test_a_long_file_is_found() -> None:
+    (message,) = violations(Path("glassplat/render/x.py"), "x = 1\n" * (MOST_FILE_LINES + 1), SMALL_ROWS)
+    assert "401 lines where 400 are the most" in message
+
+
+@pytest.mark.parametrize("path", ["glassplat/render/utils.py", "tests/helpers/x.py", "tools/Common.py"])
+def test_a_name_that_says_nothing_is_found(path: str) -> None:
+    (message,) = violations(Path(path), "", SMALL_ROWS)
+    assert re.search(r"`(utils|helpers|Common)` says nothing", message)
