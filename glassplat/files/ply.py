@@ -1,0 +1,129 @@
+"""Gaussians as the PLY file that every splatting viewer and trainer reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from glassplat.files.ply_table import PlyTable, read_table, write_table
+from glassplat.scene.gaussians import Gaussians
+
+POSITION = ("x", "y", "z")
+NORMAL = ("nx", "ny", "nz")
+COLOR = ("f_dc_0", "f_dc_1", "f_dc_2")
+SCALE = ("scale_0", "scale_1", "scale_2")
+ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+REQUIRED = (*POSITION, "opacity", *SCALE, *ROTATION)
+CHANNEL_PREFIXES = ("log_", "logit_", "raw_")
+"""Raw values are named after their activation, so these prefixes tell our channels from foreign properties."""
+SH_COEFFICIENTS = (1, 4, 9, 16)
+
+
+def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
+    """Writes a set of Gaussians as a standard 3DGS PLY: float32, binary little endian, atomically.
+
+    The properties are x y z, nx ny nz (zero), f_dc_*, f_rest_* (channel-major), opacity (logit),
+    scale_* (log), rot_* (`wxyz`), then one property per channel, which other readers skip.
+    Gaussians without colour (K = 0) have neither f_dc nor f_rest.
+
+    Raises:
+        ValueError: a channel's name could not be told from a foreign property when read back.
+    """
+    unreadable = [name for name in gaussians.channels if not name.startswith(CHANNEL_PREFIXES)]
+    if unreadable:
+        raise ValueError(
+            f"cannot store channels {unreadable}: a raw channel's name begins with one of {CHANNEL_PREFIXES}"
+        )
+    color_names, colors = _color_columns(gaussians.sh)
+    names = [*POSITION, *NORMAL, *color_names, "opacity", *SCALE, *ROTATION, *gaussians.channels]
+    normals = torch.zeros_like(gaussians.means)
+    columns = [gaussians.means, normals, colors, gaussians.logit_opacities[:, None], gaussians.log_scales]
+    columns += [gaussians.quats, *(channel[:, None] for channel in gaussians.channels.values())]
+    rows = torch.cat([column.detach().to("cpu", torch.float32) for column in columns], dim=1)
+    write_table(Path(path), names, rows.numpy())
+
+
+def read_gaussians(path: Path | str) -> Gaussians:
+    """Reads a 3DGS PLY as raw float32 tensors, bit for bit as stored.
+
+    Properties may come in any order, in ascii or either byte order, with SH degree 0 to 3 or no colour
+    at all. Properties that begin with `log_`, `logit_` or `raw_` become channels; normals and other
+    foreign properties are ignored. `active_sh_degree` is the highest degree stored.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: a damaged or truncated file, a point cloud, a mesh, or a compressed splat file.
+    """
+    path = Path(path)
+    table = read_table(path)
+    _check_is_splat(table, path)
+    columns = {name: torch.from_numpy(_as_float32(values)) for name, values in table.columns.items()}
+    sh = _read_sh(columns, path)
+    return Gaussians(
+        means=_stacked(columns, POSITION),
+        quats=_stacked(columns, ROTATION),
+        log_scales=_stacked(columns, SCALE),
+        logit_opacities=columns["opacity"],
+        sh=sh,
+        channels={name: column for name, column in columns.items() if name.startswith(CHANNEL_PREFIXES)},
+        active_sh_degree=max(round(sh.shape[1] ** 0.5) - 1, 0),
+    )
+
+
+def _color_columns(sh: Tensor) -> tuple[list[str], Tensor]:
+    """Names and values [N, 3 K] of the colour properties; the higher bands lie channel by channel."""
+    count = sh.shape[1]
+    if count == 0:
+        return [], sh.reshape(sh.shape[0], 0)
+    rest = sh[:, 1:].transpose(1, 2).reshape(sh.shape[0], 3 * (count - 1))
+    return [*COLOR, *(f"f_rest_{i}" for i in range(rest.shape[1]))], torch.cat([sh[:, 0], rest], dim=1)
+
+
+def _read_sh(columns: Mapping[str, Tensor], path: Path) -> Tensor:
+    """Coefficients [N, K, 3] from the f_dc and f_rest properties."""
+    rest_count = sum(name.startswith("f_rest_") for name in columns)
+    rest_names = [f"f_rest_{i}" for i in range(rest_count)]
+    has_color = any(name in columns for name in COLOR)
+    if not has_color and rest_count == 0:
+        return torch.zeros(columns["x"].shape[0], 0, 3)
+    missing = [name for name in (*COLOR, *rest_names) if name not in columns]
+    if missing:
+        raise ValueError(f"{path} lacks the colour properties {missing}; expected f_dc_0..2 and f_rest_* without gaps")
+    if rest_count not in [3 * (count - 1) for count in SH_COEFFICIENTS]:
+        raise ValueError(f"{path} has {rest_count} f_rest properties; expected 0, 9, 24 or 45 (SH degree 0 to 3)")
+    band_zero = _stacked(columns, COLOR)[:, None]
+    if rest_count == 0:
+        return band_zero
+    rest = _stacked(columns, tuple(rest_names)).reshape(-1, 3, rest_count // 3).transpose(1, 2)
+    return torch.cat([band_zero, rest], dim=1).contiguous()
+
+
+def _check_is_splat(table: PlyTable, path: Path) -> None:
+    """Raises with what the file seems to be, if it does not hold Gaussians."""
+    missing = [name for name in REQUIRED if name not in table.columns]
+    if not missing:
+        return
+    expected = f"expected a 3D Gaussian splat with the properties {' '.join(REQUIRED)}"
+    if "packed_position" in table.columns:
+        raise ValueError(
+            f"{path} is a compressed PlayCanvas/SuperSplat PLY; {expected}. "
+            "Export it as an uncompressed PLY (in SuperSplat: Export, PLY, without compression)"
+        )
+    if len(missing) < len(REQUIRED) - len(POSITION):
+        raise ValueError(f"{path} lacks {' '.join(missing)}; {expected}. Was it made by another kind of method?")
+    faces = table.header.element("face")
+    kind = "a mesh" if faces is not None and faces.count > 0 else "a point cloud"
+    raise ValueError(f"{path} looks like {kind} and lacks {' '.join(missing)}; {expected}. Give a trained splat")
+
+
+def _as_float32(values: NDArray) -> NDArray[np.float32]:
+    return np.ascontiguousarray(values, dtype=np.float32)
+
+
+def _stacked(columns: Mapping[str, Tensor], names: tuple[str, ...]) -> Tensor:
+    return torch.stack([columns[name] for name in names], dim=1)

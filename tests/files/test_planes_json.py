@@ -1,0 +1,111 @@
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from glassplat.files.planes_json import read_planes, write_planes
+from glassplat.scene.plane import Planes
+
+
+def random_planes(count: int = 3) -> Planes:
+    generator = torch.Generator().manual_seed(5)
+    return Planes(
+        centers=torch.randn(count, 3, generator=generator),
+        raw_normals=torch.randn(count, 3, generator=generator),
+        logit_reflectances=4 * torch.randn(count, generator=generator),
+        tangents=torch.randn(count, 3, generator=generator),
+        half_sizes=torch.rand(count, 2, generator=generator),
+        labels=tuple(range(2, 2 + count)),
+    )
+
+
+def edit(path: Path, **changes: object) -> None:
+    entries = json.loads(path.read_text())
+    for key, value in changes.items():
+        if value is None:
+            del entries[0][key]
+        else:
+            entries[0][key] = value
+    path.write_text(json.dumps(entries))
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_planes_survive_bit_for_bit(tmp_path: Path, count: int) -> None:
+    planes = random_planes(count)
+    write_planes(tmp_path / "planes.json", planes)
+    read = read_planes(tmp_path / "planes.json")
+    assert read.labels == planes.labels
+    for name, tensor in planes.tensors().items():
+        assert torch.equal(read.tensors()[name], tensor), name
+
+
+def test_a_perfect_mirror_survives(tmp_path: Path) -> None:
+    planes = random_planes(1).with_tensors({"logit_reflectances": torch.tensor([30.0])})
+    write_planes(tmp_path / "planes.json", planes)
+    assert json.loads((tmp_path / "planes.json").read_text())[0]["base_reflectance"] == 1.0
+    assert read_planes(tmp_path / "planes.json").logit_reflectances.item() == 30.0
+
+
+def test_readable_values_are_unit_normals_and_reflectances(tmp_path: Path) -> None:
+    planes = random_planes(2)
+    write_planes(tmp_path / "planes.json", planes)
+    entries = json.loads((tmp_path / "planes.json").read_text())
+    assert [math.hypot(*entry["normal"]) for entry in entries] == pytest.approx([1.0, 1.0])
+    assert [entry["base_reflectance"] for entry in entries] == planes.base_reflectances.tolist()
+
+
+def test_an_edit_by_hand_wins_over_the_raw_value(tmp_path: Path) -> None:
+    write_planes(tmp_path / "planes.json", random_planes())
+    edit(tmp_path / "planes.json", normal=[0.0, 2.0, 0.0], base_reflectance=0.25)
+    read = read_planes(tmp_path / "planes.json")
+    assert read.normals[0].tolist() == [0.0, 1.0, 0.0]
+    assert read.base_reflectances[0].item() == pytest.approx(0.25)
+    assert torch.equal(read.raw_normals[1:], random_planes().raw_normals[1:])
+
+
+def test_raw_values_may_be_left_out(tmp_path: Path) -> None:
+    write_planes(tmp_path / "planes.json", random_planes())
+    edit(tmp_path / "planes.json", raw_normal=None, logit_reflectance=None, base_reflectance=1.0)
+    read = read_planes(tmp_path / "planes.json")
+    torch.testing.assert_close(read.normals, random_planes().normals)
+    assert torch.isfinite(read.logit_reflectances).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"center": [0, 1]}, r"center = \[0, 1\]; expected 3 finite numbers"),
+        ({"half_sizes": None}, "half_sizes = None; expected 2 finite numbers"),
+        ({"normal": [0, 0, 0]}, "normal of length 0"),
+        ({"label": "left"}, "label 'left'; expected a whole number"),
+        ({"label": 3}, "expected every label once"),
+        ({"base_reflectance": 1.5}, "base_reflectance = 1.5; expected a number from 0 to 1"),
+    ],
+)
+def test_a_malformed_plane_is_named(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+    write_planes(tmp_path / "planes.json", random_planes())
+    edit(tmp_path / "planes.json", **changes)
+    with pytest.raises(ValueError, match=message):
+        read_planes(tmp_path / "planes.json")
+
+
+def test_a_cut_off_file_is_refused(tmp_path: Path) -> None:
+    write_planes(tmp_path / "planes.json", random_planes())
+    text = (tmp_path / "planes.json").read_text()
+    (tmp_path / "planes.json").write_text(text[: len(text) // 2])
+    with pytest.raises(ValueError, match="not valid JSON"):
+        read_planes(tmp_path / "planes.json")
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no planes file at .*planes\.json"):
+        read_planes(tmp_path / "planes.json")
+
+
+def test_non_finite_planes_are_not_written(tmp_path: Path) -> None:
+    planes = random_planes().with_tensors({"centers": torch.full((3, 3), torch.nan)})
+    with pytest.raises(ValueError, match="plane 2 cannot be written: center must be finite"):
+        write_planes(tmp_path / "planes.json", planes)
+    assert not list(tmp_path.iterdir())
