@@ -1,0 +1,1 @@
+"""Terms of the training objective, each `(frame, view, scene) -> scalar`."""

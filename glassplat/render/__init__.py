@@ -1,0 +1,1 @@
+"""Renderers: one file per method, each a frozen dataclass `(scene, camera) -> Frame`."""

@@ -1,0 +1,63 @@
+"""The command line: `glassplat train | eval | render | demo`."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.logging import RichHandler
+
+from glassplat.commands.demo import Demo
+from glassplat.commands.evaluate import Evaluate
+from glassplat.commands.render import Render
+from glassplat.commands.train import Train
+from glassplat.data.errors import InputError
+from glassplat.init.planes import PlaneFitError
+from glassplat.train.trainer import TrainingDivergedError
+
+Command = (
+    Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Evaluate, tyro.conf.subcommand("eval")]
+    | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Demo, tyro.conf.subcommand("demo")]
+)
+INPUT_ERRORS = (InputError, PlaneFitError, FileNotFoundError, NotADirectoryError, PermissionError)
+INPUT_ERROR_CODE, FAILURE_CODE, INTERRUPTED_CODE = 2, 1, 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command; returns the exit code (0 done, 1 failed, 2 bad input, 130 interrupted)."""
+    command = tyro.cli(
+        Command,  # type: ignore[arg-type]
+        prog="glassplat",
+        description="Gaussian splatting for scenes with window panes, showcases and mirrors.",
+        args=arguments,
+        config=(tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes),
+    )
+    console = Console()
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[RichHandler(console=console, show_path=False)])
+    return guarded(command, console)
+
+
+def guarded(command: Train | Evaluate | Render | Demo, console: Console) -> int:
+    """Runs a command and turns expected errors into one readable message and an exit code."""
+    try:
+        command.run(console)
+    except INPUT_ERRORS as error:
+        Console(stderr=True).print(f"[red]error:[/red] {error}", highlight=False)
+        return INPUT_ERROR_CODE
+    except (TrainingDivergedError, OSError) as error:
+        Console(stderr=True).print(f"[red]stopped:[/red] {error}", highlight=False)
+        return FAILURE_CODE
+    except KeyboardInterrupt:
+        Console(stderr=True).print("interrupted; everything saved so far is intact, --resume goes on", highlight=False)
+        return INTERRUPTED_CODE
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,41 @@
+"""`glassplat demo`: the bundled showcase, decomposed in a few minutes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from glassplat.commands.evaluate import evaluate_run, results_table
+from glassplat.commands.stored_run import open_run
+from glassplat.commands.train import Train
+from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.splat_recipe import SplatRecipe
+
+SCENE = Path(__file__).parent.parent / "demo_scene"
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Train planar and splat on the bundled showcase and compare them.
+
+    Attributes:
+        output: where the two runs go.
+        iterations: length of each run.
+        seed: fixes every random choice.
+    """
+
+    output: Path = Path("runs/demo")
+    iterations: int = 2000
+    seed: int = 0
+
+    def run(self, console: Console) -> None:
+        """Trains both methods, evaluates them and says where the pictures are."""
+        results = []
+        for recipe in (PlanarRecipe(), SplatRecipe()):
+            folder = self.output / recipe.method
+            Train(recipe, SCENE, folder, iterations=self.iterations, seed=self.seed).run(console)
+            results.append(evaluate_run(open_run(folder)))
+        console.print(results_table(*results))
+        console.print(f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")

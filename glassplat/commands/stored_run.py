@@ -1,0 +1,36 @@
+"""Opening a finished run: its scene, renderer and data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from glassplat.data.dataset import Dataset, load_dataset
+from glassplat.render.frame import Renderer
+from glassplat.scene.scene import Scene
+from glassplat.train.run_directory import RunDirectory
+
+
+class StoredRun(NamedTuple):
+    """A finished run, ready to render."""
+
+    directory: RunDirectory
+    recipe: Any
+    scene: Scene
+    renderer: Renderer
+    dataset: Dataset
+    iterations: int
+
+
+def open_run(path: Path) -> StoredRun:
+    """Opens the run in a directory, with the capture it was trained on.
+
+    Raises:
+        InputError: the directory holds no finished run.
+        FileNotFoundError: the capture is no longer where it was.
+    """
+    directory = RunDirectory(path)
+    recipe, settings = directory.recipe(), directory.settings()
+    scene, iterations = directory.latest_scene()
+    dataset = load_dataset(Path(settings.data), downscale=settings.downscale)
+    return StoredRun(directory, recipe, scene, recipe.renderer(), dataset, iterations)

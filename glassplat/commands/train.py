@@ -1,0 +1,119 @@
+"""`glassplat train`: photographs to a trained scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from glassplat.data.dataset import Dataset, load_dataset
+from glassplat.data.errors import InputError
+from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
+from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.run import run_training
+from glassplat.train.run_directory import RunDirectory, RunSettings
+from glassplat.train.splat_recipe import SplatRecipe
+
+AnyRecipe = (
+    Annotated[SplatRecipe, tyro.conf.subcommand("splat")] | Annotated[PlanarRecipe, tyro.conf.subcommand("planar")]
+)
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a scene from photographs.
+
+    Attributes:
+        recipe: method and its options.
+        data: directory of the capture (COLMAP or transforms.json; pane masks in masks/).
+        output: directory of the run.
+        iterations: length of the run; every schedule stretches with it.
+        downscale: shrink the photographs by this factor.
+        seed: fixes every random choice.
+        device: where to train.
+        resume: go on with the run in `output`.
+    """
+
+    recipe: Annotated[AnyRecipe, tyro.conf.arg(name="")]
+    data: Path
+    output: Path
+    iterations: int = 30_000
+    downscale: float = 1.0
+    seed: int = 0
+    device: Literal["cpu"] = "cpu"
+    resume: bool = False
+
+    def run(self, console: Console) -> None:
+        """Trains, with a progress bar."""
+        if self.iterations < 1:
+            raise InputError(f"--iterations is {self.iterations}; expected at least 1")
+        dataset = load_dataset(self.data, downscale=self.downscale)
+        describe(dataset, console)
+        settings = RunSettings(str(self.data), self.iterations, self.downscale, self.seed, self.device)
+        directory = RunDirectory(self.output)
+        with TrainingProgress(console, self.iterations) as progress:
+            state = run_training(
+                self.recipe, settings, directory, dataset, resume=self.resume, listen=progress.show
+            )
+        console.print(
+            f"trained {self.recipe.method} for {state.step} iterations in {state.seconds:.0f} s: "
+            f"{len(state.scene.primary)} Gaussians, {len(state.scene.planes)} panes -> {self.output}"
+        )
+        console.print(f"next: glassplat eval {self.output}")
+
+
+def describe(dataset: Dataset, console: Console) -> None:
+    """Says what was loaded, with the loader's warnings."""
+    annotated = sum(view.pane_labels is not None for view in dataset.train)
+    console.print(
+        f"{dataset.root}: {len(dataset.train)} training and {len(dataset.test)} test views, "
+        f"{len(dataset.points.positions)} points, {annotated} annotated views with {len(dataset.pane_labels)} panes"
+    )
+    for warning in dataset.warnings:
+        console.print(f"[yellow]warning:[/yellow] {warning}")
+
+
+class TrainingProgress:
+    """A progress bar with loss, number of Gaussians and remaining time."""
+
+    def __init__(self, console: Console, iterations: int) -> None:
+        columns = (
+            TextColumn("{task.fields[stage]}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("loss {task.fields[loss]:.4f}"),
+            TextColumn("{task.fields[count]} Gaussians"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(compact=True),
+        )
+        self._bar = Progress(*columns, console=console, refresh_per_second=4)
+        self._task = self._bar.add_task("train", total=iterations, stage="", loss=0.0, count=0)
+        self._loss = 0.0
+
+    def __enter__(self) -> TrainingProgress:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._bar.stop()
+
+    def show(self, message: Message) -> None:
+        """Follows a run's messages."""
+        if isinstance(message, StageEntered):
+            self._bar.update(self._task, stage=message.stage, completed=message.step)
+            self._bar.console.print(f"step {message.step}: stage {message.stage}, {_counted(message.counts)}")
+        elif isinstance(message, ActionDone) and not message.action.startswith(("densify", "grow")):
+            self._bar.console.print(f"step {message.step}: {message.action}")
+        elif isinstance(message, StepDone):
+            self._loss = message.loss if not self._loss else 0.98 * self._loss + 0.02 * message.loss
+            total = message.counts["primary"] + message.counts["glass"]
+            self._bar.update(self._task, completed=message.step, loss=self._loss, count=total)
+
+
+def _counted(counts: object) -> str:
+    return ", ".join(f"{number} {name}" for name, number in dict(counts).items())  # type: ignore[call-overload]

@@ -1,0 +1,44 @@
+"""A scene as a folder of files: standard PLY, glass beside it, planes in a JSON sidecar."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+from glassplat.files.atomic import atomic_write
+from glassplat.files.planes_json import read_planes, write_planes
+from glassplat.files.ply import read_gaussians, write_gaussians
+from glassplat.scene.scene import Scene
+
+PRIMARY, GLASS, PLANES, SCENE = "point_cloud.ply", "glass.ply", "planes.json", "scene.json"
+
+
+def write_scene(folder: Path, scene: Scene) -> None:
+    """Writes a scene so that `read_scene` returns it exactly.
+
+    `point_cloud.ply` holds the primary Gaussians, which any splat viewer shows without the reflections;
+    `glass.ply` and `planes.json` hold what a viewer that knows panes needs on top.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    write_gaussians(folder / PRIMARY, scene.primary)
+    if len(scene.planes):
+        write_gaussians(folder / GLASS, scene.glass)
+        write_planes(folder / PLANES, scene.planes)
+    header = {"extent": scene.extent, "active_sh_degree": scene.primary.active_sh_degree}
+    with atomic_write(folder / SCENE) as temporary:
+        temporary.write_text(json.dumps(header, indent=2) + "\n")
+
+
+def read_scene(folder: Path) -> Scene:
+    """Reads what `write_scene` wrote.
+
+    Raises:
+        FileNotFoundError, ValueError: a file is missing, truncated or foreign.
+    """
+    header = json.loads((folder / SCENE).read_text())
+    primary = replace(read_gaussians(folder / PRIMARY), active_sh_degree=header["active_sh_degree"])
+    scene = Scene(primary, header["extent"])
+    if (folder / PLANES).is_file():
+        scene = replace(scene, glass=read_gaussians(folder / GLASS), planes=read_planes(folder / PLANES))
+    return scene

@@ -1,0 +1,53 @@
+"""What a renderer returns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from torch import Tensor
+
+from glassplat.scene.camera import Camera
+from glassplat.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class ScreenPass:
+    """Where the Gaussians of one scene part landed on screen, in one rasterisation pass.
+
+    The gradient of a loss with respect to `means2d` is the statistic that densification collects;
+    ask for it with `torch.autograd.grad`.
+
+    Attributes:
+        part: name of the scene part, as in `Scene.gaussian_sets`.
+        means2d: [C, N, 2] projected centres, pixels; part of the autograd graph.
+        radii: [C, N, 2] half extents in pixels; 0 where not visible.
+    """
+
+    part: str
+    means2d: Tensor
+    radii: Tensor
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A rendered view and its layers.
+
+    Attributes:
+        rgb: [H, W, 3] the image, sRGB, not clamped.
+        layers: further images by name, [H, W] or [H, W, 3]; a renderer's docstring lists its own.
+        screen: one record per rasterised part and pass.
+    """
+
+    rgb: Tensor
+    layers: Mapping[str, Tensor] = field(default_factory=dict)
+    screen: tuple[ScreenPass, ...] = ()
+
+
+class Renderer(Protocol):
+    """Anything that turns a scene and a camera into a frame."""
+
+    def __call__(self, scene: Scene, camera: Camera) -> Frame:
+        """Renders `scene` from `camera`; differentiable in every tensor of the scene."""
+        ...

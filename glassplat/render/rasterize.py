@@ -1,0 +1,64 @@
+"""The steps that every rasterising renderer shares: project a set, composite a list of splats."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from glassplat.kernels.project import project
+from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians, Splats
+from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
+
+NEAR_PER_EXTENT = 0.01
+"""Distance of the near plane as a share of the scene extent."""
+
+
+def project_gaussians(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    near: float,
+    poses: Tensor | None = None,
+    clip_planes: Tensor | None = None,
+) -> Projected:
+    """Projects a set of Gaussians into one camera, or into several that share its intrinsics.
+
+    Args:
+        gaussians: the set to project.
+        camera: intrinsics and image size; its pose is used unless `poses` is given.
+        near: depth below which a Gaussian is culled, world units.
+        poses: [C, 4, 4] `cam_from_world` of the cameras; may be left-handed.
+        clip_planes: [C, 4] world planes (n, d); a Gaussian whose centre has n . x + d <= 0 is culled.
+    """
+    poses = camera.cam_from_world[None] if poses is None else poses
+    raw = RawGaussians(
+        gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh
+    )
+    cameras = CameraBatch(
+        poses, camera.intrinsics.expand(poses.shape[0], 4).contiguous(), camera.width, camera.height, clip_planes
+    )
+    return project(raw, cameras, sh_degree=gaussians.active_sh_degree, near=near)
+
+
+def joined_splats(*parts: Projected) -> Splats:
+    """One list of splats per camera from several projected sets, in the order given."""
+    if len(parts) == 1:
+        only = parts[0]
+        return Splats(only.means2d, only.conics, only.opacities, only.depths, only.radii)
+    names = ("means2d", "conics", "opacities", "depths", "radii")
+    return Splats(*(torch.cat([getattr(part, name) for part in parts], dim=1) for name in names))
+
+
+def over_background(image: Tensor, alpha: Tensor, background: tuple[float, float, float]) -> Tensor:
+    """Adds the light of a constant background [3] behind an image [..., 3] with coverage alpha [...]."""
+    if not any(background):
+        return image
+    color = torch.tensor(background, dtype=image.dtype, device=image.device)
+    return image + (1 - alpha)[..., None] * color
+
+
+def mean_depth(depth_sum: Tensor, alpha: Tensor) -> Tensor:
+    """Blended depth (TR-Gaussians, Eq. 4): weighted depth sum over total weight; 0 where nothing is."""
+    covered = alpha > 1e-6
+    return torch.where(covered, depth_sum / torch.where(covered, alpha, torch.ones_like(alpha)), torch.zeros_like(alpha))

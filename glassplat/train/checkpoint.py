@@ -1,0 +1,101 @@
+"""Checkpoints: every tensor of a training state in one safetensors file, no pickle."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from glassplat.data.errors import InputError
+from glassplat.densify.default import ScreenStatistics
+from glassplat.files.atomic import atomic_write
+from glassplat.scene.gaussians import PER_GAUSSIAN, Gaussians
+from glassplat.scene.plane import Planes
+from glassplat.scene.scene import Scene
+from glassplat.train.optimizer import Optimizer
+from glassplat.train.state import TrainState
+
+FORMAT = "glassplat-checkpoint-1"
+
+
+def save_checkpoint(path: Path, state: TrainState) -> None:
+    """Writes `state` so that training goes on from it with the same result; atomic.
+
+    Raises:
+        OSError: the disk is full or not writable; an older file at `path` stays as it was.
+    """
+    scene = state.scene
+    tensors: dict[str, Tensor] = {}
+    for part, gaussians in scene.gaussian_sets().items():
+        tensors |= {f"scene/{part}/{name}": t for name, t in gaussians.tensors().items()}
+    tensors |= {f"scene/planes/{name}": t for name, t in scene.planes.tensors().items()}
+    for name, (first, second) in state.optimizer.moments.items():
+        tensors |= {f"first/{name}": first, f"second/{name}": second}
+    for part, statistics in state.statistics.items():
+        tensors |= {f"statistics/{part}/{name}": t for name, t in statistics.tensors().items()}
+    header = {
+        "format": FORMAT,
+        "step": state.step,
+        "seed": state.seed,
+        "seconds": state.seconds,
+        "extent": scene.extent,
+        "labels": list(scene.planes.labels),
+        "active_sh_degree": {part: g.active_sh_degree for part, g in scene.gaussian_sets().items()},
+        "updates": state.optimizer.updates,
+    }
+    with atomic_write(path) as temporary:
+        owned = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
+        save_file(owned, temporary, metadata={"glassplat": json.dumps(header)})
+
+
+def load_checkpoint(path: Path) -> TrainState:
+    """Reads what `save_checkpoint` wrote.
+
+    Raises:
+        InputError: the file is truncated, or is no checkpoint of glassplat.
+        FileNotFoundError: there is no such file.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"no checkpoint at {path}; expected the file that training writes there")
+    try:
+        with safe_open(path, framework="pt") as opened:
+            header = json.loads((opened.metadata() or {}).get("glassplat", "{}"))
+            tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    except (SafetensorError, ValueError) as error:
+        raise InputError(f"{path} is truncated or not a checkpoint ({error}); use an older one or train again") from error
+    if header.get("format") != FORMAT:
+        raise InputError(f"{path} has format {header.get('format')!r}; expected {FORMAT!r}, as glassplat's training writes it")
+    return restored_state(header, tensors)
+
+
+def restored_state(header: dict, tensors: dict[str, Tensor]) -> TrainState:
+    """The training state of a checkpoint's header and tensors."""
+    sets = {part: restored_gaussians(under(tensors, f"scene/{part}/"), degree) for part, degree in header["active_sh_degree"].items()}
+    planes = Planes(**under(tensors, "scene/planes/"), labels=tuple(header["labels"]))
+    first, second = under(tensors, "first/"), under(tensors, "second/")
+    statistics = under(tensors, "statistics/")
+    parts = {name.partition("/")[0] for name in statistics}
+    return TrainState(
+        scene=Scene(extent=header["extent"], planes=planes, **sets),
+        seed=header["seed"],
+        step=header["step"],
+        seconds=header["seconds"],
+        optimizer=Optimizer({name: (first[name], second[name]) for name in first}, dict(header["updates"])),
+        statistics={part: ScreenStatistics(**under(statistics, f"{part}/")) for part in sorted(parts)},
+    )
+
+
+def restored_gaussians(tensors: dict[str, Tensor], active_sh_degree: int) -> Gaussians:
+    """A set of Gaussians from its named tensors."""
+    channels = {name: t for name, t in tensors.items() if name not in PER_GAUSSIAN}
+    main: dict[str, torch.Tensor] = {name: tensors[name] for name in PER_GAUSSIAN}
+    return Gaussians(**main, channels=channels, active_sh_degree=active_sh_degree)
+
+
+def under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The tensors whose name begins with a prefix, which is cut off."""
+    return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}

@@ -1,0 +1,83 @@
+"""Adam over named tensors, with learning rates that follow the run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from glassplat.kernels.adam import adam
+
+Moments = dict[str, tuple[Tensor, Tensor]]
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A learning rate over the run.
+
+    Attributes:
+        start: rate at the first iteration.
+        end: rate at the last one, reached exponentially; None keeps `start`.
+        per_extent: multiply by the scene extent (for positions).
+        rest: factor for every SH coefficient but the constant one; only for `sh`.
+    """
+
+    start: float
+    end: float | None = None
+    per_extent: bool = False
+    rest: float | None = None
+
+    def at(self, progress: float, extent: float) -> float:
+        """The rate at a progress in [0, 1]."""
+        scale = extent if self.per_extent else 1.0
+        if self.end is None:
+            return self.start * scale
+        return float(self.start ** (1 - progress) * self.end**progress * scale)
+
+    def scaled(self, factor: float) -> Rate:
+        """The same schedule times a factor."""
+        return Rate(self.start * factor, None if self.end is None else self.end * factor, self.per_extent, self.rest)
+
+
+@dataclass
+class Optimizer:
+    """Adam's state, keyed by the dotted parameter names of `Scene.parameters`.
+
+    Attributes:
+        moments: first and second moment of each parameter.
+        updates: how often each parameter was stepped, for the bias correction.
+    """
+
+    moments: Moments = field(default_factory=dict)
+    updates: dict[str, int] = field(default_factory=dict)
+
+    def step(self, parameters: Mapping[str, Tensor], gradients: Mapping[str, Tensor], rates: Mapping[str, float | Tensor]) -> None:
+        """Updates `parameters` in place for every name in `gradients`."""
+        for name, gradient in gradients.items():
+            parameter = parameters[name]
+            if parameter.numel() == 0:
+                continue
+            first, second = self.moments_of(name, parameter)
+            self.updates[name] = self.updates.get(name, 0) + 1
+            adam(parameter, gradient, first, second, lr=rates[name], step=self.updates[name])
+
+    def moments_of(self, name: str, parameter: Tensor) -> tuple[Tensor, Tensor]:
+        """The moments of a parameter, zero for one that is new."""
+        known = self.moments.get(name)
+        if known is None or known[0].shape != parameter.shape:
+            known = (torch.zeros_like(parameter), torch.zeros_like(parameter))
+            self.moments[name] = known
+            self.updates[name] = 0
+        return known
+
+
+def rate_tensor(rate: Rate, parameter: Tensor, progress: float, extent: float) -> float | Tensor:
+    """The rate as `adam` takes it: one number, or one per column where SH bands differ."""
+    value = rate.at(progress, extent)
+    if rate.rest is None:
+        return value
+    columns = torch.full(parameter.shape[1:], value * rate.rest, dtype=parameter.dtype)
+    columns[:1] = value
+    return columns.flatten()

@@ -1,0 +1,214 @@
+"""The recipe of `planar`: TR-Gaussians in three stages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+from glassplat.data.dataset import Dataset
+from glassplat.densify.default import DefaultDensify
+from glassplat.init.planes import PlaneFit, fit_planes, glass_gaussians
+from glassplat.init.points import gaussians_from_points
+from glassplat.losses.geometry import depth_deviation_loss
+from glassplat.losses.reflection import gradient_conflict, mask_loss
+from glassplat.losses.term import LossTerm
+from glassplat.render.planar import Planar
+from glassplat.render.splat import Splat
+from glassplat.scene.scene import Scene
+from glassplat.train.actions import Densify, PerturbOpacity, ResetOpacity
+from glassplat.train.optimizer import Rate
+from glassplat.train.splat_recipe import GaussianRates, Growth, growth_actions, photometric_terms, reset_moments
+from glassplat.train.stage import Every, Stage
+from glassplat.train.state import TrainState
+
+
+@dataclass(frozen=True)
+class PlaneRates:
+    """Learning rates of planes and glass, which the paper leaves out; see docs/experiments.md.
+
+    Attributes:
+        center: plane position in stage 2, per scene extent.
+        normal: plane normal in stage 2.
+        reflectance: logit of R0.
+        mark: logit of the glass mark.
+        joint_factor: factor on `center` and `normal` in stage 3 (paper: 0.1).
+    """
+
+    center: float = 1e-4
+    normal: float = 1e-4
+    reflectance: float = 1e-2
+    mark: float = 5e-2
+    joint_factor: float = 0.1
+
+    def of(self, factor: float) -> dict[str, Rate]:
+        """The rates by dotted parameter name."""
+        return {
+            "planes.centers": Rate(self.center * factor, per_extent=True),
+            "planes.raw_normals": Rate(self.normal * factor),
+            "planes.logit_reflectances": Rate(self.reflectance),
+            "glass.logit_mark": Rate(self.mark),
+        }
+
+
+@dataclass(frozen=True)
+class ReflectionWeights:
+    """Weights of the terms that tell reflection from transmission (TR-Gaussians, Eq. 17)."""
+
+    depth: float = 0.005
+    conflict: float = 0.2
+    mask: float = 0.5
+
+    def terms(self) -> tuple[LossTerm, ...]:
+        """The terms whose weight is not zero."""
+        terms = (
+            LossTerm("depth", self.depth, depth_deviation_loss),
+            LossTerm("conflict", self.conflict, gradient_conflict),
+            LossTerm("mask", self.mask, mask_loss),
+        )
+        return tuple(term for term in terms if term.weight != 0)
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """When and how much the opacity of what lies behind a pane is perturbed (Section III-C3).
+
+    It shares a rhythm with the opacity resets: every third beat is a reset, the other two perturb.
+
+    Attributes:
+        amplitude: half width of the uniform noise on the opacity; 0 switches it off.
+        share: distance between beats, as a share of the run.
+        least: fewest iterations between beats.
+        stop: share of the run after which nothing is perturbed any more.
+    """
+
+    amplitude: float = 0.4
+    share: float = 1 / 30
+    least: int = 250
+    stop: float = 0.8
+
+
+@dataclass(frozen=True)
+class PlaneEntry:
+    """Fits the planes and places the glass when reflections begin (Appendix A)."""
+
+    fit: PlaneFit
+    glass_count: int
+    seed: int
+
+    def __call__(self, state: TrainState, dataset: Dataset) -> None:
+        """Edits `state`."""
+        annotations = [(v.camera, v.pane_labels) for v in dataset.train if v.pane_labels is not None]
+        planes = fit_planes(state.scene.primary.means, annotations, extent=state.scene.extent, options=self.fit)
+        glass = glass_gaussians(planes, count=self.glass_count, seed=self.seed)
+        state.scene = replace(state.scene, planes=planes, glass=glass)
+        state.statistics.clear()
+
+
+@dataclass(frozen=True)
+class PlanarRecipe:
+    """TR-Gaussians: transmission, reflection and planes, trained in three stages.
+
+    Attributes:
+        sh_degree: highest degree of the view-dependent colour.
+        ssim_weight: lambda, share of D-SSIM in the photometric loss.
+        background: colour behind everything, sRGB.
+        stage_shares: lengths of the three stages (paper: 3000, 3000 and 24,000 iterations).
+        multi_stage: False skips stage 2 (ablation).
+        fresnel: False makes the strength independent of the angle (ablation).
+        intensity: False drops the reflection intensity a(u) (ablation).
+        glass_count: glass Gaussians placed on each pane.
+        weights: of the loss terms; zero switches a term off (ablation).
+        perturbation: of opacities; amplitude zero switches it off (ablation).
+        rates: learning rates of the Gaussians.
+        plane_rates: learning rates of planes and glass.
+        plane_fit: how planes are found from masks.
+        growth: when Gaussians are added, pruned and reset.
+        densify: how.
+    """
+
+    method: ClassVar[str] = "planar"
+
+    sh_degree: int = 3
+    ssim_weight: float = 0.2
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    stage_shares: tuple[float, float, float] = (0.1, 0.1, 0.8)
+    multi_stage: bool = True
+    fresnel: bool = True
+    intensity: bool = True
+    glass_count: int = 1000
+    weights: ReflectionWeights = field(default_factory=ReflectionWeights)
+    perturbation: Perturbation = field(default_factory=Perturbation)
+    rates: GaussianRates = field(default_factory=GaussianRates)
+    plane_rates: PlaneRates = field(default_factory=PlaneRates)
+    plane_fit: PlaneFit = field(default_factory=PlaneFit)
+    growth: Growth = field(default_factory=Growth)
+    densify: DefaultDensify = field(default_factory=DefaultDensify)
+
+    def initialise(self, dataset: Dataset) -> Scene:
+        """The first scene: one Gaussian per point, no planes yet."""
+        return Scene(gaussians_from_points(dataset.points, sh_degree=self.sh_degree), dataset.extent)
+
+    def renderer(self) -> Planar:
+        """The renderer of the finished scene, with all its layers."""
+        return Planar(self.background, fresnel=self.fresnel, intensity=self.intensity)
+
+    def stages(self, seed: int) -> tuple[Stage, ...]:
+        """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
+        first, second, third = self.stage_shares
+        entry = PlaneEntry(self.plane_fit, self.glass_count, seed)
+        initialisation = Stage(
+            name="1 initialisation",
+            share=first,
+            renderer=Splat(self.background, depth=False),
+            losses=photometric_terms(self.ssim_weight),
+            rates=self.rates.of("primary"),
+            actions=growth_actions(self.growth, self.densify),
+        )
+        if not self.multi_stage:
+            return initialisation, replace(self._joint(second + third), entry=entry)
+        return initialisation, self._adjustment(second, entry), self._joint(third)
+
+    def _adjustment(self, share: float, entry: PlaneEntry) -> Stage:
+        """Stage 2: the reflection's gradient reaches the planes, not the Gaussians."""
+        return Stage(
+            name="2 plane adjustment",
+            share=share,
+            renderer=self._training_renderer("planes"),
+            losses=(*photometric_terms(self.ssim_weight), *self.weights.terms()),
+            rates=self.rates.of("primary") | self.rates.of("glass") | self.plane_rates.of(1.0),
+            actions=(*growth_actions(self.growth, self.densify), self._densify_glass()),
+            entry=entry,
+        )
+
+    def _joint(self, share: float) -> Stage:
+        """Stage 3: everything learns, opacities are perturbed, planes move slowly."""
+        beat = Every(self.perturbation.share, 0.0, self.perturbation.stop, self.perturbation.least)
+        return Stage(
+            name="3 joint optimisation",
+            share=share,
+            renderer=self._training_renderer("all"),
+            losses=(*photometric_terms(self.ssim_weight), *self.weights.terms()),
+            rates=self.rates.of("primary")
+            | self.rates.of("glass")
+            | self.plane_rates.of(self.plane_rates.joint_factor)
+            | ({"primary.log_intensity": Rate(self.rates.intensity)} if self.intensity else {}),
+            actions=(
+                *growth_actions(self.growth, self.densify),
+                self._densify_glass(),
+                ResetOpacity(reset_moments(self.growth)),
+                PerturbOpacity(replace(beat, skip_multiples_of=3), self.perturbation.amplitude),
+            ),
+        )
+
+    def _training_renderer(self, gradient: str) -> Planar:
+        return Planar(
+            self.background,
+            fresnel=self.fresnel,
+            intensity=self.intensity,
+            reflection_gradient="all" if gradient == "all" else "planes",
+            deviation=self.weights.depth != 0,
+        )
+
+    def _densify_glass(self) -> Densify:
+        window = Every(0.0, self.growth.densify_start, self.growth.densify_stop, self.growth.densify_interval)
+        return Densify(window, self.densify, part="glass")

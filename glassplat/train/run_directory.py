@@ -1,0 +1,113 @@
+"""The directory that a run leaves behind."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from glassplat.data.dataset import Dataset
+from glassplat.data.errors import InputError
+from glassplat.files.atomic import atomic_write
+from glassplat.files.cameras_json import write_cameras
+from glassplat.files.scene_folder import read_scene, write_scene
+from glassplat.scene.scene import Scene
+from glassplat.train.recipe import recipe_from_json, recipe_to_json
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """What was asked for, beside the recipe.
+
+    Attributes:
+        data: directory of the capture.
+        iterations: length of the run.
+        downscale: factor by which photographs are shrunk.
+        seed: fixes every random choice.
+        device: where training runs.
+    """
+
+    data: str
+    iterations: int
+    downscale: float = 1.0
+    seed: int = 0
+    device: str = "cpu"
+
+
+@dataclass(frozen=True)
+class RunDirectory:
+    """Names of the files of a run.
+
+    ```
+    recipe.json  settings.json         what was run
+    log.jsonl                          one line per logged step
+    checkpoint.safetensors             to resume from
+    cameras.json                       all cameras
+    point_cloud/iteration_N/           point_cloud.ply, glass.ply, scene.json
+    results.json  per_view.json        metrics
+    sheets/  index.html                pictures
+    ```
+    """
+
+    path: Path
+
+    @property
+    def checkpoint(self) -> Path:
+        """Where the newest checkpoint is."""
+        return self.path / "checkpoint.safetensors"
+
+    @property
+    def log(self) -> Path:
+        """Where the training log is."""
+        return self.path / "log.jsonl"
+
+    @property
+    def results(self) -> Path:
+        """Where the metrics are."""
+        return self.path / "results.json"
+
+    def begin(self, recipe: Any, settings: RunSettings, dataset: Dataset) -> None:
+        """Creates the directory and records what is about to run."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        write_text(self.path / "recipe.json", recipe_to_json(recipe))
+        write_text(self.path / "settings.json", json.dumps(dataclasses.asdict(settings), indent=2))
+        write_cameras(self.path / "cameras.json", [(v.name, v.camera) for v in (*dataset.train, *dataset.test)])
+
+    def recipe(self) -> Any:
+        """The recorded recipe."""
+        return recipe_from_json(self._read("recipe.json"))
+
+    def settings(self) -> RunSettings:
+        """The recorded settings."""
+        try:
+            return RunSettings(**json.loads(self._read("settings.json")))
+        except (ValueError, TypeError) as error:
+            raise InputError(f"{self.path / 'settings.json'} cannot be read ({error}); train again") from error
+
+    def export(self, scene: Scene, step: int) -> Path:
+        """Writes the scene in the formats that others read; returns its folder."""
+        folder = self.path / "point_cloud" / f"iteration_{step}"
+        write_scene(folder, scene)
+        return folder
+
+    def latest_scene(self) -> tuple[Scene, int]:
+        """The exported scene of the highest iteration, and that iteration."""
+        folders = {int(f.name.rpartition("_")[2]): f for f in self.path.glob("point_cloud/iteration_*")}
+        if not folders:
+            raise InputError(f"{self.path} holds no point_cloud/iteration_N; expected a finished run. Train first, or --resume it")
+        step = max(folders)
+        return read_scene(folders[step]), step
+
+    def _read(self, name: str) -> str:
+        file = self.path / name
+        if not file.is_file():
+            raise InputError(f"{self.path} is not a run directory: no {name} in it; expected what `glassplat train --output` wrote")
+        return file.read_text()
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a text file atomically."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(text + "\n")

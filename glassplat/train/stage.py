@@ -1,0 +1,121 @@
+"""A training stage: which renderer, which losses, what learns, and what happens when."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from glassplat.data.dataset import Dataset
+from glassplat.losses.term import LossTerm
+from glassplat.render.frame import Renderer
+from glassplat.train.optimizer import Rate
+from glassplat.train.state import TrainState
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Where a run stands.
+
+    Attributes:
+        step: iterations done so far, counting the current one.
+        iterations: length of the whole run.
+        views: number of training views.
+    """
+
+    step: int
+    iterations: int
+    views: int
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done, in [0, 1]."""
+        return self.step / self.iterations
+
+
+@dataclass(frozen=True)
+class Every:
+    """A recurring moment, in shares of the run, so that shortening a run keeps its shape.
+
+    Attributes:
+        share: distance between two occurrences.
+        start, stop: first and last moment at which one may happen; `start` itself is not one.
+        least: smallest distance in iterations, below which results suffer however short the run.
+        skip_multiples_of: leave out every n-th occurrence (for interleaving two events).
+        only_multiples_of: keep every n-th occurrence only.
+    """
+
+    share: float
+    start: float = 0.0
+    stop: float = 1.0
+    least: int = 1
+    skip_multiples_of: int | None = None
+    only_multiples_of: int | None = None
+
+    def due(self, clock: Clock) -> bool:
+        """Whether the moment is now."""
+        interval = max(round(self.share * clock.iterations), self.least, 1)
+        count, remainder = divmod(clock.step, interval)
+        if remainder or not self.start * clock.iterations < clock.step <= self.stop * clock.iterations:
+            return False
+        if self.skip_multiples_of and count % self.skip_multiples_of == 0:
+            return False
+        return not self.only_multiples_of or count % self.only_multiples_of == 0
+
+
+class Action(Protocol):
+    """An edit of the training state at certain moments (opacity reset, perturbation, SH growth)."""
+
+    @property
+    def name(self) -> str:
+        """What the log calls it."""
+        ...
+
+    def due(self, clock: Clock) -> bool:
+        """Whether to act after this step."""
+        ...
+
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
+        """Edits `state`."""
+        ...
+
+
+class Entry(Protocol):
+    """Prepares the state when a stage begins (fitting planes, adding an environment)."""
+
+    def __call__(self, state: TrainState, dataset: Dataset) -> None:
+        """Edits `state`."""
+        ...
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of a recipe.
+
+    Attributes:
+        name: for the log.
+        share: length as a share of the run; a recipe's shares add up to one.
+        renderer: what turns the scene into an image.
+        losses: terms of the objective.
+        rates: learning rate of every parameter that learns; one that is missing is frozen.
+        actions: recurring edits, in the order in which they act.
+        entry: what to do once when the stage begins.
+    """
+
+    name: str
+    share: float
+    renderer: Renderer
+    losses: tuple[LossTerm, ...]
+    rates: Mapping[str, Rate]
+    actions: tuple[Action, ...] = ()
+    entry: Entry | None = None
+
+
+def stage_starts(stages: tuple[Stage, ...], iterations: int) -> list[int]:
+    """The first step of each stage, and the end of the run last."""
+    total = sum(stage.share for stage in stages)
+    starts, passed = [], 0.0
+    for stage in stages:
+        starts.append(round(passed / total * iterations))
+        passed += stage.share
+    return [*starts, iterations]

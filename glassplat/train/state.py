@@ -1,0 +1,41 @@
+"""Everything that changes during a run, and nothing else."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field
+
+import torch
+
+from glassplat.densify.default import ScreenStatistics
+from glassplat.scene.scene import Scene
+from glassplat.train.optimizer import Optimizer
+
+
+@dataclass
+class TrainState:
+    """The mutable state of a run.
+
+    Attributes:
+        scene: the scene as trained so far.
+        seed: fixes every random choice of the run.
+        step: iterations done.
+        optimizer: Adam's moments.
+        statistics: screen gradients collected for densification, by scene part.
+        seconds: time spent training so far, over all sittings.
+    """
+
+    scene: Scene
+    seed: int
+    step: int = 0
+    optimizer: Optimizer = field(default_factory=Optimizer)
+    statistics: dict[str, ScreenStatistics] = field(default_factory=dict)
+    seconds: float = 0.0
+
+    def generator(self, purpose: str) -> torch.Generator:
+        """A random generator for one purpose at this step.
+
+        It depends on the seed, the step and the purpose alone, so that a resumed run draws the same numbers.
+        """
+        key = zlib.crc32(f"{self.seed}/{self.step}/{purpose}".encode())
+        return torch.Generator().manual_seed(key)

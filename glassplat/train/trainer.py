@@ -1,0 +1,138 @@
+"""The training loop. It knows stages, losses and actions, and no method by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from glassplat.data.dataset import Dataset, View
+from glassplat.densify.default import ScreenStatistics
+from glassplat.render.frame import Frame, ScreenPass
+from glassplat.scene.scene import Scene
+from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
+from glassplat.train.optimizer import rate_tensor
+from glassplat.train.stage import Clock, Stage, stage_starts
+from glassplat.train.state import TrainState
+
+
+class TrainingDivergedError(FloatingPointError):
+    """A loss term became NaN or infinite."""
+
+
+class Differentiated(NamedTuple):
+    """One view's losses and their gradients."""
+
+    losses: dict[str, float]
+    gradients: dict[str, Tensor]
+    screen: list[tuple[ScreenPass, Tensor]]
+
+
+def train(stages: tuple[Stage, ...], dataset: Dataset, state: TrainState, iterations: int) -> Iterator[Message]:
+    """Trains until `iterations`, from wherever `state` stands.
+
+    `state` is edited in place and is consistent whenever a message is out, so a consumer may save it or
+    stop iterating at any message; training goes on later from a saved state with the same result.
+
+    Args:
+        stages: the recipe's stages.
+        dataset: photographs to fit.
+        state: initial or resumed state.
+        iterations: length of the whole run, over which all schedules stretch.
+
+    Yields:
+        `StageEntered`, `StepDone` and `ActionDone` messages.
+
+    Raises:
+        TrainingDivergedError: a loss is not finite; names the term, the step and the view.
+    """
+    starts = stage_starts(stages, iterations)
+    for stage, start, end in zip(stages, starts, starts[1:], strict=False):
+        if state.step >= end:
+            continue
+        if state.step == start:
+            if stage.entry is not None:
+                stage.entry(state, dataset)
+            yield StageEntered(state.step, stage.name, counts_of(state.scene))
+        while state.step < end:
+            yield from advance(stage, dataset, state, iterations)
+
+
+def advance(stage: Stage, dataset: Dataset, state: TrainState, iterations: int) -> Iterator[Message]:
+    """One optimisation step and the actions that are due after it."""
+    view = scheduled_view(dataset, state)
+    result = differentiate(stage, state.scene, view)
+    for name, value in result.losses.items():
+        if not math.isfinite(value):
+            raise TrainingDivergedError(
+                f"loss term {name!r} is {value} at step {state.step + 1} in view {view.name!r}; expected a finite number. "
+                "Lower the learning rates, or look for broken poses or images near that view"
+            )
+    update(stage, state, result.gradients, iterations)
+    collect_statistics(state, result.screen, view)
+    state.step += 1
+    clock = Clock(state.step, iterations, len(dataset.train))
+    due = [action for action in stage.actions if action.due(clock)]
+    for action in due:
+        action.apply(state, dataset, clock)
+    yield StepDone(state.step, view.name, sum(result.losses.values()), result.losses, counts_of(state.scene))
+    for action in due:
+        yield ActionDone(state.step, action.name, counts_of(state.scene))
+
+
+def scheduled_view(dataset: Dataset, state: TrainState) -> View:
+    """The view of this step: every view once per pass, in an order drawn anew for each pass."""
+    count = len(dataset.train)
+    number, position = divmod(state.step, count)
+    generator = torch.Generator().manual_seed(state.seed * 1_000_003 + number)
+    return dataset.train[int(torch.randperm(count, generator=generator)[position])]
+
+
+def differentiate(stage: Stage, scene: Scene, view: View) -> Differentiated:
+    """Renders a view and returns the weighted losses with the gradients of all that learns."""
+    leaves = {
+        name: tensor.detach().requires_grad_()
+        for name, tensor in scene.parameters().items()
+        if name in stage.rates and tensor.numel() > 0
+    }
+    frame = stage.renderer(scene.with_parameters(leaves), view.camera)
+    terms = weighted_terms(stage, frame, view, scene)
+    total = torch.stack(list(terms.values())).sum()
+    tracked = [screen for screen in frame.screen if screen.means2d.requires_grad and screen.means2d.numel() > 0]
+    inputs = [*leaves.values(), *(screen.means2d for screen in tracked)]
+    found = torch.autograd.grad(total, inputs, allow_unused=True)
+    gradients = {name: g for name, g in zip(leaves, found[: len(leaves)], strict=True) if g is not None}
+    screen = [(s, g) for s, g in zip(tracked, found[len(leaves) :], strict=True) if g is not None]
+    return Differentiated({name: float(value.detach()) for name, value in terms.items()}, gradients, screen)
+
+
+def weighted_terms(stage: Stage, frame: Frame, view: View, scene: Scene) -> dict[str, Tensor]:
+    """Every loss term that applies to the view, times its weight."""
+    values = {term.name: term.function(frame, view, scene) for term in stage.losses}
+    weights = {term.name: term.weight for term in stage.losses}
+    return {name: weights[name] * value for name, value in values.items() if value is not None}
+
+
+def update(stage: Stage, state: TrainState, gradients: Mapping[str, Tensor], iterations: int) -> None:
+    """Steps the optimiser at the stage's learning rates."""
+    parameters = state.scene.parameters()
+    progress = state.step / iterations
+    rates = {name: rate_tensor(stage.rates[name], parameters[name], progress, state.scene.extent) for name in gradients}
+    state.optimizer.step(parameters, gradients, rates)
+
+
+def collect_statistics(state: TrainState, screen: list[tuple[ScreenPass, Tensor]], view: View) -> None:
+    """Adds the step's screen gradients to the statistics that densification reads."""
+    for record, gradient in screen:
+        known = state.statistics.get(record.part) or ScreenStatistics.zeros(record.means2d.shape[1])
+        state.statistics[record.part] = known.accumulate(
+            gradient, record.radii, width=view.camera.width, height=view.camera.height
+        )
+
+
+def counts_of(scene: Scene) -> dict[str, int]:
+    """Number of Gaussians in each part, and of planes."""
+    return {name: len(part) for name, part in scene.gaussian_sets().items()} | {"planes": len(scene.planes)}
