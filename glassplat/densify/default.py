@@ -1,0 +1,180 @@
+"""Adaptive density control of 3DGS: clone, split and prune by screen-space gradients."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from glassplat.densify.edit import Edit, Moments, apply_edit, clone, forget, keep, split
+from glassplat.scene.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class ScreenStatistics:
+    """What the views since the last densification saw of each Gaussian.
+
+    Attributes:
+        gradient_sum: [N] sum over views of the norm of the loss gradient with respect to the
+            centre on screen, in normalised device coordinates (the image spans [-1, 1] both ways).
+        view_count: [N] number of views that saw the Gaussian.
+        max_radius: [N] largest radius on screen, as a share of the longer image side.
+    """
+
+    gradient_sum: Tensor
+    view_count: Tensor
+    max_radius: Tensor
+
+    @staticmethod
+    def zeros(count: int, *, device: torch.device | str = "cpu") -> ScreenStatistics:
+        """Statistics of `count` Gaussians that no view has seen."""
+        return ScreenStatistics(*(torch.zeros(count, device=device) for _ in range(3)))
+
+    @property
+    def mean_gradient(self) -> Tensor:
+        """[N] mean gradient norm over the views that saw the Gaussian; 0 where none did."""
+        return self.gradient_sum / self.view_count.clamp(min=1)
+
+
+@torch.no_grad()
+def accumulate(
+    statistics: ScreenStatistics, means2d_gradient: Tensor, radii: Tensor, *, width: int, height: int
+) -> ScreenStatistics:
+    """The statistics with the views of one training step added.
+
+    A shift by one pixel is 2 / width in normalised device coordinates, so gradients per pixel are
+    multiplied by width / 2 and height / 2; that makes the threshold independent of resolution.
+
+    Args:
+        statistics: the record so far.
+        means2d_gradient: [C, N, 2] gradient of one view's loss with respect to `means2d` in pixels.
+        radii: [C, N, 2] bounds on screen in pixels; 0 where a view does not see the Gaussian.
+        width: image width in pixels.
+        height: image height in pixels.
+    """
+    visible = (radii > 0).all(dim=-1)
+    pixels_per_unit = means2d_gradient.new_tensor([width / 2, height / 2])
+    norms = torch.where(visible, (means2d_gradient * pixels_per_unit).norm(dim=-1), 0)
+    shares = torch.where(visible, radii.amax(dim=-1) / max(width, height), 0)
+    return ScreenStatistics(
+        gradient_sum=statistics.gradient_sum + norms.sum(dim=0),
+        view_count=statistics.view_count + visible.sum(dim=0),
+        max_radius=torch.maximum(statistics.max_radius, shares.amax(dim=0).to(statistics.max_radius.dtype)),
+    )
+
+
+@dataclass(frozen=True)
+class DefaultDensify:
+    """When and how 3DGS adds and removes Gaussians.
+
+    A Gaussian whose mean screen gradient exceeds the threshold is under-reconstructed: a small one
+    is cloned, a large one split in two. Nearly transparent ones are removed.
+
+    Attributes:
+        interval: steps between densifications; at least about one pass over the views, so that
+            every Gaussian has been seen when it is judged.
+        start: share of the run after which densification begins.
+        stop: share of the run after which it ends.
+        gradient_threshold: mean gradient norm, in normalised device coordinates, above which a
+            Gaussian is densified.
+        dense_fraction: Gaussians whose longest axis is above this share of the scene extent are
+            split, smaller ones cloned.
+        prune_opacity: Gaussians less opaque than this are removed.
+        prune_scale_fraction: with `prune_large`, Gaussians with an axis above this share of the
+            scene extent are removed.
+        prune_radius_fraction: with `prune_large`, Gaussians that any view saw with a radius above
+            this share of its longer side are removed; None keeps them. 3DGS states a limit of 20
+            pixels but clears the radii before it looks at them, so its published results have none.
+        cap: largest number of Gaussians to grow to; None for no limit.
+    """
+
+    interval: int = 100
+    start: float = 500 / 30_000
+    stop: float = 15_000 / 30_000
+    gradient_threshold: float = 2e-4
+    dense_fraction: float = 0.01
+    prune_opacity: float = 0.005
+    prune_scale_fraction: float = 0.1
+    prune_radius_fraction: float | None = None
+    cap: int | None = None
+
+    @torch.no_grad()
+    def densify(
+        self,
+        gaussians: Gaussians,
+        moments: Moments,
+        statistics: ScreenStatistics,
+        *,
+        extent: float,
+        generator: torch.Generator,
+        prune_large: bool = False,
+    ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
+        """The primary Gaussians and their moments after cloning, splitting and pruning.
+
+        Statistics start again at `ScreenStatistics.zeros` afterwards.
+
+        Args:
+            gaussians: the primary Gaussians.
+            moments: optimiser moments by dotted name; those of other parts pass through.
+            statistics: what was gathered since the last call, one row per Gaussian.
+            extent: radius of the capture in world units.
+            generator: source of randomness, on the device of `gaussians`.
+            prune_large: also remove what is too large; 3DGS does so once the opacities have been
+                reset for the first time.
+        """
+        if statistics.view_count.shape[0] != len(gaussians):
+            raise ValueError(
+                f"statistics hold {statistics.view_count.shape[0]} rows for {len(gaussians)} Gaussians; "
+                "start new statistics whenever the set has changed"
+            )
+        grown = self._growth(gaussians, statistics, extent=extent, generator=generator)
+        radius = torch.where(grown.fresh, 0, statistics.max_radius[grown.source])
+        superfluous = self._superfluous(gaussians, grown, radius, extent=extent, prune_large=prune_large)
+        return apply_edit(gaussians, moments, grown.then(keep(~superfluous)))
+
+    def _growth(
+        self, gaussians: Gaussians, statistics: ScreenStatistics, *, extent: float, generator: torch.Generator
+    ) -> Edit:
+        chosen = self._chosen(statistics.mean_gradient)
+        large = gaussians.log_scales.amax(dim=1) > math.log(self.dense_fraction * extent)
+        halved = split(gaussians, (chosen & large).nonzero().squeeze(1), generator=generator)
+        # What was not split moved forward by as many rows as were split before it.
+        row_after_split = (~(chosen & large)).cumsum(dim=0) - 1
+        return halved.then(clone(len(halved), row_after_split[chosen & ~large]))
+
+    def _chosen(self, mean_gradient: Tensor) -> Tensor:
+        """[N] bool: what to clone or split; under a cap, those with the largest gradients."""
+        chosen = mean_gradient >= self.gradient_threshold
+        if self.cap is None:
+            return chosen
+        room = max(self.cap - mean_gradient.shape[0], 0)
+        order = torch.where(chosen, mean_gradient, -1).argsort(descending=True, stable=True)
+        within = torch.zeros_like(chosen)
+        within[order[:room]] = True
+        return chosen & within
+
+    def _superfluous(
+        self, gaussians: Gaussians, edit: Edit, radius: Tensor, *, extent: float, prune_large: bool
+    ) -> Tensor:
+        """[M] bool: which Gaussians of the edited set to remove; `radius` [M] as in `max_radius`."""
+        superfluous = torch.sigmoid(edit.result(gaussians, "logit_opacities")) < self.prune_opacity
+        if prune_large:
+            longest = edit.result(gaussians, "log_scales").amax(dim=1)
+            superfluous |= longest > math.log(self.prune_scale_fraction * extent)
+            if self.prune_radius_fraction is not None:
+                superfluous |= radius > self.prune_radius_fraction
+        return superfluous
+
+
+@torch.no_grad()
+def reset_opacity(
+    gaussians: Gaussians, moments: Moments, *, ceiling: float = 0.01
+) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
+    """Lowers every opacity to at most `ceiling` and forgets the opacities' moments (3DGS, Section 5.2).
+
+    What the photographs need grows back; what does not is pruned.
+    """
+    lowered = gaussians.logit_opacities.clamp(max=math.log(ceiling / (1 - ceiling)))
+    return gaussians.with_tensors({"logit_opacities": lowered}), forget(moments, ("primary.logit_opacities",))
