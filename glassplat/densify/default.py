@@ -109,18 +109,20 @@ class DefaultDensify:
         *,
         extent: float,
         generator: torch.Generator,
+        part: str = "primary",
         prune_large: bool = False,
     ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
-        """The primary Gaussians and their moments after cloning, splitting and pruning.
+        """A set of Gaussians and their moments after cloning, splitting and pruning.
 
         Statistics start again at `ScreenStatistics.zeros` afterwards.
 
         Args:
-            gaussians: the primary Gaussians.
+            gaussians: the set to edit.
             moments: optimiser moments by dotted name; those of other parts pass through.
             statistics: what was gathered since the last call, one row per Gaussian.
             extent: radius of the capture in world units.
             generator: source of randomness, on the device of `gaussians`.
+            part: the scene part that `gaussians` is.
             prune_large: also remove what is too large; 3DGS does so once the opacities have been
                 reset for the first time.
         """
@@ -132,7 +134,7 @@ class DefaultDensify:
         grown = self._growth(gaussians, statistics, extent=extent, generator=generator)
         radius = torch.where(grown.fresh, 0, statistics.max_radius[grown.source])
         superfluous = self._superfluous(gaussians, grown, radius, extent=extent, prune_large=prune_large)
-        return apply_edit(gaussians, moments, grown.then(keep(~superfluous)))
+        return apply_edit(gaussians, moments, grown.then(keep(~superfluous)), part=part)
 
     def _growth(
         self, gaussians: Gaussians, statistics: ScreenStatistics, *, extent: float, generator: torch.Generator

@@ -6,22 +6,10 @@ from dataclasses import dataclass, replace
 
 from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify, reset_opacity
+from glassplat.densify.edit import forget
 from glassplat.densify.perturb import perturb_opacities
-from glassplat.scene.gaussians import Gaussians
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
-
-
-def gaussian_moments(state: TrainState, part: str) -> dict:
-    """The optimiser's moments of one set of Gaussians, by tensor name."""
-    prefix = f"{part}."
-    return {name.removeprefix(prefix): m for name, m in state.optimizer.moments.items() if name.startswith(prefix)}
-
-
-def put_gaussians(state: TrainState, part: str, gaussians: Gaussians, moments: dict) -> None:
-    """Puts an edited set and its moments back."""
-    state.scene = replace(state.scene, **{part: gaussians})
-    state.optimizer.moments.update({f"{part}.{name}": m for name, m in moments.items()})
 
 
 @dataclass(frozen=True)
@@ -47,7 +35,6 @@ class GrowSh:
 class Densify:
     """Clones, splits and prunes one set of Gaussians by its screen gradients."""
 
-    when: Every
     densifier: DefaultDensify
     part: str = "primary"
 
@@ -58,7 +45,8 @@ class Densify:
 
     def due(self, clock: Clock) -> bool:
         """Whether to act after this step; never more often than about once per pass over the views."""
-        return replace(self.when, least=max(self.when.least, min(clock.views, 100))).due(clock)
+        least = max(self.densifier.interval, min(clock.views, 2 * self.densifier.interval))
+        return Every(0.0, self.densifier.start, self.densifier.stop, least).due(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
         """Edits `state`."""
@@ -66,14 +54,15 @@ class Densify:
         gaussians = state.scene.gaussian_sets()[self.part]
         if statistics is None or len(gaussians) == 0:
             return
-        edited, moments = self.densifier.densify(
+        edited, state.optimizer.moments = self.densifier.densify(
             gaussians,
-            gaussian_moments(state, self.part),
+            state.optimizer.moments,
             statistics,
             extent=state.scene.extent,
             generator=state.generator(self.name),
+            part=self.part,
         )
-        put_gaussians(state, self.part, edited, moments)
+        state.scene = replace(state.scene, **{self.part: edited})
 
 
 @dataclass(frozen=True)
@@ -90,10 +79,10 @@ class ResetOpacity:
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
         """Edits `state`."""
-        gaussians, moments = reset_opacity(
-            state.scene.primary, gaussian_moments(state, "primary"), ceiling=self.ceiling
+        lowered, state.optimizer.moments = reset_opacity(
+            state.scene.primary, state.optimizer.moments, ceiling=self.ceiling
         )
-        put_gaussians(state, "primary", gaussians, moments)
+        state.scene = replace(state.scene, primary=lowered)
 
 
 @dataclass(frozen=True)
@@ -106,20 +95,16 @@ class PerturbOpacity:
 
     def due(self, clock: Clock) -> bool:
         """Whether to act after this step."""
-        return self.when.due(clock)
+        return self.amplitude > 0 and self.when.due(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
         """Edits `state`."""
-        if len(state.scene.planes) == 0:
-            return
-        cameras = [view.camera for view in dataset.train]
-        state.scene = replace(
-            state.scene,
-            primary=perturb_opacities(
-                state.scene.primary,
-                state.scene.planes,
-                cameras,
-                amplitude=self.amplitude,
-                generator=state.generator(self.name),
-            )[0],
+        perturbed, selected = perturb_opacities(
+            state.scene.primary,
+            state.scene.planes,
+            [view.camera for view in dataset.train],
+            amplitude=self.amplitude,
+            generator=state.generator(self.name),
         )
+        state.scene = replace(state.scene, primary=perturbed)
+        state.optimizer.moments = forget(state.optimizer.moments, ("primary.logit_opacities",), selected)

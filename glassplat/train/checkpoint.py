@@ -36,7 +36,7 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
     for name, (first, second) in state.optimizer.moments.items():
         tensors |= {f"first/{name}": first, f"second/{name}": second}
     for part, statistics in state.statistics.items():
-        tensors |= {f"statistics/{part}/{name}": t for name, t in statistics.tensors().items()}
+        tensors |= {f"statistics/{part}/{name}": t for name, t in vars(statistics).items()}
     header = {
         "format": FORMAT,
         "step": state.step,

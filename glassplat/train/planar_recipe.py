@@ -15,9 +15,9 @@ from glassplat.losses.term import LossTerm
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
-from glassplat.train.actions import Densify, PerturbOpacity, ResetOpacity
+from glassplat.train.actions import Densify, PerturbOpacity
 from glassplat.train.optimizer import Rate
-from glassplat.train.splat_recipe import GaussianRates, Growth, growth_actions, photometric_terms, reset_moments
+from glassplat.train.splat_recipe import GaussianRates, Rhythm, growth_actions, opacity_resets, photometric_terms
 from glassplat.train.stage import Every, Stage
 from glassplat.train.state import TrainState
 
@@ -122,8 +122,8 @@ class PlanarRecipe:
         rates: learning rates of the Gaussians.
         plane_rates: learning rates of planes and glass.
         plane_fit: how planes are found from masks.
-        growth: when Gaussians are added, pruned and reset.
-        densify: how.
+        rhythm: when opacities are reset and the SH degree grows.
+        densify: when and how Gaussians are added and pruned.
     """
 
     method: ClassVar[str] = "planar"
@@ -141,7 +141,7 @@ class PlanarRecipe:
     rates: GaussianRates = field(default_factory=GaussianRates)
     plane_rates: PlaneRates = field(default_factory=PlaneRates)
     plane_fit: PlaneFit = field(default_factory=PlaneFit)
-    growth: Growth = field(default_factory=Growth)
+    rhythm: Rhythm = field(default_factory=Rhythm)
     densify: DefaultDensify = field(default_factory=DefaultDensify)
 
     def initialise(self, dataset: Dataset) -> Scene:
@@ -162,7 +162,7 @@ class PlanarRecipe:
             renderer=Splat(self.background, depth=False),
             losses=photometric_terms(self.ssim_weight),
             rates=self.rates.of("primary"),
-            actions=growth_actions(self.growth, self.densify),
+            actions=growth_actions(self.rhythm, self.densify),
         )
         if not self.multi_stage:
             return initialisation, replace(self._joint(second + third), entry=entry)
@@ -176,7 +176,7 @@ class PlanarRecipe:
             renderer=self._training_renderer("planes"),
             losses=(*photometric_terms(self.ssim_weight), *self.weights.terms()),
             rates=self.rates.of("primary") | self.rates.of("glass") | self.plane_rates.of(1.0),
-            actions=(*growth_actions(self.growth, self.densify), self._densify_glass()),
+            actions=(*growth_actions(self.rhythm, self.densify), Densify(self.densify, part="glass")),
             entry=entry,
         )
 
@@ -193,9 +193,9 @@ class PlanarRecipe:
             | self.plane_rates.of(self.plane_rates.joint_factor)
             | ({"primary.log_intensity": Rate(self.rates.intensity)} if self.intensity else {}),
             actions=(
-                *growth_actions(self.growth, self.densify),
-                self._densify_glass(),
-                ResetOpacity(reset_moments(self.growth)),
+                *growth_actions(self.rhythm, self.densify),
+                Densify(self.densify, part="glass"),
+                opacity_resets(self.rhythm),
                 PerturbOpacity(replace(beat, skip_multiples_of=3), self.perturbation.amplitude),
             ),
         )
@@ -208,7 +208,3 @@ class PlanarRecipe:
             reflection_gradient="all" if gradient == "all" else "planes",
             deviation=self.weights.depth != 0,
         )
-
-    def _densify_glass(self) -> Densify:
-        window = Every(0.0, self.growth.densify_start, self.growth.densify_stop, self.growth.densify_interval)
-        return Densify(window, self.densify, part="glass")

@@ -48,21 +48,16 @@ class GaussianRates:
 
 
 @dataclass(frozen=True)
-class Growth:
-    """When the set of Gaussians changes, in shares of the run (3DGS: of 30,000 iterations).
+class Rhythm:
+    """When opacities are reset and the SH degree grows, in shares of the run (3DGS: of 30,000 iterations).
 
     Attributes:
-        densify_interval: iterations between densifications; never below one pass over the views.
-        densify_start, densify_stop: shares of the run between which Gaussians are added and pruned.
         reset_share: distance between opacity resets, as a share of the run.
         reset_least: fewest iterations between two resets, for short runs.
         reset_stop: share of the run after which no reset happens.
         sh_share: distance between rises of the SH degree, as a share of the run.
     """
 
-    densify_interval: int = 100
-    densify_start: float = 500 / 30_000
-    densify_stop: float = 0.5
     reset_share: float = 0.1
     reset_least: int = 1000
     reset_stop: float = 0.45
@@ -74,15 +69,14 @@ def photometric_terms(ssim_weight: float) -> tuple[LossTerm, ...]:
     return LossTerm("l1", 1 - ssim_weight, l1), LossTerm("dssim", ssim_weight, dssim)
 
 
-def growth_actions(growth: Growth, densifier: DefaultDensify) -> tuple[Action, ...]:
+def growth_actions(rhythm: Rhythm, densifier: DefaultDensify) -> tuple[Action, ...]:
     """Densification and SH growth of the primary Gaussians."""
-    window = Every(0.0, growth.densify_start, growth.densify_stop, growth.densify_interval)
-    return Densify(window, densifier), GrowSh(Every(growth.sh_share))
+    return Densify(densifier), GrowSh(Every(rhythm.sh_share))
 
 
-def reset_moments(growth: Growth) -> Every:
-    """When opacities are reset."""
-    return Every(growth.reset_share, 0.0, growth.reset_stop, growth.reset_least)
+def opacity_resets(rhythm: Rhythm) -> ResetOpacity:
+    """The recurring opacity reset."""
+    return ResetOpacity(Every(rhythm.reset_share, 0.0, rhythm.reset_stop, rhythm.reset_least))
 
 
 @dataclass(frozen=True)
@@ -94,8 +88,8 @@ class SplatRecipe:
         ssim_weight: lambda, share of D-SSIM in the photometric loss.
         background: colour behind everything, sRGB.
         rates: learning rates.
-        growth: when Gaussians are added, pruned and reset.
-        densify: how.
+        rhythm: when opacities are reset and the SH degree grows.
+        densify: when and how Gaussians are added and pruned.
     """
 
     method: ClassVar[str] = "splat"
@@ -104,7 +98,7 @@ class SplatRecipe:
     ssim_weight: float = 0.2
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rates: GaussianRates = field(default_factory=GaussianRates)
-    growth: Growth = field(default_factory=Growth)
+    rhythm: Rhythm = field(default_factory=Rhythm)
     densify: DefaultDensify = field(default_factory=DefaultDensify)
 
     def initialise(self, dataset: Dataset) -> Scene:
@@ -125,8 +119,8 @@ class SplatRecipe:
                 losses=photometric_terms(self.ssim_weight),
                 rates=self.rates.of("primary"),
                 actions=(
-                    *growth_actions(self.growth, self.densify),
-                    ResetOpacity(reset_moments(self.growth)),
+                    *growth_actions(self.rhythm, self.densify),
+                    opacity_resets(self.rhythm),
                 ),
             ),
         )

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from glassplat.data.dataset import Dataset, View
-from glassplat.densify.default import ScreenStatistics
+from glassplat.densify.default import ScreenStatistics, accumulate
 from glassplat.render.frame import Frame, ScreenPass
 from glassplat.scene.scene import Scene
 from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
@@ -128,8 +128,8 @@ def collect_statistics(state: TrainState, screen: list[tuple[ScreenPass, Tensor]
     """Adds the step's screen gradients to the statistics that densification reads."""
     for record, gradient in screen:
         known = state.statistics.get(record.part) or ScreenStatistics.zeros(record.means2d.shape[1])
-        state.statistics[record.part] = known.accumulate(
-            gradient, record.radii, width=view.camera.width, height=view.camera.height
+        state.statistics[record.part] = accumulate(
+            known, gradient, record.radii, width=view.camera.width, height=view.camera.height
         )
 
 
