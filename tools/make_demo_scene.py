@@ -99,7 +99,7 @@ def shrink_mask(labels: np.ndarray, factor: int) -> np.ndarray:
     return labels[factor // 2 :: factor, factor // 2 :: factor]
 
 
-def convert(source: Path, target: Path, shrink: Shrink, factor: int) -> None:
+def convert(source: Path, target: Path, shrink: Shrink, *, factor: int) -> None:
     """Reads one picture, shrinks it and writes it under the same name."""
     target.parent.mkdir(parents=True, exist_ok=True)
     with Image.open(source) as picture:
@@ -121,10 +121,10 @@ def convert_pictures(source: Path, output: Path, factor: int) -> None:
     }
     for folder, shrink in shrinks.items():
         for picture in sorted((source / folder).iterdir()):
-            convert(picture, output / folder / picture.name, shrink, factor)
+            convert(picture, output / folder / picture.name, shrink, factor=factor)
     for picture in sorted((source / "gt/strength").iterdir()):
         shrink = shrink_pane if picture.stem.endswith("_pane") else shrink_strength
-        convert(picture, output / "gt/strength" / picture.name, shrink, factor)
+        convert(picture, output / "gt/strength" / picture.name, shrink, factor=factor)
     shutil.copyfile(source / "gt/planes.json", output / "gt/planes.json")
 
 
