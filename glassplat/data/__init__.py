@@ -1,0 +1,1 @@
+"""Captures: photographs, poses, pane masks and points, from any of the formats people have."""

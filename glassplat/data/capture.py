@@ -1,0 +1,91 @@
+"""What a loader reads from a data set, before photographs, masks and splits are looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Coloured points in world space.
+
+    Attributes:
+        positions: [P, 3] float32, world units.
+        colors: [P, 3] uint8 sRGB.
+    """
+
+    positions: Tensor
+    colors: Tensor
+
+    def __post_init__(self) -> None:
+        expected = (self.positions.shape[0], 3)
+        if tuple(self.positions.shape) != expected or tuple(self.colors.shape) != expected:
+            raise ValueError(
+                f"expected positions and colors of shape [P, 3], got {list(self.positions.shape)} and "
+                f"{list(self.colors.shape)}"
+            )
+        if self.positions.dtype != torch.float32 or self.colors.dtype != torch.uint8:
+            raise TypeError(
+                f"expected float32 positions and uint8 colors, got {self.positions.dtype}, {self.colors.dtype}"
+            )
+
+    def __len__(self) -> int:
+        return self.positions.shape[0]
+
+    @staticmethod
+    def from_arrays(positions: NDArray[Any], colors: NDArray[Any]) -> PointCloud:
+        """Points from arrays of any real type; colours in 0..255."""
+        return PointCloud(
+            torch.from_numpy(np.ascontiguousarray(positions, dtype=np.float32).reshape(-1, 3)),
+            torch.from_numpy(np.ascontiguousarray(colors, dtype=np.uint8).reshape(-1, 3)),
+        )
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One posed photograph as the data set describes it, distorted or not.
+
+    Attributes:
+        name: unique name with suffix, `/` between folders.
+        image_path: the file.
+        lens: a `pycolmap.Camera` of any model.
+        cam_from_world: [4, 4] float64, OpenCV axes.
+    """
+
+    name: str
+    image_path: Path
+    lens: Any
+    cam_from_world: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Capture:
+    """All that one data format says about a capture.
+
+    Attributes:
+        shots: every photograph, or those for training when the data set ships a split.
+        test_shots: the photographs for testing; None leaves the split to the reader.
+        points: sparse points, or None where the data set has none.
+        format_name: for messages, such as "COLMAP".
+        warnings: full sentences.
+        random_points: how to place points when `points` is None; None takes the default.
+    """
+
+    shots: tuple[Shot, ...]
+    test_shots: tuple[Shot, ...] | None
+    points: PointCloud | None
+    format_name: str
+    warnings: tuple[str, ...] = ()
+    random_points: Callable[[], PointCloud] | None = None
+
+
+Loader = Callable[[Path], Capture | None]
+"""Reads a folder: None when it is not in the loader's format; raises `InputError` when it is, but broken."""

@@ -1,0 +1,189 @@
+"""The files of a COLMAP model, binary and text.
+
+COLMAP's own reader is not used: on a truncated file it reads garbage or does not come back.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import torch
+from numpy.typing import NDArray
+
+from glassplat.data.capture import PointCloud
+from glassplat.data.errors import InputError
+from glassplat.data.lens import make_lens
+from glassplat.scene.pose import rotation_from_quat
+
+UNIT_TOLERANCE = 1e-2
+"""How far the length of a quaternion may be from one, as rounding in a text file."""
+
+_OBSERVATION_BYTES = 24  # x, y as double and the id of a point
+_TRACK_BYTES = 8  # id of an image, index of an observation
+
+
+@dataclass(frozen=True)
+class ModelImage:
+    """One registered image: name, camera, rotation `wxyz` and translation of `cam_from_world`."""
+
+    name: str
+    camera_id: int
+    quat: tuple[float, ...]
+    translation: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A sparse reconstruction; `lenses` maps camera ids to `pycolmap.Camera`."""
+
+    lenses: dict[int, Any]
+    images: tuple[ModelImage, ...]
+    points: PointCloud
+
+
+def model_suffix(folder: Path) -> str | None:
+    """`.bin` or `.txt` when the folder holds a model of that kind; binary wins, as in COLMAP."""
+    for suffix in (".bin", ".txt"):
+        if all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
+            return suffix
+    return None
+
+
+def read_model(folder: Path) -> Model:
+    """Read cameras, images and points; a folder without points gives none.
+
+    Raises:
+        InputError: a file is cut off or holds what no model holds; names the file.
+    """
+    suffix = model_suffix(folder)
+    if suffix is None:
+        raise InputError(f"no COLMAP model in {folder}; expected cameras and images as .bin or .txt")
+    lenses = dict(_records_of(folder / f"cameras{suffix}"))
+    images = tuple(_records_of(folder / f"images{suffix}"))
+    points_path = folder / f"points3D{suffix}"
+    rows = _records_of(points_path) if points_path.is_file() else []
+    table = np.array(rows, dtype=np.float64).reshape(-1, 6)
+    return Model(lenses, images, PointCloud.from_arrays(table[:, :3], table[:, 3:]))
+
+
+def pose_matrix(image: ModelImage) -> NDArray[np.float64]:
+    """[4, 4] `cam_from_world`, OpenCV axes.
+
+    Raises:
+        InputError: the rotation is no unit quaternion.
+    """
+    norm = float(np.linalg.norm(image.quat))
+    if not abs(norm - 1) < UNIT_TOLERANCE:
+        quat = list(image.quat)
+        raise InputError(f"the rotation of {image.name} is {quat}; expected a finite unit quaternion (w, x, y, z)")
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_from_quat(torch.tensor(image.quat, dtype=torch.float64)).numpy()
+    pose[:3, 3] = image.translation
+    return pose
+
+
+def _records_of(path: Path) -> list[Any]:
+    """Everything in one file of a model, with errors that name the file."""
+    binary, text = PARSERS[path.stem]
+    found: list[Any] = []
+    try:
+        if path.suffix == ".bin":
+            found.extend(binary(_Bytes(path.read_bytes())))
+        else:
+            found.extend(text(iter(path.read_text(encoding="utf-8").splitlines())))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except (struct.error, EOFError, ValueError, IndexError) as error:
+        raise InputError(f"{path} is cut off or damaged ({error}); export the COLMAP model again") from error
+    return found
+
+
+class _Bytes:
+    """A cursor over a binary file."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+        self.offset = 0
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        values = struct.unpack_from(f"<{layout}", self.data, self.offset)
+        self.offset += struct.calcsize(f"<{layout}")
+        return values
+
+    def skip(self, count: int) -> None:
+        self.offset += count
+        if self.offset > len(self.data):
+            raise EOFError("the file ends too early")
+
+    def text(self) -> str:
+        end = self.data.index(b"\0", self.offset)
+        start, self.offset = self.offset, end + 1
+        return self.data[start:end].decode()
+
+
+def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, Any]]:
+    (count,) = data.take("Q")
+    for _ in range(count):
+        camera_id, model_id, width, height = data.take("IiQQ")
+        model = pycolmap.CameraModelId(model_id).name
+        parameter_count = len(
+            pycolmap.Camera.create_from_model_id(0, pycolmap.CameraModelId(model_id), 1.0, 1, 1).params
+        )
+        yield camera_id, make_lens(model, list(data.take(f"{parameter_count}d")), (width, height))
+
+
+def _binary_images(data: _Bytes) -> Iterator[ModelImage]:
+    (count,) = data.take("Q")
+    for _ in range(count):
+        values = data.take("I7dI")
+        name = data.text()
+        (observations,) = data.take("Q")
+        data.skip(observations * _OBSERVATION_BYTES)
+        yield ModelImage(name, values[8], values[1:5], values[5:8])
+
+
+def _binary_points(data: _Bytes) -> Iterator[tuple[float, ...]]:
+    (count,) = data.take("Q")
+    for _ in range(count):
+        values = data.take("Q3d3BdQ")
+        data.skip(values[8] * _TRACK_BYTES)
+        yield values[1:7]
+
+
+def _records(stream: Iterator[str]) -> Iterator[str]:
+    """Lines that are neither empty nor a comment."""
+    stripped = (line.strip() for line in stream)
+    return (line for line in stripped if line and not line.startswith("#"))
+
+
+def _text_cameras(stream: Iterator[str]) -> Iterator[tuple[int, Any]]:
+    for line in _records(stream):
+        camera_id, model, width, height, *parameters = line.split()
+        yield int(camera_id), make_lens(model, [float(value) for value in parameters], (int(width), int(height)))
+
+
+def _text_images(stream: Iterator[str]) -> Iterator[ModelImage]:
+    for line in _records(stream):
+        fields = line.split(maxsplit=9)
+        numbers = tuple(float(value) for value in fields[1:8])
+        yield ModelImage(fields[9], int(fields[8]), numbers[:4], numbers[4:])
+        next(stream, None)  # The observations; this line is empty where there are none.
+
+
+def _text_points(stream: Iterator[str]) -> Iterator[tuple[float, ...]]:
+    for line in _records(stream):
+        fields = line.split(maxsplit=7)
+        yield (*(float(value) for value in fields[1:4]), *(float(int(value)) for value in fields[4:7]))
+
+
+PARSERS: dict[str, tuple[Callable[[_Bytes], Iterator[Any]], Callable[[Iterator[str]], Iterator[Any]]]] = {
+    "cameras": (_binary_cameras, _text_cameras),
+    "images": (_binary_images, _text_images),
+    "points3D": (_binary_points, _text_points),
+}

@@ -1,0 +1,181 @@
+"""Photographs, poses, masks and points of one capture, whatever format they came in."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from glassplat.data import colmap, transforms
+from glassplat.data.capture import Capture, Loader, PointCloud, Shot
+from glassplat.data.errors import InputError, first_names
+from glassplat.data.masks import Polarity, find_masks
+from glassplat.data.random_points import points_in_view
+from glassplat.data.view import WHITE, PreparedView, Rgb, View, ViewOptions, prepare_view
+
+__all__ = ["Dataset", "PointCloud", "View", "load_dataset"]
+
+TEST_EVERY = 8
+EXTENT_MARGIN = 1.1
+FARTHEST_ORIGIN = 1e4
+
+LOADERS: tuple[tuple[Loader, str], ...] = (
+    (colmap.load_colmap, colmap.LOOKED_FOR),
+    (transforms.load_transforms, transforms.LOOKED_FOR),
+)
+"""Tried in this order; each with what it looks for, for the message when none fits."""
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """One capture, split for training and testing.
+
+    Attributes:
+        root: the folder.
+        train: views to learn from, by name; at least two.
+        test: views held out, by name; may be empty.
+        points: sparse points in the capture's own frame.
+        extent: 1.1 x the largest distance of a training camera from their mean; world units.
+        pane_labels: every label that occurs in the masks, ascending.
+        truth: folder of known layers and planes for evaluation, where the capture has one.
+        warnings: what was assumed or left out, full sentences.
+        split: how the test views were chosen.
+    """
+
+    root: Path
+    train: tuple[View, ...]
+    test: tuple[View, ...]
+    points: PointCloud
+    extent: float
+    pane_labels: tuple[int, ...] = ()
+    truth: Path | None = None
+    warnings: tuple[str, ...] = ()
+    split: str = ""
+
+
+def load_dataset(
+    root: Path | str, *, downscale: float = 1.0, background: Rgb = WHITE, mask_polarity: Polarity = "auto"
+) -> Dataset:
+    """Read a capture: COLMAP, or transforms.json in any of its dialects; photographs are read later.
+
+    Args:
+        root: the capture's folder.
+        downscale: photographs are reduced by this factor, at least 1.
+        background: sRGB in [0, 1], seen through transparent pixels.
+        mask_polarity: which value of black-and-white masks is the pane.
+
+    Raises:
+        FileNotFoundError: no such folder.
+        InputError: a format that is not known, or a capture that cannot be used; the message says why.
+    """
+    root = Path(root)
+    if not math.isfinite(downscale) or downscale < 1:
+        raise InputError(f"downscale is {downscale}; expected a number of at least 1")
+    capture = _load_capture(root)
+    shots = sorted((*capture.shots, *(capture.test_shots or ())), key=lambda shot: shot.name)
+    _check_names(shots)
+    masks = find_masks(root, {shot.name: shot.image_path for shot in shots}, mask_polarity)
+    options = ViewOptions(downscale, background)
+    prepared = [prepare_view(shot, masks.masks.get(shot.name), options) for shot in shots]
+    train, test, split = _split([p.view for p in prepared], capture)
+    points, point_warnings = _points(capture, train)
+    extent = _extent(train)
+    warnings = (
+        *capture.warnings,
+        *masks.warnings,
+        *_view_warnings(prepared),
+        *point_warnings,
+        *_far_off(train, extent),
+    )
+    truth = root / "gt"
+    return Dataset(root, train, test, points, extent, masks.labels, truth if truth.is_dir() else None, warnings, split)
+
+
+def _load_capture(root: Path) -> Capture:
+    """The answer of the first loader that knows the format."""
+    if not root.is_dir():
+        raise FileNotFoundError(f"no folder {root}; expected the folder of a capture")
+    for load, _ in LOADERS:
+        capture = load(root)
+        if capture is not None:
+            return capture
+    looked_for = "; ".join(text for _, text in LOADERS)
+    found = first_names(sorted(path.name for path in root.iterdir()), limit=8) or "nothing"
+    raise InputError(f"{root} is no capture that can be read. Looked for: {looked_for}. Found: {found}.")
+
+
+def _check_names(shots: list[Shot]) -> None:
+    names = [shot.name for shot in shots]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise InputError(f"photographs that occur more than once: {first_names(repeated)}; keep one pose for each")
+
+
+def _split(views: list[View], capture: Capture) -> tuple[tuple[View, ...], tuple[View, ...], str]:
+    """Training views, test views (both by name) and how they were chosen."""
+    if capture.test_shots is None:
+        held_out = {view.name for view in views[::TEST_EVERY]}
+        split = f"every {TEST_EVERY}th image by name"
+    else:
+        held_out = {shot.name for shot in capture.test_shots}
+        split = "shipped with the data"
+    train = tuple(view for view in views if view.name not in held_out)
+    test = tuple(view for view in views if view.name in held_out)
+    if len(train) < 2:
+        raise InputError(
+            f"{len(train)} of {len(views)} photographs are left for training (test views: {split}); expected at least two"
+        )
+    return train, test, split
+
+
+def _extent(train: tuple[View, ...]) -> float:
+    """1.1 x the radius of the training cameras about their mean; world units."""
+    centers = torch.stack([view.camera.center.double() for view in train])
+    radius = float((centers - centers.mean(0)).norm(dim=1).max())
+    if radius <= 0:
+        raise InputError("all training cameras stand at one point; expected photographs from different places")
+    return EXTENT_MARGIN * radius
+
+
+def _far_off(train: tuple[View, ...], extent: float) -> tuple[str, ...]:
+    """A warning when coordinates are so large that float32 cannot resolve the scene."""
+    distance = float(train[0].camera.center.norm())
+    if distance <= FARTHEST_ORIGIN * extent:
+        return ()
+    return (
+        f"The cameras are {distance / extent:.0f} scene extents away from the origin; shift the capture to keep precision.",
+    )
+
+
+def _points(capture: Capture, train: tuple[View, ...]) -> tuple[PointCloud, list[str]]:
+    """The capture's points, or random ones with a warning."""
+    if capture.points is None:
+        make = capture.random_points or (lambda: points_in_view([view.camera for view in train]))
+        points = make()
+        return points, [
+            f"The {capture.format_name} capture has no points; {len(points)} random points are used instead."
+        ]
+    finite = torch.isfinite(capture.points.positions).all(dim=1)
+    if finite.all():
+        return capture.points, []
+    kept = PointCloud(capture.points.positions[finite], capture.points.colors[finite])
+    if not len(kept):
+        raise InputError("no point of the capture is finite; export the sparse model again")
+    return kept, [f"{int((~finite).sum())} points that are not finite are left out."]
+
+
+def _view_warnings(prepared: list[PreparedView]) -> list[str]:
+    """What was assumed about photographs, once for all of them."""
+    warnings = []
+    rescaled = [p.view.name for p in prepared if p.rescaled]
+    if rescaled:
+        warnings.append(
+            f"{len(rescaled)} photographs are scaled copies of what was calibrated; intrinsics were scaled with them "
+            f"({first_names(rescaled)})."
+        )
+    transparent = [p.view.name for p in prepared if p.transparent]
+    if transparent:
+        warnings.append(f"{len(transparent)} photographs have transparency; they are laid over the background colour.")
+    return warnings

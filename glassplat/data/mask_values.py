@@ -1,0 +1,101 @@
+"""What the stored values of one mask file mean: labels of panes, or black and white."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from glassplat.data.errors import InputError, first_names
+from glassplat.files.images import open_image
+
+HIGHEST_LABEL = 64
+"""Grey values up to this one are labels when nothing brighter occurs; no one paints masks for the eye that dark."""
+THRESHOLD = 128
+WHITE = 255
+SOFT_SHARE = 0.05
+"""Largest share of grey pixels at the edges of a black-and-white mask."""
+FEW_SHADES = 4
+"""An antialiased edge has more shades of grey than this; fewer are labels somebody meant."""
+LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
+LOSSY_NOISE = 24
+SIXTEEN_TO_EIGHT = 257
+
+
+@dataclass(frozen=True)
+class MaskValues:
+    """One understood mask.
+
+    Attributes:
+        kind: `labels` for pane labels, `binary` for black (0) and white (1), `empty` for all black.
+        pixels: [H, W] uint8.
+    """
+
+    kind: Literal["labels", "binary", "empty"]
+    pixels: NDArray[np.uint8]
+
+
+def read_mask_values(path: Path) -> MaskValues:
+    """Read one mask file.
+
+    Raises:
+        InputError: the file is no image, or its values are neither labels nor black and white.
+    """
+    try:
+        image = open_image(path)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    shades = _shades(image, path)
+    counts = np.bincount(shades.ravel(), minlength=WHITE + 1)
+    lossy = path.suffix.lower() in LOSSY_SUFFIXES
+    if not lossy and not counts[HIGHEST_LABEL + 1 :].any():
+        return MaskValues("labels" if counts[1:].any() else "empty", shades)
+    _check_black_and_white(counts, path, lossy)
+    pixels = (shades >= THRESHOLD).astype(np.uint8)
+    return MaskValues("binary" if pixels.any() else "empty", pixels)
+
+
+def _shades(image: Image.Image, path: Path) -> NDArray[np.uint8]:
+    """[H, W] grey values, or the indices of a palette."""
+    if image.mode == "1" or (image.mode == "P" and not _is_black_and_white(image)):
+        return np.array(image).astype(np.uint8)
+    if image.mode.startswith("I"):
+        values = np.array(image)
+        return (values if values.max() <= WHITE else values // SIXTEEN_TO_EIGHT).astype(np.uint8)
+    if image.mode in ("L", "LA", "P"):
+        return np.array(image.convert("L"))
+    return _one_colour(np.array(image.convert("RGB")), path)
+
+
+def _is_black_and_white(image: Image.Image) -> bool:
+    """Whether a palette shows nothing but black and white, so that its colours count and not its indices."""
+    colours = {colour for _, colour in image.convert("RGB").getcolors(image.width * image.height) or []}
+    return colours <= {(0, 0, 0), (WHITE, WHITE, WHITE)}
+
+
+def _one_colour(pixels: NDArray[np.uint8], path: Path) -> NDArray[np.uint8]:
+    """Grey values of an RGB mask: black against one colour."""
+    bright = pixels >= THRESHOLD
+    mixtures = np.bincount((bright[..., 0] * 4 + bright[..., 1] * 2 + bright[..., 2]).ravel(), minlength=8)
+    if np.count_nonzero(mixtures[1:]) > 1:
+        raise InputError(
+            f"{path} is painted in several colours; expected a label image (grey, 0 no pane, 1..K the pane)"
+        )
+    return pixels.max(axis=2)
+
+
+def _check_black_and_white(counts: NDArray[np.int64], path: Path, lossy: bool) -> None:
+    """Refuse greys that could be labels or a photograph; `counts` holds the pixels of each value."""
+    tolerance = LOSSY_NOISE if lossy else 0
+    grey = counts[tolerance + 1 : WHITE - tolerance]
+    few = not lossy and 0 < np.count_nonzero(grey) < FEW_SHADES
+    if few or grey.sum() > SOFT_SHARE * counts.sum():
+        present = first_names([str(value) for value in np.flatnonzero(counts)])
+        raise InputError(
+            f"{path} holds the grey values {present}, which are neither pane labels (0..{HIGHEST_LABEL}) nor black and white (0 "
+            "and 255); write 0 for no pane and 1..K for the panes"
+        )

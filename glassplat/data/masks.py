@@ -1,0 +1,194 @@
+"""Pane masks: which file belongs to which photograph, and what its values mean.
+
+A mask is either a label image (0 no pane, 1..K the pane) or binary (0 and 255, one pane). Binary masks come in both
+polarities; which one is decided over the whole set, because one mask alone cannot tell.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from glassplat.data.errors import InputError, first_names
+from glassplat.data.mask_values import MaskValues, read_mask_values
+from glassplat.files.images import IMAGE_SUFFIXES
+
+MASK_FOLDER = "masks"
+MASK_MARK = "_mask"
+FRAMED_BY_PANE = 0.8
+MOSTLY_PANE = 0.5
+
+Polarity = Literal["auto", "bright", "dark"]
+"""Which value of binary masks is the pane; `auto` decides by what lies along the image borders."""
+
+
+@dataclass(frozen=True)
+class PaneMask:
+    """One mask file and how to read it.
+
+    Attributes:
+        path: the file.
+        inverted: dark pixels are the pane.
+    """
+
+    path: Path
+    inverted: bool
+
+    def labels(self) -> NDArray[np.uint8]:
+        """[H, W] pane label of every pixel of the file, 0 for no pane."""
+        return _labels(read_mask_values(self.path), self.inverted)
+
+
+@dataclass(frozen=True)
+class MaskSet:
+    """The masks of a capture by name of the photograph, all labels in them, and what the user should know."""
+
+    masks: Mapping[str, PaneMask]
+    labels: tuple[int, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def find_masks(root: Path, photographs: Mapping[str, Path], polarity: Polarity = "auto") -> MaskSet:
+    """Find and understand the masks of a capture.
+
+    Looked for, for a photograph `a/x.jpg`: `masks/a/x.png`, `masks/a/x.jpg.png`, `masks/a/x.jpg`, `masks/a/x_mask.png`, each
+    with any image suffix and without the folder where that is unique, and `x_mask.png` beside the photograph.
+
+    Args:
+        root: the capture's folder.
+        photographs: path of every photograph by name.
+        polarity: which value of binary masks is the pane.
+
+    Raises:
+        InputError: masks that match no photograph, two for one photograph, values of no clear meaning, no pane in any.
+    """
+    paths = _match(root / MASK_FOLDER, photographs)
+    if not paths:
+        if (root / MASK_FOLDER).is_dir():
+            raise InputError(f"{root / MASK_FOLDER} holds no mask images; add masks, or remove the folder")
+        return MaskSet({})
+    values = {name: read_mask_values(path) for name, path in paths.items()}
+    _check_same_kind(values, paths)
+    inverted, warnings = _decide_polarity(list(values.values()), polarity)
+    masks = {name: PaneMask(path, inverted) for name, path in paths.items()}
+    found = {name: _present(_labels(mask_values, inverted)) for name, mask_values in values.items()}
+    labels = sorted(set().union(*found.values()))
+    if not labels:
+        raise InputError(
+            f"none of the {len(masks)} masks of {root} marks a pane; expected values 1..K, or 255, on the panes"
+        )
+    empty = sorted(name for name, present in found.items() if not present)
+    if empty:
+        warnings.append(f"{len(empty)} masks mark no pane ({first_names(empty)}); these views count as seeing none.")
+    return MaskSet(masks, tuple(labels), tuple(warnings))
+
+
+def _labels(values: MaskValues, inverted: bool) -> NDArray[np.uint8]:
+    """[H, W] pane labels."""
+    return (values.pixels == 0).astype(np.uint8) if inverted else values.pixels
+
+
+def _present(labels: NDArray[np.uint8]) -> set[int]:
+    """The labels above zero that occur."""
+    return {int(label) for label in np.flatnonzero(np.bincount(labels.ravel())) if label > 0}
+
+
+def _match(folder: Path, photographs: Mapping[str, Path]) -> dict[str, Path]:
+    """Mask path by name of the photograph, in the order of the names."""
+    found: dict[str, list[Path]] = defaultdict(list)
+    names = _names_by_key(photographs)
+    unmatched: list[str] = []
+    for path in _image_files(folder):
+        owners = next((names[key] for key in _keys_of_mask(path.relative_to(folder)) if key in names), [])
+        if len(owners) > 1:
+            raise InputError(
+                f"mask {path} could belong to {first_names(sorted(owners))}; name it after one, with its folder"
+            )
+        if owners:
+            found[owners[0]].append(path)
+        else:
+            unmatched.append(path.relative_to(folder).as_posix())
+    if unmatched:
+        raise InputError(
+            f"{len(unmatched)} masks in {folder} match no photograph: {first_names(sorted(unmatched))}; name a mask like its "
+            f"photograph, such as {PurePosixPath(min(photographs)).with_suffix('.png')}"
+        )
+    for name, path in photographs.items():
+        found[name].extend(_beside(path))
+    for name, several in found.items():
+        if len(several) > 1:
+            raise InputError(f"{name} has {len(several)} masks: {first_names([str(p) for p in several])}; keep one")
+    return {name: found[name][0] for name in sorted(found) if found[name]}
+
+
+def _image_files(folder: Path) -> Iterator[Path]:
+    """Image files below a folder, hidden ones left out."""
+    if folder.is_dir():
+        yield from (p for p in sorted(folder.rglob("*")) if _is_image(p) and not p.name.startswith("."))
+
+
+def _is_image(path: Path) -> bool:
+    return path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
+
+
+def _beside(photograph: Path) -> list[Path]:
+    """Masks in the photograph's own folder."""
+    candidates = (photograph.with_name(f"{photograph.stem}{MASK_MARK}{suffix}") for suffix in IMAGE_SUFFIXES)
+    return [path for path in candidates if path.is_file()]
+
+
+def _names_by_key(names: Iterable[str]) -> dict[str, list[str]]:
+    """What a mask may be called, with and without folder and suffix, and the photographs that go by that name."""
+    found: dict[str, list[str]] = defaultdict(list)
+    for name in names:
+        path = PurePosixPath(name)
+        for key in {name, str(path.with_suffix("")), path.name, path.stem}:
+            found[key].append(name)
+    return found
+
+
+def _keys_of_mask(relative: Path) -> tuple[str, ...]:
+    """Names of photographs that a mask file may stand for, the most explicit first."""
+    without_suffix = relative.with_suffix("").as_posix()
+    return relative.as_posix(), without_suffix, without_suffix.removesuffix(MASK_MARK)
+
+
+def _check_same_kind(values: Mapping[str, MaskValues], paths: Mapping[str, Path]) -> None:
+    """Refuse a set in which some masks are label images and others binary."""
+    kinds = {kind: [str(paths[name]) for name, v in values.items() if v.kind == kind] for kind in ("labels", "binary")}
+    if kinds["labels"] and kinds["binary"]:
+        raise InputError(
+            f"some masks are label images ({first_names(kinds['labels'], 2)}) and others black and white "
+            f"({first_names(kinds['binary'], 2)}); write all of them with pane labels 1..K"
+        )
+
+
+def _decide_polarity(values: list[MaskValues], polarity: Polarity) -> tuple[bool, list[str]]:
+    """Whether dark pixels are the pane, and a warning where that was guessed."""
+    binary = [v for v in values if v.kind == "binary"]
+    if polarity != "auto" or not binary:
+        return polarity == "dark" and bool(binary), []
+    frame = float(np.median([_border_share(v.pixels) for v in binary]))
+    has_both = float(np.mean([v.pixels.min() == 0 for v in binary])) > MOSTLY_PANE
+    if frame > FRAMED_BY_PANE and has_both:
+        return True, [
+            f"The masks are white along {frame:.0%} of the image border, so they are read as inverted: black is the pane. "
+            "State the polarity if that is wrong."
+        ]
+    if frame > MOSTLY_PANE:
+        return False, [
+            f"The panes cover {frame:.0%} of the image border; state the polarity if the masks are inverted."
+        ]
+    return False, []
+
+
+def _border_share(pixels: NDArray[np.uint8]) -> float:
+    """Share of the outermost pixels that are set."""
+    border = np.concatenate([pixels[0], pixels[-1], pixels[1:-1, 0], pixels[1:-1, -1]])
+    return float((border > 0).mean())

@@ -1,0 +1,174 @@
+"""One photograph with its camera and, where annotated, its panes; pixels are read when first asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from glassplat.data.capture import Shot
+from glassplat.data.errors import InputError
+from glassplat.data.lens import PixelMap, lens_for_image, nearest_resize, pinhole_of
+from glassplat.data.masks import PaneMask
+from glassplat.data.poses import rigid_pose
+from glassplat.files.images import image_size, read_image
+from glassplat.scene.camera import Camera
+
+Rgb = tuple[float, float, float]
+WHITE: Rgb = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph of the capture.
+
+    Attributes:
+        name: unique within the data set, with suffix; `/` between folders.
+        camera: float32 pinhole camera of `photo`.
+        image_path: the file.
+        read_photo: returns `photo`; called once.
+        read_pane_labels: returns `pane_labels`; None where the view is not annotated.
+    """
+
+    name: str
+    camera: Camera
+    image_path: Path
+    read_photo: Callable[[], Tensor]
+    read_pane_labels: Callable[[], Tensor] | None = None
+
+    @cached_property
+    def photo(self) -> Tensor:
+        """[H, W, 3] uint8 sRGB, undistorted and reduced; stays in memory once read.
+
+        Raises:
+            InputError: the file cannot be read; names it.
+        """
+        return self.read_photo()
+
+    @cached_property
+    def pane_labels(self) -> Tensor | None:
+        """[H, W] uint8 pane label per pixel, 0 for no pane; None where the view is not annotated."""
+        return None if self.read_pane_labels is None else self.read_pane_labels()
+
+    @property
+    def is_annotated(self) -> bool:
+        """Whether there is a mask; does not read it."""
+        return self.read_pane_labels is not None
+
+    @staticmethod
+    def in_memory(name: str, camera: Camera, *, photo: Tensor, pane_labels: Tensor | None = None) -> View:
+        """A view of pixels at hand, such as a rendered one."""
+        return View(name, camera, Path(name), lambda: photo, None if pane_labels is None else lambda: pane_labels)
+
+
+@dataclass(frozen=True)
+class PhotoFile:
+    """How to read the pixels of one view from its file; `background` is seen through transparent pixels."""
+
+    path: Path
+    pixel_map: PixelMap
+    background: Rgb
+
+    def __call__(self) -> Tensor:
+        """[H, W, 3] uint8 in the pixel grid of the view's camera."""
+        try:
+            pixels = read_image(self.path)
+        except ValueError as error:
+            raise InputError(str(error)) from error
+        return torch.from_numpy(self.pixel_map.photo(_opaque(pixels, self.background)))
+
+
+@dataclass(frozen=True)
+class MaskFile:
+    """How to read the pane labels of one view; `size` is the photograph's, before undistortion."""
+
+    mask: PaneMask
+    size: tuple[int, int]
+    pixel_map: PixelMap
+
+    def __call__(self) -> Tensor:
+        """[H, W] uint8 in the pixel grid of the view's camera."""
+        return torch.from_numpy(self.pixel_map.labels(nearest_resize(self.mask.labels(), *self.size)))
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """How photographs become views.
+
+    Attributes:
+        downscale: width and height are divided by it and rounded.
+        background: sRGB in [0, 1], seen through transparent pixels.
+    """
+
+    downscale: float = 1.0
+    background: Rgb = WHITE
+
+
+@dataclass(frozen=True)
+class PreparedView:
+    """A view and what was noticed while its file header was looked at."""
+
+    view: View
+    rescaled: bool
+    transparent: bool
+
+
+def prepare_view(shot: Shot, mask: PaneMask | None, options: ViewOptions) -> PreparedView:
+    """Check one photograph against its camera and set up how it is read; decodes no pixels of it.
+
+    Raises:
+        InputError: unreadable file, sizes that disagree, a pose that is not rigid, a lens that cannot be undistorted.
+    """
+    try:
+        width, height, transparent = image_size(shot.image_path)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    lens = lens_for_image(shot.lens, (width, height), shot.name)
+    pinhole, distorted = pinhole_of(lens)
+    small = max(1, round(pinhole.width / options.downscale)), max(1, round(pinhole.height / options.downscale))
+    pixel_map = PixelMap(lens if distorted else None, *small)
+    pose = torch.from_numpy(rigid_pose(shot.cam_from_world, shot.name)).float()
+    camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.width, pinhole.height)
+    view = View(
+        name=shot.name,
+        camera=camera.resized(*small),
+        image_path=shot.image_path,
+        read_photo=PhotoFile(shot.image_path, pixel_map, options.background),
+        read_pane_labels=None if mask is None else _mask_file(mask, (width, height), pixel_map),
+    )
+    return PreparedView(view, lens is not shot.lens, transparent)
+
+
+def _mask_file(mask: PaneMask, size: tuple[int, int], pixel_map: PixelMap) -> MaskFile:
+    """The mask at the photograph's size, which it must have up to an integer factor."""
+    try:
+        mask_size = image_size(mask.path)[:2]
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    small, large = sorted((mask_size, size))
+    factor = round(large[0] / small[0])
+    if any(
+        abs(factor * s - l) >= max(factor, 1) and abs(l / factor - s) > 1 for s, l in zip(small, large, strict=True)
+    ):
+        raise InputError(
+            f"mask {mask.path} is {mask_size[0]}x{mask_size[1]} pixels large, its photograph {size[0]}x{size[1]}; expected the "
+            "same size, or one an integer multiple of the other"
+        )
+    return MaskFile(mask, size, pixel_map)
+
+
+def _opaque(pixels: NDArray[np.uint8], background: Rgb) -> NDArray[np.uint8]:
+    """[H, W, 3] from grey, colour or colour with transparency, over the background."""
+    if pixels.shape[2] == 1:
+        return np.repeat(pixels, 3, axis=2)
+    if pixels.shape[2] == 3:
+        return np.ascontiguousarray(pixels)
+    alpha = pixels[:, :, 3:].astype(np.float32) / 255
+    behind = np.asarray(background, dtype=np.float32) * 255
+    return np.round(pixels[:, :, :3] * alpha + behind * (1 - alpha)).astype(np.uint8)

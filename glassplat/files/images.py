@@ -1,0 +1,127 @@
+"""Reading and writing image files, sRGB as stored."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+
+from glassplat.files.atomic import atomic_write
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+_FULL_SCALE_16 = 65535
+_SHADES_16 = ("I", "I;16", "I;16B", "I;16L", "I;16N")
+
+
+def open_image(path: Path) -> Image.Image:
+    """Open and fully decode an image, in the mode it is stored in; orientation tags are not applied.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is no image, or is cut off; the message names it.
+    """
+    try:
+        with Image.open(path) as image:
+            image.load()
+            return image
+    except (FileNotFoundError, PermissionError):
+        raise
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, zlib.error) as error:
+        raise ValueError(f"cannot read {path} as an image ({error}); replace the file or remove it") from error
+
+
+def image_size(path: Path) -> tuple[int, int, bool]:
+    """Width, height, and whether the image stores transparency; reads the header only.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is no image.
+    """
+    try:
+        with Image.open(path) as image:
+            return image.width, image.height, image.has_transparency_data
+    except (FileNotFoundError, PermissionError):
+        raise
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+        raise ValueError(f"cannot read {path} as an image ({error}); replace the file or remove it") from error
+
+
+def read_image(path: Path | str) -> NDArray[np.uint8]:
+    """Read an image as uint8 [H, W, C]: one channel for grey, three for colour, four with transparency.
+
+    Sixteen-bit grey is scaled to eight bits.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is no image, or is cut off.
+    """
+    image = open_image(Path(path))
+    if image.mode in _SHADES_16:
+        return np.round(_shades(image) * 255).astype(np.uint8)[:, :, None]
+    pixels = np.array(image.convert(_plain_mode(image)))
+    return pixels[:, :, None] if pixels.ndim == 2 else pixels
+
+
+def read_image_float(path: Path | str) -> NDArray[np.float32]:
+    """Read an image as float32 [H, W, C] in [0, 1], with the full precision of sixteen-bit grey.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is no image, or is cut off.
+    """
+    image = open_image(Path(path))
+    if image.mode in _SHADES_16:
+        return _shades(image)[:, :, None]
+    pixels = np.asarray(image.convert(_plain_mode(image)), dtype=np.float32) / np.float32(255)
+    return pixels[:, :, None] if pixels.ndim == 2 else pixels
+
+
+def write_image(path: Path | str, image: Tensor | NDArray[np.generic]) -> None:
+    """Write [H, W], [H, W, 1], [H, W, 3] or [H, W, 4] as an eight-bit image, atomically.
+
+    Args:
+        path: target; its suffix chooses the format.
+        image: uint8, or floating point in [0, 1], which is clamped and rounded.
+
+    Raises:
+        TypeError: the values are neither uint8 nor floating point.
+        ValueError: the shape is not that of an image, a value is not finite, or the format is unknown.
+        OSError: the file cannot be written; an older one is unchanged.
+    """
+    pixels = _to_uint8(image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image))
+    if Path(path).suffix.lower() not in IMAGE_SUFFIXES:
+        raise ValueError(f"cannot tell the image format of {path}; use one of the suffixes {', '.join(IMAGE_SUFFIXES)}")
+    with atomic_write(path) as temporary:
+        Image.fromarray(pixels).save(temporary)
+
+
+def _plain_mode(image: Image.Image) -> str:
+    """The eight-bit mode that keeps what the image shows."""
+    if image.has_transparency_data:
+        return "RGBA"
+    return "L" if image.mode in ("1", "L") else "RGB"
+
+
+def _shades(image: Image.Image) -> NDArray[np.float32]:
+    """Sixteen-bit grey as [H, W] in [0, 1]."""
+    return np.clip(np.asarray(image).astype(np.float32) / np.float32(_FULL_SCALE_16), 0, 1)
+
+
+def _to_uint8(pixels: NDArray[np.generic]) -> NDArray[np.uint8]:
+    """Eight-bit pixels in a shape that Pillow knows."""
+    if pixels.ndim == 3 and pixels.shape[2] == 1:
+        pixels = pixels[:, :, 0]
+    if not (pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] in (3, 4))) or 0 in pixels.shape:
+        raise ValueError(f"expected an image of shape [H, W] or [H, W, 1, 3 or 4], got {list(pixels.shape)}")
+    if pixels.dtype == np.uint8:
+        return np.ascontiguousarray(pixels, dtype=np.uint8)
+    if not np.issubdtype(pixels.dtype, np.floating):
+        raise TypeError(f"expected uint8 or floating-point pixels, got {pixels.dtype}; convert them first")
+    values = pixels.astype(np.float64)
+    if not np.isfinite(values).all():
+        raise ValueError("the image holds values that are not finite; expected numbers in [0, 1]")
+    return np.ascontiguousarray(np.round(np.clip(values, 0, 1) * 255).astype(np.uint8))
