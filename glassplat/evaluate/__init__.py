@@ -1,0 +1,1 @@
+"""Metrics of a trained scene, LPIPS, comparison sheets and the overview page."""

@@ -1,0 +1,247 @@
+"""Every metric of a trained scene over the test views of its data set."""
+
+from __future__ import annotations
+
+import math
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from glassplat.data.dataset import Dataset, View
+from glassplat.evaluate.lpips import Lpips, load_lpips
+from glassplat.evaluate.metrics import psnr, quantized, reflection_gain, ssim
+from glassplat.evaluate.plane_errors import missing_panes, plane_table
+from glassplat.evaluate.truth import GroundTruth, TrueView, load_truth
+from glassplat.render.frame import Frame, Renderer
+from glassplat.scene.scene import Scene
+
+SMALLEST_REGION = 100
+"""Pixels that a view's region needs to count; a sliver of a pane says nothing."""
+MIRROR_STRENGTH = 0.999
+"""From this true strength on, nothing is transmitted."""
+NO_TRUTH = "the data set has no ground truth"
+NO_VIEW_TRUTH = "the ground truth lacks this view"
+NO_WEIGHTS = "no LPIPS weights"
+TOO_FEW = f"fewer than {SMALLEST_REGION} pixels show a pane"
+
+Outcome = float | str
+"""A metric's value, or a sentence on why there is none."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Metrics as plain data, ready to be written as JSON.
+
+    Attributes:
+        results: one value per metric; where it is None, `<name>_reason` says why.
+        per_view: the same per view name, for the metrics that views have.
+    """
+
+    results: dict[str, Any]
+    per_view: dict[str, dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class _Measurement:
+    """What one view contributes; `reflection` holds rendered and true pane pixels until the gain is known."""
+
+    metrics: dict[str, Outcome]
+    seconds: float
+    reflection: tuple[Tensor, Tensor] | str
+
+
+def evaluate(scene: Scene, renderer: Renderer, dataset: Dataset, *, lpips_weights: Path | None = None) -> Evaluation:
+    """Renders every test view and measures it, on uint8-quantised sRGB at the data set's resolution.
+
+    `psnr`, `ssim` and `lpips` are means over the views. The region metrics are means over the views in
+    which the region has at least 100 pixels: `pane_psnr` over the pane's pixels, `transmission_psnr` over
+    those that transmit (true strength below 0.999) against `gt/trans`, `reflection_psnr` against `gt/refl`
+    after one gain for the whole scene. The pane is `gt/`'s where there is one, else the rendered mask above
+    0.5; `pane_region` says which. A method without layers is scored with its image as its transmission:
+    that is what its user has. `peak_memory_mib` is that of the whole process so far.
+
+    Args:
+        scene: what to render.
+        renderer: how; called under `no_grad`. The median of its times is `seconds_per_frame`.
+        dataset: the test views; ground truth is read where it has some.
+        lpips_weights: folder with LPIPS weights; None looks in the usual places.
+
+    Raises:
+        ValueError: no test views, a render that is not finite, or broken ground truth.
+    """
+    if not dataset.test:
+        raise ValueError(f"{dataset.root} has no test views; expected at least one image to compare with")
+    truth = load_truth(dataset.truth)
+    lpips = _available_lpips(lpips_weights)
+    # The first frame may wait for the compiler; it must not count.
+    timed_render(renderer, scene, dataset.test[0])
+    measurements = {view.name: _measure(scene, renderer, view, truth, lpips) for view in dataset.test}
+    gain = _add_reflection(measurements.values())
+    per_view = {name: plain(m.metrics) | {"seconds": m.seconds} for name, m in measurements.items()}
+    results = _description(scene, dataset)
+    results["seconds_per_frame"] = statistics.median(m.seconds for m in measurements.values())
+    results["peak_memory_mib"] = peak_memory_mib()
+    results |= plain(_means([m.metrics for m in measurements.values()]))
+    results |= _footnotes(results, lpips, truth, gain)
+    results["planes"] = plane_table(scene.planes, truth, dataset.extent)
+    if len(scene.planes):
+        results["missing_panes"] = missing_panes(scene.planes, truth)
+    return Evaluation(results, per_view)
+
+
+def timed_render(renderer: Renderer, scene: Scene, view: View) -> tuple[Frame, float]:
+    """A frame without gradients, on the CPU, and the seconds it took.
+
+    Raises:
+        ValueError: the image is not finite.
+    """
+    with torch.no_grad():
+        start = time.perf_counter()
+        frame = renderer(scene, view.camera)
+        # Reading a pixel waits for a device that works asynchronously.
+        frame.rgb[0, 0, 0].item()
+        seconds = time.perf_counter() - start
+    frame = Frame(frame.rgb.cpu(), {name: layer.cpu() for name, layer in frame.layers.items()})
+    if not bool(torch.isfinite(frame.rgb).all()):
+        raise ValueError(
+            f"the render of {view.name} holds values that are not finite; the scene is broken, train it again"
+        )
+    return frame, seconds
+
+
+def plain(outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
+    """JSON values: numbers as they are; None, and `<name>_reason`, where there is no finite number."""
+    result: dict[str, Any] = {}
+    for name, outcome in outcomes.items():
+        reason = outcome if isinstance(outcome, str) else "infinite: the images are equal"
+        is_number = not isinstance(outcome, str) and math.isfinite(outcome)
+        result |= {name: outcome} if is_number else {name: None, f"{name}_reason": reason}
+    return result
+
+
+def peak_memory_mib() -> float:
+    """Largest resident size of this process so far, in MiB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
+
+
+def _available_lpips(folder: Path | None) -> Lpips | str:
+    try:
+        return load_lpips(folder)
+    except FileNotFoundError as error:
+        return str(error)
+
+
+def _measure(
+    scene: Scene, renderer: Renderer, view: View, truth: GroundTruth | None, lpips: Lpips | str
+) -> _Measurement:
+    """Renders one view and takes every metric except the reflection's, which needs all views."""
+    frame, seconds = timed_render(renderer, scene, view)
+    photo = view.photo
+    true_view = truth.view(view.name, view.camera.width, view.camera.height) if truth else None
+    pane = _pane(frame, truth, true_view)
+    metrics: dict[str, Outcome] = {
+        "psnr": psnr(frame.rgb, photo),
+        "ssim": ssim(frame.rgb, photo),
+        "lpips": NO_WEIGHTS if isinstance(lpips, str) else lpips(quantized(frame.rgb), quantized(photo)),
+        "pane_psnr": pane if isinstance(pane, str) else _region_psnr(frame.rgb, photo, pane, TOO_FEW),
+        "transmission_psnr": _transmission_psnr(frame, truth, true_view),
+    }
+    return _Measurement(metrics, seconds, _reflection_pixels(frame, truth, true_view))
+
+
+def _pane(frame: Frame, truth: GroundTruth | None, true_view: TrueView | None) -> Tensor | str:
+    """Pixels of the pane [H, W]; one source for the whole data set, so that means do not mix two."""
+    if truth is not None:
+        return true_view.labels > 0 if true_view is not None else NO_VIEW_TRUTH
+    if "mask" in frame.layers:
+        return frame.layers["mask"] > 0.5
+    return f"{NO_TRUTH}, and the method renders no mask"
+
+
+def _region_psnr(image: Tensor, target: Tensor, region: Tensor, reason: str) -> Outcome:
+    return psnr(image, target, region) if int(region.sum()) >= SMALLEST_REGION else reason
+
+
+def _transmission_psnr(frame: Frame, truth: GroundTruth | None, true_view: TrueView | None) -> Outcome:
+    if true_view is None:
+        return NO_TRUTH if truth is None else NO_VIEW_TRUTH
+    pane = true_view.labels > 0
+    reason = "the pane is a mirror, which transmits nothing" if int(pane.sum()) >= SMALLEST_REGION else TOO_FEW
+    image = frame.layers.get("transmission", frame.rgb)
+    return _region_psnr(image, true_view.transmission, pane & (true_view.strength < MIRROR_STRENGTH), reason)
+
+
+def _reflection_pixels(
+    frame: Frame, truth: GroundTruth | None, true_view: TrueView | None
+) -> tuple[Tensor, Tensor] | str:
+    """Rendered and true reflection [P, 3] at the pane's pixels, in [0, 1]."""
+    if "reflection" not in frame.layers:
+        return "the method renders no reflection"
+    if true_view is None:
+        return NO_TRUTH if truth is None else NO_VIEW_TRUTH
+    pane = true_view.labels > 0
+    if int(pane.sum()) < SMALLEST_REGION:
+        return TOO_FEW
+    return frame.layers["reflection"][pane], true_view.reflection[pane].to(torch.float32) / 255
+
+
+def _add_reflection(measurements: Iterable[_Measurement]) -> float | None:
+    """Adds `reflection_psnr` to every view's metrics; returns the scene's gain, None without reflections."""
+    measurements = list(measurements)
+    pairs = [m.reflection for m in measurements if not isinstance(m.reflection, str)]
+    gain = reflection_gain([image for image, _ in pairs], [target for _, target in pairs])
+    for measurement in measurements:
+        if isinstance(measurement.reflection, str):
+            measurement.metrics["reflection_psnr"] = measurement.reflection
+        else:
+            image, target = measurement.reflection
+            measurement.metrics["reflection_psnr"] = psnr(gain * image, target)
+    return gain if pairs else None
+
+
+def _means(per_view: list[dict[str, Outcome]]) -> dict[str, Outcome]:
+    """Mean of every metric over the views that have it, or all reasons why none has."""
+    means: dict[str, Outcome] = {}
+    for name in per_view[0]:
+        outcomes = [metrics[name] for metrics in per_view]
+        values = [outcome for outcome in outcomes if not isinstance(outcome, str)]
+        reasons = dict.fromkeys(outcome for outcome in outcomes if isinstance(outcome, str))
+        means[name] = statistics.fmean(values) if values else "; ".join(reasons)
+    return means
+
+
+def _description(scene: Scene, dataset: Dataset) -> dict[str, Any]:
+    """What was measured."""
+    sizes = dict.fromkeys(f"{view.camera.width}x{view.camera.height}" for view in dataset.test)
+    return {
+        "resolution": ", ".join(sizes),
+        "split": dataset.split,
+        "num_test_views": len(dataset.test),
+        "num_gaussians": len(scene.primary) + len(scene.glass),
+        "num_glass_gaussians": len(scene.glass),
+    }
+
+
+def _footnotes(
+    results: Mapping[str, Any], lpips: Lpips | str, truth: GroundTruth | None, gain: float | None
+) -> dict[str, Any]:
+    """What the reader of the metrics must know: backbone, region, gain."""
+    if isinstance(lpips, str):
+        backbone = plain({"lpips": lpips, "lpips_backbone": lpips})
+    else:
+        backbone = {"lpips_backbone": lpips.backbone}
+    if results["pane_psnr"] is None:
+        region = plain({"pane_region": results["pane_psnr_reason"]})
+    else:
+        region = {"pane_region": "ground-truth pane labels" if truth else "rendered mask > 0.5"}
+    gain_outcome = results["reflection_psnr_reason"] if gain is None else gain
+    return backbone | region | plain({"reflection_gain": gain_outcome})

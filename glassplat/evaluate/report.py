@@ -1,0 +1,167 @@
+"""Pictures of an evaluation: a comparison sheet per test view and an overview page."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from glassplat.data.dataset import Dataset
+from glassplat.evaluate.evaluate import timed_render
+from glassplat.evaluate.overview_style import SCRIPT, STYLE
+from glassplat.evaluate.sheet import comparison_sheet
+from glassplat.evaluate.truth import load_truth
+from glassplat.files.atomic import atomic_write
+from glassplat.files.images import write_image
+from glassplat.render.frame import Renderer
+from glassplat.scene.scene import Scene
+
+METRICS = {
+    "psnr": ("PSNR", "{:.2f} dB"),
+    "ssim": ("SSIM", "{:.4f}"),
+    "lpips": ("LPIPS", "{:.4f}"),
+    "pane_psnr": ("PSNR, pane", "{:.2f} dB"),
+    "transmission_psnr": ("PSNR, transmission", "{:.2f} dB"),
+    "reflection_psnr": ("PSNR, reflection", "{:.2f} dB"),
+}
+FACTS = {
+    "num_gaussians": ("Gaussians", "{:,}"),
+    "train_seconds": ("training", "{:.0f} s"),
+    "seconds_per_frame": ("per frame", "{:.3f} s"),
+}
+SETTINGS = ("iterations", "seed", "resolution", "split", "lpips_backbone", "pane_region")
+PLANE_COLUMNS = {
+    "label": ("pane", "{}"),
+    "base_reflectance": ("R0", "{:.3f}"),
+    "normal_error_deg": ("normal error", "{:.2f}°"),
+    "offset_error": ("offset error / extent", "{:.3%}"),
+    "base_reflectance_error": ("R0 error", "{:.3f}"),
+}
+
+
+def write_report(
+    folder: Path,
+    scene: Scene,
+    renderer: Renderer,
+    dataset: Dataset,
+    results: Mapping[str, Any],
+    per_view: Mapping[str, Mapping[str, Any]],
+) -> None:
+    """Writes `sheets/<view>.png` for every test view, and `index.html` that shows them all.
+
+    Args:
+        folder: a run's directory; nothing outside it is referred to, so it can be moved or sent.
+        scene: what is rendered, once more, view by view.
+        renderer: how.
+        dataset: the test views.
+        results: as `evaluate` returns them, with what the caller added.
+        per_view: as `evaluate` returns it.
+    """
+    truth = load_truth(dataset.truth)
+    sheets = sheet_names([view.name for view in dataset.test])
+    for view in dataset.test:
+        frame, _ = timed_render(renderer, scene, view)
+        sheet = comparison_sheet(
+            frame,
+            view.photo,
+            truth.view(view.name, view.camera.width, view.camera.height) if truth else None,
+            title=view.name,
+            subtitle=_metrics_line(per_view.get(view.name, {})),
+            gain=results.get("reflection_gain"),
+        )
+        write_image(folder / sheets[view.name], sheet)
+    with atomic_write(folder / "index.html") as temporary:
+        temporary.write_text(overview_page(results, per_view, sheets), encoding="utf-8")
+
+
+def sheet_names(names: list[str]) -> dict[str, str]:
+    """File of each view's sheet, relative to the run; distinct also for `a.jpg` and `a.png`."""
+    flat = {name: name.replace("/", "_") for name in names}
+    stems = {name: PurePosixPath(file).stem for name, file in flat.items()}
+    chosen = stems if len(set(stems.values())) == len(names) else flat
+    return {name: f"sheets/{file}.png" for name, file in chosen.items()}
+
+
+def overview_page(
+    results: Mapping[str, Any], per_view: Mapping[str, Mapping[str, Any]], sheets: Mapping[str, str]
+) -> str:
+    """The overview as one HTML page; its only references are the sheets, by relative path."""
+    title = f"glassplat: {results.get('method', 'evaluation')}"
+    parts = [
+        f"<h1>{_escaped(title)}</h1>",
+        f'<p class="settings">{_settings_line(results)}</p>',
+        _cards(results),
+        _plane_table(results.get("planes") or []),
+        _view_table(per_view, sheets),
+        *(_figure(name, path) for name, path in sheets.items()),
+        '<dialog id="large"><img alt=""></dialog>',
+    ]
+    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{_escaped(title)}</title>'
+    body = "\n".join(part for part in parts if part)
+    return (
+        f'<!doctype html>\n<html lang="en">\n<head>{head}<style>{STYLE}</style></head>\n'
+        f"<body>\n{body}\n<script>{SCRIPT}</script>\n</body>\n</html>\n"
+    )
+
+
+def _settings_line(results: Mapping[str, Any]) -> str:
+    known = [(name.replace("_", " "), results[name]) for name in SETTINGS if results.get(name) is not None]
+    return " · ".join(f"{_escaped(name)} <b>{_escaped(value)}</b>" for name, value in known)
+
+
+def _cards(results: Mapping[str, Any]) -> str:
+    cards = []
+    for name, (label, pattern) in (METRICS | FACTS).items():
+        if name in results:
+            value, reason = _formatted(results[name], pattern), results.get(f"{name}_reason") or ""
+            cards.append(f'<div title="{_escaped(reason)}"><b>{value}</b><span>{label}</span></div>')
+    return f'<div class="cards">{"".join(cards)}</div>'
+
+
+def _plane_table(planes: list[Mapping[str, Any]]) -> str:
+    if not planes:
+        return ""
+    rows = [[_formatted(plane.get(name), pattern) for name, (_, pattern) in PLANE_COLUMNS.items()] for plane in planes]
+    return _table([label for label, _ in PLANE_COLUMNS.values()], rows)
+
+
+def _view_table(per_view: Mapping[str, Mapping[str, Any]], sheets: Mapping[str, str]) -> str:
+    shown = {
+        name: column for name, column in METRICS.items() if any(row.get(name) is not None for row in per_view.values())
+    }
+    rows = [
+        [_link(name, sheets), *(_formatted(row.get(metric), pattern) for metric, (_, pattern) in shown.items())]
+        for name, row in per_view.items()
+    ]
+    return _table(["view", *(label for label, _ in shown.values())], rows)
+
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    cells = "".join(f"<th>{label}</th>" for label in head)
+    lines = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>\n" for row in rows)
+    return f'<div class="scroll"><table><thead><tr>{cells}</tr></thead><tbody>\n{lines}</tbody></table></div>'
+
+
+def _link(name: str, sheets: Mapping[str, str]) -> str:
+    return f'<a href="#{_escaped(name)}">{_escaped(name)}</a>' if name in sheets else _escaped(name)
+
+
+def _figure(name: str, path: str) -> str:
+    return (
+        f'<figure id="{_escaped(name)}"><a href="{_escaped(path)}">'
+        f'<img src="{_escaped(path)}" alt="comparison sheet of {_escaped(name)}" loading="lazy"></a></figure>'
+    )
+
+
+def _metrics_line(metrics: Mapping[str, Any]) -> str:
+    known = [(label, _formatted(metrics[n], p)) for n, (label, p) in METRICS.items() if metrics.get(n) is not None]
+    return "    ".join(f"{label} {value}" for label, value in known)
+
+
+def _formatted(value: object, pattern: str) -> str:
+    return "-" if value is None else _escaped(pattern.format(value))
+
+
+def _escaped(value: object) -> str:
+    return html.escape(str(value), quote=True)

@@ -1,0 +1,153 @@
+"""The comparison sheet of one test view: everything the renderer made of it, side by side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from glassplat.evaluate.colormap import depth_colors, heat_colors, label_colors
+from glassplat.evaluate.metrics import quantized
+from glassplat.evaluate.truth import TrueView
+from glassplat.render.frame import Frame
+
+NARROWEST_PANEL, WIDEST_PANEL = 280, 640
+MARGIN, GAP = 16, 10
+CAPTION_HEIGHT, TITLE_HEIGHT = 24, 34
+CAPTION_SIZE, TITLE_SIZE = 15, 19
+BACKGROUND, TEXT, QUIET_TEXT = (22, 24, 28), (236, 236, 236), (160, 166, 174)
+ERROR_SCALE = 0.2
+"""The colour error that is drawn brightest; the same in every sheet, so that sheets can be compared."""
+SMALLEST_STRENGTH_SCALE = 0.05
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One picture [H, W, 3] in [0, 1] or uint8, and what is written above it."""
+
+    caption: str
+    image: Tensor
+
+
+def comparison_sheet(
+    frame: Frame, photo: Tensor, truth: TrueView | None, *, title: str, subtitle: str = "", gain: float | None = None
+) -> NDArray[np.uint8]:
+    """The sheet [H, W, 3] of one view.
+
+    First row: photograph, render, error, depth. Second row, where the method has them: transmission,
+    reflection, strength, mask. Third row, where they are known: the true ones, in the same columns.
+
+    Args:
+        frame: what was rendered, on the CPU.
+        photo: [H, W, 3] uint8.
+        truth: the true layers.
+        title: set in large type; usually the view's name.
+        subtitle: set in small type beside it; usually the metrics.
+        gain: factor on the reflection that its metric was taken with; None shows the layer as it is.
+    """
+    rows = [_image_row(frame, photo), _layer_row(frame, truth, gain), _truth_row(frame, truth)]
+    return composed([row for row in rows if row], title, subtitle)
+
+
+def composed(rows: list[list[Panel]], title: str, subtitle: str) -> NDArray[np.uint8]:
+    """Panels of one size in rows, with captions and a title line."""
+    height, width = rows[0][0].image.shape[:2]
+    panel_size = _panel_size(width, height)
+    columns = max(len(row) for row in rows)
+    row_height = CAPTION_HEIGHT + panel_size[1] + GAP
+    size = (
+        2 * MARGIN + columns * panel_size[0] + (columns - 1) * GAP,
+        2 * MARGIN + TITLE_HEIGHT + len(rows) * row_height - GAP,
+    )
+    canvas = Image.new("RGB", size, BACKGROUND)
+    _draw_title(ImageDraw.Draw(canvas), title, subtitle, size[0])
+    for row_index, row in enumerate(rows):
+        for column, panel in enumerate(row):
+            x = MARGIN + column * (panel_size[0] + GAP)
+            y = MARGIN + TITLE_HEIGHT + row_index * row_height
+            _draw_panel(canvas, panel, (x, y), panel_size)
+    return np.array(canvas)
+
+
+def _image_row(frame: Frame, photo: Tensor) -> list[Panel]:
+    error = (frame.rgb.clamp(0, 1) - photo.to(torch.float32) / 255).abs().mean(dim=-1)
+    row = [
+        Panel("photograph", photo),
+        Panel("render", frame.rgb),
+        Panel(f"error (brightest: {ERROR_SCALE:g} and more)", heat_colors(error / ERROR_SCALE)),
+    ]
+    if "depth" in frame.layers:
+        row.append(Panel("depth (near is bright)", depth_colors(frame.layers["depth"], frame.layers.get("alpha"))))
+    return row
+
+
+def _layer_row(frame: Frame, truth: TrueView | None, gain: float | None) -> list[Panel]:
+    layers = frame.layers
+    row = [Panel("transmission", layers["transmission"])] if "transmission" in layers else []
+    if "reflection" in layers:
+        caption = "reflection" if gain is None else f"reflection x {gain:.2f}"
+        row.append(Panel(caption, layers["reflection"] * (1.0 if gain is None else gain)))
+    if "strength" in layers:
+        scale = _strength_scale(frame, truth)
+        row.append(Panel(f"strength (white: {scale:.2f})", _grey(layers["strength"] / scale)))
+    if "mask" in layers:
+        row.append(Panel("mask", _grey(layers["mask"])))
+    return row
+
+
+def _truth_row(frame: Frame, truth: TrueView | None) -> list[Panel]:
+    if truth is None:
+        return []
+    scale = _strength_scale(frame, truth)
+    return [
+        Panel("true transmission", truth.transmission),
+        Panel("true reflection", truth.reflection),
+        Panel(f"true strength (white: {scale:.2f})", _grey(truth.strength / scale)),
+        Panel("true panes", label_colors(truth.labels)),
+    ]
+
+
+def _strength_scale(frame: Frame, truth: TrueView | None) -> float:
+    """One scale for rendered and true strength, so that the two can be compared by eye."""
+    maps = [frame.layers["strength"]] if "strength" in frame.layers else []
+    maps += [truth.strength] if truth is not None else []
+    # Glass at grazing angles reaches 1; the bulk of the pane is what should be seen.
+    peaks = [float(np.percentile(strength.numpy(), 98)) for strength in maps]
+    return min(max(*peaks, SMALLEST_STRENGTH_SCALE), 1.0)
+
+
+def _grey(values: Tensor) -> Tensor:
+    return values.clamp(0, 1)[..., None].expand(*values.shape, 3)
+
+
+def _panel_size(width: int, height: int) -> tuple[int, int]:
+    """Small images grow by a whole factor, so that captions fit; large ones shrink."""
+    if width < NARROWEST_PANEL:
+        factor: float = -(-NARROWEST_PANEL // width)
+    else:
+        factor = min(1.0, WIDEST_PANEL / width)
+    return round(width * factor), round(height * factor)
+
+
+def _draw_panel(canvas: Image.Image, panel: Panel, corner: tuple[int, int], size: tuple[int, int]) -> None:
+    picture = Image.fromarray(quantized(panel.image).contiguous().numpy())
+    if picture.size != size:
+        grows = size[0] > picture.width
+        picture = picture.resize(size, Image.Resampling.NEAREST if grows else Image.Resampling.LANCZOS)
+    canvas.paste(picture, (corner[0], corner[1] + CAPTION_HEIGHT))
+    font = ImageFont.load_default(CAPTION_SIZE)
+    ImageDraw.Draw(canvas).text((corner[0], corner[1] + 2), panel.caption, fill=QUIET_TEXT, font=font)
+
+
+def _draw_title(draw: ImageDraw.ImageDraw, title: str, subtitle: str, width: int) -> None:
+    title_font, font = ImageFont.load_default(TITLE_SIZE), ImageFont.load_default(CAPTION_SIZE)
+    baseline = MARGIN + TITLE_SIZE
+    draw.text((MARGIN, baseline), title, fill=TEXT, font=title_font, anchor="ls")
+    start = MARGIN + draw.textlength(title, font=title_font) + 2 * GAP
+    # A narrow sheet has no room for the metrics; the overview page lists them anyway.
+    if start + draw.textlength(subtitle, font=font) <= width - MARGIN:
+        draw.text((start, baseline), subtitle, fill=QUIET_TEXT, font=font, anchor="ls")

@@ -1,0 +1,187 @@
+import json
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from glassplat.evaluate.evaluate import evaluate, plain
+from glassplat.evaluate.metrics import psnr
+from glassplat.evaluate.plane_errors import plane_table
+from glassplat.evaluate.truth import load_truth
+from glassplat.scene.plane import Planes
+
+REQUIRED_KEYS = {
+    "resolution",
+    "split",
+    "num_gaussians",
+    "seconds_per_frame",
+    "psnr",
+    "ssim",
+    "lpips",
+    "lpips_backbone",
+    "pane_psnr",
+    "pane_region",
+    "transmission_psnr",
+    "reflection_psnr",
+    "planes",
+    "peak_memory_mib",
+}
+
+
+@pytest.fixture(autouse=True)
+def _no_lpips(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Results must not depend on weights that this machine happens to have."""
+
+    def absent(folder: object = None) -> None:
+        raise FileNotFoundError("no LPIPS weights: put them somewhere")
+
+    monkeypatch.setattr("glassplat.evaluate.evaluate.load_lpips", absent)
+
+
+def test_results_are_json_and_complete(case) -> None:
+    evaluation = evaluate(case.scene, case.renderer, case.dataset)
+    assert set(evaluation.results) >= REQUIRED_KEYS
+    json.dumps([evaluation.results, evaluation.per_view], allow_nan=False)
+    for table in (evaluation.results, *evaluation.per_view.values()):
+        assert all(f"{key}_reason" in table for key, value in table.items() if value is None)
+    assert evaluation.results["resolution"] == "48x32"
+    assert evaluation.results["split"] == "every 8th image by name"
+    assert evaluation.results["lpips_reason"] == "no LPIPS weights: put them somewhere"
+
+
+def test_image_metrics_are_means_over_all_views(case) -> None:
+    evaluation = evaluate(case.scene, case.renderer, case.dataset)
+    expected = [psnr(case.renderer.frames[view.camera.fx].rgb, view.photo) for view in case.dataset.test]
+    assert [row["psnr"] for row in evaluation.per_view.values()] == pytest.approx(expected)
+    assert evaluation.results["psnr"] == pytest.approx(sum(expected) / 3)
+    assert list(evaluation.per_view) == ["a.jpg", "b.jpg", "c.jpg"]
+
+
+def test_region_metrics_are_means_over_the_views_that_see_a_pane(case) -> None:
+    evaluation = evaluate(case.scene, case.renderer, case.dataset)
+    views = evaluation.per_view
+    assert evaluation.results["pane_psnr"] == pytest.approx(
+        (views["a.jpg"]["pane_psnr"] + views["b.jpg"]["pane_psnr"]) / 2
+    )
+    assert views["c.jpg"]["pane_psnr"] is None
+    assert views["c.jpg"]["pane_psnr_reason"] == "fewer than 100 pixels show a pane"
+    assert evaluation.results["pane_region"] == "ground-truth pane labels"
+    region = case.renderer.frames[41.0].layers["mask"] > 0.5
+    assert views["b.jpg"]["pane_psnr"] == psnr(case.renderer.frames[41.0].rgb, case.dataset.test[1].photo, region)
+
+
+def test_the_reflection_is_compared_up_to_one_gain(case) -> None:
+    evaluation = evaluate(case.scene, case.renderer, case.dataset)
+    assert evaluation.results["reflection_gain"] == pytest.approx(2.0, rel=1e-5)
+    assert evaluation.results["reflection_psnr"] is None
+    assert "equal" in evaluation.results["reflection_psnr_reason"]
+    noisy = case.renderer.with_layers(reflection=torch.rand(32, 48, 3, generator=torch.Generator().manual_seed(2)))
+    louder = noisy.with_layers(reflection=3 * noisy.frames[40.0].layers["reflection"])
+    values = [evaluate(case.scene, renderer, case.dataset).results["reflection_psnr"] for renderer in (noisy, louder)]
+    assert values[0] == pytest.approx(values[1], abs=0.02)
+    assert 5 < values[0] < 20
+
+
+def test_a_perfect_transmission_is_found_perfect(case) -> None:
+    results = evaluate(case.scene, case.renderer, case.dataset).results
+    assert results["transmission_psnr"] is None
+    assert "equal" in results["transmission_psnr_reason"]
+
+
+def test_without_layers_the_image_stands_for_the_transmission(case) -> None:
+    renderer = case.renderer.without_layers()
+    results = evaluate(replace(case.scene, planes=Planes.empty()), renderer, case.dataset).results
+    assert 10 < results["transmission_psnr"] < 60
+    assert results["reflection_psnr_reason"] == "the method renders no reflection"
+    assert (results["reflection_psnr"], results["reflection_gain"], results["planes"]) == (None, None, [])
+    assert results["reflection_gain_reason"] == "the method renders no reflection"
+    assert results["pane_psnr"] is not None
+
+
+def test_mirrors_have_no_transmission(case, monkeypatch: pytest.MonkeyPatch) -> None:
+    truth = load_truth(case.dataset.truth)
+    assert truth is not None
+    views = {name: truth.view(name, 48, 32) for name in ("a.jpg", "b.jpg", "c.jpg")}
+    mirrors = {name: replace(view, strength=torch.ones(32, 48)) for name, view in views.items() if view is not None}
+    monkeypatch.setattr("glassplat.evaluate.truth.GroundTruth.view", lambda self, name, width, height: mirrors[name])
+    results = evaluate(case.scene, case.renderer.without_layers(), case.dataset).results
+    assert results["transmission_psnr"] is None
+    assert "the pane is a mirror, which transmits nothing" in results["transmission_psnr_reason"]
+
+
+def test_without_truth_the_rendered_mask_is_the_region(case) -> None:
+    dataset = replace(case.dataset, truth=None)
+    results = evaluate(case.scene, case.renderer, dataset).results
+    assert results["pane_region"] == "rendered mask > 0.5"
+    assert results["pane_psnr"] == evaluate(case.scene, case.renderer, case.dataset).results["pane_psnr"]
+    assert results["transmission_psnr_reason"] == "the data set has no ground truth"
+    assert results["planes"][0]["normal_error_deg"] is None
+
+
+def test_without_truth_and_mask_there_is_no_region(case) -> None:
+    results = evaluate(case.scene, case.renderer.without_layers(), replace(case.dataset, truth=None)).results
+    assert (results["pane_psnr"], results["pane_region"]) == (None, None)
+    assert results["pane_region_reason"] == "the data set has no ground truth, and the method renders no mask"
+
+
+def test_plane_errors(case) -> None:
+    results = evaluate(case.scene, case.renderer, case.dataset).results
+    (plane,) = results["planes"]
+    assert plane["label"] == 1
+    assert plane["normal"] == pytest.approx([0, 0, -1])
+    assert plane["normal_error_deg"] == pytest.approx(0, abs=1e-4)
+    assert plane["offset_error"] == pytest.approx(0.1 / 4, rel=1e-5)
+    assert plane["base_reflectance_error"] == pytest.approx(0.42)
+    assert results["missing_panes"] == [2]
+
+
+@pytest.mark.parametrize("angle", [0.01, 1.0, 30.0, 179.5])
+def test_normal_error_is_the_angle_between_lines(case, angle: float) -> None:
+    radians = math.radians(angle)
+    planes = case.scene.planes.with_tensors({"raw_normals": torch.tensor([[math.sin(radians), 0, math.cos(radians)]])})
+    (plane,) = plane_table(planes, load_truth(case.dataset.truth), extent=4.0)
+    assert plane["normal_error_deg"] == pytest.approx(min(angle, 180 - angle), rel=1e-3)
+
+
+def test_the_first_frame_is_rendered_once_more_than_it_is_timed(case) -> None:
+    evaluate(case.scene, case.renderer, case.dataset)
+    assert case.renderer.calls == [40.0, 40.0, 41.0, 42.0]
+
+
+def test_no_gradients_are_recorded(case) -> None:
+    def renderer(scene, camera):
+        assert not torch.is_grad_enabled()
+        return case.renderer(scene, camera)
+
+    assert evaluate(case.scene, renderer, case.dataset).results["num_test_views"] == 3
+
+
+def test_a_broken_render_is_named(case) -> None:
+    frame = case.renderer.frames[41.0]
+    case.renderer.frames[41.0] = replace(frame, rgb=frame.rgb / 0)
+    with pytest.raises(ValueError, match=r"render of b\.jpg holds values that are not finite"):
+        evaluate(case.scene, case.renderer, case.dataset)
+
+
+def test_no_test_views_are_refused(case) -> None:
+    with pytest.raises(ValueError, match="has no test views"):
+        evaluate(case.scene, case.renderer, replace(case.dataset, test=()))
+
+
+def test_lpips_is_taken_with_its_backbone(case, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Constant:
+        backbone = "alex"
+
+        def __call__(self, image: torch.Tensor, target: torch.Tensor) -> float:
+            assert image.dtype == target.dtype == torch.uint8
+            return 0.25
+
+    monkeypatch.setattr("glassplat.evaluate.evaluate.load_lpips", lambda folder: Constant())
+    results = evaluate(case.scene, case.renderer, case.dataset).results
+    assert (results["lpips"], results["lpips_backbone"]) == (0.25, "alex")
+
+
+def test_plain_gives_a_reason_for_every_missing_number() -> None:
+    assert plain({"a": 1.5, "b": "because"}) == {"a": 1.5, "b": None, "b_reason": "because"}
+    assert plain({"a": math.inf})["a"] is None

@@ -1,0 +1,120 @@
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from glassplat.evaluate.colormap import depth_colors, heat_colors, label_colors
+from glassplat.evaluate.evaluate import evaluate
+from glassplat.evaluate.report import overview_page, sheet_names, write_report
+from glassplat.evaluate.sheet import CAPTION_HEIGHT, MARGIN, TITLE_HEIGHT, comparison_sheet
+from glassplat.files.images import read_image
+from glassplat.scene.plane import Planes
+
+
+class References(HTMLParser):
+    """Collects what a page refers to, and checks that its tags are balanced."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.links: set[str] = set()
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.links |= {value for name, value in attributes if name in ("src", "href") and value}
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def references(page: str) -> set[str]:
+    parser = References()
+    parser.feed(page)
+    assert parser.open == []
+    return parser.links
+
+
+def written_report(case, folder: Path) -> str:
+    evaluation = evaluate(case.scene, case.renderer, case.dataset)
+    results = {"method": "planar <&>", "iterations": 30, **evaluation.results}
+    write_report(folder, case.scene, case.renderer, case.dataset, results, evaluation.per_view)
+    return (folder / "index.html").read_text(encoding="utf-8")
+
+
+def test_every_view_has_a_sheet_and_the_page_shows_it(case, tmp_path: Path) -> None:
+    page = written_report(case, tmp_path / "run")
+    sheets = {"sheets/a.png", "sheets/b.png", "sheets/c.png"}
+    assert references(page) == sheets | {"#a.jpg", "#b.jpg", "#c.jpg"}
+    assert {str(path.relative_to(tmp_path / "run")) for path in (tmp_path / "run").rglob("*.png")} == sheets
+    assert "planar &lt;&amp;&gt;" in page
+    assert "http" not in page
+
+
+def test_panels_lie_where_their_captions_say(case) -> None:
+    frame, view = case.renderer.frames[40.0], case.dataset.test[0]
+    sheet = comparison_sheet(frame, view.photo, None, title="a")
+    top, factor = MARGIN + TITLE_HEIGHT + CAPTION_HEIGHT, 6
+    photo = sheet[top : top + 32 * factor, MARGIN : MARGIN + 48 * factor]
+    np.testing.assert_array_equal(photo[::factor, ::factor], view.photo.numpy())
+
+
+def test_rows_follow_what_is_known(case) -> None:
+    full, view = case.renderer.frames[40.0], case.dataset.test[0]
+    bare = replace(full, layers={})
+    heights = [comparison_sheet(frame, view.photo, None, title="a").shape[0] for frame in (bare, full)]
+    widths = [comparison_sheet(frame, view.photo, None, title="a").shape[1] for frame in (bare, full)]
+    row = CAPTION_HEIGHT + 32 * 6 + 10
+    assert heights[1] - heights[0] == row
+    assert widths[1] - widths[0] == 48 * 6 + 10
+
+
+def test_large_photographs_give_sheets_of_a_bearable_size(case) -> None:
+    frame = replace(case.renderer.frames[40.0], rgb=torch.zeros(1920, 1080, 3), layers={})
+    sheet = comparison_sheet(frame, torch.zeros(1920, 1080, 3, dtype=torch.uint8), None, title="a")
+    assert sheet.shape[1] == 2 * MARGIN + 3 * 640 + 20
+
+
+def test_a_method_without_layers_is_reported_too(case, tmp_path: Path) -> None:
+    plain = replace(case, renderer=case.renderer.without_layers(), scene=replace(case.scene, planes=Planes.empty()))
+    assert "PSNR, transmission" in written_report(plain, tmp_path / "run")
+    assert read_image(tmp_path / "run" / "sheets" / "a.png").shape[2] == 3
+
+
+def test_missing_values_are_dashes_with_their_reason() -> None:
+    page = overview_page({"lpips": None, "lpips_reason": 'no "weights"'}, {}, {})
+    assert '<div title="no &quot;weights&quot;"><b>-</b><span>LPIPS</span></div>' in page
+
+
+def test_names_of_sheets_are_distinct() -> None:
+    assert sheet_names(["left/1.jpg", "2.png"]) == {"left/1.jpg": "sheets/left_1.png", "2.png": "sheets/2.png"}
+    assert len(set(sheet_names(["1.jpg", "1.png"]).values())) == 2
+
+
+def test_heat_gets_lighter_all_the_way() -> None:
+    lightness = heat_colors(torch.linspace(0, 1, 50)) @ torch.tensor([0.2126, 0.7152, 0.0722])
+    assert (lightness.diff() > 0).all()
+    assert (
+        heat_colors(torch.tensor([-1.0, float("nan"), 7.0])).tolist() == heat_colors(torch.tensor([0.0, 0, 1])).tolist()
+    )
+
+
+def test_near_is_bright_and_nothing_is_black() -> None:
+    depth = torch.tensor([[1.0, 2.0, 4.0, 0.0, 3.0, float("inf")]])
+    alpha = torch.tensor([[1.0, 1.0, 1.0, 1.0, 0.1, 1.0]])
+    brightness = depth_colors(depth, alpha).sum(-1)[0]
+    assert brightness[0] > brightness[1] > brightness[2] > 0
+    assert brightness[3:].tolist() == [0, 0, 0]
+
+
+def test_depth_of_one_distance_or_of_nothing() -> None:
+    assert torch.isfinite(depth_colors(torch.full((3, 4), 2.0))).all()
+    assert depth_colors(torch.zeros(3, 4), torch.ones(3, 4)).abs().max() == 0
+
+
+def test_labels_have_colours_of_their_own() -> None:
+    colors = label_colors(torch.tensor([0, 1, 2, 3], dtype=torch.uint8))
+    assert colors[0].tolist() == [0, 0, 0]
+    assert len({tuple(color) for color in colors.tolist()}) == 4

@@ -1,0 +1,80 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from glassplat.evaluate.truth import load_truth
+
+
+def write_view(folder: Path, stem: str, labels: np.ndarray) -> None:
+    for kind in ("trans", "refl", "strength"):
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+    height, width = labels.shape
+    Image.fromarray(np.full((height, width, 3), 10, np.uint8)).save(folder / "trans" / f"{stem}.png")
+    Image.fromarray(np.full((height, width, 3), 20, np.uint8)).save(folder / "refl" / f"{stem}.png")
+    Image.fromarray(np.full((height, width), 13107, np.uint16)).save(folder / "strength" / f"{stem}.png")
+    Image.fromarray(labels).save(folder / "strength" / f"{stem}_pane.png")
+
+
+LABELS = np.array([[1, 1, 2, 2, 0, 0], [1, 1, 2, 0, 0, 0]], dtype=np.uint8)
+
+
+def test_no_folder_is_no_truth() -> None:
+    assert load_truth(None) is None
+
+
+def test_layers_are_read_with_their_full_depth(tmp_path: Path) -> None:
+    write_view(tmp_path, "0008", LABELS)
+    truth = load_truth(tmp_path)
+    assert truth is not None
+    assert truth.planes == ()
+    view = truth.view("images/0008.jpg", 6, 2)
+    assert view is not None
+    assert view.transmission.shape == (2, 6, 3)
+    assert (view.transmission.unique().tolist(), view.reflection.unique().tolist()) == ([10], [20])
+    torch.testing.assert_close(view.strength, torch.full((2, 6), 0.2))
+    assert view.labels.tolist() == LABELS.tolist()
+
+
+def test_a_smaller_pixel_is_pane_only_where_the_pane_covers_it(tmp_path: Path) -> None:
+    write_view(tmp_path, "0008", LABELS)
+    truth = load_truth(tmp_path)
+    assert truth is not None
+    view = truth.view("0008.jpg", 3, 1)
+    assert view is not None
+    assert view.labels.tolist() == [[1, 0, 0]]
+    torch.testing.assert_close(view.strength, torch.full((1, 3), 0.2))
+
+
+def test_a_view_may_be_absent_but_not_incomplete(tmp_path: Path) -> None:
+    write_view(tmp_path, "0008", LABELS)
+    truth = load_truth(tmp_path)
+    assert truth is not None
+    assert truth.view("0016.jpg", 6, 2) is None
+    (tmp_path / "refl" / "0008.png").unlink()
+    with pytest.raises(ValueError, match=r"incomplete: .*refl.0008\.png missing"):
+        truth.view("0008.jpg", 6, 2)
+
+
+PLANE = {"label": 3, "center": [0, 1, 2], "normal": [0, 0, 1], "half_u": [1, 0, 0], "half_v": [0, 1, 0], "ior": 1.5}
+PLANE |= {"mirror": True, "base_reflectance": 1.0}
+
+
+def test_planes_are_read(tmp_path: Path) -> None:
+    (tmp_path / "planes.json").write_text(json.dumps([PLANE]))
+    truth = load_truth(tmp_path)
+    assert truth is not None
+    (plane,) = truth.planes
+    assert (plane.label, plane.center, plane.mirror, plane.base_reflectance) == (3, (0.0, 1.0, 2.0), True, 1.0)
+
+
+@pytest.mark.parametrize(
+    "content", ["[{]", "[[1]]", json.dumps([{"label": 1}]), json.dumps([PLANE | {"normal": [0, 0, 0]}])]
+)
+def test_broken_planes_are_refused(tmp_path: Path, content: str) -> None:
+    (tmp_path / "planes.json").write_text(content)
+    with pytest.raises(ValueError, match=r"cannot read .*planes\.json .*expected a list of planes with label, center"):
+        load_truth(tmp_path)
