@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from glassplat.data.dataset import Dataset, View
+from glassplat.data.errors import InputError
 from glassplat.evaluate.lpips import Lpips, load_lpips
 from glassplat.evaluate.metrics import psnr, quantized, reflection_gain, ssim
 from glassplat.evaluate.plane_errors import missing_panes, plane_table
@@ -75,10 +76,10 @@ def evaluate(scene: Scene, renderer: Renderer, dataset: Dataset, *, lpips_weight
         lpips_weights: folder with LPIPS weights; None looks in the usual places.
 
     Raises:
-        ValueError: no test views, a render that is not finite, or broken ground truth.
+        InputError: no test views, a render that is not finite, or broken ground truth.
     """
     if not dataset.test:
-        raise ValueError(f"{dataset.root} has no test views; expected at least one image to compare with")
+        raise InputError(f"{dataset.root} has no test views; expected at least one image to compare with")
     truth = load_truth(dataset.truth)
     lpips = _available_lpips(lpips_weights)
     # The first frame may wait for the compiler; it must not count.
@@ -101,7 +102,7 @@ def timed_render(renderer: Renderer, scene: Scene, view: View) -> tuple[Frame, f
     """A frame without gradients, on the CPU, and the seconds it took.
 
     Raises:
-        ValueError: the image is not finite.
+        InputError: the image is not finite.
     """
     with torch.no_grad():
         start = time.perf_counter()
@@ -111,7 +112,7 @@ def timed_render(renderer: Renderer, scene: Scene, view: View) -> tuple[Frame, f
         seconds = time.perf_counter() - start
     frame = Frame(frame.rgb.cpu(), {name: layer.cpu() for name, layer in frame.layers.items()})
     if not bool(torch.isfinite(frame.rgb).all()):
-        raise ValueError(
+        raise InputError(
             f"the render of {view.name} holds values that are not finite; the scene is broken, train it again"
         )
     return frame, seconds

@@ -18,6 +18,8 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+from glassplat.data.errors import InputError
+
 Backbone = Literal["vgg", "alex"]
 WEIGHTS_VARIABLE = "GLASSPLAT_LPIPS_WEIGHTS"
 SMALLEST_SIDE = 32
@@ -131,7 +133,7 @@ def load_lpips(folder: Path | None = None, backbone: Backbone | None = None) -> 
 
     Raises:
         FileNotFoundError: the files are not there; the message says which and where they may be put.
-        ValueError: a file is damaged or holds something else.
+        InputError: a file is damaged or holds something else.
     """
     folders = _search_folders(folder)
     wanted = get_args(Backbone) if backbone is None else (backbone,)
@@ -175,7 +177,7 @@ def _load_pair(backbone: Backbone, features_path: Path, linear_path: Path) -> Lp
     weights = [_taken(linear, f"lin{tap}.model.1.weight", linear_path) for tap in range(taps)]
     outputs = [pair[0].shape[0] for pair, layer in zip(pairs, layers, strict=True) if layer.tapped]
     if outputs != [weight.shape[1] for weight in weights]:
-        raise ValueError(
+        raise InputError(
             f"{linear_path} does not belong to {features_path}: channels differ; use files of one backbone"
         )
     return Lpips(backbone, tuple(pairs), tuple(weights))
@@ -185,15 +187,15 @@ def _load_weights(path: Path) -> Mapping[str, Tensor]:
     try:
         weights = torch.load(path, map_location="cpu", weights_only=True)
     except (RuntimeError, UnpicklingError, EOFError) as error:
-        raise ValueError(f"cannot read the weights in {path}; the file is damaged: download it again") from error
+        raise InputError(f"cannot read the weights in {path}; the file is damaged: download it again") from error
     if not isinstance(weights, dict):
-        raise ValueError(f"{path} holds {type(weights).__name__}; expected a dictionary of named weights")
+        raise InputError(f"{path} holds {type(weights).__name__}; expected a dictionary of named weights")
     return weights
 
 
 def _taken(weights: Mapping[str, Tensor], key: str, path: Path) -> Tensor:
     if key not in weights:
-        raise ValueError(f"{path} has no weights named {key!r}; expected the published file of that name")
+        raise InputError(f"{path} has no weights named {key!r}; expected the published file of that name")
     return weights[key].to(torch.float32)
 
 

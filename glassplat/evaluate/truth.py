@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from glassplat.data.errors import InputError
 from glassplat.files.images import read_image, read_image_float
 
 
@@ -67,7 +68,7 @@ class GroundTruth:
             None where the folder holds nothing for this view.
 
         Raises:
-            ValueError: only some of the view's files are there, or a file is broken.
+            InputError: only some of the view's files are there, or a file is broken.
         """
         stem = Path(image_name).stem
         paths = {
@@ -80,7 +81,7 @@ class GroundTruth:
         if len(missing) == len(paths):
             return None
         if missing:
-            raise ValueError(
+            raise InputError(
                 f"ground truth for {image_name} is incomplete: {', '.join(missing)} missing; add or remove all"
             )
         size = (width, height)
@@ -96,7 +97,7 @@ def load_truth(folder: Path | None) -> GroundTruth | None:
     """Opens a data set's folder of known layers and panes; None for None.
 
     Raises:
-        ValueError: its `planes.json` cannot be understood.
+        InputError: its `planes.json` cannot be understood.
     """
     if folder is None:
         return None
@@ -107,7 +108,7 @@ def load_truth(folder: Path | None) -> GroundTruth | None:
         entries = json.loads(path.read_text(encoding="utf-8"))
         return GroundTruth(folder, tuple(_true_plane(entry) for entry in entries))
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(
+        raise InputError(
             f"cannot read {path} ({error!r}); expected a list of planes with label, center, normal, half_u, half_v, "
             "mirror and base_reflectance"
         ) from error

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from glassplat.data.errors import InputError
 from glassplat.evaluate.evaluate import evaluate, plain
 from glassplat.evaluate.metrics import psnr
 from glassplat.evaluate.plane_errors import plane_table
@@ -165,7 +166,7 @@ def test_a_broken_render_is_named(case) -> None:
 
 
 def test_no_test_views_are_refused(case) -> None:
-    with pytest.raises(ValueError, match="has no test views"):
+    with pytest.raises(InputError, match="has no test views"):
         evaluate(case.scene, case.renderer, replace(case.dataset, test=()))
 
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from glassplat.data.errors import InputError
 from glassplat.evaluate.lpips import LAYERS, Backbone, Lpips, load_lpips
 
 WIDTHS = {"alex": (4, 6, 5, 5, 3), "vgg": (3, 4, 5, 4, 6, 5, 4, 3, 4, 5, 3, 4, 5)}
@@ -145,7 +146,7 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
     folder = write_weights(tmp_path / "weights", "alex")
     linear = folder / "alex.pth"
     linear.write_bytes(linear.read_bytes()[:100])
-    with pytest.raises(ValueError, match=r"cannot read the weights in .*alex\.pth"):
+    with pytest.raises(InputError, match=r"cannot read the weights in .*alex\.pth"):
         load_lpips(folder)
 
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 from PIL import Image
 
+from glassplat.data.errors import InputError
 from glassplat.evaluate.truth import load_truth
 
 
@@ -76,5 +77,5 @@ def test_planes_are_read(tmp_path: Path) -> None:
 )
 def test_broken_planes_are_refused(tmp_path: Path, content: str) -> None:
     (tmp_path / "planes.json").write_text(content)
-    with pytest.raises(ValueError, match=r"cannot read .*planes\.json .*expected a list of planes with label, center"):
+    with pytest.raises(InputError, match=r"cannot read .*planes\.json .*expected a list of planes with label, center"):
         load_truth(tmp_path)
