@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +21,8 @@ __all__ = ["Dataset", "PointCloud", "View", "load_dataset"]
 TEST_EVERY = 8
 EXTENT_MARGIN = 1.1
 FARTHEST_ORIGIN = 1e4
+SAME_PLACE = 1e-6
+"""Cameras closer together than this share of their distance from the origin differ by rounding only."""
 
 LOADERS: tuple[tuple[Loader, str], ...] = (
     (colmap.load_colmap, colmap.LOOKED_FOR),
@@ -107,8 +110,7 @@ def _load_capture(root: Path) -> Capture:
 
 
 def _check_names(shots: list[Shot]) -> None:
-    names = [shot.name for shot in shots]
-    repeated = sorted({name for name in names if names.count(name) > 1})
+    repeated = [name for name, count in Counter(shot.name for shot in shots).items() if count > 1]
     if repeated:
         raise InputError(f"photographs that occur more than once: {first_names(repeated)}; keep one pose for each")
 
@@ -125,7 +127,8 @@ def _split(views: list[View], capture: Capture) -> tuple[tuple[View, ...], tuple
     test = tuple(view for view in views if view.name in held_out)
     if len(train) < 2:
         raise InputError(
-            f"{len(train)} of {len(views)} photographs are left for training (test views: {split}); expected at least two"
+            f"{len(train)} of {len(views)} photographs are left for training (test views: {split}); "
+            "expected at least two"
         )
     return train, test, split
 
@@ -134,7 +137,7 @@ def _extent(train: tuple[View, ...]) -> float:
     """1.1 x the radius of the training cameras about their mean; world units."""
     centers = torch.stack([view.camera.center.double() for view in train])
     radius = float((centers - centers.mean(0)).norm(dim=1).max())
-    if radius <= 0:
+    if radius <= SAME_PLACE * float(centers.norm(dim=1).max()):
         raise InputError("all training cameras stand at one point; expected photographs from different places")
     return EXTENT_MARGIN * radius
 
@@ -144,9 +147,8 @@ def _far_off(train: tuple[View, ...], extent: float) -> tuple[str, ...]:
     distance = float(train[0].camera.center.norm())
     if distance <= FARTHEST_ORIGIN * extent:
         return ()
-    return (
-        f"The cameras are {distance / extent:.0f} scene extents away from the origin; shift the capture to keep precision.",
-    )
+    ratio = distance / extent
+    return (f"The cameras are {ratio:.0f} scene extents away from the origin; shift the capture to keep precision.",)
 
 
 def _points(capture: Capture, train: tuple[View, ...]) -> tuple[PointCloud, list[str]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pycolmap
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from glassplat.data.errors import InputError
+
+Interpolation = Literal["BILINEAR", "NEAREST_NEIGHBOR"]
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 PERSPECTIVE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -46,16 +48,23 @@ class PixelMap:
     def photo(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """[H, W, 3] of the file to [height, width, 3]; bilinear undistortion, area-averaging reduction."""
         if self.lens is not None:
-            pixels = _undistort(pixels, self.lens, pycolmap.Interpolation.BILINEAR)
-        if pixels.shape[:2] == (self.height, self.width):
-            return pixels
-        return np.array(Image.fromarray(pixels).resize((self.width, self.height), Image.Resampling.BOX))
+            pixels = _undistort(pixels, self.lens, "BILINEAR")
+        return area_resize(pixels, self.width, self.height)
 
     def labels(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """[H, W] of the photograph's size to [height, width]; the nearest pixel's label, no label in between."""
         if self.lens is not None:
-            labels = _undistort(labels, self.lens, pycolmap.Interpolation.NEAREST_NEIGHBOR)
+            labels = _undistort(labels, self.lens, "NEAREST_NEIGHBOR")
         return nearest_resize(labels, self.width, self.height)
+
+
+def area_resize(pixels: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """[H, W, 3] averaged over the area of each new pixel; rounded once, so that no bias builds up."""
+    if pixels.shape[:2] == (height, width):
+        return pixels
+    channels = [Image.fromarray(channel.astype(np.float32)) for channel in np.moveaxis(pixels, 2, 0)]
+    reduced = [np.asarray(channel.resize((width, height), Image.Resampling.BOX)) for channel in channels]
+    return np.clip(np.round(np.stack(reduced, axis=2)), 0, 255).astype(np.uint8)
 
 
 def nearest_resize(labels: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
@@ -106,8 +115,8 @@ def lens_for_image(lens: Any, size: tuple[int, int], name: str) -> Any:
     tolerance = max(1.0, scale)
     if abs(scale * lens.width - width) > tolerance or abs(scale * lens.height - height) > tolerance:
         raise InputError(
-            f"{name} is {width}x{height} pixels large, but its camera {lens.width}x{lens.height}; expected the same size, or "
-            "a scaled copy with the same aspect (a photograph rotated or cropped after calibration cannot be used)"
+            f"{name} is {width}x{height} pixels large, but its camera {lens.width}x{lens.height}; expected the "
+            "same size or a scaled copy; photographs rotated or cropped after calibration cannot be used"
         )
     rescaled = pycolmap.Camera(lens.todict())
     rescaled.rescale(width, height)
@@ -157,8 +166,9 @@ def _intrinsics(lens: Any) -> Pinhole:
     )
 
 
-def _undistort(pixels: NDArray[np.uint8], lens: Any, interpolation: Any) -> NDArray[np.uint8]:
+def _undistort(pixels: NDArray[np.uint8], lens: Any, interpolation: Interpolation) -> NDArray[np.uint8]:
     options = pycolmap.UndistortCameraOptions()
-    options.warp_options.interpolation = interpolation
+    kinds = type(options.warp_options.interpolation)  # pycolmap gives this enumeration no public name.
+    options.warp_options.interpolation = getattr(kinds, interpolation)
     image, _ = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(np.ascontiguousarray(pixels)), lens)
     return np.array(image.to_array())

@@ -96,6 +96,6 @@ def _check_black_and_white(counts: NDArray[np.int64], path: Path, lossy: bool) -
     if few or grey.sum() > SOFT_SHARE * counts.sum():
         present = first_names([str(value) for value in np.flatnonzero(counts)])
         raise InputError(
-            f"{path} holds the grey values {present}, which are neither pane labels (0..{HIGHEST_LABEL}) nor black and white (0 "
-            "and 255); write 0 for no pane and 1..K for the panes"
+            f"{path} holds the grey values {present}, which are neither pane labels (0..{HIGHEST_LABEL}) nor black and "
+            "white (0 and 255); write 0 for no pane and 1..K for the panes"
         )

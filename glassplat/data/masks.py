@@ -57,8 +57,9 @@ class MaskSet:
 def find_masks(root: Path, photographs: Mapping[str, Path], polarity: Polarity = "auto") -> MaskSet:
     """Find and understand the masks of a capture.
 
-    Looked for, for a photograph `a/x.jpg`: `masks/a/x.png`, `masks/a/x.jpg.png`, `masks/a/x.jpg`, `masks/a/x_mask.png`, each
-    with any image suffix and without the folder where that is unique, and `x_mask.png` beside the photograph.
+    Looked for, for a photograph `a/x.jpg`: `masks/a/x.png`, `masks/a/x.jpg.png`, `masks/a/x.jpg` and
+    `masks/a/x_mask.png`, each with any image suffix and without the folder where that is unique, and `x_mask.png`
+    beside the photograph.
 
     Args:
         root: the capture's folder.
@@ -116,8 +117,8 @@ def _match(folder: Path, photographs: Mapping[str, Path]) -> dict[str, Path]:
             unmatched.append(path.relative_to(folder).as_posix())
     if unmatched:
         raise InputError(
-            f"{len(unmatched)} masks in {folder} match no photograph: {first_names(sorted(unmatched))}; name a mask like its "
-            f"photograph, such as {PurePosixPath(min(photographs)).with_suffix('.png')}"
+            f"{len(unmatched)} masks in {folder} match no photograph: {first_names(sorted(unmatched))}; name a mask "
+            f"like its photograph, such as {PurePosixPath(min(photographs)).with_suffix('.png')}"
         )
     for name, path in photographs.items():
         found[name].extend(_beside(path))
@@ -178,8 +179,8 @@ def _decide_polarity(values: list[MaskValues], polarity: Polarity) -> tuple[bool
     has_both = float(np.mean([v.pixels.min() == 0 for v in binary])) > MOSTLY_PANE
     if frame > FRAMED_BY_PANE and has_both:
         return True, [
-            f"The masks are white along {frame:.0%} of the image border, so they are read as inverted: black is the pane. "
-            "State the polarity if that is wrong."
+            f"The masks are white along {frame:.0%} of the image border, so they are read as inverted: black is the "
+            "pane. State the polarity if that is wrong."
         ]
     if frame > MOSTLY_PANE:
         return False, [

@@ -17,7 +17,7 @@ BOX_COUNT = 100_000
 BOX_HALF_SIZE = 1.3
 SEED = 0
 LEAST_CROSSING = 1e-2
-"""Smallest eigenvalue of the mean of I - d d^T for which the optical axes are taken to cross (about 6 degrees apart)."""
+"""Smallest eigenvalue of the mean of I - d d^T for which optical axes are taken to cross (about 6 degrees apart)."""
 MOST_CAMERAS = 0.8
 """Share of the cameras that must see the crossing in front of them; fewer do in a room photographed from its middle."""
 AHEAD = 3.0

@@ -95,8 +95,8 @@ def _shots(root: Path, settings: Settings, file_name: str) -> dict[str, Shot]:
     missing = [path.name for path in paths if not path.is_file()]
     if missing:
         raise InputError(
-            f"{len(missing)} of the {len(paths)} photographs of {root / file_name} are missing: {first_names(missing)}; copy them "
-            "to where file_path says, or delete their entries from `frames`"
+            f"{len(missing)} of {len(paths)} photographs of {root / file_name} are missing: {first_names(missing)}; "
+            "copy them to where file_path says, or delete their entries from `frames`"
         )
     shots = {}
     for frame, path in zip(settings["frames"], paths, strict=True):

@@ -18,8 +18,9 @@ PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV",
 def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str) -> Any:
     """The `pycolmap.Camera` of one frame.
 
-    Focal length: `fl_x`, `fl_y`, or the opening angles `camera_angle_x`, `camera_angle_y` in radians. Principal point:
-    `cx`, `cy`, or the middle. Size: `w`, `h`, or that of the image. Distortion: `k1` ... `k6`, `p1`, `p2`, as in OpenCV.
+    Focal length: `fl_x`, `fl_y`, or the opening angles `camera_angle_x`, `camera_angle_y` in radians. Principal
+    point: `cx`, `cy`, or the middle. Size: `w`, `h`, or that of the image. Distortion: `k1` ... `k6`, `p1`, `p2`, as
+    in OpenCV.
 
     Raises:
         InputError: no focal length, a value that is no number, an unknown camera model; names the photograph.

@@ -151,16 +151,20 @@ def _mask_file(mask: PaneMask, size: tuple[int, int], pixel_map: PixelMap) -> Ma
         mask_size = image_size(mask.path)[:2]
     except ValueError as error:
         raise InputError(str(error)) from error
-    small, large = sorted((mask_size, size))
-    factor = round(large[0] / small[0])
-    if any(
-        abs(factor * s - l) >= max(factor, 1) and abs(l / factor - s) > 1 for s, l in zip(small, large, strict=True)
-    ):
+    if not (_is_multiple(mask_size, size) or _is_multiple(size, mask_size)):
         raise InputError(
-            f"mask {mask.path} is {mask_size[0]}x{mask_size[1]} pixels large, its photograph {size[0]}x{size[1]}; expected the "
-            "same size, or one an integer multiple of the other"
+            f"mask {mask.path} is {mask_size[0]}x{mask_size[1]} pixels large, its photograph {size[0]}x{size[1]}; "
+            "expected the same size, or one an integer multiple of the other"
         )
     return MaskFile(mask, size, pixel_map)
+
+
+def _is_multiple(large: tuple[int, int], small: tuple[int, int]) -> bool:
+    """Whether one size is an integer multiple of the other, up to the rounding of the smaller one."""
+    factor = round(large[0] / small[0])
+    return factor >= 1 and all(
+        abs(a / factor - b) < 1 and (factor > 1 or a == b) for a, b in zip(large, small, strict=True)
+    )
 
 
 def _opaque(pixels: NDArray[np.uint8], background: Rgb) -> NDArray[np.uint8]:

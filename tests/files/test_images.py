@@ -1,0 +1,93 @@
+"""Image files in and out."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from glassplat.files.images import image_size, open_image, read_image, read_image_float, write_image
+
+GENERATOR = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("shape", [(5, 7), (5, 7, 1), (5, 7, 3), (5, 7, 4)])
+def test_eight_bits_survive(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    pixels = GENERATOR.integers(0, 256, shape, dtype=np.uint8)
+    write_image(tmp_path / "a.png", pixels)
+    read = read_image(tmp_path / "a.png")
+    assert read.shape == (5, 7, shape[2] if len(shape) == 3 else 1)
+    np.testing.assert_array_equal(read, pixels.reshape(read.shape))
+    np.testing.assert_allclose(read_image_float(tmp_path / "a.png"), read / 255, atol=1e-6)
+
+
+def test_floats_are_clamped_and_rounded(tmp_path: Path) -> None:
+    image = torch.tensor([[-1.0, 0.0, 0.5], [0.2, 1.0, 3.0]], requires_grad=True)
+    write_image(tmp_path / "a.png", image)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png")[:, :, 0], [[0, 0, 128], [51, 255, 255]])
+
+
+def test_sixteen_bit_grey_keeps_its_precision(tmp_path: Path) -> None:
+    values = np.array([[0, 1, 300], [32768, 65534, 65535]], dtype=np.uint16)
+    Image.fromarray(values).save(tmp_path / "a.png")
+    np.testing.assert_allclose(read_image_float(tmp_path / "a.png")[:, :, 0], values / 65535, atol=1e-7)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png")[:, :, 0], np.round(values / 257.0))
+
+
+def test_palette_and_transparency(tmp_path: Path) -> None:
+    palette = Image.new("P", (4, 3), 1)
+    palette.putpalette([0, 0, 0, 200, 100, 50])
+    palette.save(tmp_path / "palette.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "palette.png")[0, 0], [200, 100, 50])
+    palette.save(tmp_path / "clear.png", transparency=1)
+    np.testing.assert_array_equal(read_image(tmp_path / "clear.png")[0, 0], [200, 100, 50, 0])
+    assert image_size(tmp_path / "clear.png") == (4, 3, True)
+    assert image_size(tmp_path / "palette.png") == (4, 3, False)
+
+
+def test_orientation_tag_is_not_applied(tmp_path: Path) -> None:
+    """Poses and intrinsics refer to the pixels as stored."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (8, 4)).save(tmp_path / "a.jpg", exif=exif)
+    assert read_image(tmp_path / "a.jpg").shape == (4, 8, 3)
+
+
+@pytest.mark.parametrize("read", [read_image, read_image_float, image_size, open_image])
+def test_files_that_cannot_be_read(tmp_path: Path, read) -> None:
+    with pytest.raises(FileNotFoundError):
+        read(tmp_path / "nothing.png")
+    (tmp_path / "text.png").write_text("text")
+    with pytest.raises(ValueError, match=r"text\.png as an image"):
+        read(tmp_path / "text.png")
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_cut_off_file_is_named(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a.{suffix}"
+    write_image(path, GENERATOR.integers(0, 256, (40, 40, 3), dtype=np.uint8))
+    os.truncate(path, path.stat().st_size // 2)
+    with pytest.raises(ValueError, match=rf"a\.{suffix} as an image"):
+        read_image(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "image", "error", "message"),
+    [
+        ("a.png", np.zeros((2, 2, 2), dtype=np.uint8), ValueError, r"got \[2, 2, 2\]"),
+        ("a.png", np.zeros((0, 2, 3), dtype=np.uint8), ValueError, r"got \[0, 2, 3\]"),
+        ("a.png", np.zeros((2, 2, 3), dtype=np.int64), TypeError, "got int64"),
+        ("a.png", torch.full((2, 2), float("nan")), ValueError, "not finite"),
+        ("a.xyz", np.zeros((2, 2, 3), dtype=np.uint8), ValueError, "image format of .*a.xyz"),
+    ],
+)
+def test_images_that_cannot_be_written(tmp_path: Path, name: str, image, error: type, message: str) -> None:
+    (tmp_path / name).write_text("old")
+    with pytest.raises(error, match=message):
+        write_image(tmp_path / name, image)
+    assert (tmp_path / name).read_text() == "old"
+    assert len(list(tmp_path.iterdir())) == 1
