@@ -7,7 +7,8 @@ from typing import ClassVar
 
 from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify
-from glassplat.init.planes import PlaneFit, fit_planes, glass_gaussians
+from glassplat.init.glass import glass_gaussians
+from glassplat.init.planes import PlaneFit, fit_planes
 from glassplat.init.points import gaussians_from_points
 from glassplat.losses.geometry import depth_deviation_loss
 from glassplat.losses.reflection import gradient_conflict, mask_loss

@@ -1,0 +1,176 @@
+"""One pane in one annotated photograph: its mask, the mask's edge, and rays through its pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from torch import Tensor
+
+from glassplat.scene.camera import Camera
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+THINNEST_PART = 0.005  # Half width below which a part of a mask is taken for an artefact, in image diagonals.
+
+
+@dataclass(frozen=True)
+class PaneView:
+    """Where one pane is, and is not, in one annotated view.
+
+    Attributes:
+        cam_from_world: [4, 4] rigid transform, world to camera.
+        intrinsics: [4] fx, fy, cx, cy in pixels.
+        mask: [H, W] true on the pane.
+        distance: [H, W] pixels from a pixel's centre to the edge of the mask, positive inside. Where
+            the mask leaves the image there is no edge, because the pane goes on.
+        edge: [E, 2] points (x, y) half-way between a pixel on the pane and a neighbour off it.
+    """
+
+    cam_from_world: Array
+    intrinsics: Array
+    mask: Mask
+    distance: Array
+    edge: Array
+
+    @property
+    def center(self) -> Array:
+        """[3] camera centre in the world."""
+        return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the image diagonal in pixels."""
+        return float(np.hypot(*self.mask.shape))
+
+    def directions(self, pixels: Array) -> Array:
+        """[P, 3] world directions of the rays through pixel positions [P, 2]; camera z grows by 1 along each."""
+        fx, fy, cx, cy = self.intrinsics
+        in_camera = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], axis=1)
+        return in_camera @ self.cam_from_world[:3, :3]
+
+    def project(self, points: Array) -> tuple[Array, Mask]:
+        """Pixel positions [..., 2] of world points [..., 3], and whether the image holds them."""
+        fx, fy, cx, cy = self.intrinsics
+        in_camera = points @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]
+        depth = in_camera[..., 2]
+        safe = np.where(depth > 0, depth, np.inf)
+        x, y = fx * in_camera[..., 0] / safe + cx, fy * in_camera[..., 1] / safe + cy
+        height, width = self.mask.shape
+        held = (depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        return np.stack([x, y], axis=-1), held
+
+    def covers(self, pixels: Array, held: Mask) -> Mask:
+        """[...] whether pixel positions [..., 2] lie on the pane; false where `held` is."""
+        found = np.zeros(held.shape, dtype=bool)
+        column, row = np.floor(pixels[held]).astype(np.int64).T
+        found[held] = self.mask[row, column]
+        return found
+
+    def edge_distance(self, pixels: Array) -> Array:
+        """[P] signed distance to the mask's edge at pixel positions [P, 2], interpolated."""
+        centred = pixels[:, ::-1].T - 0.5
+        sampled: Array = ndimage.map_coordinates(self.distance, centred, order=1, mode="nearest")
+        return sampled
+
+    def grid(self, count: int) -> Array:
+        """[P, 2] about `count` pixel positions spread evenly over the image."""
+        height, width = self.mask.shape
+        step = max(np.sqrt(height * width / count), 1.0)
+        x, y = np.meshgrid(np.arange(step / 2, width, step), np.arange(step / 2, height, step))
+        return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def pane_view(camera: Camera, labels: Tensor, label: int) -> PaneView:
+    """One pane of one annotated view.
+
+    Args:
+        camera: the view's camera.
+        labels: [H, W] integer label image, of the camera's size.
+        label: which pane.
+
+    Raises:
+        ValueError: the label image and the camera differ in size.
+    """
+    if tuple(labels.shape) != (camera.height, camera.width):
+        raise ValueError(
+            f"a mask of shape {tuple(labels.shape)} belongs to a camera of {camera.height} x {camera.width} pixels; "
+            "resize both the same way"
+        )
+    mask = _without_slivers(labels.cpu().numpy() == label)
+    return PaneView(
+        cam_from_world=_array(camera.cam_from_world),
+        intrinsics=np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+        mask=mask,
+        distance=_signed_distance(mask),
+        edge=_edge_points(mask),
+    )
+
+
+def _array(tensor: Tensor) -> Array:
+    return tensor.detach().cpu().numpy().astype(np.float64)
+
+
+def _without_slivers(mask: Mask) -> Mask:
+    """The mask without parts that are only a few pixels wide.
+
+    Label images that were resized or saved with blending carry a line of label 1 around label 2.
+    """
+    parts, count = ndimage.label(mask)
+    if count == 0:
+        return mask
+    half_widths = ndimage.maximum(_signed_distance(mask), parts, index=np.arange(count + 1))
+    wide = half_widths > THINNEST_PART * np.hypot(*mask.shape)
+    wide[0] = False
+    return np.asarray(wide[parts])
+
+
+def _signed_distance(mask: Mask) -> Array:
+    """[H, W] distance to the mask's edge in pixels, positive inside."""
+    if mask.all() or not mask.any():
+        return np.full(mask.shape, np.hypot(*mask.shape) if mask.all() else -np.hypot(*mask.shape))
+    # The edge runs half a pixel before the nearest centre on the other side.
+    inside: Array = ndimage.distance_transform_edt(mask)
+    outside: Array = ndimage.distance_transform_edt(~mask)
+    return np.where(mask, inside - 0.5, 0.5 - outside)
+
+
+def _edge_points(mask: Mask) -> Array:
+    row, column = np.nonzero(mask[:, 1:] != mask[:, :-1])
+    upright = np.stack([column + 1.0, row + 0.5], axis=1)
+    row, column = np.nonzero(mask[1:] != mask[:-1])
+    level = np.stack([column + 0.5, row + 1.0], axis=1)
+    return np.concatenate([upright, level])
+
+
+def pane_views(annotations: Sequence[tuple[Camera, Tensor]], label: int) -> list[PaneView]:
+    """The annotated views that show a pane, ignoring parts of it that are only a few pixels wide."""
+    views = (pane_view(camera, labels, label) for camera, labels in annotations)
+    return [view for view in views if view.mask.any()]
+
+
+def plane_candidates(
+    points: Array, views: Sequence[PaneView], *, band: float, agreement: float = 0.5
+) -> NDArray[np.bool_]:
+    """[N] bool: which points lie along the pane's edge (TR-Gaussians, Appendix A, steps 1 and 2).
+
+    A point on the frame projects close to the mask's edge in every view; a point before or behind
+    it may do so in one view but moves away in others. So the views vote.
+
+    Args:
+        points: [N, 3] world positions.
+        views: annotated views of the pane.
+        band: half width of the band along the mask's edge, as a share of the image diagonal.
+        agreement: share of the views whose image holds the point in which it must lie in the band.
+            Not all of them, since something may stand before the edge.
+    """
+    votes, held_count = np.zeros(len(points)), np.zeros(len(points))
+    for view in views:
+        pixels, held = view.project(points)
+        votes[held] += np.abs(view.edge_distance(pixels[held])) <= band * view.diagonal
+        held_count += held
+    return (votes >= min(2, len(views))) & (votes >= agreement * held_count)

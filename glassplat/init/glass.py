@@ -1,0 +1,68 @@
+"""The first glass Gaussians: flat discs spread over each pane (TR-Gaussians, Section III-C1)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.plane import Planes
+
+OVERLAP = 0.7
+"""Standard deviation of a disc, in distances between neighbours; the discs blend into an even sheet."""
+THICKNESS = 0.05
+"""Standard deviation across the pane, as a share of that along it."""
+
+
+def glass_gaussians(
+    planes: Planes, *, count: int = 1000, seed: int = 0, opacity: float = 0.5, mark: float = 0.99
+) -> Gaussians:
+    """Glass Gaussians on every pane's rectangle.
+
+    They are spread evenly, one in each cell of a grid at a random place, so that chance leaves no
+    holes. At the default opacity the sheet shows a mask of about 0.85 from the first step on, and
+    training thins it out where the rectangle is larger than the pane.
+
+    Args:
+        planes: the panes.
+        count: Gaussians on each pane, up to rounding to whole rows of the grid.
+        seed: of the places.
+        opacity: of each Gaussian, in (0, 1).
+        mark: m of each Gaussian, in (0, 1); the paper's 1 has no finite logit.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    panes = [_pane_discs(planes, index, count=count, generator=generator) for index in range(len(planes))]
+    if not panes:
+        return Gaussians.empty(channels=("logit_mark",))
+    means, quats, log_scales = (torch.cat(tensors) for tensors in zip(*panes, strict=True))
+    number = len(means)
+    return Gaussians(
+        means=means,
+        quats=quats,
+        log_scales=log_scales,
+        logit_opacities=torch.full((number,), math.log(opacity / (1 - opacity))),
+        sh=torch.zeros(number, 0, 3),
+        channels={"logit_mark": torch.full((number,), math.log(mark / (1 - mark)))},
+    ).to(planes.centers.device)
+
+
+def _pane_discs(planes: Planes, index: int, *, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    """Means [M, 3], quats [M, 4] and log scales [M, 3] of the discs on one pane."""
+    half = planes.half_sizes[index].detach().cpu()
+    spacing = math.sqrt(float(4 * half.prod()) / count)
+    rows, columns = (max(round(float(2 * side) / spacing), 1) for side in half)
+    cells = torch.cartesian_prod(torch.arange(rows), torch.arange(columns))
+    places = (cells + torch.rand(cells.shape, generator=generator)) / torch.tensor([rows, columns])
+    tangent, bitangent = (axis[index].detach().cpu() for axis in planes.axes())
+    in_plane = (2 * places - 1) * half
+    means = planes.centers[index].detach().cpu() + in_plane @ torch.stack([tangent, bitangent])
+
+    frame = torch.stack([tangent, bitangent, planes.normals[index].detach().cpu()], dim=1)
+    x, y, z, w = Rotation.from_matrix(frame.double().numpy()).as_quat()
+    quat = torch.tensor([w, x, y, z], dtype=torch.float32)
+    along = OVERLAP * spacing
+    log_scales = torch.tensor([along, along, THICKNESS * along]).log()
+    return means, quat.repeat(len(means), 1), log_scales.repeat(len(means), 1)

@@ -1,0 +1,203 @@
+"""The first planes: a rectangle for every annotated pane (TR-Gaussians, Section III-C1 and Appendix A)."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from glassplat.init.annotation import PaneView, pane_views, plane_candidates
+from glassplat.init.consistency import RefinedPlane, mask_agreement, refined_plane
+from glassplat.init.footprint import pane_rectangle
+from glassplat.init.ransac import PlaneEquations, random_planes, support
+from glassplat.scene.camera import Camera
+from glassplat.scene.plane import Planes
+
+Array = NDArray[np.float64]
+log = logging.getLogger("glassplat.init")
+
+SUPPORT_WEIGHT = 0.1
+"""Weight of a hypothesis' inliers against the agreement of the masks: it decides where parallax is too small to."""
+
+
+class PlaneFitError(ValueError):
+    """No plane could be fitted to a pane; the message names the pane and what to annotate."""
+
+
+@dataclass(frozen=True)
+class PlaneFit:
+    """How planes are found from masks.
+
+    Attributes:
+        mirror_labels: panes that are mirrors; they start at a base reflectance near one.
+        glass_reflectance: base reflectance R0 that glass starts at.
+        mirror_reflectance: base reflectance that mirrors start at; one has no finite logit.
+        band: half width of the band along a mask's edge in which candidates lie, as a share of the
+            image diagonal; the paper's 20 pixels at 960x720.
+        inlier_distance: of RANSAC, as a share of the scene extent.
+        hypotheses: number of planes drawn by RANSAC.
+        refined: number of them, the best by agreement of the masks, that are refined.
+        least_agreement: intersection over union of the masks on the plane below which a fit is refused.
+        margin: factor on the rectangle's sides, which must not cut into the pane.
+        seed: of RANSAC.
+    """
+
+    mirror_labels: tuple[int, ...] = ()
+    glass_reflectance: float = 0.2
+    mirror_reflectance: float = 0.99
+    band: float = 20 / 1200
+    inlier_distance: float = 0.01
+    hypotheses: int = 1000
+    refined: int = 6
+    least_agreement: float = 0.5
+    margin: float = 1.05
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class _Pane:
+    """One fitted pane, in NumPy."""
+
+    center: Array
+    normal: Array
+    tangent: Array
+    half_sizes: Array
+
+
+def fit_planes(
+    centers: Tensor,
+    annotations: Sequence[tuple[Camera, Tensor]],
+    *,
+    extent: float,
+    weights: Tensor | None = None,
+    options: PlaneFit | None = None,
+) -> Planes:
+    """A reflection plane for every pane that the masks name, in the order of their labels.
+
+    As in the paper, candidates are points that project near a mask's edge, RANSAC draws planes
+    through them, and rotating calipers bound the rectangle. Beyond the paper, the masks themselves
+    choose among the planes and place the best one exactly: on the pane's own plane, and on no other,
+    the masks of all views coincide (`consistency`). RANSAC alone often prefers a wall or the floor.
+
+    Args:
+        centers: [N, 3] centres of the primary Gaussians, or SfM points.
+        annotations: cameras and their label images [H, W]; 0 is no pane.
+        extent: radius of the capture in world units.
+        weights: [N] how much each centre counts, such as its opacity; all the same if None.
+        options: how to fit; the defaults if None.
+
+    Returns:
+        Planes whose normals point to the side that most annotated cameras are on.
+
+    Raises:
+        PlaneFitError: no mask names a pane, or a pane has too few views or candidates, or its masks
+            agree on no plane.
+    """
+    options = options or PlaneFit()
+    labels = sorted({int(label) for _, image in annotations for label in image.unique()} - {0})
+    if not labels:
+        raise PlaneFitError(
+            f"none of the {len(annotations)} masks names a pane; expected pixels with labels 1, 2, ... in at least two"
+        )
+    points = centers.detach().cpu().double().numpy()
+    shares = np.ones(len(points)) if weights is None else weights.detach().cpu().double().numpy()
+    usable = np.isfinite(points).all(axis=1) & (shares > 0)
+    panes = [
+        _fit_pane(label, points[usable], shares[usable], annotations, extent=extent, options=options)
+        for label in labels
+    ]
+    return _planes(panes, labels, options).to(centers.device)
+
+
+def _fit_pane(
+    label: int,
+    points: Array,
+    weights: Array,
+    annotations: Sequence[tuple[Camera, Tensor]],
+    *,
+    extent: float,
+    options: PlaneFit,
+) -> _Pane:
+    views = pane_views(annotations, label)
+    if len(views) < 2:
+        raise PlaneFitError(
+            f"pane {label} is annotated in {len(views)} view(s), but its plane shows only between views: "
+            "annotate at least two more views of it, taken from places well apart"
+        )
+    chosen = plane_candidates(points, views, band=options.band)
+    if chosen.sum() < 3:
+        raise PlaneFitError(
+            f"pane {label}: {int(chosen.sum())} of {len(points)} points lie along its edge in the {len(views)} "
+            "annotated views; expected at least three. Annotate more views in which the frame of the pane is visible "
+            "and sharp, and check that the masks end at the frame and belong to these images"
+        )
+    best = _best_plane(points[chosen], weights[chosen], views, label=label, extent=extent, options=options)
+    agreement = float(mask_agreement(best.plane, views)[0])
+    log.info("pane %d: %d views, %d candidates, masks agree to %.3f", label, len(views), chosen.sum(), agreement)
+    if agreement < options.least_agreement:
+        raise PlaneFitError(
+            f"pane {label}: no plane brings its {len(views)} masks together; on the best of {options.hypotheses} "
+            f"planes through {int(chosen.sum())} candidates they overlap by {agreement:.2f}, expected at least "
+            f"{options.least_agreement:.2f}. Check that label {label} means the same flat pane in every mask, and "
+            "annotate more views that show all of it with nothing standing before it"
+        )
+    return _pane(best.plane, views, options.margin)
+
+
+def _best_plane(
+    points: Array, weights: Array, views: Sequence[PaneView], *, label: int, extent: float, options: PlaneFit
+) -> RefinedPlane:
+    """The plane on which the mask edges coincide best, out of the refined best hypotheses."""
+    rng = np.random.default_rng((options.seed, label))
+    distance = options.inlier_distance * extent
+    drawn = random_planes(points, weights, options.hypotheses, rng)
+    supports = support(drawn, points, weights, distance=distance)
+    supported = np.argsort(-supports, kind="stable")[: max(options.hypotheses // 4, options.refined)]
+    scores = mask_agreement(drawn.select(supported), views) + SUPPORT_WEIGHT * supports[supported]
+    leading = supported[np.argsort(-scores, kind="stable")[: options.refined]]
+
+    refined = []
+    for number in leading:
+        start = drawn.select(np.array([number]))
+        inliers = points[np.abs(start.distances(points)[0]) <= distance]
+        refined.append(refined_plane(start, views, inliers, extent=extent, distance=distance))
+    return min(refined, key=lambda found: found.cost)
+
+
+def _pane(plane: PlaneEquations, views: Sequence[PaneView], margin: float) -> _Pane:
+    eyes = np.stack([view.center for view in views])
+    normal = plane.normals[0]
+    if (np.sign(plane.distances(eyes)[0])).sum() < 0:
+        normal = -normal
+    axes = np.linalg.svd(normal[None])[2][1:]
+    rectangle = pane_rectangle(plane, views, axes)
+    foot = plane.normals[0] * plane.offsets[0]
+    return _Pane(
+        center=foot + rectangle.center @ axes,
+        normal=normal,
+        tangent=rectangle.axis @ axes,
+        half_sizes=margin * rectangle.half_sizes,
+    )
+
+
+def _planes(panes: Sequence[_Pane], labels: Sequence[int], options: PlaneFit) -> Planes:
+    def stacked(rows: list[Array]) -> Tensor:
+        return torch.tensor(np.stack(rows), dtype=torch.float32)
+
+    reflectances = [
+        options.mirror_reflectance if label in options.mirror_labels else options.glass_reflectance for label in labels
+    ]
+    return Planes(
+        centers=stacked([pane.center for pane in panes]),
+        raw_normals=stacked([pane.normal for pane in panes]),
+        logit_reflectances=torch.tensor([math.log(value / (1 - value)) for value in reflectances]),
+        tangents=stacked([pane.tangent for pane in panes]),
+        half_sizes=stacked([pane.half_sizes for pane in panes]),
+        labels=tuple(labels),
+    )

@@ -1,0 +1,67 @@
+"""Planes through points: random triplets, inliers and weighted least squares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PlaneEquations:
+    """H planes, the points x with normal . x = offset.
+
+    Attributes:
+        normals: [H, 3] unit normals.
+        offsets: [H] signed distances of the planes from the origin.
+    """
+
+    normals: Array
+    offsets: Array
+
+    def __len__(self) -> int:
+        return len(self.offsets)
+
+    def distances(self, points: Array) -> Array:
+        """[H, N] signed distances of points [N, 3]."""
+        return self.normals @ points.T - self.offsets[:, None]
+
+    def select(self, index: NDArray[np.int64]) -> PlaneEquations:
+        """The planes at `index`."""
+        return PlaneEquations(self.normals[index], self.offsets[index])
+
+
+def random_planes(points: Array, weights: Array, count: int, rng: np.random.Generator) -> PlaneEquations:
+    """Planes through random triplets of points [N, 3]; up to `count`, since flat triplets are dropped.
+
+    Args:
+        points: [N, 3] at least three positions.
+        weights: [N] how likely each point is drawn, not necessarily normalised.
+        count: number of triplets.
+        rng: source of randomness.
+    """
+    a, b, c = points[rng.choice(len(points), size=(3, count), p=weights / weights.sum())]
+    normals = np.cross(b - a, c - a)
+    area = np.linalg.norm(normals, axis=1)
+    # A triplet close to a line says nothing about the tilt of a plane around that line.
+    spread = np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1)
+    usable = area > 0.1 * np.maximum(spread, np.finfo(np.float64).tiny)
+    normals = normals[usable] / area[usable, None]
+    return PlaneEquations(normals, np.einsum("hd,hd->h", normals, a[usable]))
+
+
+def support(planes: PlaneEquations, points: Array, weights: Array, *, distance: float) -> Array:
+    """[H] share of the points' weight within `distance` of each plane."""
+    return (np.abs(planes.distances(points)) <= distance) @ (weights / weights.sum())
+
+
+def fitted_plane(points: Array, weights: Array) -> PlaneEquations:
+    """The plane of least weighted squares of the distances to points [N, 3], N >= 3."""
+    share = weights / weights.sum()
+    centroid = share @ points
+    moved = (points - centroid) * np.sqrt(share)[:, None]
+    normal = np.linalg.svd(moved, full_matrices=False)[2][2]
+    return PlaneEquations(normal[None], np.array([normal @ centroid]))
