@@ -98,7 +98,10 @@ class RunDirectory:
         if not folders:
             raise InputError(f"{self.path} holds no point_cloud/iteration_N; expected a finished run. Train first, or --resume it")
         step = max(folders)
-        return read_scene(folders[step]), step
+        try:
+            return read_scene(folders[step]), step
+        except ValueError as error:
+            raise InputError(f"the scene in {folders[step]} cannot be read: {error}") from error
 
     def _read(self, name: str) -> str:
         file = self.path / name

@@ -1,0 +1,66 @@
+"""Reflection and geometry losses."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+
+from glassplat.losses.geometry import depth_deviation_loss
+from glassplat.losses.reflection import gradient_conflict, mask_loss, sobel
+from glassplat.render.frame import Frame
+
+
+def frame_with(**layers: torch.Tensor) -> Any:
+    return Frame(rgb=torch.zeros(8, 9, 3), layers=layers)
+
+
+def test_sobel_is_the_sobel_operator() -> None:
+    image = torch.rand(8, 9, 3, generator=torch.Generator().manual_seed(0))
+    kernel = torch.tensor([[-1.0, 0, 1], [-2, 0, 2], [-1, 0, 1]])
+    planes = image.permute(2, 0, 1)[:, None]
+    horizontal, vertical = sobel(image)
+    for found, weights in ((horizontal, kernel), (vertical, kernel.T)):
+        expected = torch.nn.functional.conv2d(planes, weights[None, None])[:, 0].permute(1, 2, 0)
+        torch.testing.assert_close(found, expected)
+
+
+def test_gradient_conflict_counts_shared_edges_inside_the_hit_mask_only() -> None:
+    step = (torch.arange(9) >= 4).float()[None, :, None].expand(8, 9, 3)
+    flat, hit = torch.full((8, 9, 3), 0.5), torch.ones(8, 9)
+    view, scene = SimpleNamespace(), SimpleNamespace()
+
+    def value(transmission: torch.Tensor, reflection: torch.Tensor, mask: torch.Tensor) -> float:
+        return float(gradient_conflict(frame_with(transmission=transmission, reflection=reflection, hit=mask), view, scene))
+
+    assert value(step, step, hit) > 0
+    assert value(step, flat, hit) == 0
+    assert value(step, step, torch.zeros(8, 9)) == 0
+
+
+def test_gradient_conflict_leaves_the_reflection_alone() -> None:
+    transmission = torch.rand(8, 9, 3, requires_grad=True)
+    reflection = torch.rand(8, 9, 3, requires_grad=True)
+    frame = frame_with(transmission=transmission, reflection=reflection, hit=torch.ones(8, 9))
+    loss = gradient_conflict(frame, SimpleNamespace(), SimpleNamespace())
+    to_transmission, to_reflection = torch.autograd.grad(loss, [transmission, reflection], allow_unused=True)
+    assert float(to_transmission.abs().sum()) > 0 and to_reflection is None
+
+
+def test_mask_loss_applies_to_annotated_views_only() -> None:
+    frame = frame_with(mask=torch.full((8, 9), 0.25))
+    labels = torch.zeros(8, 9, dtype=torch.uint8)
+    labels[:4] = 2
+    assert mask_loss(frame, SimpleNamespace(pane_labels=None), SimpleNamespace()) is None
+    annotated = mask_loss(frame, SimpleNamespace(pane_labels=labels), SimpleNamespace())
+    torch.testing.assert_close(annotated, torch.tensor(0.5 * 0.75 + 0.5 * 0.25))
+
+
+def test_depth_deviation_loss_does_not_depend_on_the_unit_of_length() -> None:
+    deviation, hit = torch.rand(8, 9), torch.ones(8, 9)
+    metres = depth_deviation_loss(frame_with(deviation=deviation, hit=hit), SimpleNamespace(), SimpleNamespace(extent=2.0))
+    millimetres = depth_deviation_loss(
+        frame_with(deviation=1000 * deviation, hit=hit), SimpleNamespace(), SimpleNamespace(extent=2000.0)
+    )
+    torch.testing.assert_close(metres, millimetres)

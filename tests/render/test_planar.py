@@ -1,0 +1,210 @@
+"""The optics of `planar`, tested by their properties."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tests.render.tiny_scene import camera_at, in_single_precision, joined, pane, showcase
+
+from glassplat.render.planar import Planar, detached
+from glassplat.render.reflectance import nearest_hits, schlick_strength
+from glassplat.render.splat import Splat
+from glassplat.scene.camera import Camera
+from glassplat.scene.plane import Planes
+from glassplat.scene.pose import mirror_matrices, rotation_from_quat
+from glassplat.scene.scene import Scene
+
+CAMERA = camera_at(0.0, 0.0, -0.2)
+
+
+def test_layers_recombine_to_the_image() -> None:
+    layers = (frame := Planar()(showcase(), CAMERA)).layers
+    strength = layers["strength"][..., None]
+    recombined = (1 - strength) * layers["transmission"] + strength * layers["reflection"]
+    assert float(strength.max()) > 0.1
+    torch.testing.assert_close(recombined, frame.rgb)
+
+
+def test_the_reflection_shows_the_room_and_not_what_is_behind_the_pane() -> None:
+    scene = showcase()
+    reflection = Planar()(scene, CAMERA).layers["reflection"]
+    assert float(reflection.abs().max()) > 0.1
+    room = replace(scene, primary=scene.primary.select(scene.primary.means[:, 2] < 1.5))
+    without_case = Planar()(room, CAMERA)
+    visible = (without_case.layers["mask"] > 0) & (Planar()(scene, CAMERA).layers["mask"] > 0)
+    torch.testing.assert_close(without_case.layers["reflection"][visible], reflection[visible])
+
+
+def test_zero_reflectance_is_splat_bit_for_bit() -> None:
+    scene = in_single_precision(showcase())
+    scene = replace(scene, planes=scene.planes.with_tensors({"logit_reflectances": torch.tensor([-200.0])}))
+    camera = replace(CAMERA, cam_from_world=CAMERA.cam_from_world.float())
+    planar = Planar(fresnel=False)(scene, camera)
+    assert torch.equal(planar.rgb, Splat()(scene, camera).rgb)
+    assert torch.equal(planar.layers["depth"], Splat()(scene, camera).layers["depth"])
+
+
+def test_a_scene_without_planes_is_splat_bit_for_bit() -> None:
+    scene = replace(showcase(), planes=Planes.empty())
+    assert torch.equal(Planar()(scene, CAMERA).rgb, Splat()(scene, CAMERA).rgb)
+
+
+def test_a_perfect_mirror_hides_what_is_behind_it() -> None:
+    scene = replace(showcase(), planes=pane(2.0, base_reflectance=1 - 1e-12))
+    frame = Planar()(scene, CAMERA)
+    expected = frame.layers["mask"][..., None] * frame.layers["reflection"]
+    expected = expected + (1 - frame.layers["mask"][..., None]) * frame.layers["transmission"]
+    torch.testing.assert_close(frame.rgb, expected)
+
+
+def test_moving_everything_together_changes_nothing() -> None:
+    scene = showcase()
+    turn = rotation_from_quat(torch.tensor([0.8, 0.3, -0.4, 0.2], dtype=torch.float64))
+    shift = torch.tensor([3.0, -2.0, 5.0], dtype=torch.float64)
+    before, after = Planar()(lambertian(scene), CAMERA), Planar()(*moved(lambertian(scene), CAMERA, turn, shift))
+    for name, layer in before.layers.items():
+        torch.testing.assert_close(after.layers[name], layer, rtol=1e-7, atol=1e-9)
+    torch.testing.assert_close(after.rgb, before.rgb, rtol=1e-7, atol=1e-9)
+
+
+def lambertian(scene: Scene) -> Scene:
+    """The scene without view dependence, whose SH would have to be rotated."""
+    return replace(scene, primary=replace(scene.primary, active_sh_degree=0))
+
+
+def moved(scene: Scene, camera: Camera, turn: torch.Tensor, shift: torch.Tensor) -> tuple[Scene, Camera]:
+    """Scene, planes and camera after one rigid motion."""
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3], motion[:3, 3] = turn, shift
+    quat = torch.tensor([0.8, 0.3, -0.4, 0.2], dtype=torch.float64)
+    quat = quat / quat.norm()
+    parts = {}
+    for name, part in scene.gaussian_sets().items():
+        parts[name] = part.with_tensors({"means": part.means @ turn.T + shift, "quats": quat_product(quat, part.quats)})
+    planes = scene.planes.with_tensors(
+        {
+            "centers": scene.planes.centers @ turn.T + shift,
+            "raw_normals": scene.planes.raw_normals @ turn.T,
+            "tangents": scene.planes.tangents @ turn.T,
+        }
+    )
+    pose = camera.cam_from_world @ torch.linalg.inv(motion)
+    return replace(scene, **parts, planes=planes), replace(camera, cam_from_world=pose)
+
+
+def quat_product(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+    w, v = left[0], left[1:]
+    rw, rv = right[:, :1], right[:, 1:]
+    vector = w * rv + rw * v + torch.linalg.cross(v.expand_as(rv), rv)
+    return torch.cat([w * rw - (rv * v).sum(-1, keepdim=True), vector], dim=1)
+
+
+def test_mirroring_twice_is_the_identity() -> None:
+    matrix = mirror_matrices(showcase().planes.centers, showcase().planes.normals)[0]
+    torch.testing.assert_close(matrix @ matrix, torch.eye(4, dtype=torch.float64))
+
+
+def test_the_sign_of_the_normal_does_not_matter() -> None:
+    scene = showcase()
+    flipped = replace(scene, planes=scene.planes.with_tensors({"raw_normals": -scene.planes.raw_normals}))
+    torch.testing.assert_close(Planar()(flipped, CAMERA).rgb, Planar()(scene, CAMERA).rgb)
+
+
+def test_a_pane_reflects_for_cameras_on_either_side() -> None:
+    scene = showcase()
+    half_turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
+    shift = torch.eye(4, dtype=torch.float64)
+    shift[2, 3] = -6.0
+    from_behind = replace(CAMERA, cam_from_world=half_turn @ shift)
+    frame = Planar()(scene, from_behind)
+    in_case = replace(scene, primary=scene.primary.select(scene.primary.means[:, 2] > 2.5))
+    alone = Planar()(in_case, from_behind)
+    both = (frame.layers["mask"] > 0) & (alone.layers["mask"] > 0)
+    assert float(frame.layers["reflection"][both].abs().max()) > 0.05
+    torch.testing.assert_close(alone.layers["reflection"][both], frame.layers["reflection"][both])
+
+
+def test_the_nearest_pane_wins() -> None:
+    planes = joined(pane(4.0, label=1), pane(2.0, half=0.5, label=2))
+    hits = nearest_hits(planes, CAMERA)
+    assert bool(hits[0].any()) and bool(hits[1].any())
+    assert not bool((hits[0] & hits[1]).any())
+    alone = nearest_hits(pane(2.0, half=0.5, label=2), CAMERA)
+    assert torch.equal(hits[1], alone[0])
+    assert bool((hits[0] | hits[1]).all())
+
+
+def test_a_pane_behind_the_camera_is_not_hit() -> None:
+    assert not bool(nearest_hits(pane(-3.0), CAMERA).any())
+
+
+def test_strength_rises_from_base_reflectance_to_one_at_grazing_angles() -> None:
+    planes = pane(2.0, base_reflectance=0.2)
+    strength = schlick_strength(planes, CAMERA)[0]
+    assert float(strength.min()) >= 0.2
+    cosine = (CAMERA.ray_directions() @ planes.normals[0]).abs()
+    torch.testing.assert_close(strength, 0.2 + 0.8 * (1 - cosine) ** 5)
+
+
+def test_two_panes_keep_their_own_reflections() -> None:
+    left, right = pane(2.0, half=0.5, label=1), pane(4.0, label=2)
+    both = Planar()(showcase(joined(left, right)), CAMERA).layers["reflection"]
+    hits = nearest_hits(joined(left, right), CAMERA)
+    for k, planes in enumerate((left, right)):
+        alone = Planar()(showcase(planes), CAMERA).layers["reflection"]
+        torch.testing.assert_close(both[hits[k]], alone[hits[k]])
+
+
+@pytest.mark.parametrize("name", ["centers", "raw_normals", "logit_reflectances"])
+def test_plane_gradients_match_finite_differences_through_the_whole_renderer(name: str) -> None:
+    scene = showcase()
+    weights = torch.randn(28, 40, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+
+    def objective(values: torch.Tensor) -> torch.Tensor:
+        return (Planar()(scene.with_parameters({f"planes.{name}": values}), CAMERA).rgb * weights).sum()
+
+    values = scene.parameters()[f"planes.{name}"].clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(objective(values), values)
+    with torch.no_grad():
+        numerical = torch.zeros_like(gradient)
+        for index in range(values.numel()):
+            step = torch.zeros_like(values).flatten()
+            step[index] = 1e-6
+            step = step.reshape(values.shape)
+            numerical.flatten()[index] = (objective(values + step) - objective(values - step)) / 2e-6
+    torch.testing.assert_close(gradient, numerical, rtol=1e-4, atol=1e-5)
+
+
+def test_blocked_reflection_gradient_reaches_the_plane_and_not_the_gaussians() -> None:
+    scene = showcase()
+    centers = scene.planes.centers.clone().requires_grad_()
+    means = scene.primary.means.clone().requires_grad_()
+    trainable = scene.with_parameters({"planes.centers": centers, "primary.means": means})
+    blocked = Planar(reflection_gradient="planes")(trainable, CAMERA)
+    to_means, to_centers = torch.autograd.grad(
+        blocked.layers["reflection"].sum(), [means, centers], allow_unused=True
+    )
+    assert to_means is None and float(to_centers.abs().sum()) > 0
+    free = Planar()(trainable, CAMERA).layers["reflection"].sum()
+    assert float(torch.autograd.grad(free, means)[0].abs().sum()) > 0
+
+
+def test_switches_change_what_they_name() -> None:
+    scene = showcase()
+    constant = Planar(fresnel=False)(scene, CAMERA).layers
+    torch.testing.assert_close(constant["strength"], scene.planes.base_reflectances * constant["mask"])
+    assert not torch.equal(Planar(intensity=False)(scene, CAMERA).rgb, Planar()(scene, CAMERA).rgb)
+
+
+def test_deviation_is_there_when_asked_for() -> None:
+    frame = Planar(deviation=True)(showcase(), CAMERA)
+    assert float(frame.layers["deviation"].sum()) > 0
+    assert "deviation" not in Planar()(showcase(), CAMERA).layers
+
+
+def test_detached_cuts_every_tensor_off() -> None:
+    scene = showcase()
+    trainable = scene.primary.with_tensors({"means": scene.primary.means.clone().requires_grad_()})
+    assert not detached(trainable).means.requires_grad

@@ -1,0 +1,132 @@
+"""The training loop: progress, determinism, resuming, and its refusal of broken losses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from glassplat.data.errors import InputError
+from glassplat.init.points import gaussians_from_points
+from glassplat.losses.photometric import l1
+from glassplat.losses.term import LossTerm
+from glassplat.scene.scene import Scene
+from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
+from glassplat.train.messages import ActionDone, StageEntered, StepDone
+from glassplat.train.planar_recipe import PlanarRecipe, PlaneEntry
+from glassplat.train.splat_recipe import SplatRecipe
+from glassplat.train.stage import Stage
+from glassplat.train.state import TrainState
+from glassplat.train.trainer import TrainingDivergedError, train
+from tests.train.tiny_capture import tiny_capture, true_scene
+
+
+def fresh_state(seed: int = 0) -> TrainState:
+    return TrainState(SplatRecipe(sh_degree=1).initialise(tiny_capture()), seed)
+
+
+def place_true_planes(state: TrainState, dataset: object) -> None:
+    """Stands in for the plane fit, which needs more masks than the tiny capture has."""
+    truth = true_scene()
+    state.scene = replace(state.scene, planes=truth.planes, glass=truth.glass)
+
+
+def planar_stages() -> tuple[Stage, ...]:
+    stages = PlanarRecipe(sh_degree=1, stage_shares=(0.2, 0.3, 0.5)).stages(seed=0)
+    return tuple(replace(s, entry=place_true_planes) if s.entry else s for s in stages)
+
+
+def run(state: TrainState, stages: tuple[Stage, ...], iterations: int, until: int | None = None) -> list[StepDone]:
+    steps = []
+    for message in train(stages, tiny_capture(), state, iterations):
+        if isinstance(message, StepDone):
+            steps.append(message)
+            if message.step == until:
+                break
+    return steps
+
+
+def assert_same_scene(first: Scene, second: Scene) -> None:
+    for name, tensor in first.parameters().items():
+        assert torch.equal(tensor, second.parameters()[name]), name
+
+
+def test_training_lowers_the_loss() -> None:
+    steps = run(fresh_state(), SplatRecipe(sh_degree=1).stages(seed=0), 60)
+    assert sum(s.loss for s in steps[-6:]) < 0.6 * sum(s.loss for s in steps[:6])
+
+
+def test_planar_goes_through_its_stages() -> None:
+    state = fresh_state()
+    messages = list(train(planar_stages(), tiny_capture(), state, 20))
+    assert [(m.step, m.stage[0]) for m in messages if isinstance(m, StageEntered)] == [(0, "1"), (4, "2"), (10, "3")]
+    assert any(isinstance(m, ActionDone) for m in messages)
+    terms = [set(m.losses) for m in messages if isinstance(m, StepDone)]
+    assert terms[0] == {"l1", "dssim"}
+    assert {"l1", "dssim", "depth", "conflict"} <= terms[-1]
+    assert any("mask" in names for names in terms)
+
+
+def test_stage_two_moves_the_plane_and_stage_one_does_not_touch_what_is_frozen() -> None:
+    state = fresh_state()
+    run(state, planar_stages(), 20, until=4)
+    assert torch.equal(state.scene.primary.channels["log_intensity"], torch.zeros(len(state.scene.primary)))
+    before = true_scene().planes
+    run(state, planar_stages(), 20, until=10)
+    assert not torch.equal(state.scene.planes.centers, before.centers)
+
+
+def test_the_same_seed_gives_the_same_scene_and_another_seed_another() -> None:
+    states = [fresh_state(0), fresh_state(0), fresh_state(1)]
+    for state in states:
+        run(state, planar_stages(), 12)
+    assert_same_scene(states[0].scene, states[1].scene)
+    assert not torch.equal(states[0].scene.primary.sh, states[2].scene.primary.sh)
+
+
+@pytest.mark.parametrize("pause", [3, 4, 7])
+def test_resuming_continues_to_the_same_result(pause: int, tmp_path: Path) -> None:
+    whole = fresh_state()
+    run(whole, planar_stages(), 12)
+    interrupted = fresh_state()
+    run(interrupted, planar_stages(), 12, until=pause)
+    save_checkpoint(tmp_path / "checkpoint.safetensors", interrupted)
+    resumed = load_checkpoint(tmp_path / "checkpoint.safetensors")
+    assert resumed.step == pause
+    run(resumed, planar_stages(), 12)
+    assert_same_scene(whole.scene, resumed.scene)
+
+
+def test_a_loss_that_is_not_finite_stops_training_and_is_named() -> None:
+    broken = Stage(
+        name="broken",
+        share=1.0,
+        renderer=SplatRecipe().renderer(),
+        losses=(LossTerm("l1", 1.0, l1), LossTerm("poison", 1.0, lambda f, v, s: f.rgb.sum() * float("nan"))),
+        rates=SplatRecipe().rates.of("primary"),
+    )
+    state = fresh_state()
+    with pytest.raises(TrainingDivergedError, match=r"'poison' is nan at step 1 in view '\d.png'"):
+        run(state, (broken,), 5)
+    assert state.step == 0
+    assert_same_scene(state.scene, fresh_state().scene)
+
+
+def test_a_truncated_checkpoint_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "checkpoint.safetensors"
+    save_checkpoint(file, fresh_state())
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(InputError, match="truncated or not a checkpoint"):
+        load_checkpoint(file)
+    with pytest.raises(FileNotFoundError, match="no checkpoint at"):
+        load_checkpoint(tmp_path / "nothing")
+
+
+def test_plane_entry_needs_annotated_views() -> None:
+    dataset = tiny_capture()
+    bare = replace(dataset, train=tuple(replace(view, read_pane_labels=None) for view in dataset.train))
+    entry = PlaneEntry(PlanarRecipe().plane_fit, 10, 0)
+    with pytest.raises(ValueError, match="mask"):
+        entry(TrainState(Scene(gaussians_from_points(dataset.points), dataset.extent), 0), bare)
