@@ -32,7 +32,7 @@ INPUT_ERROR_CODE, FAILURE_CODE, INTERRUPTED_CODE = 2, 1, 130
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code (0 done, 1 failed, 2 bad input, 130 interrupted)."""
     command = tyro.cli(
-        Command,  # type: ignore[arg-type]
+        Command,
         prog="glassplat",
         description="Gaussian splatting for scenes with window panes, showcases and mirrors.",
         args=arguments,

@@ -33,7 +33,7 @@ def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str)
         fx, fy = _focal_lengths(settings, width, height)
         middle = [float(settings.get("cx", width / 2)), float(settings.get("cy", height / 2))]
         k1, k2, k3, k4, k5, k6, p1, p2 = (float(settings.get(key, 0)) for key in _COEFFICIENTS)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"the intrinsics of {name} cannot be read: {error}") from error
     pinhole = [fx, fy, *middle]
     if model == FISHEYE:

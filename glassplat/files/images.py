@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
 from glassplat.files.atomic import atomic_write
@@ -24,14 +26,9 @@ def open_image(path: Path) -> Image.Image:
         FileNotFoundError: there is no such file.
         ValueError: the file is no image, or is cut off; the message names it.
     """
-    try:
-        with Image.open(path) as image:
-            image.load()
-            return image
-    except (FileNotFoundError, PermissionError):
-        raise
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, zlib.error) as error:
-        raise ValueError(f"cannot read {path} as an image ({error}); replace the file or remove it") from error
+    with _readable(path), Image.open(path) as image:
+        image.load()
+        return image
 
 
 def image_size(path: Path) -> tuple[int, int, bool]:
@@ -41,13 +38,8 @@ def image_size(path: Path) -> tuple[int, int, bool]:
         FileNotFoundError: there is no such file.
         ValueError: the file is no image.
     """
-    try:
-        with Image.open(path) as image:
-            return image.width, image.height, image.has_transparency_data
-    except (FileNotFoundError, PermissionError):
-        raise
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
-        raise ValueError(f"cannot read {path} as an image ({error}); replace the file or remove it") from error
+    with _readable(path), Image.open(path) as image:
+        return image.width, image.height, image.has_transparency_data
 
 
 def read_image(path: Path | str) -> NDArray[np.uint8]:
@@ -97,6 +89,17 @@ def write_image(path: Path | str, image: Tensor | NDArray[np.generic]) -> None:
         raise ValueError(f"cannot tell the image format of {path}; use one of the suffixes {', '.join(IMAGE_SUFFIXES)}")
     with atomic_write(path) as temporary:
         Image.fromarray(pixels).save(temporary)
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Turn all that Pillow raises about a bad file into one error that names it; a missing file stays one."""
+    try:
+        yield
+    except (FileNotFoundError, PermissionError):
+        raise
+    except (OSError, SyntaxError, ValueError, zlib.error, Image.DecompressionBombError) as error:
+        raise ValueError(f"cannot read {path} as an image ({error}); replace the file or remove it") from error
 
 
 def _plain_mode(image: Image.Image) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -66,7 +66,10 @@ class Planes:
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Planes:
         """The same planes with some tensors replaced by name."""
-        return replace(self, **tensors)
+        unknown = set(tensors) - set(self.tensors())
+        if unknown:
+            raise ValueError(f"unknown tensors {sorted(unknown)}; planes have {sorted(self.tensors())}")
+        return Planes(**(self.tensors() | dict(tensors)), labels=self.labels)
 
     def to(self, device: torch.device | str) -> Planes:
         """The same planes on another device."""

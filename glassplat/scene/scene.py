@@ -52,6 +52,14 @@ class Scene:
             planes=self.planes.with_tensors(parts["planes"]),
         )
 
+    def with_gaussians(self, part: str, gaussians: Gaussians) -> Scene:
+        """The same scene with one set of Gaussians replaced."""
+        if part == "primary":
+            return replace(self, primary=gaussians)
+        if part == "glass":
+            return replace(self, glass=gaussians)
+        raise ValueError(f"unknown set of Gaussians {part!r}; expected one of {sorted(self.gaussian_sets())}")
+
     def to(self, device: torch.device | str) -> Scene:
         """The same scene on another device."""
         return replace(self, primary=self.primary.to(device), glass=self.glass.to(device), planes=self.planes.to(device))

@@ -28,7 +28,7 @@ class GrowSh:
         """Edits `state`."""
         gaussians = state.scene.gaussian_sets()[self.part]
         degree = min(gaussians.active_sh_degree + 1, gaussians.max_sh_degree)
-        state.scene = replace(state.scene, **{self.part: replace(gaussians, active_sh_degree=degree)})
+        state.scene = state.scene.with_gaussians(self.part, replace(gaussians, active_sh_degree=degree))
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Densify:
             generator=state.generator(self.name),
             part=self.part,
         )
-        state.scene = replace(state.scene, **{self.part: edited})
+        state.scene = state.scene.with_gaussians(self.part, edited)
 
 
 @dataclass(frozen=True)

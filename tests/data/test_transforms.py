@@ -182,6 +182,7 @@ def test_missing_photographs_are_named(capture) -> None:
     [
         ({"fl_x": 0, "fl_y": 0}, "no focal length above zero"),
         ({"fl_x": -5.0}, "focal length > 0"),
+        ({"w": float("inf")}, "intrinsics of 0000.png cannot be read"),
         ({"fl_x": "wide"}, "intrinsics of 0000.png cannot be read"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model of 0000.png is 'EQUIRECTANGULAR'; expected one of"),
         ({"frames": []}, "lists no frames"),

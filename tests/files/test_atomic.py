@@ -6,6 +6,7 @@ import errno
 from pathlib import Path
 
 import pytest
+
 from glassplat.files.atomic import atomic_write
 
 

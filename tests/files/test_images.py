@@ -66,6 +66,16 @@ def test_files_that_cannot_be_read(tmp_path: Path, read) -> None:
         read(tmp_path / "text.png")
 
 
+def test_header_of_absurd_size_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.bmp"
+    Image.new("RGB", (4, 3)).save(path)
+    content = bytearray(path.read_bytes())
+    content[18:26] = (10**6).to_bytes(4, "little") * 2  # Width and height.
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"a\.bmp as an image"):
+        read_image(path)
+
+
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
 def test_cut_off_file_is_named(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a.{suffix}"

@@ -67,6 +67,31 @@ if __name__ == "__main__":
     print(values.tolist(), "misses", sum(scale.dispatcher.stats.cache_misses.values()))
 """
 
+OPERATIONS = """
+import gc
+
+import torch
+
+from glassplat.kernels.bin_tiles import bin_tiles
+from glassplat.kernels.composite import composite
+from glassplat.kernels.cpu.jit import Kernel
+from glassplat.kernels.project import project
+from glassplat.kernels.splats import CameraBatch, RawGaussians, Splats
+
+means = torch.tensor([[0.0, 0.0, 2.0], [0.1, 0.0, 3.0]])
+raw = RawGaussians(means, torch.randn(2, 4), torch.full((2, 3), -2.0), torch.zeros(2), torch.zeros(2, 1, 3))
+raw = RawGaussians(*(tensor.requires_grad_() for tensor in raw))
+cameras = CameraBatch(torch.eye(4)[None], torch.tensor([[20.0, 20.0, 10.0, 8.0]]), 20, 16)
+projected = project(raw, cameras, sh_degree=0, near=0.01)
+splats = Splats(projected.means2d, projected.conics, projected.opacities, projected.depths, projected.radii)
+image = composite(splats, projected.colors, bin_tiles(splats, 20, 16)).image
+image.sum().backward()
+
+used = [k for k in gc.get_objects() if isinstance(k, Kernel) and k.dispatcher.signatures]
+missed = [k.name for k in used if sum(k.dispatcher.stats.cache_misses.values())]
+print(len(used), "kernels used, compiled:", *missed)
+"""
+
 
 def printed_by(script: Path, **environment: str) -> list[str]:
     """Lines that a Python script prints in a process of its own."""
@@ -91,6 +116,16 @@ def test_a_kernel_is_announced_then_cached_and_compiled_again_when_its_formula_c
 
     (tmp_path / "formula.py").write_text(FORMULA.replace("factor * x", "factor * x + factor"))
     assert printed_by(script, NUMBA_CACHE_DIR=cache)[-1] == "[10.0, 10.0] misses 1"
+
+
+def test_a_second_process_compiles_no_operation(tmp_path: Path) -> None:
+    script = tmp_path / "operations.py"
+    script.write_text(OPERATIONS)
+    printed_by(script)
+    (result,) = printed_by(script)
+    used, _, compiled = result.partition(" kernels used, compiled:")
+    assert int(used) >= 4
+    assert compiled == ""
 
 
 def is_compiled(function: ast.FunctionDef) -> bool:

@@ -1,0 +1,245 @@
+"""Scalar maths of projection: the shape of a Gaussian in the world and on screen, and the adjoints of both.
+
+Every function is pure, takes and returns scalars and tuples of scalars, and is typed by its factory, so that one source
+compiles for the CPU and for CUDA. A bare float or int literal would promote float32 to float64 there: constants are typed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from glassplat.kernels.cpu.jit import inlined
+
+LOW_PASS = 0.3
+"""Variance in px^2 added to every splat, so that none falls between pixel centres (3DGS)."""
+ALPHA_MIN = 1.0 / 255.0
+"""Coverage below this is ignored, which bounds a splat's extent on screen."""
+TANGENT_MARGIN = 0.3
+"""How far beyond the image, in half image sizes, the Jacobian of the projection still follows the centre (3DGS)."""
+
+Scalar = Callable[..., Any]
+
+
+class VectorMaths(NamedTuple):
+    """Functions of 3-vectors, which are tuples (x, y, z).
+
+    Attributes:
+        dot: a . b.
+        blend: s a + t b.
+        scaled_sum: x a + y b + z c for coefficients (x, y, z): a matrix of columns a, b, c times a vector.
+        along: (a . v, b . v, c . v): the transpose of that matrix times a vector.
+        cross_squared: |a x b|^2.
+    """
+
+    dot: Scalar
+    blend: Scalar
+    scaled_sum: Scalar
+    along: Scalar
+    cross_squared: Scalar
+
+
+def vector_maths() -> VectorMaths:
+    """Builds the functions; they take the type of their arguments."""
+
+    @inlined
+    def dot(a, b):
+        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+    @inlined
+    def blend(s, a, t, b):
+        return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]
+
+    @inlined
+    def scaled_sum(v, a, b, c):
+        return (
+            v[0] * a[0] + v[1] * b[0] + v[2] * c[0],
+            v[0] * a[1] + v[1] * b[1] + v[2] * c[1],
+            v[0] * a[2] + v[1] * b[2] + v[2] * c[2],
+        )
+
+    @inlined
+    def along(v, a, b, c):
+        return dot(a, v), dot(b, v), dot(c, v)
+
+    @inlined
+    def cross_squared(a, b):
+        x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        return x * x + y * y + z * z
+
+    return VectorMaths(dot, blend, scaled_sum, along, cross_squared)
+
+
+class ShapeMaths(NamedTuple):
+    """From raw parameters to a Gaussian's opacity and principal axes, and back.
+
+    Attributes:
+        sigmoid: 1 / (1 + exp(-x)).
+        is_finite: whether a value is neither NaN nor infinite.
+        unit_quat: the quaternion `wxyz` over its norm, and the inverse norm; the latter is not finite or zero where
+            the quaternion has no direction.
+        rotation: columns of the rotation matrix of a unit quaternion.
+        unit_quat_gradient: gradient to the raw quaternion from the gradients of the three columns.
+    """
+
+    sigmoid: Scalar
+    is_finite: Scalar
+    unit_quat: Scalar
+    rotation: Scalar
+    unit_quat_gradient: Scalar
+
+
+def shape_maths(real: type) -> ShapeMaths:
+    """Builds the functions for `real`, np.float32 or np.float64."""
+    one, two = real(1.0), real(2.0)
+    largest = real(np.finfo(real).max)
+
+    @inlined
+    def sigmoid(x):
+        return one / (one + math.exp(-x))
+
+    @inlined
+    def is_finite(x):
+        return abs(x) <= largest
+
+    @inlined
+    def unit_quat(w, x, y, z):
+        inverse_norm = one / math.sqrt(w * w + x * x + y * y + z * z)
+        return (w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm), inverse_norm
+
+    @inlined
+    def rotation(quat):
+        w, x, y, z = quat
+        return (
+            (one - two * (y * y + z * z), two * (x * y + w * z), two * (x * z - w * y)),
+            (two * (x * y - w * z), one - two * (x * x + z * z), two * (y * z + w * x)),
+            (two * (x * z + w * y), two * (y * z - w * x), one - two * (x * x + y * y)),
+        )
+
+    @inlined
+    def unit_quat_gradient(quat, inverse_norm, g0, g1, g2):
+        w, x, y, z = quat
+        gw = x * (g1[2] - g2[1]) + y * (g2[0] - g0[2]) + z * (g0[1] - g1[0])
+        gx = y * (g1[0] + g0[1]) + z * (g2[0] + g0[2]) + w * (g1[2] - g2[1]) - two * x * (g1[1] + g2[2])
+        gy = x * (g1[0] + g0[1]) + z * (g2[1] + g1[2]) + w * (g2[0] - g0[2]) - two * y * (g0[0] + g2[2])
+        gz = x * (g2[0] + g0[2]) + y * (g2[1] + g1[2]) + w * (g0[1] - g1[0]) - two * z * (g0[0] + g1[1])
+        # The norm of the raw quaternion has no effect, so its direction is taken out of the gradient.
+        radial = w * gw + x * gx + y * gy + z * gz
+        scale = two * inverse_norm
+        return scale * (gw - radial * w), scale * (gx - radial * x), scale * (gy - radial * y), scale * (gz - radial * z)
+
+    return ShapeMaths(sigmoid, is_finite, unit_quat, rotation, unit_quat_gradient)
+
+
+class ScreenMaths(NamedTuple):
+    """EWA projection of principal axes to a screen ellipse, and its adjoint.
+
+    Attributes:
+        tangent_limits: (lowest x, highest x, lowest y, highest y) of the tangents for which the Jacobian is taken.
+        clamped: a value held between two limits.
+        footprint: world vectors (w_x, w_y) whose dot products with a displacement are its pixels on screen.
+        screen_covariance: (xx, xy, yy, determinant), low-pass included, from the axes seen along w_x and w_y.
+        half_extents: pixels from the centre to where the coverage sinks to `ALPHA_MIN`, along x and y; (0, 0)
+            where it never rises above.
+        covariance_gradient: gradients (xx, xy, yy) of the covariance from those of its inverse.
+        footprint_gradient: gradients of w_x and w_y from those of the covariance, and of the three axes.
+    """
+
+    tangent_limits: Scalar
+    clamped: Scalar
+    footprint: Scalar
+    screen_covariance: Scalar
+    half_extents: Scalar
+    covariance_gradient: Scalar
+    footprint_gradient: Scalar
+
+
+def screen_maths(real: type) -> ScreenMaths:
+    """Builds the functions for `real`, np.float32 or np.float64."""
+    return ScreenMaths(*_footprint(real), *_screen_covariance(real), *_screen_gradients(real))
+
+
+def _footprint(real: type) -> tuple[Scalar, Scalar, Scalar]:
+    blend = vector_maths().blend
+    margin = real(TANGENT_MARGIN * 0.5)
+
+    @inlined
+    def tangent_limits(fx, fy, cx, cy, width, height):
+        return (
+            -(cx + margin * width) / fx,
+            (width - cx + margin * width) / fx,
+            -(cy + margin * height) / fy,
+            (height - cy + margin * height) / fy,
+        )
+
+    @inlined
+    def clamped(x, lowest, highest):
+        return min(max(x, lowest), highest)
+
+    @inlined
+    def footprint(row_x, row_y, row_z, scale_x, scale_y, tangent_x, tangent_y):
+        w_x = blend(scale_x, row_x, -scale_x * tangent_x, row_z)
+        w_y = blend(scale_y, row_y, -scale_y * tangent_y, row_z)
+        return w_x, w_y
+
+    return tangent_limits, clamped, footprint
+
+
+def _screen_covariance(real: type) -> tuple[Scalar, Scalar]:
+    vectors = vector_maths()
+    dot, cross_squared = vectors.dot, vectors.cross_squared
+    low_pass, low_pass_squared = real(LOW_PASS), real(LOW_PASS * LOW_PASS)
+    zero, one, two, inverse_alpha_min = real(0.0), real(1.0), real(2.0), real(1.0 / ALPHA_MIN)
+
+    @inlined
+    def screen_covariance(v_x, v_y):
+        xx, xy, yy = dot(v_x, v_x), dot(v_x, v_y), dot(v_y, v_y)
+        # xx yy - xy^2 cancels for needles; Lagrange's identity gives the same as a sum of squares.
+        determinant = cross_squared(v_x, v_y) + low_pass * (xx + yy) + low_pass_squared
+        return xx + low_pass, xy, yy + low_pass, determinant
+
+    @inlined
+    def half_extents(xx, yy, opacity):
+        visible = inverse_alpha_min * opacity
+        if not visible > one:
+            return zero, zero
+        reach = two * math.log(visible)
+        return math.sqrt(reach * xx), math.sqrt(reach * yy)
+
+    return screen_covariance, half_extents
+
+
+def _screen_gradients(real: type) -> tuple[Scalar, Scalar]:
+    vectors = vector_maths()
+    blend, scaled_sum = vectors.blend, vectors.scaled_sum
+    half, two = real(0.5), real(2.0)
+
+    @inlined
+    def covariance_gradient(xx, xy, yy, g_xx, g_xy, g_yy):
+        # d(inverse) = -inverse d(matrix) inverse; the off-diagonal entry stands for two.
+        mixed = half * g_xy
+        left_xx, left_xy = xx * g_xx + xy * mixed, xx * mixed + xy * g_yy
+        left_yx, left_yy = xy * g_xx + yy * mixed, xy * mixed + yy * g_yy
+        return (
+            -(left_xx * xx + left_xy * xy),
+            -two * (left_xx * xy + left_xy * yy),
+            -(left_yx * xy + left_yy * yy),
+        )
+
+    @inlined
+    def footprint_gradient(w_x, w_y, v_x, v_y, axes, g_xx, g_xy, g_yy):
+        gv_x = blend(two * g_xx, v_x, g_xy, v_y)
+        gv_y = blend(g_xy, v_x, two * g_yy, v_y)
+        gw_x = scaled_sum(gv_x, axes[0], axes[1], axes[2])
+        gw_y = scaled_sum(gv_y, axes[0], axes[1], axes[2])
+        g_axes = (
+            blend(gv_x[0], w_x, gv_y[0], w_y),
+            blend(gv_x[1], w_x, gv_y[1], w_y),
+            blend(gv_x[2], w_x, gv_y[2], w_y),
+        )
+        return gw_x, gw_y, g_axes
+
+    return covariance_gradient, footprint_gradient

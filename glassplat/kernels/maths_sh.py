@@ -1,0 +1,196 @@
+"""Scalar maths of view-dependent colour: real spherical harmonics up to degree 3, and their adjoint.
+
+Signs and order are those of 3DGS, so that its files can be read as they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from glassplat.kernels.cpu.jit import inlined
+
+MAX_DEGREE = 3
+SH_CONSTANTS = (
+    math.sqrt(1 / (4 * math.pi)),
+    math.sqrt(3 / (4 * math.pi)),
+    math.sqrt(15 / (4 * math.pi)),
+    math.sqrt(5 / (16 * math.pi)),
+    math.sqrt(15 / (16 * math.pi)),
+    math.sqrt(35 / (32 * math.pi)),
+    math.sqrt(105 / (4 * math.pi)),
+    math.sqrt(21 / (32 * math.pi)),
+    math.sqrt(7 / (16 * math.pi)),
+    math.sqrt(105 / (16 * math.pi)),
+)
+"""Normalisation of the harmonics: degree 0; degree 1; degree 2 in the order (xy, z^2, x^2 - y^2); degree 3 in the order
+(y (3 x^2 - y^2), xyz, y (4 z^2 - x^2 - y^2), z (2 z^2 - 3 x^2 - 3 y^2), z (x^2 - y^2))."""
+
+
+class ColorMaths(NamedTuple):
+    """Colour of one Gaussian from its coefficients `sh[n]` [K, 3], for one floating-point type.
+
+    Attributes:
+        color: (r, g, b) before the offset and the clamp, seen along a unit direction (x, y, z).
+        color_gradient: adds the gradient of the coefficients to `g_sh[n]` and returns that of the direction.
+    """
+
+    color: Callable[..., Any]
+    color_gradient: Callable[..., Any]
+
+
+def color_maths(real: type) -> ColorMaths:
+    """Builds the functions for `real`, np.float32 or np.float64."""
+    basis = _basis(real)
+    return ColorMaths(_color(basis), _color_gradient(real, basis))
+
+
+def _basis(real: type) -> Callable[..., Any]:
+    c0, c1, c_xy, c_zz, c_xx, c_yxx, c_xyz, c_yzz, c_zzz, c_zxx = (real(c) for c in SH_CONSTANTS)
+    two, three, four = real(2.0), real(3.0), real(4.0)
+
+    @inlined
+    def basis(x, y, z):
+        xx, yy, zz = x * x, y * y, z * z
+        return (
+            c0,
+            -c1 * y,
+            c1 * z,
+            -c1 * x,
+            c_xy * x * y,
+            -c_xy * y * z,
+            c_zz * (two * zz - xx - yy),
+            -c_xy * x * z,
+            c_xx * (xx - yy),
+            -c_yxx * y * (three * xx - yy),
+            c_xyz * x * y * z,
+            -c_yzz * y * (four * zz - xx - yy),
+            c_zzz * z * (two * zz - three * (xx + yy)),
+            -c_yzz * x * (four * zz - xx - yy),
+            c_zxx * z * (xx - yy),
+            -c_yxx * x * (xx - three * yy),
+        )
+
+    return basis
+
+
+def _color(basis: Callable[..., Any]) -> Callable[..., Any]:
+    # Tuples are indexed by constants only: a variable index compiles to a switch.
+    @inlined
+    def channel(sh, n, c, degree, b):
+        value = b[0] * sh[n, 0, c]
+        if degree > 0:
+            value += b[1] * sh[n, 1, c] + b[2] * sh[n, 2, c] + b[3] * sh[n, 3, c]
+        if degree > 1:
+            value += b[4] * sh[n, 4, c] + b[5] * sh[n, 5, c] + b[6] * sh[n, 6, c] + b[7] * sh[n, 7, c]
+            value += b[8] * sh[n, 8, c]
+        if degree > 2:
+            value += b[9] * sh[n, 9, c] + b[10] * sh[n, 10, c] + b[11] * sh[n, 11, c] + b[12] * sh[n, 12, c]
+            value += b[13] * sh[n, 13, c] + b[14] * sh[n, 14, c] + b[15] * sh[n, 15, c]
+        return value
+
+    @inlined
+    def color(sh, n, degree, x, y, z):
+        b = basis(x, y, z)
+        return channel(sh, n, 0, degree, b), channel(sh, n, 1, degree, b), channel(sh, n, 2, degree, b)
+
+    return color
+
+
+def _color_gradient(real: type, basis: Callable[..., Any]) -> Callable[..., Any]:
+    add_row, pull = _rows()
+    pulls = _direction_gradients(real)
+    first, second, third = pulls
+
+    @inlined
+    def color_gradient(sh, n, degree, x, y, z, g, g_sh):
+        b = basis(x, y, z)
+        add_row(g_sh, n, 0, b[0], g)
+        gx = gy = gz = b[0] - b[0]
+        if degree > 0:
+            add_row(g_sh, n, 1, b[1], g)
+            add_row(g_sh, n, 2, b[2], g)
+            add_row(g_sh, n, 3, b[3], g)
+            gx, gy, gz = first(pull(sh, n, 1, g), pull(sh, n, 2, g), pull(sh, n, 3, g))
+        if degree > 1:
+            add_row(g_sh, n, 4, b[4], g)
+            add_row(g_sh, n, 5, b[5], g)
+            add_row(g_sh, n, 6, b[6], g)
+            add_row(g_sh, n, 7, b[7], g)
+            add_row(g_sh, n, 8, b[8], g)
+            h = (pull(sh, n, 4, g), pull(sh, n, 5, g), pull(sh, n, 6, g), pull(sh, n, 7, g), pull(sh, n, 8, g))
+            more = second(x, y, z, h)
+            gx, gy, gz = gx + more[0], gy + more[1], gz + more[2]
+        if degree > 2:
+            add_row(g_sh, n, 9, b[9], g)
+            add_row(g_sh, n, 10, b[10], g)
+            add_row(g_sh, n, 11, b[11], g)
+            add_row(g_sh, n, 12, b[12], g)
+            add_row(g_sh, n, 13, b[13], g)
+            add_row(g_sh, n, 14, b[14], g)
+            add_row(g_sh, n, 15, b[15], g)
+            low = (pull(sh, n, 9, g), pull(sh, n, 10, g), pull(sh, n, 11, g), pull(sh, n, 12, g))
+            high = (pull(sh, n, 13, g), pull(sh, n, 14, g), pull(sh, n, 15, g))
+            more = third(x, y, z, low, high)
+            gx, gy, gz = gx + more[0], gy + more[1], gz + more[2]
+        return gx, gy, gz
+
+    return color_gradient
+
+
+def _rows() -> tuple[Callable[..., Any], Callable[..., Any]]:
+    @inlined
+    def add_row(g_sh, n, k, b, g):
+        g_sh[n, k, 0] += b * g[0]
+        g_sh[n, k, 1] += b * g[1]
+        g_sh[n, k, 2] += b * g[2]
+
+    @inlined
+    def pull(sh, n, k, g):
+        return sh[n, k, 0] * g[0] + sh[n, k, 1] * g[1] + sh[n, k, 2] * g[2]
+
+    return add_row, pull
+
+
+def _direction_gradients(real: type) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
+    """Gradients of the direction, degree by degree, from the gradients h of the harmonics."""
+    _, c1, c_xy, c_zz, c_xx, c_yxx, c_xyz, c_yzz, c_zzz, c_zxx = (real(c) for c in SH_CONSTANTS)
+    two, three, four, six, eight = real(2.0), real(3.0), real(4.0), real(6.0), real(8.0)
+
+    @inlined
+    def first(h1, h2, h3):
+        return -c1 * h3, -c1 * h1, c1 * h2
+
+    @inlined
+    def second(x, y, z, h):
+        return (
+            c_xy * (y * h[0] - z * h[3]) - two * c_zz * x * h[2] + two * c_xx * x * h[4],
+            c_xy * (x * h[0] - z * h[1]) - two * c_zz * y * h[2] - two * c_xx * y * h[4],
+            -c_xy * (y * h[1] + x * h[3]) + four * c_zz * z * h[2],
+        )
+
+    @inlined
+    def third(x, y, z, low, high):
+        xx, yy, zz = x * x, y * y, z * z
+        h9, h10, h11, h12 = low
+        h13, h14, h15 = high
+        flat = three * (xx - yy)
+        return (
+            -c_yxx * (six * x * y * h9 + flat * h15)
+            + c_xyz * y * z * h10
+            + c_yzz * (two * x * y * h11 - (four * zz - three * xx - yy) * h13)
+            - six * c_zzz * x * z * h12
+            + two * c_zxx * x * z * h14,
+            c_yxx * (six * x * y * h15 - flat * h9)
+            + c_xyz * x * z * h10
+            + c_yzz * (two * x * y * h13 - (four * zz - xx - three * yy) * h11)
+            - six * c_zzz * y * z * h12
+            - two * c_zxx * y * z * h14,
+            c_xyz * x * y * h10
+            - eight * c_yzz * (y * z * h11 + x * z * h13)
+            + c_zzz * (six * zz - three * (xx + yy)) * h12
+            + c_zxx * (xx - yy) * h14,
+        )
+
+    return first, second, third

@@ -1,0 +1,135 @@
+"""Projects Gaussians onto the screens of a batch of cameras."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from glassplat.kernels.cpu.project import project_backward, project_forward
+from glassplat.kernels.maths_sh import MAX_DEGREE
+from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians
+
+REAL_OF = {torch.float32: np.float32, torch.float64: np.float64}
+
+
+def project(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, near: float) -> Projected:
+    """Projects Gaussians into cameras: activation, EWA splatting, bounds, culling and view-dependent colour.
+
+    A Gaussian is culled in a camera when its depth is at most `near`, its centre is not on the kept side of
+    the camera's clip plane, its coverage reaches 1/255 nowhere on the image, or a parameter is not
+    finite. Then its radii and all its other values are zero and it gets no gradient from that camera.
+
+    A splat's covariance is J A Sigma A^T J^T plus 0.3 px^2 on the diagonal, A the upper 3x3 block of
+    `cam_from_world` and J the Jacobian of the projection; beyond 1.3 times the image, J stays that of the border. Colours
+    are seen along the direction from the camera centre, defined as -A^T t, to the mean, offset by 0.5 and clamped
+    at 0. A mirrored, left-handed A is as good as any.
+
+    Differentiable in all tensors of `gaussians` and in `cam_from_world`; `radii` carry no gradient.
+
+    Args:
+        gaussians: raw tensors, float32 or float64.
+        cameras: of the same floating-point type; intrinsics and clip planes get no gradient.
+        sh_degree: highest degree of the spherical harmonics to evaluate; `gaussians.sh` may hold more, or
+            none at all, which makes all colours zero.
+        near: smallest depth (camera z, world units), at least 0.
+
+    Raises:
+        ValueError: a shape, the degree or `near` is out of range.
+        TypeError: tensors of different or unsupported floating-point types, or not on the CPU.
+    """
+    _check(gaussians, cameras, sh_degree, near)
+    clip_planes = cameras.clip_planes
+    if clip_planes is None:
+        clip_planes = gaussians.means.new_empty(0, 4)
+    outputs = _Project.apply(
+        *gaussians, cameras.cam_from_world, cameras.intrinsics, clip_planes,
+        cameras.width, cameras.height, sh_degree, near,
+    )  # fmt: skip
+    return Projected(*outputs)
+
+
+def _check(gaussians: RawGaussians, cameras: CameraBatch, sh_degree: int, near: float) -> None:
+    count, num_cameras = gaussians.means.shape[0], cameras.cam_from_world.shape[0]
+    coefficients = gaussians.sh.shape[1] if gaussians.sh.dim() == 3 else 0
+    expected = {
+        "means": (gaussians.means, (count, 3)),
+        "quats": (gaussians.quats, (count, 4)),
+        "log_scales": (gaussians.log_scales, (count, 3)),
+        "logit_opacities": (gaussians.logit_opacities, (count,)),
+        "sh": (gaussians.sh, (count, coefficients, 3)),
+        "cam_from_world": (cameras.cam_from_world, (num_cameras, 4, 4)),
+        "intrinsics": (cameras.intrinsics, (num_cameras, 4)),
+    }
+    if cameras.clip_planes is not None:
+        expected["clip_planes"] = (cameras.clip_planes, (num_cameras, 4))
+    check_tensors(expected)
+    if not 0 <= sh_degree <= MAX_DEGREE or (coefficients and coefficients < (sh_degree + 1) ** 2):
+        raise ValueError(
+            f"sh_degree is {sh_degree}, but degrees go from 0 to {MAX_DEGREE} and sh holds {coefficients} coefficients, "
+            f"of which degree L needs (L + 1)^2; lower sh_degree or pass more coefficients"
+        )
+    if not near >= 0:
+        raise ValueError(f"near is {near}; expected a depth of at least 0")
+
+
+def check_tensors(expected: dict[str, tuple[Tensor, tuple[int, ...]]]) -> None:
+    """Raises unless all tensors have their expected shapes, one floating-point type and lie on the CPU."""
+    first_name, (first, _) = next(iter(expected.items()))
+    for name, (tensor, shape) in expected.items():
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} has shape {tuple(tensor.shape)}; expected {shape}")
+        if tensor.dtype not in REAL_OF or tensor.dtype != first.dtype:
+            raise TypeError(
+                f"{name} is {tensor.dtype} and {first_name} is {first.dtype}; expected float32 or float64 throughout"
+            )
+        if tensor.device.type != "cpu":
+            raise TypeError(f"{name} is on {tensor.device}, but only the CPU has kernels; move it there with .cpu()")
+
+
+class _Project(torch.autograd.Function):
+    """The kernels as one node of the autograd graph."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, quats: Tensor, log_scales: Tensor, logit_opacities: Tensor, sh: Tensor,
+        cam_from_world: Tensor, intrinsics: Tensor, clip_planes: Tensor,
+        width: int, height: int, sh_degree: int, near: float,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        tensors = (means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, clip_planes)
+        tensors = tuple(tensor.contiguous() for tensor in tensors)
+        real = REAL_OF[means.dtype]
+        degree = sh_degree if sh.shape[1] else -1
+        leading = (cam_from_world.shape[0], means.shape[0])
+        means2d, conics, depths, opacities, colors, radii = (
+            means.new_empty(*leading, *rest) for rest in ((2,), (3,), (), (), (3,), (2,))
+        )
+        outputs = (means2d, conics, depths, opacities, colors, radii)
+        project_forward(real)(
+            *(tensor.detach().numpy() for tensor in tensors),
+            real(width), real(height), degree, real(near), *(tensor.numpy() for tensor in outputs),
+        )  # fmt: skip
+        ctx.save_for_backward(*tensors[:7], radii, conics)
+        ctx.size_and_degree = (real(width), real(height), degree)
+        ctx.mark_non_differentiable(radii)
+        return outputs
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        *inputs, radii, conics = ctx.saved_tensors
+        cotangents = [gradient.contiguous() for gradient in gradients[:5]]
+        found = [torch.empty_like(tensor) for tensor in inputs[:5]]
+        cam_from_world = inputs[5]
+        needs_camera = bool(ctx.needs_input_grad[5])
+        cameras = np.zeros((cam_from_world.shape[0], 12))
+        project_backward(REAL_OF[cam_from_world.dtype])(
+            *(tensor.detach().numpy() for tensor in inputs), *ctx.size_and_degree, radii.numpy(), conics.numpy(),
+            *(tensor.numpy() for tensor in cotangents), needs_camera, *(tensor.numpy() for tensor in found), cameras,
+        )  # fmt: skip
+        pose_gradient = None
+        if needs_camera:
+            pose_gradient = torch.zeros_like(cam_from_world)
+            pose_gradient[:, :3] = torch.from_numpy(cameras).reshape(-1, 3, 4)
+        return (*found, pose_gradient, None, None, None, None, None, None)
