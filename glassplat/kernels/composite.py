@@ -1,0 +1,92 @@
+"""Front-to-back blending of splats into images, with a second transmittance for the glass mask."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from glassplat.kernels.blend_inputs import check_splats, check_tensor, primary_count
+from glassplat.kernels.cpu import composite as cpu
+from glassplat.kernels.cpu.tile import MOST_CHANNELS
+from glassplat.kernels.splats import Splats, TileBins
+
+
+class Composite(NamedTuple):
+    """Blended images.
+
+    image [C, H, W, D]: sum of channels. alpha [C, H, W]: coverage by primary splats, 1 - T.
+    mask [C, H, W]: visible marks of glass splats.
+    """
+
+    image: Tensor
+    alpha: Tensor
+    mask: Tensor
+
+
+def composite(
+    splats: Splats, channels: Tensor, bins: TileBins, *, marks: Tensor | None = None, num_primary: int | None = None
+) -> Composite:
+    """Blends depth-sorted splats over each pixel (3DGS; TR-Gaussians, Eqs. 2, 4, 7 and 13).
+
+        alpha_i = min(0.99, opacity_i exp(-q_i / 2)), ignored below 1/255
+        image   = sum over primary i of channels_i alpha_i T_i
+        mask    = sum over glass j of marks_j alpha_j T_j T_glass_j
+
+    T_i is the product of (1 - alpha) over the primary splats in front, T_glass_j the same over the glass splats in
+    front; their product is the transmittance over both together. A pixel stops before the primary splat that would
+    take T below 1e-4; its mask also before the glass splat that would take T_glass there. Pixels of tiles that are
+    not active are zero everywhere. No background is added.
+
+    Differentiable in `means2d`, `conics`, `opacities`, `channels` and `marks`; the order of depths is constant.
+    A non-finite channel makes pixels non-finite only in the tiles that its splat reaches; a splat with non-finite
+    geometry is not drawn.
+
+    Args:
+        splats: [C, G] splats; those with index >= `num_primary` are glass, and appear in the mask only.
+        channels: [C, G, D] values to blend, 1 to 32 of them; those of glass splats are not used.
+        bins: the same splats sorted into tiles, from `bin_tiles`.
+        marks: [C, G - num_primary] what a glass splat adds to the mask, in [0, 1]; needed where there is glass.
+        num_primary: how many splats are primary; all of them by default.
+
+    Raises:
+        TypeError: tensors are not all float32 or all float64.
+        ValueError: shapes disagree, glass has no marks, or the tensors are not on the CPU.
+    """
+    check_splats(splats, bins)
+    num_primary = primary_count(num_primary, splats)
+    cameras, count = splats.opacities.shape
+    if channels.ndim != 3 or not 1 <= channels.shape[2] <= MOST_CHANNELS:
+        raise ValueError(f"channels has shape {list(channels.shape)}, expected [C, G, D] with D in 1..{MOST_CHANNELS}")
+    check_tensor("channels", channels, (cameras, count, channels.shape[2]), like=splats.means2d)
+    if marks is None:
+        if num_primary < count:
+            raise ValueError(
+                f"{count - num_primary} splats are glass, but there are no marks; pass one per glass splat"
+            )
+        marks = channels.new_zeros(cameras, 0)
+    check_tensor("marks", marks, (cameras, count - num_primary), like=splats.means2d)
+    return Composite(*_Composite.apply(*splats, channels, marks, bins, num_primary))
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
+        *tensors, bins, num_primary = arguments
+        *fields, channels, marks = (tensor.detach().contiguous() for tensor in tensors)
+        splats = Splats(*fields)
+        image, alpha, mask, saved = cpu.composite(splats, channels, bins, marks=marks, num_primary=num_primary)
+        ctx.save_for_backward(*splats, channels, marks)
+        ctx.bins, ctx.num_primary, ctx.saved = bins, num_primary, saved
+        return image, alpha, mask
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *v_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        *fields, channels, marks = ctx.saved_tensors
+        v_means, v_conics, v_opacities, v_channels, v_marks = cpu.composite_gradients(
+            Splats(*fields), channels, ctx.bins, ctx.saved, v_outputs, marks=marks, num_primary=ctx.num_primary
+        )
+        return v_means, v_conics, v_opacities, None, None, v_channels, v_marks, None, None

@@ -1,0 +1,377 @@
+"""Blending of sorted splats, tile by tile: forward, and backward back to front.
+
+The backward pass writes one gradient row per (tile, splat) pair and sums the rows of each splat in a fixed order, so
+that the result has the same bits for any number of threads.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numba import prange
+from numpy.typing import NDArray
+from torch import Tensor
+
+from glassplat.kernels.cpu import tile
+from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
+from glassplat.kernels.cpu.pair_gradients import new_pair_rows, sum_pair_rows
+from glassplat.kernels.maths_blend import ALPHA_MAX, TRANSMITTANCE_MIN, Scalar, blend_maths
+from glassplat.kernels.splats import Splats, TileBins
+
+# Planes of the forward pass after those that both directions share. WEIGHT holds one row only.
+MASK, WEIGHT, SUMS = 4 * tile.PLANE, 5 * tile.PLANE, 6 * tile.PLANE
+
+# Planes of the backward pass. BEHIND and BEHIND_GLASS hold what lies behind the current splat, weighted by the incoming
+# gradients. LANES holds rows of 16 column sums: weight, dot, then g, g dy, g dy^2, then one per channel.
+BEHIND, BEHIND_GLASS, V_MASK, LANES, V_IMAGE = (
+    4 * tile.PLANE,
+    5 * tile.PLANE,
+    6 * tile.PLANE,
+    7 * tile.PLANE,
+    10 * tile.PLANE,
+)
+LANE_DOT, LANE_GEOMETRY, LANE_VALUES = LANES + 16, LANES + 32, LANES + 80
+
+
+class SavedTiles(NamedTuple):
+    """What the backward pass needs from the forward pass: packed splats and each active tile's final state."""
+
+    packed: NDArray[Any]
+    state: NDArray[Any]
+
+
+def composite(
+    splats: Splats, channels: Tensor, bins: TileBins, *, marks: Tensor, num_primary: int
+) -> tuple[Tensor, Tensor, Tensor, SavedTiles]:
+    """Image [C, H, W, D], alpha [C, H, W], mask [C, H, W], and what `composite_gradients` starts from."""
+    real = splats.means2d.numpy().dtype.type
+    cameras, count, num_channels = channels.shape
+    shape = (bins.num_cameras, bins.height, bins.width)
+    image, alpha, mask = (torch.zeros(s, dtype=channels.dtype) for s in ((*shape, num_channels), shape, shape))
+    saved = SavedTiles(
+        np.zeros((cameras * count, tile.packed_width(num_channels)), real),
+        np.empty((len(bins.active), tile.STATE_PLANES, tile.PIXELS), real),
+    )
+    _forward(real)(
+        *_flat(splats, channels), marks.numpy(), count, num_primary,
+        bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.splat_offsets.numpy(), bins.active.numpy(),
+        saved.packed, saved.state, image.numpy(), alpha.numpy(), mask.numpy(),
+    )  # fmt: skip
+    return image, alpha, mask, saved
+
+
+def composite_gradients(
+    splats: Splats, channels: Tensor, bins: TileBins, saved: SavedTiles, v_outputs: tuple[Tensor, Tensor, Tensor],
+    *, marks: Tensor, num_primary: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Gradients of means2d, conics, opacities, channels and marks, given those of image, alpha and mask."""
+    real = splats.means2d.numpy().dtype.type
+    num_channels, count = channels.shape[2], channels.shape[1]
+    rows = new_pair_rows(bins, num_channels, real)
+    _backward(real)(
+        splats.conics.numpy().reshape(-1, 3), marks.numpy(), count, num_primary, num_channels,
+        bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), saved.packed, saved.state,
+        *(v.contiguous().numpy() for v in v_outputs), rows,
+    )  # fmt: skip
+    v_means, v_conics, v_opacities, v_values = sum_pair_rows(rows, bins, splats)
+    v_marks = torch.zeros_like(marks)
+    if num_primary < count:
+        v_marks.copy_(v_values[:, num_primary:, 0])
+        v_values[:, num_primary:] = 0
+    return v_means, v_conics, v_opacities, v_values, v_marks
+
+
+def _flat(splats: Splats, channels: Tensor) -> tuple[NDArray[Any], ...]:
+    return (
+        splats.means2d.numpy().reshape(-1, 2),
+        splats.conics.numpy().reshape(-1, 3),
+        splats.opacities.numpy().reshape(-1),
+        channels.numpy().reshape(-1, channels.shape[2]),
+    )
+
+
+def _blend_primary(real: type) -> Scalar:
+    exp2, _, clipped_alpha, _, row_range = blend_maths(real)
+    zero, half, t_min = real(0.0), real(0.5), real(TRANSMITTANCE_MIN)
+    T, LAST, PLANE, VALUES = tile.T, tile.LAST, tile.PLANE, tile.VALUES
+
+    @inlined
+    def blend_primary(scratch, splat, groups, order, x0, y0, num_rows):
+        mean_x, mean_y = splat[0] - real(x0), splat[1] - real(y0)
+        xx, xy, yy, opacity = splat[2], splat[3], splat[4], splat[5]
+        c0, c1, c2, c3 = splat[VALUES], splat[VALUES + 1], splat[VALUES + 2], splat[VALUES + 3]
+        first, last = row_range(mean_y, splat[6], num_rows)
+        for row in range(first, last):
+            base = (row & 15) * 16
+            dy = real(row) + half - mean_y
+            linear, constant = xy * dy, yy * dy * dy
+            for i in range(16):
+                dx = real(np.int32(i)) + half - mean_x
+                a = clipped_alpha(opacity * exp2((xx * dx + linear) * dx + constant))
+                t = scratch[T + base + i]
+                weight = a * t
+                after = t - weight
+                alive = after >= t_min
+                scratch[T + base + i] = after if alive else -abs(t)
+                scratch[LAST + base + i] = order if alive else scratch[LAST + base + i]
+                weight = weight if alive else zero
+                scratch[SUMS + base + i] += weight * c0
+                scratch[SUMS + PLANE + base + i] += weight * c1
+                scratch[SUMS + 2 * PLANE + base + i] += weight * c2
+                scratch[SUMS + 3 * PLANE + base + i] += weight * c3
+                scratch[WEIGHT + i] = weight
+            for g in range(1, groups):
+                at = VALUES + 4 * g
+                e0, e1, e2, e3 = splat[at], splat[at + 1], splat[at + 2], splat[at + 3]
+                sums = SUMS + (g & 7) * 4 * PLANE + base
+                for i in range(16):
+                    weight = scratch[WEIGHT + i]
+                    scratch[sums + i] += weight * e0
+                    scratch[sums + PLANE + i] += weight * e1
+                    scratch[sums + 2 * PLANE + i] += weight * e2
+                    scratch[sums + 3 * PLANE + i] += weight * e3
+
+    return blend_primary
+
+
+def _blend_glass(real: type) -> Scalar:
+    exp2, _, clipped_alpha, _, row_range = blend_maths(real)
+    zero, half, t_min = real(0.0), real(0.5), real(TRANSMITTANCE_MIN)
+    T, T_GLASS, LAST_GLASS = tile.T, tile.T_GLASS, tile.LAST_GLASS
+
+    @inlined
+    def blend_glass(scratch, splat, mark, order, x0, y0, num_rows):
+        mean_x, mean_y = splat[0] - real(x0), splat[1] - real(y0)
+        xx, xy, yy, opacity = splat[2], splat[3], splat[4], splat[5]
+        first, last = row_range(mean_y, splat[6], num_rows)
+        for row in range(first, last):
+            base = (row & 15) * 16
+            dy = real(row) + half - mean_y
+            linear, constant = xy * dy, yy * dy * dy
+            for i in range(16):
+                dx = real(np.int32(i)) + half - mean_x
+                a = clipped_alpha(opacity * exp2((xx * dx + linear) * dx + constant))
+                t, t_glass = scratch[T + base + i], scratch[T_GLASS + base + i]
+                weight = a * t_glass
+                after = t_glass - weight
+                alive = (after >= t_min) & (t > zero)
+                scratch[T_GLASS + base + i] = after if alive else -abs(t_glass)
+                scratch[LAST_GLASS + base + i] = order if alive else scratch[LAST_GLASS + base + i]
+                scratch[MASK + base + i] += weight * t * mark if alive else zero
+
+    return blend_glass
+
+
+@functools.cache
+def _forward(real: type) -> Kernel:
+    pack, place, begin, is_finished, save_state, _, _ = tile.tile_functions(real)
+    blend_primary, blend_glass = _blend_primary(real), _blend_glass(real)
+    one, zero = real(1.0), real(0.0)
+    T, PLANE, VALUES = tile.T, tile.PLANE, tile.VALUES
+
+    @inlined
+    def write_tile(scratch, image, alpha, mask, camera, x0, y0, columns, rows):
+        for y in range(rows):
+            for x in range(columns):
+                i = (y & 15) * 16 + (x & 15)
+                alpha[camera, y0 + y, x0 + x] = one - abs(scratch[T + i])
+                mask[camera, y0 + y, x0 + x] = scratch[MASK + i]
+                for d in range(image.shape[3]):
+                    image[camera, y0 + y, x0 + x, d] = scratch[SUMS + (d & 31) * PLANE + i]
+
+    @kernel("composite_forward", real)
+    def forward(
+        means, conics, opacities, channels, marks, splats_per_camera, num_primary,
+        pair_splats, tile_offsets, splat_offsets, active, packed, state, image, alpha, mask,
+    ):  # fmt: skip
+        num_splats, num_channels = channels.shape
+        groups = (num_channels + 3) // 4
+        for s in prange(num_splats):
+            if splat_offsets[s + 1] > splat_offsets[s]:
+                pack(packed, s, means, conics, opacities)
+                for d in range(num_channels):
+                    packed[s, VALUES + d] = channels[s, d]
+        for n in prange(active.size):
+            camera, x0, y0, columns, rows = place(active[n], image.shape[2], image.shape[1])
+            scratch = np.empty(SUMS + groups * 4 * PLANE, real)
+            scratch[:] = zero
+            begin(scratch, columns, rows)
+            start = tile_offsets[active[n]]
+            for p in range(start, tile_offsets[active[n] + 1]):
+                # Looking at every pixel costs as much as blending a few rows, so it is not done for every splat.
+                if (p - start) % 8 == 7 and is_finished(scratch):
+                    break
+                s = pair_splats[p]
+                order = real(np.int32(p - start))
+                glass = s - camera * splats_per_camera - num_primary
+                if glass < 0:
+                    blend_primary(scratch, packed[s], groups, order, x0, y0, rows)
+                else:
+                    blend_glass(scratch, packed[s], marks[camera, glass], order, x0, y0, rows)
+            save_state(state, n, scratch)
+            write_tile(scratch, image, alpha, mask, camera, x0, y0, columns, rows)
+
+    return forward
+
+
+def _unblend_primary(real: type) -> Scalar:
+    exp2, _, clipped_alpha, _, row_range = blend_maths(real)
+    zero, half, one, alpha_max = real(0.0), real(0.5), real(1.0), real(ALPHA_MAX)
+    T, LAST, PLANE, VALUES = tile.T, tile.LAST, tile.PLANE, tile.VALUES
+
+    @inlined
+    def unblend_primary(scratch, splat, groups, order, x0, y0, num_rows):
+        """Adds up this splat's lane sums; returns whether it reaches any row."""
+        mean_x, mean_y = splat[0] - real(x0), splat[1] - real(y0)
+        xx, xy, yy, opacity = splat[2], splat[3], splat[4], splat[5]
+        c0, c1, c2, c3 = splat[VALUES], splat[VALUES + 1], splat[VALUES + 2], splat[VALUES + 3]
+        first, last = row_range(mean_y, splat[6], num_rows)
+        for row in range(first, last):
+            base = (row & 15) * 16
+            dy = real(row) + half - mean_y
+            linear, constant = xy * dy, yy * dy * dy
+            for i in range(16):
+                scratch[LANE_DOT + i] = zero
+            for g in range(1, groups):
+                at = VALUES + 4 * g
+                e0, e1, e2, e3 = splat[at], splat[at + 1], splat[at + 2], splat[at + 3]
+                v = V_IMAGE + (g & 7) * 4 * PLANE + base
+                for i in range(16):
+                    scratch[LANE_DOT + i] += (
+                        e0 * scratch[v + i] + e1 * scratch[v + PLANE + i]
+                        + e2 * scratch[v + 2 * PLANE + i] + e3 * scratch[v + 3 * PLANE + i]
+                    )  # fmt: skip
+            for i in range(16):
+                dx = real(np.int32(i)) + half - mean_x
+                coverage = opacity * exp2((xx * dx + linear) * dx + constant)
+                a = clipped_alpha(coverage) if order <= scratch[LAST + base + i] else zero
+                inverse = one / (one - a)
+                t = scratch[T + base + i] * inverse
+                weight = a * t
+                v0, v1 = scratch[V_IMAGE + base + i], scratch[V_IMAGE + PLANE + base + i]
+                v2, v3 = scratch[V_IMAGE + 2 * PLANE + base + i], scratch[V_IMAGE + 3 * PLANE + base + i]
+                dot = scratch[LANE_DOT + i] + v0 * c0 + v1 * c1 + v2 * c2 + v3 * c3
+                behind = scratch[BEHIND + base + i]
+                v_alpha = t * dot - behind * inverse
+                scratch[BEHIND + base + i] = behind + weight * dot
+                scratch[T + base + i] = t
+                gain = v_alpha * a if coverage < alpha_max else zero
+                scratch[LANE_GEOMETRY + i] += gain
+                scratch[LANE_GEOMETRY + 16 + i] += gain * dy
+                scratch[LANE_GEOMETRY + 32 + i] += gain * dy * dy
+                scratch[LANE_VALUES + i] += weight * v0
+                scratch[LANE_VALUES + 16 + i] += weight * v1
+                scratch[LANE_VALUES + 32 + i] += weight * v2
+                scratch[LANE_VALUES + 48 + i] += weight * v3
+                scratch[LANES + i] = weight
+            for g in range(1, groups):
+                v = V_IMAGE + (g & 7) * 4 * PLANE + base
+                lanes = LANE_VALUES + (g & 7) * 64
+                for i in range(16):
+                    weight = scratch[LANES + i]
+                    scratch[lanes + i] += weight * scratch[v + i]
+                    scratch[lanes + 16 + i] += weight * scratch[v + PLANE + i]
+                    scratch[lanes + 32 + i] += weight * scratch[v + 2 * PLANE + i]
+                    scratch[lanes + 48 + i] += weight * scratch[v + 3 * PLANE + i]
+        return first < last
+
+    return unblend_primary
+
+
+def _unblend_glass(real: type) -> Scalar:
+    exp2, _, clipped_alpha, _, row_range = blend_maths(real)
+    zero, half, one, alpha_max = real(0.0), real(0.5), real(1.0), real(ALPHA_MAX)
+    T, T_GLASS, LAST_GLASS = tile.T, tile.T_GLASS, tile.LAST_GLASS
+
+    @inlined
+    def unblend_glass(scratch, splat, mark, order, x0, y0, num_rows):
+        """As `unblend_primary`; the first row of value lanes gets the gradient of the mark."""
+        mean_x, mean_y = splat[0] - real(x0), splat[1] - real(y0)
+        xx, xy, yy, opacity = splat[2], splat[3], splat[4], splat[5]
+        first, last = row_range(mean_y, splat[6], num_rows)
+        for row in range(first, last):
+            base = (row & 15) * 16
+            dy = real(row) + half - mean_y
+            linear, constant = xy * dy, yy * dy * dy
+            for i in range(16):
+                dx = real(np.int32(i)) + half - mean_x
+                coverage = opacity * exp2((xx * dx + linear) * dx + constant)
+                a = clipped_alpha(coverage) if order <= scratch[LAST_GLASS + base + i] else zero
+                inverse = one / (one - a)
+                t_glass = scratch[T_GLASS + base + i] * inverse
+                v_mark = scratch[V_MASK + base + i] * scratch[T + base + i] * t_glass
+                behind = scratch[BEHIND_GLASS + base + i]
+                v_alpha = v_mark * mark - behind * inverse
+                shown = a * v_mark * mark
+                scratch[BEHIND_GLASS + base + i] = behind + shown
+                scratch[BEHIND + base + i] += shown
+                scratch[T_GLASS + base + i] = t_glass
+                gain = v_alpha * a if coverage < alpha_max else zero
+                scratch[LANE_GEOMETRY + i] += gain
+                scratch[LANE_GEOMETRY + 16 + i] += gain * dy
+                scratch[LANE_GEOMETRY + 32 + i] += gain * dy * dy
+                scratch[LANE_VALUES + i] += a * v_mark
+        return first < last
+
+    return unblend_glass
+
+
+@functools.cache
+def _backward(real: type) -> Kernel:
+    _, place, _, _, _, load_state, geometry_gradient = tile.tile_functions(real)
+    unblend_primary, unblend_glass = _unblend_primary(real), _unblend_glass(real)
+    zero = real(0.0)
+    T, PLANE, V_VALUES = tile.T, tile.PLANE, tile.V_VALUES
+
+    @inlined
+    def load_gradients(scratch, v_image, v_alpha, v_mask, camera, x0, y0, columns, rows):
+        for y in range(rows):
+            for x in range(columns):
+                i = (y & 15) * 16 + (x & 15)
+                # alpha = 1 - T: its gradient acts like something behind every splat.
+                scratch[BEHIND + i] = -v_alpha[camera, y0 + y, x0 + x] * scratch[T + i]
+                scratch[V_MASK + i] = v_mask[camera, y0 + y, x0 + x]
+                for d in range(v_image.shape[3]):
+                    scratch[V_IMAGE + (d & 31) * PLANE + i] = v_image[camera, y0 + y, x0 + x, d]
+
+    @kernel("composite_backward", real)
+    def backward(
+        conics, marks, splats_per_camera, num_primary, num_channels,
+        pair_splats, tile_offsets, active, packed, state, v_image, v_alpha, v_mask, out,
+    ):  # fmt: skip
+        groups = (num_channels + 3) // 4
+        for n in prange(active.size):
+            camera, x0, y0, columns, rows = place(active[n], v_image.shape[2], v_image.shape[1])
+            scratch = np.empty(V_IMAGE + groups * 4 * PLANE, real)
+            scratch[:] = zero
+            looked_at = load_state(state, n, scratch)
+            load_gradients(scratch, v_image, v_alpha, v_mask, camera, x0, y0, columns, rows)
+            start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
+            out[start + looked_at : stop] = zero
+            for k in range(looked_at):
+                p = start + looked_at - 1 - k
+                s = pair_splats[p]
+                order = real(np.int32(p - start))
+                glass = s - camera * splats_per_camera - num_primary
+                scratch[LANE_GEOMETRY : LANE_VALUES + groups * 64] = zero
+                if glass < 0:
+                    reached = unblend_primary(scratch, packed[s], groups, order, x0, y0, rows)
+                else:
+                    reached = unblend_glass(scratch, packed[s], marks[camera, glass], order, x0, y0, rows)
+                if not reached:
+                    out[p, :] = zero
+                    continue
+                mean_x, opacity = packed[s, 0] - real(x0), packed[s, 5]
+                geometry_gradient(
+                    out, p, scratch, LANE_GEOMETRY, mean_x, conics[s, 0], conics[s, 1], conics[s, 2], opacity
+                )
+                for d in range(num_channels):
+                    total = zero
+                    for i in range(16):
+                        total += scratch[LANE_VALUES + (d & 31) * 16 + i]
+                    out[p, V_VALUES + d] = total
+
+    return backward

@@ -1,0 +1,61 @@
+"""Gradient rows of (tile, splat) pairs, and their sum per splat in a fixed order."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+import torch
+from numba import prange
+from numpy.typing import NDArray
+from torch import Tensor
+
+from glassplat.kernels.cpu import tile
+from glassplat.kernels.cpu.jit import Kernel, kernel
+from glassplat.kernels.splats import Splats, TileBins
+
+
+def new_pair_rows(bins: TileBins, num_values: int, real: type) -> NDArray[Any]:
+    """Room for one gradient row per pair: mean (2), conic (3), opacity (1), then `num_values`.
+
+    A kernel fills the rows of active tiles. Only where other tiles have pairs must the rest be zero beforehand.
+    """
+    shape = (len(bins.pair_splats), tile.V_VALUES + num_values)
+    active = bins.active.long()
+    filled = int((bins.tile_offsets[active + 1] - bins.tile_offsets[active]).sum())
+    return np.empty(shape, real) if filled == shape[0] else np.zeros(shape, real)
+
+
+def sum_pair_rows(rows: NDArray[Any], bins: TileBins, splats: Splats) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Gradients of means2d, conics, opacities and values [C, G, num_values], summed over each splat's tiles."""
+    real = rows.dtype.type
+    num_values = rows.shape[1] - tile.V_VALUES
+    shape = tuple(splats.opacities.shape)
+    widths = ((2,), (3,), (), (num_values,))
+    totals = tuple(torch.empty((*shape, *width), dtype=splats.opacities.dtype) for width in widths)
+    flat = (total.numpy().reshape(-1, *width) for total, width in zip(totals, widths, strict=True))
+    _sum_rows(real)(rows, bins.pair_slots.numpy(), bins.splat_offsets.numpy(), *flat)
+    return totals
+
+
+@functools.cache
+def _sum_rows(real: type) -> Kernel:
+    zero = real(0.0)
+    V_CONIC, V_OPACITY, V_VALUES = tile.V_CONIC, tile.V_OPACITY, tile.V_VALUES
+
+    @kernel("sum_pair_rows", real)
+    def sum_rows(rows, slots, offsets, v_means, v_conics, v_opacities, v_values):
+        for s in prange(offsets.size - 1):
+            v_means[s, :], v_conics[s, :], v_opacities[s], v_values[s, :] = zero, zero, zero, zero
+            for k in range(offsets[s], offsets[s + 1]):
+                row = rows[slots[k]]
+                for d in range(2):
+                    v_means[s, d] += row[d]
+                for d in range(3):
+                    v_conics[s, d] += row[V_CONIC + d]
+                v_opacities[s] += row[V_OPACITY]
+                for d in range(v_values.shape[1]):
+                    v_values[s, d] += row[V_VALUES + d]
+
+    return sum_rows

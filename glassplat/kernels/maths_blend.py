@@ -1,0 +1,136 @@
+"""Scalar maths of blending: how much a splat covers a pixel, and which rows of an image it can reach.
+
+Every function is pure and typed by its factory, so that one source compiles for the CPU and for CUDA.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from glassplat.kernels.cpu.jit import inlined
+
+ALPHA_MIN = 1.0 / 255.0
+"""Coverage below this is ignored."""
+ALPHA_MAX = 0.99
+"""Coverage is clamped here, so that one splat never takes all the light."""
+TRANSMITTANCE_MIN = 1e-4
+"""A pixel stops before the splat that would take its transmittance below this."""
+
+# Minimax polynomial of 2^f for f in [-1, 0] with 2^0 = 1 exactly; relative error 2.4e-7 in float32.
+_EXP2_COEFFICIENTS = (1.0, 0.693143721, 0.240180143, 0.0552973572, 0.00920579680, 0.000944903083)
+
+Scalar = Callable[..., Any]
+
+
+class BlendMaths(NamedTuple):
+    """Scalar functions of blending for one floating-point type.
+
+    Attributes:
+        exp2: 2^t for t <= 0. NaN and anything below -80 give 2^-80, which is far below `ALPHA_MIN`.
+        screen_form: a conic scaled so that a Gaussian falls off as 2^(quadratic form of the offset).
+        clipped_alpha: the coverage that blends, of opacity times falloff: 0 below `ALPHA_MIN`, at most `ALPHA_MAX`.
+        vertical_reach: distance in rows from its centre at which a splat's coverage sinks to `ALPHA_MIN`;
+            negative where it reaches nothing.
+        row_range: first and one-past-last of the rows 0 .. count - 1 that a splat reaches.
+    """
+
+    exp2: Scalar
+    screen_form: Scalar
+    clipped_alpha: Scalar
+    vertical_reach: Scalar
+    row_range: Scalar
+
+
+def blend_maths(real: type) -> BlendMaths:
+    """Builds the functions for `real`, np.float32 or np.float64."""
+    exp2 = _fast_exp2(real) if real is np.float32 else _exact_exp2(real)
+    return BlendMaths(exp2, _screen_form(real), _clipped_alpha(real), _vertical_reach(real), _row_range(real))
+
+
+def _fast_exp2(real: type) -> Scalar:
+    c0, c1, c2, c3, c4, c5 = (real(c) for c in _EXP2_COEFFICIENTS)
+    lowest = real(-80.0)
+
+    @inlined
+    def exp2(t):  # type: ignore[no-untyped-def]
+        # This order of the comparison sends NaN to the lowest value too.
+        t = t if t > lowest else lowest
+        # Truncation towards zero is one vector instruction; math.floor would widen to 64 bits.
+        whole = np.int32(t)
+        f = t - real(whole)
+        fraction = ((((c5 * f + c4) * f + c3) * f + c2) * f + c1) * f + c0
+        power = np.int32((whole + np.int32(127)) << np.int32(23)).view(np.float32)
+        return fraction * power
+
+    return exp2
+
+
+def _exact_exp2(real: type) -> Scalar:
+    lowest, natural = real(-80.0), real(math.log(2.0))
+
+    @inlined
+    def exp2(t):  # type: ignore[no-untyped-def]
+        t = t if t > lowest else lowest
+        return real(math.exp(t * natural))
+
+    return exp2
+
+
+def _screen_form(real: type) -> Scalar:
+    bits = real(-1.0 / math.log(2.0))
+    half_bits = real(-0.5 / math.log(2.0))
+
+    @inlined
+    def screen_form(conic_xx, conic_xy, conic_yy):  # type: ignore[no-untyped-def]
+        return half_bits * conic_xx, bits * conic_xy, half_bits * conic_yy
+
+    return screen_form
+
+
+def _clipped_alpha(real: type) -> Scalar:
+    zero, smallest, largest = real(0.0), real(ALPHA_MIN), real(ALPHA_MAX)
+
+    @inlined
+    def clipped_alpha(coverage):  # type: ignore[no-untyped-def]
+        clamped = coverage if coverage < largest else largest
+        return clamped if coverage >= smallest else zero
+
+    return clipped_alpha
+
+
+def _vertical_reach(real: type) -> Scalar:
+    zero, one, two, nothing = real(0.0), real(1.0), real(2.0), real(-1.0)
+    inverse_alpha_min, slack = real(1.0 / ALPHA_MIN), real(1e-3)
+
+    @inlined
+    def vertical_reach(conic_xx, conic_xy, conic_yy, opacity):  # type: ignore[no-untyped-def]
+        # In double precision, because the determinant of a needle's conic is a small difference of large products.
+        xx, xy = np.float64(conic_xx), np.float64(conic_xy)
+        determinant = xx * np.float64(conic_yy) - xy * xy
+        visible = inverse_alpha_min * opacity
+        # Written so that NaN anywhere ends in "reaches nothing".
+        if not (determinant > 0.0 and conic_xx > zero and visible > one):
+            return nothing
+        return real(math.sqrt(two * math.log(visible) * real(xx / determinant))) + slack
+
+    return vertical_reach
+
+
+def _row_range(real: type) -> Scalar:
+    half, zero = real(0.5), real(0.0)
+
+    @inlined
+    def row_range(center, reach, count):  # type: ignore[no-untyped-def]
+        # Row r is sampled at r + 0.5. Clamping before the conversion keeps infinite reaches well defined.
+        low, high, bottom = center - reach - half, center + reach - half, real(count - 1)
+        if not (reach >= zero and high >= zero and low <= bottom):
+            return np.int32(0), np.int32(0)
+        low = low if low > zero else zero
+        high = high if high < bottom else bottom
+        return np.int32(math.ceil(low)), np.int32(high) + np.int32(1)
+
+    return row_range

@@ -1,0 +1,82 @@
+"""The definition of `composite`: every splat over every pixel, front to back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from glassplat.kernels.composite import Composite
+from glassplat.kernels.maths_blend import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from glassplat.kernels.splats import Splats, TileBins
+
+TILE = 16
+
+
+def composite(
+    splats: Splats, channels: Tensor, bins: TileBins, *, marks: Tensor | None = None, num_primary: int | None = None
+) -> Composite:
+    """See `glassplat.kernels.composite.composite`. Of the bins, only the image size and active tiles are used."""
+    num_primary = splats.opacities.shape[1] if num_primary is None else num_primary
+    cameras = [
+        _camera_composite(
+            _camera_splats(splats, c), channels[c], bins, None if marks is None else marks[c], num_primary
+        )
+        for c in range(bins.num_cameras)
+    ]
+    image, alpha, mask = (torch.stack(layers) for layers in zip(*cameras, strict=True))
+    active = active_pixels(bins)
+    return Composite(image * active[..., None], alpha * active, mask * active)
+
+
+def _camera_composite(
+    splats: Splats, channels: Tensor, bins: TileBins, marks: Tensor | None, num_primary: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    transmittance = splats.means2d.new_ones(bins.height, bins.width)
+    image = transmittance[..., None] * channels.new_zeros(channels.shape[-1])
+    mask, glass_transmittance = torch.zeros_like(transmittance), torch.ones_like(transmittance)
+    running = glass_running = torch.ones_like(transmittance, dtype=torch.bool)
+    for index, alpha in alphas_front_to_back(splats, bins):
+        if index < num_primary:
+            after = transmittance * (1 - alpha)
+            running = running & (after >= TRANSMITTANCE_MIN)
+            weight = torch.where(running, alpha * transmittance, 0)
+            image = image + torch.where((weight > 0)[..., None], weight[..., None] * channels[index], 0)
+            transmittance = torch.where(running, after, transmittance)
+        elif marks is not None:
+            after = glass_transmittance * (1 - alpha)
+            glass_running = glass_running & (~running | (after >= TRANSMITTANCE_MIN))
+            seen = running & glass_running
+            shown = alpha * transmittance * glass_transmittance * marks[index - num_primary]
+            mask = mask + torch.where(seen, shown, 0)
+            glass_transmittance = torch.where(seen, after, glass_transmittance)
+    return image, 1 - transmittance, mask
+
+
+def alphas_front_to_back(splats: Splats, bins: TileBins) -> Iterator[tuple[int, Tensor]]:
+    """Index and coverage [H, W] of every splat of one camera that is drawn, nearest first."""
+    like = splats.means2d
+    x = torch.arange(bins.width, dtype=like.dtype) + 0.5
+    y = torch.arange(bins.height, dtype=like.dtype)[:, None] + 0.5
+    for index in torch.argsort(splats.depths, stable=True).tolist():
+        xx, xy, yy = splats.conics[index]
+        if not bool((splats.radii[index] > 0).all() & (xx > 0) & (xx * yy - xy * xy > 0)):
+            continue
+        dx, dy = x - splats.means2d[index, 0], y - splats.means2d[index, 1]
+        q = xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy
+        coverage = splats.opacities[index] * torch.exp(-0.5 * q)
+        yield index, torch.where(coverage >= ALPHA_MIN, coverage.clamp(max=ALPHA_MAX), 0)
+
+
+def active_pixels(bins: TileBins) -> Tensor:
+    """[C, H, W] bool: whether a pixel lies in an active tile."""
+    columns, rows = -(-bins.width // TILE), -(-bins.height // TILE)
+    tiles = torch.zeros(bins.num_cameras * rows * columns, dtype=torch.bool)
+    tiles[bins.active.long()] = True
+    pixels = tiles.reshape(bins.num_cameras, rows, columns).repeat_interleave(TILE, 1).repeat_interleave(TILE, 2)
+    return pixels[:, : bins.height, : bins.width]
+
+
+def _camera_splats(splats: Splats, camera: int) -> Splats:
+    return Splats(*(tensor[camera] for tensor in splats))
