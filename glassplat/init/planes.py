@@ -13,17 +13,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.init.annotation import PaneView, pane_views, plane_candidates
-from glassplat.init.consistency import RefinedPlane, mask_agreement, refined_plane
+from glassplat.init.consistency import mask_agreement
 from glassplat.init.footprint import pane_rectangle
-from glassplat.init.ransac import PlaneEquations, random_planes, support
+from glassplat.init.plane_search import Search, best_plane
+from glassplat.init.ransac import PlaneEquations
 from glassplat.scene.camera import Camera
 from glassplat.scene.plane import Planes
 
 Array = NDArray[np.float64]
 log = logging.getLogger("glassplat.init")
-
-SUPPORT_WEIGHT = 0.1
-"""Weight of a hypothesis' inliers against the agreement of the masks: it decides where parallax is too small to."""
 
 
 class PlaneFitError(ValueError):
@@ -54,7 +52,7 @@ class PlaneFit:
     band: float = 20 / 1200
     inlier_distance: float = 0.01
     hypotheses: int = 1000
-    refined: int = 6
+    refined: int = 4
     least_agreement: float = 0.5
     margin: float = 1.05
     seed: int = 0
@@ -137,8 +135,10 @@ def _fit_pane(
             "annotated views; expected at least three. Annotate more views in which the frame of the pane is visible "
             "and sharp, and check that the masks end at the frame and belong to these images"
         )
-    best = _best_plane(points[chosen], weights[chosen], views, label=label, extent=extent, options=options)
-    agreement = float(mask_agreement(best.plane, views)[0])
+    search = Search(extent, options.inlier_distance * extent, options.hypotheses, options.refined)
+    rng = np.random.default_rng((options.seed, label))
+    best = best_plane(points[chosen], weights[chosen], views, search, rng)
+    agreement = float(mask_agreement(best, views)[0])
     log.info("pane %d: %d views, %d candidates, masks agree to %.3f", label, len(views), chosen.sum(), agreement)
     if agreement < options.least_agreement:
         raise PlaneFitError(
@@ -147,27 +147,7 @@ def _fit_pane(
             f"{options.least_agreement:.2f}. Check that label {label} means the same flat pane in every mask, and "
             "annotate more views that show all of it with nothing standing before it"
         )
-    return _pane(best.plane, views, options.margin)
-
-
-def _best_plane(
-    points: Array, weights: Array, views: Sequence[PaneView], *, label: int, extent: float, options: PlaneFit
-) -> RefinedPlane:
-    """The plane on which the mask edges coincide best, out of the refined best hypotheses."""
-    rng = np.random.default_rng((options.seed, label))
-    distance = options.inlier_distance * extent
-    drawn = random_planes(points, weights, options.hypotheses, rng)
-    supports = support(drawn, points, weights, distance=distance)
-    supported = np.argsort(-supports, kind="stable")[: max(options.hypotheses // 4, options.refined)]
-    scores = mask_agreement(drawn.select(supported), views) + SUPPORT_WEIGHT * supports[supported]
-    leading = supported[np.argsort(-scores, kind="stable")[: options.refined]]
-
-    refined = []
-    for number in leading:
-        start = drawn.select(np.array([number]))
-        inliers = points[np.abs(start.distances(points)[0]) <= distance]
-        refined.append(refined_plane(start, views, inliers, extent=extent, distance=distance))
-    return min(refined, key=lambda found: found.cost)
+    return _pane(best, views, options.margin)
 
 
 def _pane(plane: PlaneEquations, views: Sequence[PaneView], margin: float) -> _Pane:
