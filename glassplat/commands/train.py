@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from glassplat.data.dataset import Dataset, load_dataset
 from glassplat.data.errors import InputError
+from glassplat.data.masks import Polarity
 from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.run import run_training
@@ -36,6 +37,7 @@ class Train:
         seed: fixes every random choice.
         device: where to train.
         resume: go on with the run in `output`.
+        mask_polarity: which value of black-and-white masks is the pane.
     """
 
     recipe: Annotated[AnyRecipe, tyro.conf.arg(name="")]
@@ -46,14 +48,17 @@ class Train:
     seed: int = 0
     device: Literal["cpu"] = "cpu"
     resume: bool = False
+    mask_polarity: Polarity = "auto"
 
     def run(self, console: Console) -> None:
         """Trains, with a progress bar."""
         if self.iterations < 1:
             raise InputError(f"--iterations is {self.iterations}; expected at least 1")
-        dataset = load_dataset(self.data, downscale=self.downscale)
+        dataset = load_dataset(self.data, downscale=self.downscale, mask_polarity=self.mask_polarity)
         describe(dataset, console)
-        settings = RunSettings(str(self.data), self.iterations, self.downscale, self.seed, self.device)
+        settings = RunSettings(
+            str(self.data), self.iterations, self.downscale, self.seed, self.device, self.mask_polarity
+        )
         directory = RunDirectory(self.output)
         with TrainingProgress(console, self.iterations) as progress:
             state = run_training(
@@ -68,7 +73,7 @@ class Train:
 
 def describe(dataset: Dataset, console: Console) -> None:
     """Says what was loaded, with the loader's warnings."""
-    annotated = sum(view.pane_labels is not None for view in dataset.train)
+    annotated = sum(view.is_annotated for view in dataset.train)
     console.print(
         f"{dataset.root}: {len(dataset.train)} training and {len(dataset.test)} test views, "
         f"{len(dataset.points.positions)} points, {annotated} annotated views with {len(dataset.pane_labels)} panes"

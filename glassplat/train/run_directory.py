@@ -10,6 +10,7 @@ from typing import Any
 
 from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError
+from glassplat.data.masks import Polarity
 from glassplat.files.atomic import atomic_write
 from glassplat.files.cameras_json import write_cameras
 from glassplat.files.scene_folder import read_scene, write_scene
@@ -27,6 +28,7 @@ class RunSettings:
         downscale: factor by which photographs are shrunk.
         seed: fixes every random choice.
         device: where training runs.
+        mask_polarity: which value of black-and-white masks is the pane.
     """
 
     data: str
@@ -34,6 +36,7 @@ class RunSettings:
     downscale: float = 1.0
     seed: int = 0
     device: str = "cpu"
+    mask_polarity: Polarity = "auto"
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,68 @@
+"""A whole run: interrupted, resumed, and the files it leaves."""
+
+from __future__ import annotations
+
+import json
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from glassplat.train.checkpoint import load_checkpoint
+from glassplat.train.messages import Message, StepDone
+from glassplat.train.recipe import recipe_from_json, recipe_to_json
+from glassplat.train.planar_recipe import PlanarRecipe, ReflectionWeights
+from glassplat.train.run import run_training
+from glassplat.train.run_directory import RunDirectory, RunSettings
+from glassplat.train.splat_recipe import SplatRecipe
+from tests.train.tiny_capture import tiny_capture
+
+SETTINGS = RunSettings("tiny", iterations=12)
+RECIPE = SplatRecipe(sh_degree=1)
+
+
+def run(path: Path, *, resume: bool = False, interrupt_at: int | None = None) -> Any:
+    def listen(message: Message) -> None:
+        if isinstance(message, StepDone) and message.step == interrupt_at:
+            signal.raise_signal(signal.SIGINT)
+
+    return run_training(RECIPE, SETTINGS, RunDirectory(path), tiny_capture(), resume=resume, listen=listen)
+
+
+def test_an_interrupted_run_resumes_to_the_same_scene(tmp_path: Path) -> None:
+    whole = run(tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "stopped", interrupt_at=5)
+    assert load_checkpoint(RunDirectory(tmp_path / "stopped").checkpoint).step == 5
+    resumed = run(tmp_path / "stopped", resume=True)
+    for name, tensor in whole.scene.parameters().items():
+        assert torch.equal(tensor, resumed.scene.parameters()[name]), name
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_the_log_has_every_tenth_step_once(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, interrupt_at=11)
+    run(tmp_path, resume=True)
+    lines = [json.loads(line) for line in RunDirectory(tmp_path).log.read_text().splitlines()]
+    assert [line["step"] for line in lines if line["message"] == "StepDone"] == [10]
+
+
+def test_the_exported_scene_is_the_trained_one(tmp_path: Path) -> None:
+    state = run(tmp_path)
+    scene, iterations = RunDirectory(tmp_path).latest_scene()
+    assert iterations == 12
+    assert scene.extent == state.scene.extent
+    for name, tensor in state.scene.primary.tensors().items():
+        assert torch.equal(tensor, scene.primary.tensors()[name]), name
+
+
+@pytest.mark.parametrize(
+    "recipe", [RECIPE, PlanarRecipe(fresnel=False, weights=ReflectionWeights(depth=0.0), background=(1.0, 1.0, 1.0))]
+)
+def test_a_recipe_survives_its_file(recipe: Any) -> None:
+    assert recipe_from_json(recipe_to_json(recipe)) == recipe
+    assert recipe_from_json(recipe_to_json(recipe)) != replace(recipe, sh_degree=0)
