@@ -18,15 +18,14 @@ def adam_step(real: type) -> Kernel:
     def step(parameter, gradient, first, second, rates, betas, gains, second_scale, eps):
         count, block = parameter.size, rates.size
         for b in prange((count + block - 1) // block):
-            start = b * block
-            for j in range(min(block, count - start)):
-                i = start + j
-                g = gradient[i]
-                m = betas[0] * first[i] + gains[0] * g
-                v = betas[1] * second[i] + gains[1] * g * g
-                first[i] = m
-                second[i] = v
-                parameter[i] -= rates[j] * m / (math.sqrt(v) * second_scale + eps)
+            # Slices from zero, because an index with an offset might be negative for all the compiler knows, and wrap.
+            begin, end = b * block, min(count, (b + 1) * block)
+            p, g, m, v = parameter[begin:end], gradient[begin:end], first[begin:end], second[begin:end]
+            for i in range(end - begin):
+                mean = betas[0] * m[i] + gains[0] * g[i]
+                square = betas[1] * v[i] + gains[1] * g[i] * g[i]
+                m[i], v[i] = mean, square
+                p[i] -= rates[i] * mean / (math.sqrt(square) * second_scale + eps)
 
     return step
 
