@@ -7,6 +7,7 @@ that the result has the same bits for any number of threads.
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,7 +48,7 @@ def composite(
     splats: Splats, channels: Tensor, bins: TileBins, *, marks: Tensor, num_primary: int
 ) -> tuple[Tensor, Tensor, Tensor, SavedTiles]:
     """Image [C, H, W, D], alpha [C, H, W], mask [C, H, W], and what `composite_gradients` starts from."""
-    real = splats.means2d.numpy().dtype.type
+    real = tile.real_of(splats)
     cameras, count, num_channels = channels.shape
     shape = (bins.num_cameras, bins.height, bins.width)
     image, alpha, mask = (torch.zeros(s, dtype=channels.dtype) for s in ((*shape, num_channels), shape, shape))
@@ -64,11 +65,11 @@ def composite(
 
 
 def composite_gradients(
-    splats: Splats, channels: Tensor, bins: TileBins, saved: SavedTiles, v_outputs: tuple[Tensor, Tensor, Tensor],
+    splats: Splats, channels: Tensor, bins: TileBins, saved: SavedTiles, v_outputs: Sequence[Tensor],
     *, marks: Tensor, num_primary: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Gradients of means2d, conics, opacities, channels and marks, given those of image, alpha and mask."""
-    real = splats.means2d.numpy().dtype.type
+    real = tile.real_of(splats)
     num_channels, count = channels.shape[2], channels.shape[1]
     rows = new_pair_rows(bins, num_channels, real)
     _backward(real)(

@@ -6,7 +6,6 @@ import functools
 from typing import Any
 
 import numpy as np
-import torch
 from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
@@ -29,14 +28,16 @@ def new_pair_rows(bins: TileBins, num_values: int, real: type) -> NDArray[Any]:
 
 def sum_pair_rows(rows: NDArray[Any], bins: TileBins, splats: Splats) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Gradients of means2d, conics, opacities and values [C, G, num_values], summed over each splat's tiles."""
-    real = rows.dtype.type
     num_values = rows.shape[1] - tile.V_VALUES
     shape = tuple(splats.opacities.shape)
     widths = ((2,), (3,), (), (num_values,))
-    totals = tuple(torch.empty((*shape, *width), dtype=splats.opacities.dtype) for width in widths)
-    flat = (total.numpy().reshape(-1, *width) for total, width in zip(totals, widths, strict=True))
-    _sum_rows(real)(rows, bins.pair_slots.numpy(), bins.splat_offsets.numpy(), *flat)
-    return totals
+    v_means, v_conics, v_opacities, v_values = (splats.opacities.new_empty(*shape, *width) for width in widths)
+    _sum_rows(tile.real_of(splats))(
+        rows, bins.pair_slots.numpy(), bins.splat_offsets.numpy(),
+        v_means.numpy().reshape(-1, 2), v_conics.numpy().reshape(-1, 3), v_opacities.numpy().reshape(-1),
+        v_values.numpy().reshape(-1, num_values),
+    )  # fmt: skip
+    return v_means, v_conics, v_opacities, v_values
 
 
 @functools.cache

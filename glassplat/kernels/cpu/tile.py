@@ -11,9 +11,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from glassplat.kernels.cpu.jit import inlined
 from glassplat.kernels.maths_blend import Scalar, blend_maths
+from glassplat.kernels.splats import Splats
 
 TILE = 16
 PIXELS = TILE * TILE
@@ -67,6 +69,11 @@ def tile_functions(real: type) -> TileFunctions:
 def packed_width(num_values: int) -> int:
     """Columns of a packed splat that carries `num_values` channels, filled up to whole groups."""
     return VALUES + GROUP * ((num_values + GROUP - 1) // GROUP)
+
+
+def real_of(splats: Splats) -> type:
+    """The NumPy type that a kernel for these splats is built with."""
+    return np.float64 if splats.means2d.dtype == torch.float64 else np.float32
 
 
 def _pack(real: type) -> Scalar:

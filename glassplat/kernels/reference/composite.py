@@ -21,7 +21,7 @@ def composite(
     num_primary = splats.opacities.shape[1] if num_primary is None else num_primary
     cameras = [
         _camera_composite(
-            _camera_splats(splats, c), channels[c], bins, None if marks is None else marks[c], num_primary
+            splats_of_camera(splats, c), channels[c], bins, None if marks is None else marks[c], num_primary
         )
         for c in range(bins.num_cameras)
     ]
@@ -78,5 +78,6 @@ def active_pixels(bins: TileBins) -> Tensor:
     return pixels[:, : bins.height, : bins.width]
 
 
-def _camera_splats(splats: Splats, camera: int) -> Splats:
+def splats_of_camera(splats: Splats, camera: int) -> Splats:
+    """The splats of one camera, [G, ...]."""
     return Splats(*(tensor[camera] for tensor in splats))

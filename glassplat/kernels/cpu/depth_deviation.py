@@ -1,0 +1,228 @@
+"""Blended distance of splats from a depth map: as `composite` with one channel that differs from pixel to pixel."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numba import prange
+from numpy.typing import NDArray
+from torch import Tensor
+
+from glassplat.kernels.cpu import tile
+from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
+from glassplat.kernels.cpu.pair_gradients import new_pair_rows, sum_pair_rows
+from glassplat.kernels.maths_blend import ALPHA_MAX, TRANSMITTANCE_MIN, Scalar, blend_maths
+from glassplat.kernels.splats import Splats, TileBins
+
+DEPTH, SUM = 4 * tile.PLANE, 5 * tile.PLANE
+FORWARD_PLANES = 6
+
+# In the backward pass, LANES holds rows of 16 column sums: g, g dy, g dy^2, then the gradient of the splat's depth.
+BEHIND, V_SUM, V_DEPTH, LANES = 5 * tile.PLANE, 6 * tile.PLANE, 7 * tile.PLANE, 8 * tile.PLANE
+LANE_DEPTH = LANES + 48
+BACKWARD_PLANES = 9
+
+
+class SavedTiles(NamedTuple):
+    """What the backward pass needs from the forward pass: packed splats and each active tile's final state."""
+
+    packed: NDArray[Any]
+    state: NDArray[Any]
+
+
+def depth_deviation(
+    splats: Splats, depth_map: Tensor, bins: TileBins, *, num_primary: int
+) -> tuple[Tensor, SavedTiles]:
+    """Deviation [C, H, W], and what `depth_deviation_gradients` starts from."""
+    real = tile.real_of(splats)
+    count = splats.opacities.numel()
+    saved = SavedTiles(
+        np.zeros((count, tile.packed_width(1)), real),
+        np.empty((len(bins.active), tile.STATE_PLANES, tile.PIXELS), real),
+    )
+    deviation = torch.zeros_like(depth_map)
+    _forward(real)(
+        splats.means2d.numpy().reshape(-1, 2), splats.conics.numpy().reshape(-1, 3),
+        splats.opacities.numpy().reshape(-1), splats.depths.numpy().reshape(-1), depth_map.numpy(),
+        splats.opacities.shape[1], num_primary, bins.pair_splats.numpy(), bins.tile_offsets.numpy(),
+        bins.splat_offsets.numpy(), bins.active.numpy(), saved.packed, saved.state, deviation.numpy(),
+    )  # fmt: skip
+    return deviation, saved
+
+
+def depth_deviation_gradients(
+    splats: Splats, depth_map: Tensor, bins: TileBins, saved: SavedTiles, v_deviation: Tensor, *, num_primary: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Gradients of means2d, conics, opacities, depths and the depth map."""
+    real = tile.real_of(splats)
+    rows = new_pair_rows(bins, 1, real)
+    v_depth_map = torch.zeros_like(depth_map)
+    _backward(real)(
+        splats.conics.numpy().reshape(-1, 3), depth_map.numpy(), splats.opacities.shape[1], num_primary,
+        bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), saved.packed, saved.state,
+        v_deviation.contiguous().numpy(), rows, v_depth_map.numpy(),
+    )  # fmt: skip
+    v_means, v_conics, v_opacities, v_depths = sum_pair_rows(rows, bins, splats)
+    return v_means, v_conics, v_opacities, v_depths[..., 0], v_depth_map
+
+
+def _blend(real: type) -> Scalar:
+    maths = blend_maths(real)
+    exp2, clipped_alpha, row_range = maths.exp2, maths.clipped_alpha, maths.row_range
+    zero, half, t_min = real(0.0), real(0.5), real(TRANSMITTANCE_MIN)
+    T, LAST, VALUES = tile.T, tile.LAST, tile.VALUES
+
+    @inlined
+    def blend(scratch, splat, order, x0, y0, num_rows):
+        mean_x, mean_y = splat[0] - real(x0), splat[1] - real(y0)
+        xx, xy, yy, opacity, depth = splat[2], splat[3], splat[4], splat[5], splat[VALUES]
+        first, last = row_range(mean_y, splat[6], num_rows)
+        for row in range(first, last):
+            base = (row & 15) * 16
+            dy = real(row) + half - mean_y
+            linear, constant = xy * dy, yy * dy * dy
+            for i in range(16):
+                dx = real(np.int32(i)) + half - mean_x
+                a = clipped_alpha(opacity * exp2((xx * dx + linear) * dx + constant))
+                t = scratch[T + base + i]
+                weight = a * t
+                after = t - weight
+                alive = after >= t_min
+                scratch[T + base + i] = after if alive else -abs(t)
+                scratch[LAST + base + i] = order if alive else scratch[LAST + base + i]
+                weight = weight if alive else zero
+                scratch[SUM + base + i] += weight * abs(depth - scratch[DEPTH + base + i])
+
+    return blend
+
+
+@functools.cache
+def _forward(real: type) -> Kernel:
+    pack, place, begin, is_finished, save_state, _, _ = tile.tile_functions(real)
+    blend = _blend(real)
+    zero = real(0.0)
+    PLANE, VALUES = tile.PLANE, tile.VALUES
+
+    @kernel("depth_deviation_forward", real)
+    def forward(
+        means, conics, opacities, depths, depth_map, splats_per_camera, num_primary,
+        pair_splats, tile_offsets, splat_offsets, active, packed, state, deviation,
+    ):  # fmt: skip
+        for s in prange(opacities.size):
+            if splat_offsets[s + 1] > splat_offsets[s]:
+                pack(packed, s, means, conics, opacities)
+                packed[s, VALUES] = depths[s]
+        for n in prange(active.size):
+            camera, x0, y0, columns, rows = place(active[n], depth_map.shape[2], depth_map.shape[1])
+            scratch = np.empty(FORWARD_PLANES * PLANE, real)
+            scratch[:] = zero
+            begin(scratch, columns, rows)
+            for y in range(rows):
+                for x in range(columns):
+                    scratch[DEPTH + (y & 15) * 16 + (x & 15)] = depth_map[camera, y0 + y, x0 + x]
+            start = tile_offsets[active[n]]
+            for p in range(start, tile_offsets[active[n] + 1]):
+                if (p - start) % 8 == 7 and is_finished(scratch):
+                    break
+                s = pair_splats[p]
+                if s - camera * splats_per_camera < num_primary:
+                    blend(scratch, packed[s], real(np.int32(p - start)), x0, y0, rows)
+            save_state(state, n, scratch)
+            for y in range(rows):
+                for x in range(columns):
+                    deviation[camera, y0 + y, x0 + x] = scratch[SUM + (y & 15) * 16 + (x & 15)]
+
+    return forward
+
+
+def _unblend(real: type) -> Scalar:
+    maths = blend_maths(real)
+    exp2, clipped_alpha, row_range = maths.exp2, maths.clipped_alpha, maths.row_range
+    zero, half, one, alpha_max = real(0.0), real(0.5), real(1.0), real(ALPHA_MAX)
+    T, LAST, VALUES = tile.T, tile.LAST, tile.VALUES
+
+    @inlined
+    def unblend(scratch, splat, order, x0, y0, num_rows):
+        """Adds up this splat's lane sums; returns whether it reaches any row."""
+        mean_x, mean_y = splat[0] - real(x0), splat[1] - real(y0)
+        xx, xy, yy, opacity, depth = splat[2], splat[3], splat[4], splat[5], splat[VALUES]
+        first, last = row_range(mean_y, splat[6], num_rows)
+        for row in range(first, last):
+            base = (row & 15) * 16
+            dy = real(row) + half - mean_y
+            linear, constant = xy * dy, yy * dy * dy
+            for i in range(16):
+                dx = real(np.int32(i)) + half - mean_x
+                coverage = opacity * exp2((xx * dx + linear) * dx + constant)
+                a = clipped_alpha(coverage) if order <= scratch[LAST + base + i] else zero
+                inverse = one / (one - a)
+                t = scratch[T + base + i] * inverse
+                weight = a * t
+                difference = depth - scratch[DEPTH + base + i]
+                v_sum = scratch[V_SUM + base + i]
+                dot = v_sum * abs(difference)
+                behind = scratch[BEHIND + base + i]
+                v_alpha = t * dot - behind * inverse
+                scratch[BEHIND + base + i] = behind + weight * dot
+                scratch[T + base + i] = t
+                gain = v_alpha * a if coverage < alpha_max else zero
+                scratch[LANES + i] += gain
+                scratch[LANES + 16 + i] += gain * dy
+                scratch[LANES + 32 + i] += gain * dy * dy
+                v_difference = weight * v_sum
+                v_difference = v_difference if difference > zero else -v_difference
+                v_difference = v_difference if difference != zero else zero
+                scratch[LANE_DEPTH + i] += v_difference
+                scratch[V_DEPTH + base + i] -= v_difference
+        return first < last
+
+    return unblend
+
+
+@functools.cache
+def _backward(real: type) -> Kernel:
+    _, place, _, _, _, load_state, geometry_gradient = tile.tile_functions(real)
+    unblend = _unblend(real)
+    zero = real(0.0)
+    PLANE, V_VALUES = tile.PLANE, tile.V_VALUES
+
+    @kernel("depth_deviation_backward", real)
+    def backward(
+        conics, depth_map, splats_per_camera, num_primary,
+        pair_splats, tile_offsets, active, packed, state, v_deviation, out, v_depth_map,
+    ):  # fmt: skip
+        for n in prange(active.size):
+            camera, x0, y0, columns, rows = place(active[n], depth_map.shape[2], depth_map.shape[1])
+            scratch = np.empty(BACKWARD_PLANES * PLANE, real)
+            scratch[:] = zero
+            looked_at = load_state(state, n, scratch)
+            for y in range(rows):
+                for x in range(columns):
+                    i = (y & 15) * 16 + (x & 15)
+                    scratch[DEPTH + i] = depth_map[camera, y0 + y, x0 + x]
+                    scratch[V_SUM + i] = v_deviation[camera, y0 + y, x0 + x]
+            start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
+            out[start + looked_at : stop] = zero
+            for k in range(looked_at):
+                p = start + looked_at - 1 - k
+                s = pair_splats[p]
+                scratch[LANES : LANES + 64] = zero
+                order = real(np.int32(p - start))
+                glass = s - camera * splats_per_camera >= num_primary
+                if glass or not unblend(scratch, packed[s], order, x0, y0, rows):
+                    out[p, :] = zero
+                    continue
+                mean_x, opacity = packed[s, 0] - real(x0), packed[s, 5]
+                geometry_gradient(out, p, scratch, LANES, mean_x, conics[s, 0], conics[s, 1], conics[s, 2], opacity)
+                total = zero
+                for i in range(16):
+                    total += scratch[LANE_DEPTH + i]
+                out[p, V_VALUES] = total
+            for y in range(rows):
+                for x in range(columns):
+                    v_depth_map[camera, y0 + y, x0 + x] = scratch[V_DEPTH + (y & 15) * 16 + (x & 15)]
+
+    return backward
