@@ -243,3 +243,56 @@ def _screen_gradients(real: type) -> tuple[Scalar, Scalar]:
         return gw_x, gw_y, g_axes
 
     return covariance_gradient, footprint_gradient
+
+
+class EllipseMaths(NamedTuple):
+    """The region of the screen where a splat's coverage is at least `ALPHA_MIN`, an ellipse around its centre.
+
+    In double precision throughout, because the determinant of a needle's conic is a small difference of large products.
+
+    Attributes:
+        half_height: largest |dy| in the ellipse; negative where there is none, infinite where the conic is degenerate.
+        outline: what `band` needs, (slope, widening, half height, dy of the rightmost point).
+        band: lowest and highest dx of the ellipse over dy in [low, high], which must overlap it.
+    """
+
+    half_height: Scalar
+    outline: Scalar
+    band: Scalar
+
+
+def ellipse_maths() -> EllipseMaths:
+    """Builds the functions."""
+
+    @inlined
+    def half_height(xx, xy, yy, opacity):
+        visible = opacity / ALPHA_MIN
+        if not visible >= 1.0:
+            return -1.0
+        determinant = xx * yy - xy * xy
+        if not (determinant > 0.0 and xx > 0.0):
+            return np.inf
+        # Compositing evaluates the quadratic form in single precision, where its terms cancel the more the longer the
+        # needle: the bound is widened by that error, so that no pixel is lost to rounding.
+        bound = 2.0 * math.log(visible) * (1.0 + 1e-6 * xx * yy / determinant) + 2e-3
+        return math.sqrt(bound * xx / determinant)
+
+    @inlined
+    def outline(xx, xy, yy, height):
+        if not height < np.inf:
+            return 0.0, np.inf, height, 0.0
+        widening = math.sqrt(xx * yy - xy * xy) / xx
+        # At the rightmost point dx = height sqrt(yy / xx), the form's derivative along y vanishes.
+        return -xy / xx, widening, height, -xy / math.sqrt(xx * yy) * height
+
+    @inlined
+    def band(shape, low, high):
+        slope, widening, height, rightmost = shape
+        if not height < np.inf:
+            return -np.inf, np.inf
+        at_right, at_left = min(max(rightmost, low), high), min(max(-rightmost, low), high)
+        right = slope * at_right + widening * math.sqrt(max(height * height - at_right * at_right, 0.0))
+        left = slope * at_left - widening * math.sqrt(max(height * height - at_left * at_left, 0.0))
+        return left, right
+
+    return EllipseMaths(half_height, outline, band)
