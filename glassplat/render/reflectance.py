@@ -47,6 +47,8 @@ def nearest_hits(planes: Planes, camera: Camera) -> Tensor:
     A pixel belongs to at most one plane: where rectangles overlap in the image the nearest wins.
     Not differentiable (piecewise constant).
     """
+    if len(planes) == 0:
+        return torch.zeros(0, camera.height, camera.width, dtype=torch.bool, device=camera.cam_from_world.device)
     with torch.no_grad():
         grid = PixelGrid.of(camera)
         normals = planes.normals
