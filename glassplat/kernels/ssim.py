@@ -52,7 +52,8 @@ class _Ssim(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_mean: Tensor) -> tuple[Tensor, None]:
-        return cpu.ssim_gradient(*ctx.saved_tensors, v_mean.item()), None
+        image, target, slopes = ctx.saved_tensors
+        return cpu.ssim_gradient(image, target, slopes, v_mean.item()), None
 
 
 def _as_real(target: Tensor, image: Tensor) -> Tensor:

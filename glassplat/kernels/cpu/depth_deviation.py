@@ -117,7 +117,7 @@ def _forward(real: type) -> Kernel:
                 packed[s, VALUES] = depths[s]
         for n in prange(active.size):
             camera, x0, y0, columns, rows = place(active[n], depth_map.shape[2], depth_map.shape[1])
-            scratch = np.empty(FORWARD_PLANES * PLANE, real)
+            scratch: NDArray[Any] = np.empty(FORWARD_PLANES * PLANE, real)
             scratch[:] = zero
             begin(scratch, columns, rows)
             for y in range(rows):
@@ -196,7 +196,7 @@ def _backward(real: type) -> Kernel:
     ):  # fmt: skip
         for n in prange(active.size):
             camera, x0, y0, columns, rows = place(active[n], depth_map.shape[2], depth_map.shape[1])
-            scratch = np.empty(BACKWARD_PLANES * PLANE, real)
+            scratch: NDArray[Any] = np.empty(BACKWARD_PLANES * PLANE, real)
             scratch[:] = zero
             looked_at = load_state(state, n, scratch)
             for y in range(rows):

@@ -25,13 +25,17 @@ C1, C2 = 0.01**2, 0.03**2
 CHANNELS = 3
 
 ROWS = 32
-COLUMNS = 240  # A multiple of the three channels; counts floats, not pixels.
+COLUMNS = 240
+"""Columns of a tile; like all columns here, floats and not pixels."""
 MARGIN = RADIUS * CHANNELS
 STRIDE = COLUMNS + 2 * MARGIN + 2
 PLANE = (ROWS + 2 * RADIUS) * STRIDE
-# Planes of one tile with its margin, then one row of each after the vertical blur.
+# Planes of one tile with its margin, then one row of each after the vertical blur, then rows of results. One flat buffer
+# with offsets known to the compiler lets it see that they never overlap, so that every loop becomes vector instructions.
 PLANES = 4
 BLURRED = PLANES * PLANE
+RESULTS = BLURRED + PLANES * STRIDE
+SCRATCH = RESULTS + PLANES * STRIDE
 
 
 def ssim(image: Tensor, target: Tensor, *, with_slopes: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -43,7 +47,7 @@ def ssim(image: Tensor, target: Tensor, *, with_slopes: bool) -> tuple[Tensor, T
     height, width, _ = image.shape
     similarity = torch.empty_like(image)
     slopes = image.new_empty(3 if with_slopes else 0, height, width, CHANNELS)
-    sums = np.zeros(_tile_rows(height) * _tile_columns(width), np.float64)
+    sums = np.zeros(-(-height // ROWS), np.float64)
     _forward(real)(_rows(image), _rows(target), _rows(similarity), _planes(slopes), sums)
     return image.new_tensor(sums.sum() / image.numel()), similarity, slopes
 
@@ -72,14 +76,6 @@ def _rows(image: Tensor) -> NDArray[Any]:
 
 def _planes(slopes: Tensor) -> NDArray[Any]:
     return slopes.numpy().reshape(*slopes.shape[:2], slopes.shape[2] * CHANNELS)
-
-
-def _tile_rows(height: int) -> int:
-    return -(-height // ROWS)
-
-
-def _tile_columns(width: int) -> int:
-    return -(-width * CHANNELS // COLUMNS)
 
 
 def _blur(real: type) -> Scalar:
@@ -111,55 +107,76 @@ def _blur_row(real: type) -> Scalar:
     return blur_row
 
 
+def _load_row(real: type) -> Scalar:
+    zero = real(0.0)
+
+    @inlined
+    def load_row(scratch, at, image, y, left):
+        """Copies a tile's row with its margin; what lies beyond the image is zero."""
+        for j in range(STRIDE):
+            scratch[at + j] = zero
+        if y < 0 or y >= image.shape[0]:
+            return
+        values, skipped = image[y, max(0, left - MARGIN) : left + COLUMNS + MARGIN], max(0, MARGIN - left) & 15
+        for j in range(values.size):
+            scratch[at + skipped + j] = values[j]
+
+    return load_row
+
+
 @functools.cache
 def _forward(real: type) -> Kernel:
-    blur, blur_row = _blur(real), _blur_row(real)
+    blur, blur_row, load_row = _blur(real), _blur_row(real), _load_row(real)
     zero, one, two, c1, c2 = real(0.0), real(1.0), real(2.0), real(C1), real(C2)
 
     @inlined
     def load(scratch, image, target, top, left):
         for row in range(ROWS + 2 * RADIUS):
-            y, at = top - RADIUS + row, (row & 63) * STRIDE
-            if y < 0 or y >= image.shape[0]:
-                continue
-            first, last = max(0, MARGIN - left), min(COLUMNS + 2 * MARGIN, image.shape[1] - left + MARGIN)
-            for j in range(first, last):
-                a, b = image[y, left - MARGIN + j], target[y, left - MARGIN + j]
-                scratch[at + j] = a
-                scratch[PLANE + at + j] = b
+            at = (row & 63) * STRIDE
+            load_row(scratch, at, image, top - RADIUS + row, left)
+            load_row(scratch, PLANE + at, target, top - RADIUS + row, left)
+            for j in range(STRIDE):
+                a, b = scratch[at + j], scratch[PLANE + at + j]
                 scratch[2 * PLANE + at + j] = a * a + b * b
                 scratch[3 * PLANE + at + j] = a * b
+
+    @inlined
+    def compare_row(scratch):
+        """Similarity of one row and its slopes, from the blurred rows."""
+        for j in range(COLUMNS):
+            mean_a = blur(scratch, BLURRED + j, CHANNELS)
+            mean_b = blur(scratch, BLURRED + STRIDE + j, CHANNELS)
+            squares = blur(scratch, BLURRED + 2 * STRIDE + j, CHANNELS)
+            product = blur(scratch, BLURRED + 3 * STRIDE + j, CHANNELS)
+            means, mean_squares = mean_a * mean_b, mean_a * mean_a + mean_b * mean_b
+            a1, a2 = two * means + c1, two * (product - means) + c2
+            b1, b2 = one / (mean_squares + c1), one / (squares - mean_squares + c2)
+            value = a1 * a2 * b1 * b2
+            scratch[RESULTS + j] = value
+            scratch[RESULTS + STRIDE + j] = two * (mean_b * (a2 - a1) * b1 * b2 + mean_a * value * (b2 - b1))
+            scratch[RESULTS + 2 * STRIDE + j] = -value * b2
+            scratch[RESULTS + 3 * STRIDE + j] = two * a1 * b1 * b2
 
     @kernel("ssim_forward", real)
     def forward(image, target, similarity, slopes, sums):
         height, width = image.shape
-        tile_columns = (width + COLUMNS - 1) // COLUMNS
         for n in prange(sums.size):
-            top, left = n // tile_columns * ROWS, n % tile_columns * COLUMNS
-            rows, columns = min(ROWS, height - top), min(COLUMNS, width - left)
-            scratch = np.zeros(PLANES * (PLANE + STRIDE), real)
-            load(scratch, image, target, top, left)
-            total = 0.0
-            for row in range(rows):
-                blur_row(scratch, row, PLANES)
-                y, row_sum = top + row, zero
-                for j in range(columns):
-                    mean_a = blur(scratch, BLURRED + j, CHANNELS)
-                    mean_b = blur(scratch, BLURRED + STRIDE + j, CHANNELS)
-                    squares = blur(scratch, BLURRED + 2 * STRIDE + j, CHANNELS)
-                    product = blur(scratch, BLURRED + 3 * STRIDE + j, CHANNELS)
-                    means, mean_squares = mean_a * mean_b, mean_a * mean_a + mean_b * mean_b
-                    a1, a2 = two * means + c1, two * (product - means) + c2
-                    b1, b2 = one / (mean_squares + c1), one / (squares - mean_squares + c2)
-                    value = a1 * a2 * b1 * b2
-                    row_sum += value
-                    similarity[y, left + j] = value
-                    if slopes.shape[0] > 0:
-                        by_mean = two * (mean_b * (a2 - a1) * b1 * b2 + mean_a * value * (b2 - b1))
-                        slopes[0, y, left + j] = by_mean
-                        slopes[1, y, left + j] = -value * b2
-                        slopes[2, y, left + j] = two * a1 * b1 * b2
-                total += row_sum
+            top, total = n * ROWS, 0.0
+            scratch: NDArray[Any] = np.empty(SCRATCH, real)
+            for left in range(0, width, COLUMNS):
+                load(scratch, image, target, top, left)
+                for y in range(top, min(top + ROWS, height)):
+                    blur_row(scratch, y - top, PLANES)
+                    compare_row(scratch)
+                    out, row_sum = similarity[y, left : left + COLUMNS], zero
+                    for j in range(out.size):
+                        out[j] = scratch[RESULTS + j]
+                        row_sum += scratch[RESULTS + j]
+                    total += row_sum
+                    for plane in range(slopes.shape[0]):
+                        out, at = slopes[plane, y, left : left + COLUMNS], RESULTS + (1 + (plane & 3)) * STRIDE
+                        for j in range(out.size):
+                            out[j] = scratch[at + j]
             sums[n] = total
 
     return forward
@@ -167,37 +184,30 @@ def _forward(real: type) -> Kernel:
 
 @functools.cache
 def _backward(real: type) -> Kernel:
-    blur, blur_row = _blur(real), _blur_row(real)
+    blur, blur_row, load_row = _blur(real), _blur_row(real), _load_row(real)
     two = real(2.0)
-
-    @inlined
-    def load(scratch, slopes, top, left):
-        for row in range(ROWS + 2 * RADIUS):
-            y, at = top - RADIUS + row, (row & 63) * STRIDE
-            if y < 0 or y >= slopes.shape[1]:
-                continue
-            first, last = max(0, MARGIN - left), min(COLUMNS + 2 * MARGIN, slopes.shape[2] - left + MARGIN)
-            for plane in range(3):
-                for j in range(first, last):
-                    scratch[plane * PLANE + at + j] = slopes[plane, y, left - MARGIN + j]
 
     @kernel("ssim_backward", real)
     def backward(image, target, slopes, scale, v_image):
         height, width = image.shape
-        tile_rows, tile_columns = (height + ROWS - 1) // ROWS, (width + COLUMNS - 1) // COLUMNS
-        for n in prange(tile_rows * tile_columns):
-            top, left = n // tile_columns * ROWS, n % tile_columns * COLUMNS
-            rows, columns = min(ROWS, height - top), min(COLUMNS, width - left)
-            scratch = np.zeros(PLANES * (PLANE + STRIDE), real)
-            load(scratch, slopes, top, left)
-            for row in range(rows):
-                blur_row(scratch, row, 3)
-                y = top + row
-                for j in range(columns):
-                    by_mean = blur(scratch, BLURRED + j, CHANNELS)
-                    by_squares = blur(scratch, BLURRED + STRIDE + j, CHANNELS)
-                    by_product = blur(scratch, BLURRED + 2 * STRIDE + j, CHANNELS)
-                    a, b = image[y, left + j], target[y, left + j]
-                    v_image[y, left + j] = scale * (by_mean + two * a * by_squares + b * by_product)
+        for n in prange((height + ROWS - 1) // ROWS):
+            top = n * ROWS
+            scratch: NDArray[Any] = np.empty(SCRATCH, real)
+            for left in range(0, width, COLUMNS):
+                for plane in range(3):
+                    for row in range(ROWS + 2 * RADIUS):
+                        at = (plane & 3) * PLANE + (row & 63) * STRIDE
+                        load_row(scratch, at, slopes[plane], top - RADIUS + row, left)
+                for y in range(top, min(top + ROWS, height)):
+                    blur_row(scratch, y - top, 3)
+                    for j in range(COLUMNS):
+                        scratch[RESULTS + j] = blur(scratch, BLURRED + j, CHANNELS)
+                        scratch[RESULTS + STRIDE + j] = blur(scratch, BLURRED + STRIDE + j, CHANNELS)
+                        scratch[RESULTS + 2 * STRIDE + j] = blur(scratch, BLURRED + 2 * STRIDE + j, CHANNELS)
+                    a, b = image[y, left : left + COLUMNS], target[y, left : left + COLUMNS]
+                    out = v_image[y, left : left + COLUMNS]
+                    for j in range(out.size):
+                        by_squares, by_product = scratch[RESULTS + STRIDE + j], scratch[RESULTS + 2 * STRIDE + j]
+                        out[j] = scale * (scratch[RESULTS + j] + two * a[j] * by_squares + b[j] * by_product)
 
     return backward
