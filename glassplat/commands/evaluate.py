@@ -16,7 +16,16 @@ from glassplat.evaluate.report import write_report
 from glassplat.train.checkpoint import load_checkpoint
 from glassplat.train.run_directory import write_text
 
-SHOWN = ("psnr", "ssim", "lpips", "pane_psnr", "transmission_psnr", "reflection_psnr", "num_gaussians", "seconds_per_frame")
+SHOWN = (
+    "psnr",
+    "ssim",
+    "lpips",
+    "pane_psnr",
+    "transmission_psnr",
+    "reflection_psnr",
+    "num_gaussians",
+    "seconds_per_frame",
+)
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,5 @@ def open_run(path: Path) -> StoredRun:
     directory = RunDirectory(path)
     recipe, settings = directory.recipe(), directory.settings()
     scene, iterations = directory.latest_scene()
-    dataset = load_dataset(
-        Path(settings.data), downscale=settings.downscale, mask_polarity=settings.mask_polarity
-    )
+    dataset = load_dataset(Path(settings.data), downscale=settings.downscale, mask_polarity=settings.mask_polarity)
     return StoredRun(directory, recipe, scene, recipe.renderer(), dataset, iterations)

@@ -61,9 +61,7 @@ class Train:
         )
         directory = RunDirectory(self.output)
         with TrainingProgress(console, self.iterations) as progress:
-            state = run_training(
-                self.recipe, settings, directory, dataset, resume=self.resume, listen=progress.show
-            )
+            state = run_training(self.recipe, settings, directory, dataset, resume=self.resume, listen=progress.show)
         console.print(
             f"trained {self.recipe.method} for {state.step} iterations in {state.seconds:.0f} s: "
             f"{len(state.scene.primary)} Gaussians, {len(state.scene.planes)} panes -> {self.output}"

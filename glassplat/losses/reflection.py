@@ -36,4 +36,3 @@ def mask_loss(frame: Frame, view: View, scene: Scene) -> Tensor | None:
         return None
     annotated = (view.pane_labels > 0).to(frame.rgb.device).to(frame.rgb.dtype)
     return (frame.layers["mask"] - annotated).abs().mean()
-

@@ -32,9 +32,7 @@ def project_gaussians(
         clip_planes: [C, 4] world planes (n, d); a Gaussian whose centre has n . x + d <= 0 is culled.
     """
     poses = camera.cam_from_world[None] if poses is None else poses
-    raw = RawGaussians(
-        gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh
-    )
+    raw = RawGaussians(gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh)
     cameras = CameraBatch(
         poses, camera.intrinsics.expand(poses.shape[0], 4).contiguous(), camera.width, camera.height, clip_planes
     )
@@ -61,4 +59,6 @@ def over_background(image: Tensor, alpha: Tensor, background: tuple[float, float
 def mean_depth(depth_sum: Tensor, alpha: Tensor) -> Tensor:
     """Blended depth (TR-Gaussians, Eq. 4): weighted depth sum over total weight; 0 where nothing is."""
     covered = alpha > 1e-6
-    return torch.where(covered, depth_sum / torch.where(covered, alpha, torch.ones_like(alpha)), torch.zeros_like(alpha))
+    return torch.where(
+        covered, depth_sum / torch.where(covered, alpha, torch.ones_like(alpha)), torch.zeros_like(alpha)
+    )

@@ -50,7 +50,10 @@ class Camera:
         matrix = self.cam_from_world
         x = (torch.arange(self.width, dtype=matrix.dtype, device=matrix.device) + 0.5 - self.cx) / self.fx
         y = (torch.arange(self.height, dtype=matrix.dtype, device=matrix.device) + 0.5 - self.cy) / self.fy
-        in_camera = torch.stack([x.expand(self.height, -1), y[:, None].expand(-1, self.width), torch.ones_like(x).expand(self.height, -1)], dim=-1)
+        in_camera = torch.stack(
+            [x.expand(self.height, -1), y[:, None].expand(-1, self.width), torch.ones_like(x).expand(self.height, -1)],
+            dim=-1,
+        )
         in_world = in_camera @ matrix[:3, :3]
         return in_world / in_world.norm(dim=-1, keepdim=True)
 

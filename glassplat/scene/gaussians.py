@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -39,9 +39,13 @@ class Gaussians:
         count = self.means.shape[0]
         for name, tensor in self.tensors().items():
             if tensor.shape[0] != count:
-                raise ValueError(f"{name} has {tensor.shape[0]} rows where means has {count}; every tensor needs one row per Gaussian")
+                raise ValueError(
+                    f"{name} has {tensor.shape[0]} rows where means has {count}; every tensor needs one row per Gaussian"
+                )
         if not 0 <= self.active_sh_degree <= max(self.max_sh_degree, 0):
-            raise ValueError(f"active_sh_degree is {self.active_sh_degree}, but sh holds degrees up to {self.max_sh_degree}")
+            raise ValueError(
+                f"active_sh_degree is {self.active_sh_degree}, but sh holds degrees up to {self.max_sh_degree}"
+            )
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -62,7 +66,7 @@ class Gaussians:
             raise ValueError(f"unknown tensors {sorted(unknown)}; this set has {sorted(self.tensors())}")
         merged = self.tensors() | dict(tensors)
         channels = {name: merged.pop(name) for name in self.channels}
-        return replace(self, **merged, channels=channels)
+        return Gaussians(**merged, channels=channels, active_sh_degree=self.active_sh_degree)
 
     def select(self, index: Tensor) -> Gaussians:
         """The Gaussians at `index` (a boolean mask [N] or integer indices)."""

@@ -38,7 +38,9 @@ class Planes:
     def __post_init__(self) -> None:
         for name, tensor in self.tensors().items():
             if tensor.shape[0] != len(self.labels):
-                raise ValueError(f"{name} has {tensor.shape[0]} rows for {len(self.labels)} plane labels; expected one row per plane")
+                raise ValueError(
+                    f"{name} has {tensor.shape[0]} rows for {len(self.labels)} plane labels; expected one row per plane"
+                )
 
     def __len__(self) -> int:
         return len(self.labels)

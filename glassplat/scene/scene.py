@@ -62,4 +62,6 @@ class Scene:
 
     def to(self, device: torch.device | str) -> Scene:
         """The same scene on another device."""
-        return replace(self, primary=self.primary.to(device), glass=self.glass.to(device), planes=self.planes.to(device))
+        return replace(
+            self, primary=self.primary.to(device), glass=self.glass.to(device), planes=self.planes.to(device)
+        )

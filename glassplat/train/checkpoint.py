@@ -66,15 +66,22 @@ def load_checkpoint(path: Path) -> TrainState:
             header = json.loads((opened.metadata() or {}).get("glassplat", "{}"))
             tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
     except (SafetensorError, ValueError) as error:
-        raise InputError(f"{path} is truncated or not a checkpoint ({error}); use an older one or train again") from error
+        raise InputError(
+            f"{path} is truncated or not a checkpoint ({error}); use an older one or train again"
+        ) from error
     if header.get("format") != FORMAT:
-        raise InputError(f"{path} has format {header.get('format')!r}; expected {FORMAT!r}, as glassplat's training writes it")
+        raise InputError(
+            f"{path} has format {header.get('format')!r}; expected {FORMAT!r}, as glassplat's training writes it"
+        )
     return restored_state(header, tensors)
 
 
 def restored_state(header: dict, tensors: dict[str, Tensor]) -> TrainState:
     """The training state of a checkpoint's header and tensors."""
-    sets = {part: restored_gaussians(under(tensors, f"scene/{part}/"), degree) for part, degree in header["active_sh_degree"].items()}
+    sets = {
+        part: restored_gaussians(under(tensors, f"scene/{part}/"), degree)
+        for part, degree in header["active_sh_degree"].items()
+    }
     planes = Planes(**under(tensors, "scene/planes/"), labels=tuple(header["labels"]))
     first, second = under(tensors, "first/"), under(tensors, "second/")
     statistics = under(tensors, "statistics/")

@@ -53,7 +53,9 @@ class Optimizer:
     moments: Moments = field(default_factory=dict)
     updates: dict[str, int] = field(default_factory=dict)
 
-    def step(self, parameters: Mapping[str, Tensor], gradients: Mapping[str, Tensor], rates: Mapping[str, float | Tensor]) -> None:
+    def step(
+        self, parameters: Mapping[str, Tensor], gradients: Mapping[str, Tensor], rates: Mapping[str, float | Tensor]
+    ) -> None:
         """Updates `parameters` in place for every name in `gradients`."""
         for name, gradient in gradients.items():
             parameter = parameters[name]

@@ -61,7 +61,9 @@ def prepare(recipe: Any, settings: RunSettings, directory: RunDirectory, dataset
             )
         return load_checkpoint(directory.checkpoint)
     if directory.checkpoint.exists() or directory.results.exists():
-        raise InputError(f"{directory.path} already holds a run; pass --resume to go on with it, or choose another --output")
+        raise InputError(
+            f"{directory.path} already holds a run; pass --resume to go on with it, or choose another --output"
+        )
     directory.begin(recipe, settings, dataset)
     return TrainState(recipe.initialise(dataset), settings.seed)
 

@@ -99,7 +99,9 @@ class RunDirectory:
         """The exported scene of the highest iteration, and that iteration."""
         folders = {int(f.name.rpartition("_")[2]): f for f in self.path.glob("point_cloud/iteration_*")}
         if not folders:
-            raise InputError(f"{self.path} holds no point_cloud/iteration_N; expected a finished run. Train first, or --resume it")
+            raise InputError(
+                f"{self.path} holds no point_cloud/iteration_N; expected a finished run. Train first, or --resume it"
+            )
         step = max(folders)
         try:
             return read_scene(folders[step]), step
@@ -109,7 +111,9 @@ class RunDirectory:
     def _read(self, name: str) -> str:
         file = self.path / name
         if not file.is_file():
-            raise InputError(f"{self.path} is not a run directory: no {name} in it; expected what `glassplat train --output` wrote")
+            raise InputError(
+                f"{self.path} is not a run directory: no {name} in it; expected what `glassplat train --output` wrote"
+            )
         return file.read_text()
 
 

@@ -41,7 +41,9 @@ def test_train_eval_render(method: str, tmp_path: Path) -> None:
     assert json.loads((run / "per_view.json").read_text())
     assert len(list((run / "sheets").glob("*.png"))) == results["num_test_views"]
     assert (run / "index.html").is_file()
-    layers = ["rgb", "depth"] if method == "splat" else ["rgb", "transmission", "reflection", "strength", "mask", "depth"]
+    layers = (
+        ["rgb", "depth"] if method == "splat" else ["rgb", "transmission", "reflection", "strength", "mask", "depth"]
+    )
     assert main(["render", str(run), "--layers", *layers, "--split", "test", "--output", str(tmp_path / "out")]) == 0
     assert all(len(list((tmp_path / "out" / name).glob("*.png"))) == results["num_test_views"] for name in layers)
 

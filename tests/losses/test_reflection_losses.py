@@ -32,7 +32,9 @@ def test_gradient_conflict_counts_shared_edges_inside_the_hit_mask_only() -> Non
     view, scene = SimpleNamespace(), SimpleNamespace()
 
     def value(transmission: torch.Tensor, reflection: torch.Tensor, mask: torch.Tensor) -> float:
-        return float(gradient_conflict(frame_with(transmission=transmission, reflection=reflection, hit=mask), view, scene))
+        return float(
+            gradient_conflict(frame_with(transmission=transmission, reflection=reflection, hit=mask), view, scene)
+        )
 
     assert value(step, step, hit) > 0
     assert value(step, flat, hit) == 0
@@ -59,7 +61,9 @@ def test_mask_loss_applies_to_annotated_views_only() -> None:
 
 def test_depth_deviation_loss_does_not_depend_on_the_unit_of_length() -> None:
     deviation, hit = torch.rand(8, 9), torch.ones(8, 9)
-    metres = depth_deviation_loss(frame_with(deviation=deviation, hit=hit), SimpleNamespace(), SimpleNamespace(extent=2.0))
+    metres = depth_deviation_loss(
+        frame_with(deviation=deviation, hit=hit), SimpleNamespace(), SimpleNamespace(extent=2.0)
+    )
     millimetres = depth_deviation_loss(
         frame_with(deviation=1000 * deviation, hit=hit), SimpleNamespace(), SimpleNamespace(extent=2000.0)
     )

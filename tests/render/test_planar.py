@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tests.render.tiny_scene import camera_at, in_single_precision, joined, pane, showcase
 
 from glassplat.render.planar import Planar, detached
 from glassplat.render.reflectance import nearest_hits, schlick_strength
@@ -15,6 +14,7 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.plane import Planes
 from glassplat.scene.pose import mirror_matrices, rotation_from_quat
 from glassplat.scene.scene import Scene
+from tests.render.tiny_scene import camera_at, in_single_precision, joined, pane, showcase
 
 CAMERA = camera_at(0.0, 0.0, -0.2)
 
@@ -183,9 +183,7 @@ def test_blocked_reflection_gradient_reaches_the_plane_and_not_the_gaussians() -
     means = scene.primary.means.clone().requires_grad_()
     trainable = scene.with_parameters({"planes.centers": centers, "primary.means": means})
     blocked = Planar(reflection_gradient="planes")(trainable, CAMERA)
-    to_means, to_centers = torch.autograd.grad(
-        blocked.layers["reflection"].sum(), [means, centers], allow_unused=True
-    )
+    to_means, to_centers = torch.autograd.grad(blocked.layers["reflection"].sum(), [means, centers], allow_unused=True)
     assert to_means is None and float(to_centers.abs().sum()) > 0
     free = Planar()(trainable, CAMERA).layers["reflection"].sum()
     assert float(torch.autograd.grad(free, means)[0].abs().sum()) > 0

@@ -56,9 +56,7 @@ def joined(*parts: Planes) -> Planes:
 
 
 def concatenated(*parts: Gaussians) -> Gaussians:
-    return parts[0].with_tensors(
-        {name: torch.cat([p.tensors()[name] for p in parts]) for name in parts[0].tensors()}
-    )
+    return parts[0].with_tensors({name: torch.cat([p.tensors()[name] for p in parts]) for name in parts[0].tensors()})
 
 
 def showcase(planes: Planes | None = None) -> Scene:
@@ -66,9 +64,7 @@ def showcase(planes: Planes | None = None) -> Scene:
     behind_pane = random_gaussians(14, (0.0, 0.0, 3.5), seed=1)
     in_room = random_gaussians(16, (0.2, 0.1, -1.5), seed=2)
     glass = random_gaussians(12, (0.0, 0.0, 2.0), seed=3, glass=True)
-    return Scene(
-        primary=concatenated(behind_pane, in_room), glass=glass, planes=planes or pane(2.0), extent=2.0
-    )
+    return Scene(primary=concatenated(behind_pane, in_room), glass=glass, planes=planes or pane(2.0), extent=2.0)
 
 
 def in_single_precision(scene: Scene) -> Scene:

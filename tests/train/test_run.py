@@ -13,8 +13,8 @@ import torch
 
 from glassplat.train.checkpoint import load_checkpoint
 from glassplat.train.messages import Message, StepDone
-from glassplat.train.recipe import recipe_from_json, recipe_to_json
 from glassplat.train.planar_recipe import PlanarRecipe, ReflectionWeights
+from glassplat.train.recipe import recipe_from_json, recipe_to_json
 from glassplat.train.run import run_training
 from glassplat.train.run_directory import RunDirectory, RunSettings
 from glassplat.train.splat_recipe import SplatRecipe

@@ -29,6 +29,8 @@ def tiny_capture() -> Dataset:
         with torch.no_grad():
             photo = (255 * Planar()(scene, camera).rgb.clamp(0, 1)).to(torch.uint8)
             labels = nearest_hits(scene.planes, camera)[0].to(torch.uint8)
-        views.append(View.in_memory(f"{index}.png", camera, photo=photo, pane_labels=labels if index % 3 == 0 else None))
+        views.append(
+            View.in_memory(f"{index}.png", camera, photo=photo, pane_labels=labels if index % 3 == 0 else None)
+        )
     points = PointCloud(scene.primary.means, (255 * torch.rand(len(scene.primary), 3)).to(torch.uint8))
     return Dataset(Path("tiny"), tuple(views), tuple(views[:1]), points, scene.extent, pane_labels=(1,))

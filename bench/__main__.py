@@ -1,0 +1,51 @@
+"""`python -m bench [--write]`: measures everything; with --write, puts the tables into docs/performance.md."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+from pathlib import Path
+
+import numba
+import torch
+
+from bench.kernels import kernel_times, twin_ratios
+from bench.methods import method_costs, scaling
+
+PAGE = Path(__file__).parent.parent / "docs" / "performance.md"
+BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
+
+
+def machine() -> str:
+    """The machine and versions, in one line."""
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        names = [
+            line.partition(":")[2].strip() for line in cpuinfo.read_text().splitlines() if line.startswith("model name")
+        ]
+        model = names[0] if names else model
+    return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}, torch {torch.__version__}, numba {numba.__version__}"
+
+
+def main() -> None:
+    """Measures, prints, and writes if asked to."""
+    parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
+    parser.add_argument("--write", action="store_true", help="put the tables into docs/performance.md")
+    arguments = parser.parse_args()
+    parts = [f"Machine: {machine()}.\n"]
+    print(parts[0])
+    for measure in (kernel_times, twin_ratios, method_costs, scaling):
+        parts.append(measure().markdown())
+        print(parts[-1], flush=True)
+    if arguments.write:
+        page = PAGE.read_text()
+        before, _, rest = page.partition(BEGIN)
+        after = rest.partition(END)[2]
+        PAGE.write_text(f"{before}{BEGIN}\n\n" + "\n".join(parts) + f"\n{END}{after}")
+        print(f"written to {PAGE}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+"""Throughput of the kernels, beside the machine's multiply-add peak and their PyTorch twins."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import torch
+from torch import Tensor
+
+from bench.peak import peak_multiply_adds
+from bench.scene import bench_camera, room
+from bench.table import Table
+from bench.timing import Work, interleaved_seconds, median_seconds, paired_ratio
+from glassplat.kernels import bin_tiles as bin_tiles_module
+from glassplat.kernels.bin_tiles import bin_tiles
+from glassplat.kernels.composite import composite
+from glassplat.kernels.project import project
+from glassplat.kernels.reference import composite as composite_twin
+from glassplat.kernels.reference import project as project_twin
+from glassplat.kernels.reference import ssim as ssim_twin
+from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians, Splats, TileBins
+from glassplat.kernels.ssim import ssim
+from glassplat.render.rasterize import joined_splats
+from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
+
+WIDTH, HEIGHT, COUNT = 480, 352, 100_000
+MULTIPLY_ADDS = 18
+"""Multiply-adds of one pixel-Gaussian evaluation with three channels: offsets and quadratic form 5, exponential 7,
+alpha and transmittance 3, colour 3."""
+
+
+def raw_of(gaussians: Gaussians, trainable: bool = False) -> RawGaussians:
+    """The tensors that `project` takes."""
+    g = gaussians
+    tensors = (g.means, g.quats, g.log_scales, g.logit_opacities, g.sh)
+    return RawGaussians(*(t.clone().requires_grad_() if trainable else t for t in tensors))
+
+
+def batch_of(camera: Camera) -> CameraBatch:
+    """One camera as a batch."""
+    return CameraBatch(camera.cam_from_world[None], camera.intrinsics[None], camera.width, camera.height, None)
+
+
+def visited_pixels(splats: Splats, bins: TileBins) -> int:
+    """Pixel-Gaussian evaluations of a full traversal: for each (tile, splat) pair, 16 pixels in each row it reaches."""
+    tile_of_pair = torch.repeat_interleave(torch.arange(len(bins.tile_offsets) - 1), bins.tile_offsets.diff())
+    columns = -(-bins.width // bin_tiles_module.TILE)
+    top = (tile_of_pair // columns * bin_tiles_module.TILE).float()
+    pair = bins.pair_splats.long()
+    center, reach = splats.means2d[0, :, 1][pair], splats.radii[0, :, 1][pair]
+    first = torch.maximum(torch.ceil(center - reach - 0.5), top)
+    last = torch.minimum(torch.floor(center + reach - 0.5), top + bin_tiles_module.TILE - 1)
+    return int((last - first + 1).clamp(min=0).sum()) * bin_tiles_module.TILE
+
+
+def kernel_times() -> Table:
+    """Milliseconds of every kernel at 100k Gaussians."""
+    camera = bench_camera(WIDTH, HEIGHT)
+    gaussians = room(COUNT)
+    raw, batch = raw_of(gaussians, trainable=True), batch_of(camera)
+    projected = project(raw, batch, sh_degree=3, near=0.03)
+    flat = Projected(*(t.detach() for t in projected))
+    splats = joined_splats(flat)
+    bins = bin_tiles(splats, WIDTH, HEIGHT)
+    leaves = splats._replace(
+        means2d=splats.means2d.clone().requires_grad_(),
+        conics=splats.conics.clone().requires_grad_(),
+        opacities=splats.opacities.clone().requires_grad_(),
+    )
+    colors = flat.colors.clone().requires_grad_()
+    blended = composite(leaves, colors, bins)
+    photo = torch.rand(HEIGHT, WIDTH, 3)
+    image = photo.clone().requires_grad_()
+    similarity = ssim(image, photo)
+    weights = [torch.rand_like(t) for t in projected[:5]]
+    works: dict[str, Work] = {
+        "project forward": lambda: project(raw_of(gaussians), batch, sh_degree=3, near=0.03),
+        "project backward": backward(list(projected[:5]), weights, list(raw)),
+        "bin_tiles": lambda: bin_tiles(splats, WIDTH, HEIGHT),
+        "composite forward": lambda: composite(splats, flat.colors, bins),
+        "composite backward": backward([blended.image], [photo[None]], [*leaves[:3], colors]),
+        "ssim forward": lambda: ssim(photo, photo),
+        "ssim backward": backward([similarity], [torch.tensor(1.0)], [image]),
+    }
+    evaluations = visited_pixels(splats, bins)
+    table = Table(
+        f"Kernels, {COUNT // 1000}k Gaussians (half of them before the camera), SH 3, {WIDTH}x{HEIGHT}",
+        ("kernel", "1 thread, ms", "2 threads, ms", "evaluations/s, 2 threads", "share of peak"),
+        f"{len(bins.pair_splats):,} (tile, splat) pairs, {evaluations:,} pixel-Gaussian evaluations. The peak is measured: "
+        f"{peak_multiply_adds(2) / 1e9:.0f} G multiply-adds/s on two threads; an evaluation counts {MULTIPLY_ADDS} forward "
+        "and twice that backward.",
+    )
+    peak = peak_multiply_adds(2)
+    for name, work in works.items():
+        one, two = at_threads(work, 1), at_threads(work, 2)
+        if name.startswith("composite"):
+            rate = evaluations / two
+            share = rate * MULTIPLY_ADDS * (2 if name.endswith("backward") else 1) / peak
+            table.add(name, 1e3 * one, 1e3 * two, f"{rate / 1e9:.2f} G", f"{100 * share:.0f} %")
+        else:
+            table.add(name, 1e3 * one, 1e3 * two, "", "")
+    return table
+
+
+def backward(outputs: list[Tensor], weights: list[Tensor], inputs: list[Any]) -> Work:
+    """A backward pass that can be repeated."""
+    return lambda: torch.autograd.grad(outputs, inputs, weights, retain_graph=True)
+
+
+def at_threads(work: Work, threads: int) -> float:
+    """Median seconds on a number of threads."""
+    before, torch_before = numba.get_num_threads(), torch.get_num_threads()
+    numba.set_num_threads(threads)
+    torch.set_num_threads(threads)
+    try:
+        return median_seconds(work)
+    finally:
+        numba.set_num_threads(before)
+        torch.set_num_threads(torch_before)
+
+
+def twin_ratios() -> Table:
+    """How much faster the kernels are than their twins, at a size the twins can bear."""
+    camera = bench_camera(64, 48)
+    gaussians = room(1000)
+    raw, batch = raw_of(gaussians), batch_of(camera)
+    flat = project(raw, batch, sh_degree=3, near=0.03)
+    splats = joined_splats(flat)
+    bins = bin_tiles(splats, 64, 48)
+    photo = torch.rand(HEIGHT, WIDTH, 3)
+    large = raw_of(room(COUNT))
+    full = batch_of(bench_camera(WIDTH, HEIGHT))
+    pairs: dict[str, tuple[Work, Work]] = {
+        "project, 100k Gaussians": (
+            lambda: project(large, full, sh_degree=3, near=0.03),
+            lambda: project_twin.project(large, full, sh_degree=3, near=0.03),
+        ),
+        "composite, 1k Gaussians, 64x48": (
+            lambda: composite(splats, flat.colors, bins),
+            lambda: composite_twin.composite(splats, flat.colors, bins),
+        ),
+        f"ssim, {WIDTH}x{HEIGHT}": (lambda: ssim(photo, photo), lambda: ssim_twin.ssim(photo, photo)),
+    }
+    table = Table(
+        "Kernels against their PyTorch twins, forward", ("operation", "kernel, ms", "twin, ms", "twin : kernel")
+    )
+    for name, (kernel, twin) in pairs.items():
+        seconds = interleaved_seconds({"kernel": kernel, "twin": twin}, repeats=5)
+        medians = [1e3 * sorted(seconds[n])[2] for n in ("kernel", "twin")]
+        table.add(name, *medians, paired_ratio(seconds, "twin", "kernel"))
+    return table

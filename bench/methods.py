@@ -1,0 +1,105 @@
+"""What the reflections cost: `planar` against `splat`, frame and training step, in one run."""
+
+from __future__ import annotations
+
+import statistics
+
+import torch
+
+from bench.scene import bench_camera, bench_scene
+from bench.table import Table
+from bench.timing import Work, interleaved_seconds, median_seconds, paired_ratio
+from glassplat.data.dataset import View
+from glassplat.render.planar import Planar
+from glassplat.render.splat import Splat
+from glassplat.scene.camera import Camera
+from glassplat.scene.scene import Scene
+from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.splat_recipe import SplatRecipe
+from glassplat.train.stage import Stage
+from glassplat.train.state import TrainState
+from glassplat.train.trainer import differentiate, update
+
+WIDTH, HEIGHT, COUNT = 480, 360, 100_000
+PANES = ((1, 0.5), (3, 0.5), (1, 1.0))
+
+
+def frame_work(scene: Scene, renderer: Splat | Planar, camera: Camera) -> Work:
+    """Renders one frame without gradients."""
+
+    def work() -> None:
+        with torch.no_grad():
+            renderer(scene, camera)
+
+    return work
+
+
+def step_work(scene: Scene, stage: Stage, view: View) -> Work:
+    """One optimisation step, without densification."""
+    state = TrainState(scene, seed=0)
+
+    def work() -> None:
+        result = differentiate(stage, state.scene, view)
+        update(stage, state, result.gradients, iterations=1000)
+
+    return work
+
+
+def view_of(camera: Camera) -> View:
+    """A photograph of noise with a mask, to train against."""
+    generator = torch.Generator().manual_seed(0)
+    photo = (255 * torch.rand(camera.height, camera.width, 3, generator=generator)).to(torch.uint8)
+    return View.in_memory(
+        "noise", camera, photo=photo, pane_labels=torch.ones(camera.height, camera.width).to(torch.uint8)
+    )
+
+
+def method_costs() -> Table:
+    """Frame and step of both methods with the same primary Gaussians."""
+    camera = bench_camera(WIDTH, HEIGHT)
+    view = view_of(camera)
+    table = Table(
+        f"planar against splat, {COUNT // 1000}k primary Gaussians, SH 3, {WIDTH}x{HEIGHT}",
+        (
+            "panes",
+            "share of the image",
+            "splat frame, ms",
+            "planar frame, ms",
+            "frame ratio",
+            "splat step, ms",
+            "planar step, ms",
+            "step ratio",
+        ),
+        "Ratios are medians of ratios taken round by round. The planar step is one of stage 3 on an annotated view.",
+    )
+    splat_stage, planar_stage = SplatRecipe().stages(0)[0], PlanarRecipe().stages(0)[2]
+    for number, share in PANES:
+        scene = bench_scene(COUNT, number, share, camera)
+        frames = interleaved_seconds(
+            {"splat": frame_work(scene, Splat(depth=False), camera), "planar": frame_work(scene, Planar(), camera)}
+        )
+        steps = interleaved_seconds(
+            {"splat": step_work(scene, splat_stage, view), "planar": step_work(scene, planar_stage, view)}, repeats=5
+        )
+        cells: list[float] = []
+        for seconds in (frames, steps):
+            cells += [1e3 * statistics.median(seconds[name]) for name in ("splat", "planar")]
+            cells.append(paired_ratio(seconds, "planar", "splat"))
+        table.add(number, f"{share:.0%}", *cells)
+    return table
+
+
+def scaling() -> Table:
+    """Frame time over Gaussians, pixels, panes."""
+    table = Table("Scaling of a frame, two threads", ("what", "Gaussians", "pixels", "panes", "ms", "frames/s"))
+    cases = [
+        *(("Gaussians", count, (480, 360), 0) for count in (10_000, 100_000, 1_000_000)),
+        *(("pixels", COUNT, size, 0) for size in ((240, 180), (480, 360), (960, 720))),
+        *(("panes over half of the image", COUNT, (480, 360), number) for number in (1, 2, 4, 8)),
+    ]
+    for what, count, (width, height), number in cases:
+        camera = bench_camera(width, height)
+        scene = bench_scene(count, number, 0.5, camera)
+        seconds = median_seconds(frame_work(scene, Planar() if number else Splat(depth=False), camera))
+        table.add(what, f"{count:,}", f"{width}x{height}", number, 1e3 * seconds, 1 / seconds)
+    return table
