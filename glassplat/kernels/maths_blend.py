@@ -104,7 +104,7 @@ def _clipped_alpha(real: type) -> Scalar:
 
 def _vertical_reach(real: type) -> Scalar:
     zero, one, two, nothing = real(0.0), real(1.0), real(2.0), real(-1.0)
-    inverse_alpha_min, slack = real(1.0 / ALPHA_MIN), real(1e-3)
+    inverse_alpha_min, slack, endless = real(1.0 / ALPHA_MIN), real(1e-3), real(np.inf)
 
     @inlined
     def vertical_reach(conic_xx, conic_xy, conic_yy, opacity):  # type: ignore[no-untyped-def]
@@ -113,7 +113,7 @@ def _vertical_reach(real: type) -> Scalar:
         determinant = xx * np.float64(conic_yy) - xy * xy
         visible = inverse_alpha_min * opacity
         # Written so that NaN anywhere ends in "reaches nothing".
-        if not (determinant > 0.0 and conic_xx > zero and visible > one):
+        if not (determinant > 0.0 and conic_xx > zero and one < visible < endless):
             return nothing
         return real(math.sqrt(two * math.log(visible) * real(xx / determinant))) + slack
 

@@ -30,8 +30,8 @@ COLUMNS = 240
 MARGIN = RADIUS * CHANNELS
 STRIDE = COLUMNS + 2 * MARGIN + 2
 PLANE = (ROWS + 2 * RADIUS) * STRIDE
-# Planes of one tile with its margin, then one row of each after the vertical blur, then rows of results. One flat buffer
-# with offsets known to the compiler lets it see that they never overlap, so that every loop becomes vector instructions.
+# Planes of one tile with its margin, then one row of each after the vertical blur, then rows of results. One flat
+# buffer with offsets known to the compiler lets it see that they never overlap, so that loops become vector code.
 PLANES = 4
 BLURRED = PLANES * PLANE
 RESULTS = BLURRED + PLANES * STRIDE

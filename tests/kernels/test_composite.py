@@ -1,0 +1,244 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numba
+import pytest
+import torch
+from torch import Tensor
+
+from glassplat.kernels.bin_tiles import bin_tiles
+from glassplat.kernels.composite import Composite, composite
+from glassplat.kernels.reference.composite import composite as composite_twin
+from glassplat.kernels.splats import Splats, TileBins
+
+MakeSplats = Callable[..., Splats]
+INPUTS = ("means2d", "conics", "opacities", "channels", "marks")
+
+
+class Blend(NamedTuple):
+    """Everything a call of `composite` takes; `inputs` are its differentiable tensors by name."""
+
+    splats: Splats
+    channels: Tensor
+    marks: Tensor
+    num_primary: int
+    bins: TileBins
+
+    def __call__(self, function: Callable[..., Composite]) -> Composite:
+        return function(self.splats, self.channels, self.bins, marks=self.marks, num_primary=self.num_primary)
+
+    def inputs(self) -> list[Tensor]:
+        return [self.splats.means2d, self.splats.conics, self.splats.opacities, self.channels, self.marks]
+
+
+def blend(splats: Splats, size: tuple[int, int], *, channels: int = 3, glass: int = 0, seed: int = 1) -> Blend:
+    """Random channels and marks for the splats, of which the last `glass` of each camera are glass."""
+    generator = torch.Generator().manual_seed(seed)
+    cameras, count = splats.opacities.shape
+    dtype = splats.means2d.dtype
+    values = torch.rand(cameras, count, channels, generator=generator, dtype=torch.float64).to(dtype)
+    marks = torch.rand(cameras, glass, generator=generator, dtype=torch.float64).to(dtype)
+    return Blend(splats, values, marks, count - glass, bin_tiles(splats, *size))
+
+
+def with_gradients(case: Blend, function: Callable[..., Composite], seed: int = 2) -> dict[str, Tensor]:
+    """Outputs and, for random cotangents, the gradients of all inputs."""
+    inputs = [tensor.detach().requires_grad_() for tensor in case.inputs()]
+    means2d, conics, opacities, channels, marks = inputs
+    splats = case.splats._replace(means2d=means2d, conics=conics, opacities=opacities)
+    outputs = case._replace(splats=splats, channels=channels, marks=marks)(function)
+    generator = torch.Generator().manual_seed(seed)
+    cotangents = [torch.randn(o.shape, generator=generator, dtype=torch.float64).to(o.dtype) for o in outputs]
+    # The twin does not touch inputs that reach no pixel; the added zero gives them a gradient of zero.
+    total = sum((o * c).sum() for o, c in zip(outputs, cotangents, strict=True)) + 0 * sum(i.sum() for i in inputs)
+    gradients = torch.autograd.grad(total, inputs)
+    named = outputs._asdict() | {f"v_{name}": g for name, g in zip(INPUTS, gradients, strict=True)}
+    return {name: tensor.detach() for name, tensor in named.items()}
+
+
+def assert_close(found: dict[str, Tensor], expected: dict[str, Tensor], tolerance: float) -> None:
+    """Relative norm of the difference, and the cosine between the two, per tensor."""
+    for name, want in expected.items():
+        got, want = found[name].double().flatten(), want.double().flatten()
+        size = float(want.norm())
+        assert float((got - want).norm()) <= tolerance * max(size, 1e-3), name
+        if size > 0:
+            assert float(got @ want) / (size * float(got.norm())) > 1 - tolerance, name
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-5), (torch.float64, 1e-12)])
+@pytest.mark.parametrize(
+    ("cameras", "count", "glass", "channels", "size"),
+    [
+        (1, 0, 0, 3, (20, 20)),
+        (1, 1, 0, 3, (20, 20)),
+        (1, 1, 1, 1, (16, 16)),
+        (1, 40, 0, 1, (37, 29)),
+        (2, 60, 20, 5, (40, 33)),
+        (1, 40, 10, 9, (17, 50)),
+    ],
+)
+def test_kernel_matches_its_twin(
+    random_splats: MakeSplats, dtype: torch.dtype, tolerance: float,
+    cameras: int, count: int, glass: int, channels: int, size: tuple[int, int],
+) -> None:  # fmt: skip
+    case = blend(random_splats((cameras, count), size, dtype=dtype), size, channels=channels, glass=glass)
+    assert_close(with_gradients(case, composite), with_gradients(case, composite_twin), tolerance)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-4), (torch.float64, 1e-12)])
+def test_an_opaque_pile_stops_where_its_twin_stops(
+    random_splats: MakeSplats, dtype: torch.dtype, tolerance: float
+) -> None:
+    splats = random_splats((1, 200), (24, 20), dtype=dtype, opacities=(0.8, 1.0), sigmas=(5.0, 20.0))
+    case = blend(splats, (24, 20), glass=60)
+    found = with_gradients(case, composite)
+    assert float(found["alpha"].min()) > 0.99
+    assert float(found["v_channels"].abs().sum(dim=-1).count_nonzero()) < 100
+    assert_close(found, with_gradients(case, composite_twin), tolerance)
+
+
+def test_a_pile_of_glass_leaves_finite_gradients(random_splats: MakeSplats) -> None:
+    splats = random_splats((1, 60), (20, 20), dtype=torch.float32, opacities=(0.98, 1.0), sigmas=(20.0, 30.0))
+    case = blend(splats, (20, 20), glass=60)
+    found = with_gradients(case, composite)
+    assert all(bool(tensor.isfinite().all()) for tensor in found.values())
+    assert_close(found, with_gradients(case, composite_twin), 1e-3)
+
+
+def test_gradients_match_finite_differences(random_splats: MakeSplats) -> None:
+    size = (19, 18)
+    splats = random_splats((1, 7), size, opacities=(0.3, 0.8), sigmas=(2.0, 6.0), seed=3)
+    case = blend(splats, size, channels=2, glass=3)
+
+    cotangents = [torch.randn_like(output) for output in case(composite)]
+
+    def weighted(means2d: Tensor, conics: Tensor, opacities: Tensor, channels: Tensor, marks: Tensor) -> Tensor:
+        moved = splats._replace(means2d=means2d, conics=conics, opacities=opacities)
+        outputs = composite(moved, channels, case.bins, marks=marks, num_primary=case.num_primary)
+        return torch.stack([(o * c).sum() for o, c in zip(outputs, cotangents, strict=True)])
+
+    inputs = [tensor.detach().clone().requires_grad_() for tensor in case.inputs()]
+    assert torch.autograd.gradcheck(weighted, inputs, eps=1e-7, atol=1e-6, rtol=1e-6)
+
+
+def test_clamped_coverage_passes_no_gradient_to_geometry() -> None:
+    splats = Splats(
+        torch.full((1, 1, 2), 8.5), torch.tensor([[[1e-6, 0, 1e-6]]]), torch.ones(1, 1), torch.ones(1, 1),
+        torch.full((1, 1, 2), 4e3),
+    )  # fmt: skip
+    found = with_gradients(blend(splats, (16, 16)), composite)
+    torch.testing.assert_close(found["alpha"], torch.full((1, 16, 16), 0.99))
+    assert not found["v_opacities"].any()
+    assert not found["v_means2d"].any()
+    assert found["v_channels"].any()
+
+
+def test_only_active_tiles_are_drawn(random_splats: MakeSplats) -> None:
+    size = (60, 40)
+    full = blend(random_splats((2, 50), size, dtype=torch.float32), size, glass=10)
+    tiles = torch.zeros(2, 3, 4, dtype=torch.bool)
+    tiles[0, 1, 2] = tiles[1, 0, 0] = tiles[1, 2, 3] = True
+    few = full._replace(bins=bin_tiles(full.splats, *size, tiles))
+    seen = tiles.repeat_interleave(16, 1).repeat_interleave(16, 2)[:, :40, :60]
+    everywhere, there = full(composite), few(composite)
+    for all_tiles, some_tiles in zip(everywhere, there, strict=True):
+        assert torch.equal(some_tiles[seen], all_tiles[seen])
+        assert not some_tiles[~seen].any()
+    assert_close(with_gradients(few, composite), with_gradients(few, composite_twin), 2e-5)
+
+    # Bins of every tile with a shorter list of active ones must give the same.
+    shortened = full._replace(bins=full.bins._replace(active=few.bins.active))
+    expected = with_gradients(few, composite)
+    assert all(torch.equal(t, expected[name]) for name, t in with_gradients(shortened, composite).items())
+
+
+def test_the_number_of_threads_changes_no_bit(random_splats: MakeSplats) -> None:
+    size = (100, 70)
+    case = blend(random_splats((2, 300), size, dtype=torch.float32), size, channels=4, glass=50)
+    both = with_gradients(case, composite)
+    numba.set_num_threads(1)
+    one = with_gradients(case, composite)
+    assert all(torch.equal(one[name], both[name]) for name in both)
+
+
+def test_glass_never_changes_the_image(random_splats: MakeSplats) -> None:
+    size = (40, 40)
+    case = blend(random_splats((1, 60), size, dtype=torch.float32), size, glass=20)
+    kept = Splats(*(tensor[:, :40] for tensor in case.splats))
+    alone = composite(kept, case.channels[:, :40], bin_tiles(kept, *size))
+    together = case(composite)
+    assert torch.equal(together.image, alone.image)
+    assert torch.equal(together.alpha, alone.alpha)
+    assert together.mask.any()
+    assert not alone.mask.any()
+
+
+def two_discs(depths: tuple[float, float], opacities: tuple[float, float]) -> Splats:
+    """A primary and a glass splat that both cover a 16 x 16 image evenly."""
+    return Splats(
+        torch.full((1, 2, 2), 8.0), torch.tensor([[[1e-7, 0.0, 1e-7]] * 2]), torch.tensor([opacities]),
+        torch.tensor([depths]), torch.full((1, 2, 2), 1e4),
+    )  # fmt: skip
+
+
+def test_a_primary_splat_in_front_hides_glass() -> None:
+    channels, marks = torch.ones(1, 2, 1), torch.full((1, 1), 0.5)
+    masks = {}
+    for order, depths in {"behind": (1.0, 2.0), "in front": (2.0, 1.0)}.items():
+        splats = two_discs(depths, (0.6, 0.8))
+        masks[order] = composite(splats, channels, bin_tiles(splats, 16, 16), marks=marks, num_primary=1).mask
+    torch.testing.assert_close(masks["in front"], torch.full((1, 16, 16), 0.5 * 0.8), atol=1e-4, rtol=0)
+    torch.testing.assert_close(masks["behind"], torch.full((1, 16, 16), 0.5 * 0.8 * 0.4), atol=1e-4, rtol=0)
+
+
+def test_a_channel_that_is_not_a_number_stays_in_its_tiles(random_splats: MakeSplats) -> None:
+    size = (80, 80)
+    case = blend(random_splats((1, 60), size, dtype=torch.float32, sigmas=(1.0, 3.0)), size)
+    clean = case(composite).image
+    poisoned = case.channels.clone()
+    poisoned[0, 7] = torch.nan
+    image = case._replace(channels=poisoned)(composite).image
+    reached = torch.zeros(5, 5, dtype=torch.bool)
+    pairs = torch.repeat_interleave(torch.arange(25), case.bins.tile_offsets.diff())
+    reached.view(-1)[pairs[case.bins.pair_splats == 7]] = True
+    outside = ~reached.repeat_interleave(16, 0).repeat_interleave(16, 1)
+    assert torch.equal(image[0][outside], clean[0][outside])
+    assert image.isnan().any()
+
+
+@pytest.mark.parametrize("field", ["means2d", "conics", "opacities"])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+def test_a_splat_with_broken_geometry_is_not_drawn(random_splats: MakeSplats, field: str, value: float) -> None:
+    size = (40, 40)
+    case = blend(random_splats((1, 30), size, dtype=torch.float32), size)
+    broken = getattr(case.splats, field).clone()
+    broken[0, 4] = value
+    # Binning leaves such splats out; a list that holds them nevertheless must do no harm.
+    found = with_gradients(case._replace(splats=case.splats._replace(**{field: broken})), composite)
+    culled = case.splats.radii.clone()
+    culled[0, 4] = 0
+    without = case.splats._replace(radii=culled)
+    expected = case._replace(splats=without, bins=bin_tiles(without, *size))(composite)
+    torch.testing.assert_close(found["image"], expected.image)
+    assert not found["v_channels"][0, 4].any()
+
+
+def test_wrong_inputs_are_named(random_splats: MakeSplats) -> None:
+    case = blend(random_splats((1, 5), (20, 20)), (20, 20), glass=2)
+    splats, channels, bins = case.splats, case.channels, case.bins
+    with pytest.raises(ValueError, match="2 splats are glass, but there are no marks"):
+        composite(splats, channels, bins, num_primary=3)
+    with pytest.raises(ValueError, match=r"marks has shape \[1, 2\], expected \[1, 1\]"):
+        composite(splats, channels, bins, marks=case.marks, num_primary=4)
+    with pytest.raises(ValueError, match="num_primary is 6"):
+        composite(splats, channels, bins, num_primary=6)
+    with pytest.raises(ValueError, match=r"D in 1\.\.32"):
+        composite(splats, torch.zeros(1, 5, 33, dtype=torch.float64), bins)
+    with pytest.raises(TypeError, match=r"channels is torch\.float32, expected torch\.float64"):
+        composite(splats, channels.float(), bins)
+    fewer = Splats(*(tensor[:, :4] for tensor in splats))
+    with pytest.raises(ValueError, match="bin these very splats"):
+        composite(fewer, channels[:, :4], bins)

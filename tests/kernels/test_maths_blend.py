@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from glassplat.kernels.maths_blend import ALPHA_MIN, blend_maths
+
+
+@pytest.mark.parametrize(("real", "tolerance"), [(np.float32, 4e-7), (np.float64, 1e-15)])
+def test_exp2_is_accurate_where_coverage_counts(real: type, tolerance: float) -> None:
+    exp2 = blend_maths(real).exp2
+    for t in np.linspace(-20, 0, 401):
+        assert float(exp2(real(t))) == pytest.approx(2.0 ** float(real(t)), rel=tolerance)
+    assert exp2(real(0)) == 1
+
+
+@pytest.mark.parametrize("real", [np.float32, np.float64])
+@pytest.mark.parametrize("t", [-100.0, -1e30, -math.inf, math.nan])
+def test_exp2_ends_in_nothing(real: type, t: float) -> None:
+    assert 0 <= float(blend_maths(real).exp2(real(t))) < 1e-20
+
+
+@pytest.mark.parametrize("real", [np.float32, np.float64])
+def test_coverage_is_cut_and_clamped(real: type) -> None:
+    clipped_alpha = blend_maths(real).clipped_alpha
+    assert clipped_alpha(real(ALPHA_MIN)) == real(ALPHA_MIN)
+    assert clipped_alpha(real(0.0039)) == 0
+    assert clipped_alpha(real(0.5)) == real(0.5)
+    assert clipped_alpha(real(3)) == real(0.99)
+    assert clipped_alpha(real(math.nan)) == 0
+
+
+@pytest.mark.parametrize("real", [np.float32, np.float64])
+@pytest.mark.parametrize(("xx", "xy", "yy"), [(0.5, 0.0, 0.5), (0.4, 0.19, 0.1), (2.0, -0.3, 0.06), (1.0, 0.9999, 1.0)])
+@pytest.mark.parametrize("center", [-3.2, 0.5, 7.9, 30.0])
+def test_rows_in_range_are_those_with_coverage(real: type, xx: float, xy: float, yy: float, center: float) -> None:
+    maths, opacity = blend_maths(real), real(0.7)
+    reach = maths.vertical_reach(real(xx), real(xy), real(yy), opacity)
+    first, last = maths.row_range(real(center), reach, 16)
+    assert 0 <= first <= last <= 16
+    # The largest coverage in a row is where the quadratic form is least over x.
+    least = (yy - xy * xy / xx) * (np.arange(16) + 0.5 - center) ** 2
+    covered = np.flatnonzero(opacity * np.exp(-0.5 * least) >= ALPHA_MIN)
+    assert list(range(first, last)) == list(covered)
+
+
+@pytest.mark.parametrize("broken", [0, 1, 2, 3])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_broken_splats_reach_nothing(broken: int, value: float) -> None:
+    maths = blend_maths(np.float32)
+    inputs = [np.float32(v) for v in (0.5, 0.1, 0.5, 0.7)]
+    inputs[broken] = np.float32(value)
+    with np.errstate(invalid="ignore"):
+        first, last = maths.row_range(np.float32(8), maths.vertical_reach(*inputs), 16)
+    assert first == last or (value == math.inf and broken in (0, 2))
+
+
+def test_a_splat_without_a_place_reaches_nothing() -> None:
+    row_range = blend_maths(np.float32).row_range
+    for center in (math.nan, math.inf, -math.inf):
+        first, last = row_range(np.float32(center), np.float32(5), 16)
+        assert first == last
