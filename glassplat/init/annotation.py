@@ -147,10 +147,34 @@ def _edge_points(mask: Mask) -> Array:
     return np.concatenate([upright, level])
 
 
-def pane_views(annotations: Sequence[tuple[Camera, Tensor]], label: int) -> list[PaneView]:
-    """The annotated views that show a pane, ignoring parts of it that are only a few pixels wide."""
-    views = (pane_view(camera, labels, label) for camera, labels in annotations)
+def pane_views(annotations: Sequence[tuple[Camera, Tensor]], label: int, *, most: int = 12) -> list[PaneView]:
+    """Annotated views that show a pane, ignoring parts of it that are only a few pixels wide.
+
+    Args:
+        annotations: cameras and their label images [H, W].
+        label: which pane.
+        most: largest number of views; where a capture has a mask for every photograph, those that
+            show much of the pane and were taken far from one another tell enough.
+    """
+    centers = np.array([_array(camera.center) for camera, _ in annotations])
+    shares = np.array([float((labels == label).double().mean()) for _, labels in annotations])
+    chosen = _far_apart(centers, shares, most)
+    views = (pane_view(*annotations[index], label) for index in sorted(chosen))
     return [view for view in views if view.mask.any()]
+
+
+def _far_apart(positions: Array, values: Array, count: int) -> list[int]:
+    """Up to `count` indices of positive values, greedily by value times distance from those already chosen."""
+    chosen: list[int] = []
+    distance = np.ones(len(values))
+    while len(chosen) < min(count, int((values > 0).sum())):
+        # Views from one place have no distance; the small constant still takes the largest of them.
+        worth = values * (distance + 1e-9)
+        worth[chosen] = 0
+        chosen.append(int(np.argmax(worth)))
+        nearest = np.linalg.norm(positions - positions[chosen[-1]], axis=1)
+        distance = nearest if len(chosen) == 1 else np.minimum(distance, nearest)
+    return chosen
 
 
 def plane_candidates(

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 CELLS = 128  # Along the longer side of the map of the plane.
-GRAZING = 0.03  # Cosine below which one pixel covers too much of the plane to say where the pane ends.
+GRAZING = 0.06  # Cosine to the normal below which a pixel covers too much of the plane to say where the pane ends.
 SMALLEST_PART = 0.05  # Of the largest connected part; below it a part is an error in a mask.
 AGREEMENT = 0.34  # Share of the views that must show the pane where they look; the others may be occluded.
 
@@ -39,7 +39,7 @@ def pane_rectangle(plane: PlaneEquations, views: Sequence[PaneView], axes: Array
     """
     foot = plane.normals[0] * plane.offsets[0]
     seen = np.concatenate([_pixels_on_plane(plane, view) for view in views])
-    seen = seen[_is_pane(seen, views)]
+    seen = seen[_is_pane(seen, views, plane.normals[0])]
     if len(seen) < 3:
         raise ValueError(f"{len(seen)} mask pixels agree on where the pane is; expected at least three")
     corners = (seen - foot) @ axes.T
@@ -47,8 +47,8 @@ def pane_rectangle(plane: PlaneEquations, views: Sequence[PaneView], axes: Array
     cell = (high - low).max() / CELLS
     u, v = (np.arange(a - cell, b + 2 * cell, cell) for a, b in zip(low, high, strict=True))
     grid = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1)
-    inside = _without_specks(_is_pane((foot + grid @ axes).reshape(-1, 3), views).reshape(grid.shape[:2]))
-    return min_area_rectangle(grid[inside])
+    inside = _is_pane((foot + grid @ axes).reshape(-1, 3), views, plane.normals[0])
+    return min_area_rectangle(grid[_without_specks(inside.reshape(grid.shape[:2]))])
 
 
 def _pixels_on_plane(plane: PlaneEquations, view: PaneView, count: int = 4000) -> Array:
@@ -56,15 +56,16 @@ def _pixels_on_plane(plane: PlaneEquations, view: PaneView, count: int = 4000) -
     pixels = view.grid(count)
     directions = view.directions(pixels[view.covers(pixels, np.ones(len(pixels), dtype=bool))])
     points, hit = meet(plane, view.center, directions)
-    cosine = np.abs(directions @ plane.normals[0]) / np.linalg.norm(directions, axis=1)
-    return points[0, hit[0] & (cosine > GRAZING)]
+    return points[0, hit[0]]
 
 
-def _is_pane(points: Array, views: Sequence[PaneView]) -> Mask:
-    """[P] bool: whether enough of the views whose image holds a point [P, 3] show pane there."""
+def _is_pane(points: Array, views: Sequence[PaneView], normal: Array) -> Mask:
+    """[P] bool: whether enough of the views whose image holds a point [P, 3] of the plane show pane there."""
     shown, held_count = np.zeros(len(points)), np.zeros(len(points))
     for view in views:
         pixels, held = view.project(points)
+        rays = points - view.center
+        held &= np.abs(rays @ normal) > GRAZING * np.linalg.norm(rays, axis=1)
         shown += view.covers(pixels, held)
         held_count += held
     return (shown > 0) & (shown >= AGREEMENT * held_count)

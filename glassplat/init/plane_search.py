@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 COARSE, MIDDLE, FINE = 0.01, 0.004, 0.002
 """Distances, in image diagonals, at which the loss of two mask edges that do not meet is one half."""
-POINTS_WEIGHT = 0.02
+POINTS_WEIGHT = 0.1
 """Weight of the inliers against the mask edges: they decide only what the edges leave open."""
 SUPPORT_WEIGHT = 0.1
 """Weight of a hypothesis' inliers against the agreement of the masks: it decides where parallax is too small to."""
@@ -57,8 +57,13 @@ def best_plane(
         views: annotated views of the pane, at least two.
         search: how far to go.
         rng: source of randomness.
+
+    Raises:
+        ValueError: the candidates span no plane.
     """
     drawn = random_planes(points, weights, search.hypotheses, rng)
+    if len(drawn) == 0:
+        raise ValueError(f"its {len(points)} candidate points lie on one line")
     supports = support(drawn, points, weights, distance=search.distance)
     supported = np.argsort(-supports, kind="stable")[: max(search.hypotheses // 4, search.refined)]
     scores = mask_agreement(drawn.select(supported), views) + SUPPORT_WEIGHT * supports[supported]
@@ -66,11 +71,12 @@ def best_plane(
     start = _best_refined(leading, points, views, search, tolerances=(COARSE, MIDDLE))
 
     anchor = _inliers(start, points, search.distance).mean(axis=0)
+    finest = 1 / min(view.diagonal for view in views)  # A mask drawn in pixels says no more than that.
     shift = NEARBY_SHIFT * search.extent
     around = planes_nearby(start, anchor, NEARBY_COUNT, tilt=NEARBY_TILT, shift=shift, rng=rng)
-    costs = edge_cost(around, views, tolerance=MIDDLE)
+    costs = edge_cost(around, views, tolerance=max(MIDDLE, finest))
     leading = around.select(np.argsort(costs, kind="stable")[: search.refined])
-    return _best_refined(leading, points, views, search, tolerances=(MIDDLE, FINE))
+    return _best_refined(leading, points, views, search, tolerances=(max(MIDDLE, finest), max(FINE, finest)))
 
 
 def _best_refined(

@@ -41,6 +41,7 @@ class PlaneFit:
         inlier_distance: of RANSAC, as a share of the scene extent.
         hypotheses: number of planes drawn by RANSAC.
         refined: number of them, the best by agreement of the masks, that are refined.
+        most_views: number of annotated views that are used; a few that were taken far apart tell enough.
         least_agreement: intersection over union of the masks on the plane below which a fit is refused.
         margin: factor on the rectangle's sides, which must not cut into the pane.
         seed: of RANSAC.
@@ -53,8 +54,9 @@ class PlaneFit:
     inlier_distance: float = 0.01
     hypotheses: int = 1000
     refined: int = 4
+    most_views: int = 12
     least_agreement: float = 0.5
-    margin: float = 1.05
+    margin: float = 1.08
     seed: int = 0
 
 
@@ -122,7 +124,7 @@ def _fit_pane(
     extent: float,
     options: PlaneFit,
 ) -> _Pane:
-    views = pane_views(annotations, label)
+    views = pane_views(annotations, label, most=options.most_views)
     if len(views) < 2:
         raise PlaneFitError(
             f"pane {label} is annotated in {len(views)} view(s), but its plane shows only between views: "
@@ -137,17 +139,25 @@ def _fit_pane(
         )
     search = Search(extent, options.inlier_distance * extent, options.hypotheses, options.refined)
     rng = np.random.default_rng((options.seed, label))
-    best = best_plane(points[chosen], weights[chosen], views, search, rng)
-    agreement = float(mask_agreement(best, views)[0])
-    log.info("pane %d: %d views, %d candidates, masks agree to %.3f", label, len(views), chosen.sum(), agreement)
-    if agreement < options.least_agreement:
+    try:
+        plane = best_plane(points[chosen], weights[chosen], views, search, rng)
+        _check_agreement(plane, views, options.least_agreement)
+        log.info("pane %d: plane found from %d views and %d candidate points", label, len(views), chosen.sum())
+        return _pane(plane, views, options.margin)
+    except ValueError as error:
         raise PlaneFitError(
-            f"pane {label}: no plane brings its {len(views)} masks together; on the best of {options.hypotheses} "
-            f"planes through {int(chosen.sum())} candidates they overlap by {agreement:.2f}, expected at least "
-            f"{options.least_agreement:.2f}. Check that label {label} means the same flat pane in every mask, and "
-            "annotate more views that show all of it with nothing standing before it"
+            f"pane {label}, annotated in {len(views)} views: {error}. Check that label {label} means the same flat "
+            "pane in every mask, and annotate more views that show all of it with nothing standing before it"
+        ) from error
+
+
+def _check_agreement(plane: PlaneEquations, views: Sequence[PaneView], least: float) -> None:
+    agreement = float(mask_agreement(plane, views)[0])
+    if agreement < least:
+        raise ValueError(
+            f"no plane brings its masks together; on the best one they overlap by {agreement:.2f}, "
+            f"expected at least {least:.2f}"
         )
-    return _pane(best, views, options.margin)
 
 
 def _pane(plane: PlaneEquations, views: Sequence[PaneView], margin: float) -> _Pane:

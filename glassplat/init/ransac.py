@@ -1,4 +1,4 @@
-"""Planes through points: random triplets, inliers and weighted least squares."""
+"""Planes through points: random triplets and their inliers."""
 
 from __future__ import annotations
 
@@ -56,12 +56,3 @@ def random_planes(points: Array, weights: Array, count: int, rng: np.random.Gene
 def support(planes: PlaneEquations, points: Array, weights: Array, *, distance: float) -> Array:
     """[H] share of the points' weight within `distance` of each plane."""
     return (np.abs(planes.distances(points)) <= distance) @ (weights / weights.sum())
-
-
-def fitted_plane(points: Array, weights: Array) -> PlaneEquations:
-    """The plane of least weighted squares of the distances to points [N, 3], N >= 3."""
-    share = weights / weights.sum()
-    centroid = share @ points
-    moved = (points - centroid) * np.sqrt(share)[:, None]
-    normal = np.linalg.svd(moved, full_matrices=False)[2][2]
-    return PlaneEquations(normal[None], np.array([normal @ centroid]))
