@@ -73,7 +73,7 @@ def composite_gradients(
     num_channels, count = channels.shape[2], channels.shape[1]
     rows = new_pair_rows(bins, num_channels, real)
     _backward(real)(
-        splats.conics.numpy().reshape(-1, 3), marks.numpy(), count, num_primary, num_channels,
+        marks.numpy(), count, num_primary, num_channels,
         bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), saved.packed, saved.state,
         *(v.contiguous().numpy() for v in v_outputs), rows,
     )  # fmt: skip
@@ -168,10 +168,10 @@ def _blend_glass(real: type) -> Scalar:
 
 @functools.cache
 def _forward(real: type) -> Kernel:
-    pack, place, begin, is_finished, save_state, _, _ = tile.tile_functions(real)
+    pack, place, begin, is_finished, save_state, _, fetch, _ = tile.tile_functions(real)
     blend_primary, blend_glass = _blend_primary(real), _blend_glass(real)
     one, zero = real(1.0), real(0.0)
-    T, PLANE, VALUES = tile.T, tile.PLANE, tile.VALUES
+    T, PLANE, VALUES, BATCH = tile.T, tile.PLANE, tile.VALUES, tile.BATCH
 
     @inlined
     def write_tile(scratch, image, alpha, mask, camera, x0, y0, columns, rows):
@@ -200,18 +200,20 @@ def _forward(real: type) -> Kernel:
             scratch = np.empty(SUMS + groups * 4 * PLANE, real)
             scratch[:] = zero
             begin(scratch, columns, rows)
-            start = tile_offsets[active[n]]
-            for p in range(start, tile_offsets[active[n] + 1]):
-                # Looking at every pixel costs as much as blending a few rows, so it is not done for every splat.
-                if (p - start) % 8 == 7 and is_finished(scratch):
+            batch = np.empty((BATCH, packed.shape[1]), real)
+            start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
+            for first in range(start, stop, BATCH):
+                if is_finished(scratch):
                     break
-                s = pair_splats[p]
-                order = real(np.int32(p - start))
-                glass = s - camera * splats_per_camera - num_primary
-                if glass < 0:
-                    blend_primary(scratch, packed[s], groups, order, x0, y0, rows)
-                else:
-                    blend_glass(scratch, packed[s], marks[camera, glass], order, x0, y0, rows)
+                last = min(first + BATCH, stop)
+                fetch(batch, packed, pair_splats, first, last)
+                for p in range(first, last):
+                    order, splat = real(np.int32(p - start)), batch[p - first]
+                    glass = pair_splats[p] - camera * splats_per_camera - num_primary
+                    if glass < 0:
+                        blend_primary(scratch, splat, groups, order, x0, y0, rows)
+                    else:
+                        blend_glass(scratch, splat, marks[camera, glass], order, x0, y0, rows)
             save_state(state, n, scratch)
             write_tile(scratch, image, alpha, mask, camera, x0, y0, columns, rows)
 
@@ -322,10 +324,10 @@ def _unblend_glass(real: type) -> Scalar:
 
 @functools.cache
 def _backward(real: type) -> Kernel:
-    _, place, _, _, _, load_state, geometry_gradient = tile.tile_functions(real)
+    _, place, _, _, _, load_state, fetch, geometry_gradient = tile.tile_functions(real)
     unblend_primary, unblend_glass = _unblend_primary(real), _unblend_glass(real)
     zero = real(0.0)
-    T, PLANE, V_VALUES = tile.T, tile.PLANE, tile.V_VALUES
+    T, PLANE, V_VALUES, BATCH = tile.T, tile.PLANE, tile.V_VALUES, tile.BATCH
 
     @inlined
     def load_gradients(scratch, v_image, v_alpha, v_mask, camera, x0, y0, columns, rows):
@@ -340,7 +342,7 @@ def _backward(real: type) -> Kernel:
 
     @kernel("composite_backward", real)
     def backward(
-        conics, marks, splats_per_camera, num_primary, num_channels,
+        marks, splats_per_camera, num_primary, num_channels,
         pair_splats, tile_offsets, active, packed, state, v_image, v_alpha, v_mask, out,
     ):  # fmt: skip
         groups = (num_channels + 3) // 4
@@ -352,27 +354,28 @@ def _backward(real: type) -> Kernel:
             load_gradients(scratch, v_image, v_alpha, v_mask, camera, x0, y0, columns, rows)
             start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
             out[start + looked_at : stop] = zero
-            for k in range(looked_at):
-                p = start + looked_at - 1 - k
-                s = pair_splats[p]
-                order = real(np.int32(p - start))
-                glass = s - camera * splats_per_camera - num_primary
-                scratch[LANE_GEOMETRY : LANE_VALUES + groups * 64] = zero
-                if glass < 0:
-                    reached = unblend_primary(scratch, packed[s], groups, order, x0, y0, rows)
-                else:
-                    reached = unblend_glass(scratch, packed[s], marks[camera, glass], order, x0, y0, rows)
-                if not reached:
-                    out[p, :] = zero
-                    continue
-                mean_x, opacity = packed[s, 0] - real(x0), packed[s, 5]
-                geometry_gradient(
-                    out, p, scratch, LANE_GEOMETRY, mean_x, conics[s, 0], conics[s, 1], conics[s, 2], opacity
-                )
-                for d in range(num_channels):
-                    total = zero
-                    for i in range(16):
-                        total += scratch[LANE_VALUES + (d & 31) * 16 + i]
-                    out[p, V_VALUES + d] = total
+            batch = np.empty((BATCH, packed.shape[1]), real)
+            for behind in range(0, looked_at, BATCH):
+                last = start + looked_at - behind
+                first = max(last - BATCH, start)
+                fetch(batch, packed, pair_splats, first, last)
+                for k in range(last - first):
+                    p = last - 1 - k
+                    order, splat = real(np.int32(p - start)), batch[p - first]
+                    glass = pair_splats[p] - camera * splats_per_camera - num_primary
+                    scratch[LANE_GEOMETRY : LANE_VALUES + groups * 64] = zero
+                    if glass < 0:
+                        reached = unblend_primary(scratch, splat, groups, order, x0, y0, rows)
+                    else:
+                        reached = unblend_glass(scratch, splat, marks[camera, glass], order, x0, y0, rows)
+                    if not reached:
+                        out[p, :] = zero
+                        continue
+                    geometry_gradient(out, p, scratch, LANE_GEOMETRY, splat, x0)
+                    for d in range(num_channels):
+                        total = zero
+                        for i in range(16):
+                            total += scratch[LANE_VALUES + (d & 31) * 16 + i]
+                        out[p, V_VALUES + d] = total
 
     return backward

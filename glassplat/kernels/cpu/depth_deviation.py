@@ -61,7 +61,7 @@ def depth_deviation_gradients(
     rows = new_pair_rows(bins, 1, real)
     v_depth_map = torch.zeros_like(depth_map)
     _backward(real)(
-        splats.conics.numpy().reshape(-1, 3), depth_map.numpy(), splats.opacities.shape[1], num_primary,
+        depth_map.numpy(), splats.opacities.shape[1], num_primary,
         bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), saved.packed, saved.state,
         v_deviation.contiguous().numpy(), rows, v_depth_map.numpy(),
     )  # fmt: skip
@@ -101,10 +101,10 @@ def _blend(real: type) -> Scalar:
 
 @functools.cache
 def _forward(real: type) -> Kernel:
-    pack, place, begin, is_finished, save_state, _, _ = tile.tile_functions(real)
+    pack, place, begin, is_finished, save_state, _, fetch, _ = tile.tile_functions(real)
     blend = _blend(real)
     zero = real(0.0)
-    PLANE, VALUES = tile.PLANE, tile.VALUES
+    PLANE, VALUES, BATCH = tile.PLANE, tile.VALUES, tile.BATCH
 
     @kernel("depth_deviation_forward", real)
     def forward(
@@ -123,13 +123,16 @@ def _forward(real: type) -> Kernel:
             for y in range(rows):
                 for x in range(columns):
                     scratch[DEPTH + (y & 15) * 16 + (x & 15)] = depth_map[camera, y0 + y, x0 + x]
-            start = tile_offsets[active[n]]
-            for p in range(start, tile_offsets[active[n] + 1]):
-                if (p - start) % 8 == 7 and is_finished(scratch):
+            batch: NDArray[Any] = np.empty((BATCH, packed.shape[1]), real)
+            start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
+            for first in range(start, stop, BATCH):
+                if is_finished(scratch):
                     break
-                s = pair_splats[p]
-                if s - camera * splats_per_camera < num_primary:
-                    blend(scratch, packed[s], real(np.int32(p - start)), x0, y0, rows)
+                last = min(first + BATCH, stop)
+                fetch(batch, packed, pair_splats, first, last)
+                for p in range(first, last):
+                    if pair_splats[p] - camera * splats_per_camera < num_primary:
+                        blend(scratch, batch[p - first], real(np.int32(p - start)), x0, y0, rows)
             save_state(state, n, scratch)
             for y in range(rows):
                 for x in range(columns):
@@ -184,14 +187,14 @@ def _unblend(real: type) -> Scalar:
 
 @functools.cache
 def _backward(real: type) -> Kernel:
-    _, place, _, _, _, load_state, geometry_gradient = tile.tile_functions(real)
+    _, place, _, _, _, load_state, fetch, geometry_gradient = tile.tile_functions(real)
     unblend = _unblend(real)
     zero = real(0.0)
-    PLANE, V_VALUES = tile.PLANE, tile.V_VALUES
+    PLANE, V_VALUES, BATCH = tile.PLANE, tile.V_VALUES, tile.BATCH
 
     @kernel("depth_deviation_backward", real)
     def backward(
-        conics, depth_map, splats_per_camera, num_primary,
+        depth_map, splats_per_camera, num_primary,
         pair_splats, tile_offsets, active, packed, state, v_deviation, out, v_depth_map,
     ):  # fmt: skip
         for n in prange(active.size):
@@ -206,21 +209,24 @@ def _backward(real: type) -> Kernel:
                     scratch[V_SUM + i] = v_deviation[camera, y0 + y, x0 + x]
             start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
             out[start + looked_at : stop] = zero
-            for k in range(looked_at):
-                p = start + looked_at - 1 - k
-                s = pair_splats[p]
-                scratch[LANES : LANES + 64] = zero
-                order = real(np.int32(p - start))
-                glass = s - camera * splats_per_camera >= num_primary
-                if glass or not unblend(scratch, packed[s], order, x0, y0, rows):
-                    out[p, :] = zero
-                    continue
-                mean_x, opacity = packed[s, 0] - real(x0), packed[s, 5]
-                geometry_gradient(out, p, scratch, LANES, mean_x, conics[s, 0], conics[s, 1], conics[s, 2], opacity)
-                total = zero
-                for i in range(16):
-                    total += scratch[LANE_DEPTH + i]
-                out[p, V_VALUES] = total
+            batch: NDArray[Any] = np.empty((BATCH, packed.shape[1]), real)
+            for behind in range(0, looked_at, BATCH):
+                last = start + looked_at - behind
+                first = max(last - BATCH, start)
+                fetch(batch, packed, pair_splats, first, last)
+                for k in range(last - first):
+                    p = last - 1 - k
+                    order, splat = real(np.int32(p - start)), batch[p - first]
+                    scratch[LANES : LANES + 64] = zero
+                    glass = pair_splats[p] - camera * splats_per_camera >= num_primary
+                    if glass or not unblend(scratch, splat, order, x0, y0, rows):
+                        out[p, :] = zero
+                        continue
+                    geometry_gradient(out, p, scratch, LANES, splat, x0)
+                    total = zero
+                    for i in range(16):
+                        total += scratch[LANE_DEPTH + i]
+                    out[p, V_VALUES] = total
             for y in range(rows):
                 for x in range(columns):
                     v_depth_map[camera, y0 + y, x0 + x] = scratch[V_DEPTH + (y & 15) * 16 + (x & 15)]

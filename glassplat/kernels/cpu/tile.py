@@ -8,6 +8,7 @@ vector instructions without checks. For the same reason rows and channels enter 
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,9 @@ GROUP = 4
 """Channels are blended four at a time."""
 MOST_CHANNELS = 32
 
+BATCH = 16
+"""Splats that a tile fetches at once. They lie anywhere in memory: fetched one at a time, each would be waited for."""
+
 # Columns of a packed splat.
 MEAN_X, MEAN_Y, FORM_XX, FORM_XY, FORM_YY, OPACITY, REACH, VALUES = 0, 1, 2, 3, 4, 5, 6, 8
 
@@ -47,6 +51,7 @@ class TileFunctions(NamedTuple):
         begin: fresh transmittances; pixels beyond the image's edge start as stopped.
         is_finished: whether every pixel has stopped.
         save_state, load_state: the planes that the backward pass starts from.
+        fetch: copies the packed splats of consecutive pairs next to each other.
         geometry_gradient: gradient of one pair's mean, conic and opacity from three rows of lane sums.
     """
 
@@ -56,13 +61,21 @@ class TileFunctions(NamedTuple):
     is_finished: Scalar
     save_state: Scalar
     load_state: Scalar
+    fetch: Scalar
     geometry_gradient: Scalar
 
 
 def tile_functions(real: type) -> TileFunctions:
     """Builds the functions for `real`, np.float32 or np.float64."""
     return TileFunctions(
-        _pack(real), _place(), _begin(real), _is_finished(real), _save_state(), _load_state(), _geometry_gradient(real)
+        _pack(real),
+        _place(),
+        _begin(real),
+        _is_finished(real),
+        _save_state(),
+        _load_state(),
+        _fetch(),
+        _geometry_gradient(real),
     )
 
 
@@ -157,15 +170,28 @@ def _load_state() -> Scalar:
     return load_state
 
 
+def _fetch() -> Scalar:
+    @inlined
+    def fetch(batch, packed, pair_splats, first, last):
+        for p in range(first, last):
+            row, to = packed[pair_splats[p]], batch[p - first]
+            for column in range(row.size):
+                to[column] = row[column]
+
+    return fetch
+
+
 def _geometry_gradient(real: type) -> Scalar:
     zero, half = real(0.0), real(0.5)
+    nats, half_nats = real(-math.log(2.0)), real(-2.0 * math.log(2.0))
 
     @inlined
-    def geometry_gradient(out, p, scratch, lanes, mean_x, xx, xy, yy, opacity):
+    def geometry_gradient(out, p, scratch, lanes, splat, x0):
         """`lanes`: 3 x 16 column sums of g, g dy and g dy^2, with g = v_alpha alpha and dy the row's offset."""
+        offset = half - (splat[MEAN_X] - real(x0))
         g_0, g_x, g_xx, g_y, g_xy, g_yy = zero, zero, zero, zero, zero, zero
         for i in range(TILE):
-            dx = real(np.int32(i)) + half - mean_x
+            dx = real(np.int32(i)) + offset
             g, gy = scratch[lanes + i], scratch[lanes + TILE + i]
             g_0 += g
             g_x += g * dx
@@ -174,11 +200,12 @@ def _geometry_gradient(real: type) -> Scalar:
             g_xy += gy * dx
             g_yy += scratch[lanes + 2 * TILE + i]
         # alpha = opacity exp(-q / 2), q = xx dx^2 + 2 xy dx dy + yy dy^2, and g = v_q * -2.
+        xx, xy, yy = half_nats * splat[FORM_XX], nats * splat[FORM_XY], half_nats * splat[FORM_YY]
         out[p, V_MEAN] = xx * g_x + xy * g_y
         out[p, V_MEAN + 1] = xy * g_x + yy * g_y
         out[p, V_CONIC] = -half * g_xx
         out[p, V_CONIC + 1] = -g_xy
         out[p, V_CONIC + 2] = -half * g_yy
-        out[p, V_OPACITY] = g_0 / opacity
+        out[p, V_OPACITY] = g_0 / splat[OPACITY]
 
     return geometry_gradient
