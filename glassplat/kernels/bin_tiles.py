@@ -43,9 +43,7 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
     (rows, columns), count = tile_grid(width, height), num_cameras * per_camera
     real = REAL_OF[splats.depths.dtype]
     flat = [t.detach().contiguous().numpy() for t in splats]
-    means2d, conics, opacities, depths, radii = (
-        a.reshape(count, *a.shape[2:]) for a in flat
-    )
+    means2d, conics, opacities, depths, radii = (a.reshape(count, *a.shape[2:]) for a in flat)
     mask = np.zeros((0, 0, 0), np.bool_) if active_tiles is None else active_tiles.contiguous().numpy()
     spans, span_offsets, first_rows, counts = tile_spans(real)(
         means2d, conics, opacities, radii, mask, num_cameras, width, height
@@ -59,10 +57,21 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
     order, starts = depth_order(KEY_OF[splats.depths.dtype])(
         depths.view(KEY_OF[splats.depths.dtype]), counts, num_cameras
     )
-    binned = tile_pairs()(order, starts, spans, span_offsets, first_rows, counts, mask, rows, columns)
+    pair_splats, tile_offsets, pair_slots, splat_offsets = tile_pairs()(
+        order, starts, spans, span_offsets, first_rows, counts, mask, rows, columns
+    )
     tiles = num_cameras * rows * columns
     active = torch.arange(tiles) if active_tiles is None else active_tiles.flatten().nonzero()[:, 0]
-    return TileBins(*map(torch.from_numpy, binned), active.to(torch.int32), width, height, num_cameras)
+    return TileBins(
+        pair_splats=torch.from_numpy(pair_splats),
+        tile_offsets=torch.from_numpy(tile_offsets),
+        pair_slots=torch.from_numpy(pair_slots),
+        splat_offsets=torch.from_numpy(splat_offsets),
+        active=active.to(torch.int32),
+        width=width,
+        height=height,
+        num_cameras=num_cameras,
+    )
 
 
 def _check(splats: Splats, width: int, height: int, active_tiles: Tensor | None) -> None:

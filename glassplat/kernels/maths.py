@@ -1,7 +1,7 @@
 """Scalar maths of projection: the shape of a Gaussian in the world and on screen, and the adjoints of both.
 
 Every function is pure, takes and returns scalars and tuples of scalars, and is typed by its factory, so that one source
-compiles for the CPU and for CUDA. A bare float or int literal would promote float32 to float64 there: constants are typed.
+compiles for the CPU and for CUDA. A bare float or int literal would promote float32 to float64: constants are typed.
 """
 
 from __future__ import annotations
@@ -129,7 +129,12 @@ def shape_maths(real: type) -> ShapeMaths:
         # The norm of the raw quaternion has no effect, so its direction is taken out of the gradient.
         radial = w * gw + x * gx + y * gy + z * gz
         scale = two * inverse_norm
-        return scale * (gw - radial * w), scale * (gx - radial * x), scale * (gy - radial * y), scale * (gz - radial * z)
+        return (
+            scale * (gw - radial * w),
+            scale * (gx - radial * x),
+            scale * (gy - radial * y),
+            scale * (gz - radial * z),
+        )
 
     return ShapeMaths(sigmoid, is_finite, unit_quat, rotation, unit_quat_gradient)
 

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from glassplat.kernels.cpu.project import project_backward, project_forward
+from glassplat.kernels.cpu.project import project_forward
+from glassplat.kernels.cpu.project_backward import project_backward
 from glassplat.kernels.maths_sh import MAX_DEGREE
 from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians
 
@@ -23,9 +24,9 @@ def project(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, ne
     finite. Then its radii and all its other values are zero and it gets no gradient from that camera.
 
     A splat's covariance is J A Sigma A^T J^T plus 0.3 px^2 on the diagonal, A the upper 3x3 block of
-    `cam_from_world` and J the Jacobian of the projection; beyond 1.3 times the image, J stays that of the border. Colours
-    are seen along the direction from the camera centre, defined as -A^T t, to the mean, offset by 0.5 and clamped
-    at 0. A mirrored, left-handed A is as good as any.
+    `cam_from_world` and J the Jacobian of the projection; beyond 1.3 times the image, J stays that of the border.
+    Colours are seen along the direction from the camera centre, defined as -A^T t, to the mean, offset by 0.5 and
+    clamped at 0. A mirrored, left-handed A is as good as any.
 
     Differentiable in all tensors of `gaussians` and in `cam_from_world`; `radii` carry no gradient.
 
@@ -68,8 +69,8 @@ def _check(gaussians: RawGaussians, cameras: CameraBatch, sh_degree: int, near: 
     check_tensors(expected)
     if not 0 <= sh_degree <= MAX_DEGREE or (coefficients and coefficients < (sh_degree + 1) ** 2):
         raise ValueError(
-            f"sh_degree is {sh_degree}, but degrees go from 0 to {MAX_DEGREE} and sh holds {coefficients} coefficients, "
-            f"of which degree L needs (L + 1)^2; lower sh_degree or pass more coefficients"
+            f"sh_degree is {sh_degree}, but degrees go from 0 to {MAX_DEGREE} and sh holds {coefficients} coefficients"
+            ", of which degree L needs (L + 1)^2; lower sh_degree or pass more"
         )
     if not near >= 0:
         raise ValueError(f"near is {near}; expected a depth of at least 0")
@@ -98,8 +99,8 @@ class _Project(torch.autograd.Function):
         cam_from_world: Tensor, intrinsics: Tensor, clip_planes: Tensor,
         width: int, height: int, sh_degree: int, near: float,
     ) -> tuple[Tensor, ...]:  # fmt: skip
-        tensors = (means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, clip_planes)
-        tensors = tuple(tensor.contiguous() for tensor in tensors)
+        inputs = (means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, clip_planes)
+        tensors = [tensor.contiguous() for tensor in inputs]
         real = REAL_OF[means.dtype]
         degree = sh_degree if sh.shape[1] else -1
         leading = (cam_from_world.shape[0], means.shape[0])

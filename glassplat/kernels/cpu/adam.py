@@ -14,6 +14,7 @@ from glassplat.kernels.cpu.jit import Kernel, kernel
 @cache
 def adam_step(real: type) -> Kernel:
     """Updates flat arrays in place; `rates` holds the step sizes of consecutive elements and repeats over them."""
+
     @kernel("adam", real)
     def step(parameter, gradient, first, second, rates, betas, gains, second_scale, eps):
         count, block = parameter.size, rates.size

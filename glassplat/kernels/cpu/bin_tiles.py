@@ -1,7 +1,7 @@
 """Binning on the CPU: which tiles a splat touches, the splats by depth, and the two together as one list per tile.
 
-Work is split into chunks that depend on the data alone, and each chunk knows from prefix sums where its results go, so that
-they are the same for any number of threads.
+Work is split into chunks that depend on the data alone, and each chunk knows from prefix sums where its results go, so
+that they are the same for any number of threads.
 """
 
 from __future__ import annotations

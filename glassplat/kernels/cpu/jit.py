@@ -17,7 +17,8 @@ log = logging.getLogger("glassplat.kernels")
 # `nnan` and `ninf` stay out: with them a comparison with NaN is undefined, and culling bad Gaussians relies on it.
 FAST_MATH = frozenset({"contract", "reassoc", "nsz", "arcp", "afn"})
 
-inlined = register_jitable(fastmath=set(FAST_MATH), error_model="numpy")
+# Forced, because the compiler balks at functions of many arrays, where a call costs more than the body.
+inlined = register_jitable(forceinline=True, fastmath=set(FAST_MATH), error_model="numpy")
 """Marks a scalar function that kernels call; compiles for the CPU and for CUDA."""
 
 

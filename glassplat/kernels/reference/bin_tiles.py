@@ -1,7 +1,7 @@
 """Binning by brute force: the definition of `glassplat.kernels.bin_tiles.bin_tiles`, by the same name and signature.
 
-It looks at every pixel of every splat, so a tile is listed exactly where a pixel centre has coverage of at least 1/255. The
-kernel may list a few tiles more, where the ellipse passes between pixel centres.
+It looks at every pixel of every splat, so a tile is listed exactly where a pixel centre has coverage of at least 1/255.
+The kernel may list a few tiles more, where the ellipse passes between pixel centres.
 """
 
 from __future__ import annotations

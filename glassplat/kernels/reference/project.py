@@ -1,4 +1,4 @@
-"""Projection in plain PyTorch: the definition of `glassplat.kernels.project.project`, by the same name and signature."""
+"""Projection in plain PyTorch: the definition of `glassplat.kernels.project.project`, same name and signature."""
 
 from __future__ import annotations
 

@@ -1,0 +1,44 @@
+"""Random Gaussians before random cameras, one of them mirrored, for the tests of the kernels."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians, Splats
+
+WIDTH, HEIGHT = 44, 36
+
+
+def draw(*shape: int, seed: int) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def random_gaussians(count: int, *, coefficients: int = 16, dtype: torch.dtype = torch.float64) -> RawGaussians:
+    """Gaussians around (0, 0, 4), some of them behind the cameras, off screen or too faint to see."""
+    tensors = (
+        torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64) + 1.5 * draw(count, 3, seed=1),
+        draw(count, 4, seed=2),
+        -2 + 0.7 * draw(count, 3, seed=3),
+        2 * draw(count, seed=4),
+        0.6 * draw(count, coefficients, 3, seed=5),
+    )
+    return RawGaussians(*(tensor.to(dtype).requires_grad_() for tensor in tensors))
+
+
+def random_cameras(count: int, *, clip: bool = False, dtype: torch.dtype = torch.float64) -> CameraBatch:
+    """Cameras near the origin that look along +z; every second one is mirrored, and the blocks are not quite rigid."""
+    poses = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    poses[:, :3] += 0.1 * draw(count, 3, 4, seed=6)
+    poses[1::2, :3, 0] *= -1
+    intrinsics = torch.tensor([40.0, 43.0, 23.0, 17.0], dtype=torch.float64) + draw(count, 4, seed=7)
+    planes = torch.tensor([0.1, -0.2, 1.0, -3.0], dtype=torch.float64) + 0.1 * draw(count, 4, seed=8)
+    return CameraBatch(
+        poses.to(dtype).requires_grad_(), intrinsics.to(dtype), WIDTH, HEIGHT, planes.to(dtype) if clip else None
+    )
+
+
+def as_splats(projected: Projected) -> Splats:
+    """What rasterisation needs, cut off from the graph."""
+    fields = (projected.means2d, projected.conics, projected.opacities, projected.depths, projected.radii)
+    return Splats(*(field.detach() for field in fields))
