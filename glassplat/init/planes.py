@@ -130,6 +130,8 @@ def _fit_pane(
             f"pane {label} is annotated in {len(views)} view(s), but its plane shows only between views: "
             "annotate at least two more views of it, taken from places well apart"
         )
+    if len(views) == 2:
+        log.warning("pane %d is annotated in two views only; its plane may be off by degrees, a third helps", label)
     chosen = plane_candidates(points, views, band=options.band)
     if chosen.sum() < 3:
         raise PlaneFitError(

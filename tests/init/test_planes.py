@@ -196,6 +196,12 @@ def test_one_view_is_too_few() -> None:
         fit_planes(frame_and_clutter([FRONT]), scene_of([FRONT])[:1], extent=EXTENT, options=QUICK)
 
 
+def test_two_views_are_enough_but_not_without_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    planes = fit_planes(frame_and_clutter([FRONT]), scene_of([FRONT])[:2], extent=EXTENT, options=QUICK)
+    assert normal_error(planes, 0, FRONT) < 2
+    assert "annotated in two views only" in caplog.text
+
+
 def test_without_points_on_the_frame_the_error_says_what_to_annotate() -> None:
     wall = frame_and_clutter([])[:5]
     with pytest.raises(PlaneFitError, match=r"pane 1: \d of 5 points lie along its edge in the 3 annotated views"):
