@@ -22,19 +22,15 @@ from glassplat.kernels.cpu.pair_gradients import new_pair_rows, sum_pair_rows
 from glassplat.kernels.maths_blend import ALPHA_MAX, TRANSMITTANCE_MIN, Scalar, blend_maths
 from glassplat.kernels.splats import Splats, TileBins
 
-# Planes of the forward pass after those that both directions share. WEIGHT holds one row only.
-MASK, WEIGHT, SUMS = 4 * tile.PLANE, 5 * tile.PLANE, 6 * tile.PLANE
+# Planes of the forward pass after those that both directions share; SUMS has one per channel.
+MASK, SUMS = 5 * tile.PLANE, 6 * tile.PLANE
 
-# Planes of the backward pass. BEHIND and BEHIND_GLASS hold what lies behind the current splat, weighted by the incoming
-# gradients. LANES holds rows of 16 column sums: weight, dot, then g, g dy, g dy^2, then one per channel.
-BEHIND, BEHIND_GLASS, V_MASK, LANES, V_IMAGE = (
-    4 * tile.PLANE,
-    5 * tile.PLANE,
-    6 * tile.PLANE,
-    7 * tile.PLANE,
-    10 * tile.PLANE,
-)
-LANE_DOT, LANE_GEOMETRY, LANE_VALUES = LANES + 16, LANES + 32, LANES + 80
+# Planes of the backward pass; V_IMAGE has one per channel. BEHIND and BEHIND_GLASS hold what lies behind the current
+# splat, weighted by the incoming gradients; DOT its channels beyond the first group, so weighted. LANES is rows of 16
+# column sums: g, g dy and g dy^2 as `geometry_gradient` takes them, then one per channel.
+BEHIND, BEHIND_GLASS, V_MASK, DOT = 5 * tile.PLANE, 6 * tile.PLANE, 7 * tile.PLANE, 8 * tile.PLANE
+LANES, V_IMAGE = 9 * tile.PLANE, 12 * tile.PLANE
+LANE_VALUES = LANES + 48
 
 
 class SavedTiles(NamedTuple):
@@ -95,23 +91,17 @@ def _flat(splats: Splats, channels: Tensor) -> tuple[NDArray[Any], ...]:
 
 
 def _blend_primary(real: type) -> Scalar:
-    exp2, _, clipped_alpha, _, row_range = blend_maths(real)
-    zero, half, t_min = real(0.0), real(0.5), real(TRANSMITTANCE_MIN)
-    T, LAST, PLANE, VALUES = tile.T, tile.LAST, tile.PLANE, tile.VALUES
+    clipped_alpha = blend_maths(real).clipped_alpha
+    zero, t_min = real(0.0), real(TRANSMITTANCE_MIN)
+    T, LAST, COVERAGE, PLANE, VALUES = tile.T, tile.LAST, tile.COVERAGE, tile.PLANE, tile.VALUES
 
     @inlined
-    def blend_primary(scratch, splat, groups, order, x0, y0, num_rows):
-        mean_x, mean_y = splat[0] - real(x0), splat[1] - real(y0)
-        xx, xy, yy, opacity = splat[2], splat[3], splat[4], splat[5]
+    def blend_primary(scratch, splat, order, first, last):
         c0, c1, c2, c3 = splat[VALUES], splat[VALUES + 1], splat[VALUES + 2], splat[VALUES + 3]
-        first, last = row_range(mean_y, splat[6], num_rows)
         for row in range(first, last):
             base = (row & 15) * 16
-            dy = real(row) + half - mean_y
-            linear, constant = xy * dy, yy * dy * dy
             for i in range(16):
-                dx = real(np.int32(i)) + half - mean_x
-                a = clipped_alpha(opacity * exp2((xx * dx + linear) * dx + constant))
+                a = clipped_alpha(scratch[COVERAGE + base + i])
                 t = scratch[T + base + i]
                 weight = a * t
                 after = t - weight
@@ -123,38 +113,43 @@ def _blend_primary(real: type) -> Scalar:
                 scratch[SUMS + PLANE + base + i] += weight * c1
                 scratch[SUMS + 2 * PLANE + base + i] += weight * c2
                 scratch[SUMS + 3 * PLANE + base + i] += weight * c3
-                scratch[WEIGHT + i] = weight
-            for g in range(1, groups):
-                at = VALUES + 4 * g
-                e0, e1, e2, e3 = splat[at], splat[at + 1], splat[at + 2], splat[at + 3]
-                sums = SUMS + (g & 7) * 4 * PLANE + base
-                for i in range(16):
-                    weight = scratch[WEIGHT + i]
-                    scratch[sums + i] += weight * e0
-                    scratch[sums + PLANE + i] += weight * e1
-                    scratch[sums + 2 * PLANE + i] += weight * e2
-                    scratch[sums + 3 * PLANE + i] += weight * e3
+                # From here on the plane holds weights, for the channels of `blend_more`.
+                scratch[COVERAGE + base + i] = weight
 
     return blend_primary
 
 
-def _blend_glass(real: type) -> Scalar:
-    exp2, _, clipped_alpha, _, row_range = blend_maths(real)
-    zero, half, t_min = real(0.0), real(0.5), real(TRANSMITTANCE_MIN)
-    T, T_GLASS, LAST_GLASS = tile.T, tile.T_GLASS, tile.LAST_GLASS
+def _blend_more(real: type) -> Scalar:
+    COVERAGE, PLANE, VALUES = tile.COVERAGE, tile.PLANE, tile.VALUES
 
     @inlined
-    def blend_glass(scratch, splat, mark, order, x0, y0, num_rows):
-        mean_x, mean_y = splat[0] - real(x0), splat[1] - real(y0)
-        xx, xy, yy, opacity = splat[2], splat[3], splat[4], splat[5]
-        first, last = row_range(mean_y, splat[6], num_rows)
+    def blend_more(scratch, splat, group, first, last):
+        """Adds channels beyond the first group, with the weights that `blend_primary` left."""
+        at, sums = VALUES + 4 * group, SUMS + (group & 7) * 4 * PLANE
+        c0, c1, c2, c3 = splat[at], splat[at + 1], splat[at + 2], splat[at + 3]
         for row in range(first, last):
             base = (row & 15) * 16
-            dy = real(row) + half - mean_y
-            linear, constant = xy * dy, yy * dy * dy
             for i in range(16):
-                dx = real(np.int32(i)) + half - mean_x
-                a = clipped_alpha(opacity * exp2((xx * dx + linear) * dx + constant))
+                weight = scratch[COVERAGE + base + i]
+                scratch[sums + base + i] += weight * c0
+                scratch[sums + PLANE + base + i] += weight * c1
+                scratch[sums + 2 * PLANE + base + i] += weight * c2
+                scratch[sums + 3 * PLANE + base + i] += weight * c3
+
+    return blend_more
+
+
+def _blend_glass(real: type) -> Scalar:
+    clipped_alpha = blend_maths(real).clipped_alpha
+    zero, t_min = real(0.0), real(TRANSMITTANCE_MIN)
+    T, T_GLASS, LAST_GLASS, COVERAGE = tile.T, tile.T_GLASS, tile.LAST_GLASS, tile.COVERAGE
+
+    @inlined
+    def blend_glass(scratch, splat, mark, order, first, last):
+        for row in range(first, last):
+            base = (row & 15) * 16
+            for i in range(16):
+                a = clipped_alpha(scratch[COVERAGE + base + i])
                 t, t_glass = scratch[T + base + i], scratch[T_GLASS + base + i]
                 weight = a * t_glass
                 after = t_glass - weight
@@ -168,8 +163,8 @@ def _blend_glass(real: type) -> Scalar:
 
 @functools.cache
 def _forward(real: type) -> Kernel:
-    pack, place, begin, is_finished, save_state, _, fetch, _ = tile.tile_functions(real)
-    blend_primary, blend_glass = _blend_primary(real), _blend_glass(real)
+    pack, place, begin, is_finished, save_state, _, fetch, cover, _ = tile.tile_functions(real)
+    blend_primary, blend_more, blend_glass = _blend_primary(real), _blend_more(real), _blend_glass(real)
     one, zero = real(1.0), real(0.0)
     T, PLANE, VALUES, BATCH = tile.T, tile.PLANE, tile.VALUES, tile.BATCH
 
@@ -210,10 +205,13 @@ def _forward(real: type) -> Kernel:
                 for p in range(first, last):
                     order, splat = real(np.int32(p - start)), batch[p - first]
                     glass = pair_splats[p] - camera * splats_per_camera - num_primary
+                    top, bottom = cover(scratch, splat, x0, y0, rows)
                     if glass < 0:
-                        blend_primary(scratch, splat, groups, order, x0, y0, rows)
+                        blend_primary(scratch, splat, order, top, bottom)
+                        for group in range(1, groups):
+                            blend_more(scratch, splat, group, top, bottom)
                     else:
-                        blend_glass(scratch, splat, marks[camera, glass], order, x0, y0, rows)
+                        blend_glass(scratch, splat, marks[camera, glass], order, top, bottom)
             save_state(state, n, scratch)
             write_tile(scratch, image, alpha, mask, camera, x0, y0, columns, rows)
 
@@ -221,87 +219,97 @@ def _forward(real: type) -> Kernel:
 
 
 def _unblend_primary(real: type) -> Scalar:
-    exp2, _, clipped_alpha, _, row_range = blend_maths(real)
+    clipped_alpha = blend_maths(real).clipped_alpha
     zero, half, one, alpha_max = real(0.0), real(0.5), real(1.0), real(ALPHA_MAX)
-    T, LAST, PLANE, VALUES = tile.T, tile.LAST, tile.PLANE, tile.VALUES
+    T, LAST, COVERAGE, PLANE, VALUES = tile.T, tile.LAST, tile.COVERAGE, tile.PLANE, tile.VALUES
+    MEAN_Y = tile.MEAN_Y
 
     @inlined
-    def unblend_primary(scratch, splat, groups, order, x0, y0, num_rows):
-        """Adds up this splat's lane sums; returns whether it reaches any row."""
-        mean_x, mean_y = splat[0] - real(x0), splat[1] - real(y0)
-        xx, xy, yy, opacity = splat[2], splat[3], splat[4], splat[5]
+    def unblend_primary(scratch, splat, order, y0, first, last):
+        """Takes a splat off the pixels of its rows and adds up its lane sums."""
         c0, c1, c2, c3 = splat[VALUES], splat[VALUES + 1], splat[VALUES + 2], splat[VALUES + 3]
-        first, last = row_range(mean_y, splat[6], num_rows)
+        mean_y = splat[MEAN_Y] - real(y0)
         for row in range(first, last):
             base = (row & 15) * 16
             dy = real(row) + half - mean_y
-            linear, constant = xy * dy, yy * dy * dy
             for i in range(16):
-                scratch[LANE_DOT + i] = zero
-            for g in range(1, groups):
-                at = VALUES + 4 * g
-                e0, e1, e2, e3 = splat[at], splat[at + 1], splat[at + 2], splat[at + 3]
-                v = V_IMAGE + (g & 7) * 4 * PLANE + base
-                for i in range(16):
-                    scratch[LANE_DOT + i] += (
-                        e0 * scratch[v + i] + e1 * scratch[v + PLANE + i]
-                        + e2 * scratch[v + 2 * PLANE + i] + e3 * scratch[v + 3 * PLANE + i]
-                    )  # fmt: skip
-            for i in range(16):
-                dx = real(np.int32(i)) + half - mean_x
-                coverage = opacity * exp2((xx * dx + linear) * dx + constant)
+                coverage = scratch[COVERAGE + base + i]
                 a = clipped_alpha(coverage) if order <= scratch[LAST + base + i] else zero
                 inverse = one / (one - a)
                 t = scratch[T + base + i] * inverse
                 weight = a * t
                 v0, v1 = scratch[V_IMAGE + base + i], scratch[V_IMAGE + PLANE + base + i]
                 v2, v3 = scratch[V_IMAGE + 2 * PLANE + base + i], scratch[V_IMAGE + 3 * PLANE + base + i]
-                dot = scratch[LANE_DOT + i] + v0 * c0 + v1 * c1 + v2 * c2 + v3 * c3
+                dot = scratch[DOT + base + i] + v0 * c0 + v1 * c1 + v2 * c2 + v3 * c3
                 behind = scratch[BEHIND + base + i]
                 v_alpha = t * dot - behind * inverse
                 scratch[BEHIND + base + i] = behind + weight * dot
                 scratch[T + base + i] = t
                 gain = v_alpha * a if coverage < alpha_max else zero
-                scratch[LANE_GEOMETRY + i] += gain
-                scratch[LANE_GEOMETRY + 16 + i] += gain * dy
-                scratch[LANE_GEOMETRY + 32 + i] += gain * dy * dy
+                scratch[LANES + i] += gain
+                scratch[LANES + 16 + i] += gain * dy
+                scratch[LANES + 32 + i] += gain * dy * dy
                 scratch[LANE_VALUES + i] += weight * v0
                 scratch[LANE_VALUES + 16 + i] += weight * v1
                 scratch[LANE_VALUES + 32 + i] += weight * v2
                 scratch[LANE_VALUES + 48 + i] += weight * v3
-                scratch[LANES + i] = weight
-            for g in range(1, groups):
-                v = V_IMAGE + (g & 7) * 4 * PLANE + base
-                lanes = LANE_VALUES + (g & 7) * 64
-                for i in range(16):
-                    weight = scratch[LANES + i]
-                    scratch[lanes + i] += weight * scratch[v + i]
-                    scratch[lanes + 16 + i] += weight * scratch[v + PLANE + i]
-                    scratch[lanes + 32 + i] += weight * scratch[v + 2 * PLANE + i]
-                    scratch[lanes + 48 + i] += weight * scratch[v + 3 * PLANE + i]
-        return first < last
+                # From here on the plane holds weights, for the channels of `sum_more`.
+                scratch[COVERAGE + base + i] = weight
 
     return unblend_primary
 
 
-def _unblend_glass(real: type) -> Scalar:
-    exp2, _, clipped_alpha, _, row_range = blend_maths(real)
-    zero, half, one, alpha_max = real(0.0), real(0.5), real(1.0), real(ALPHA_MAX)
-    T, T_GLASS, LAST_GLASS = tile.T, tile.T_GLASS, tile.LAST_GLASS
+def _more_channels(real: type) -> tuple[Scalar, Scalar]:
+    COVERAGE, PLANE, VALUES = tile.COVERAGE, tile.PLANE, tile.VALUES
+    zero = real(0.0)
 
     @inlined
-    def unblend_glass(scratch, splat, mark, order, x0, y0, num_rows):
+    def dot_more(scratch, splat, groups, first, last):
+        """Fills DOT, before `unblend_primary`."""
+        for row in range(first, last):
+            base = (row & 15) * 16
+            for i in range(16):
+                scratch[DOT + base + i] = zero
+            for group in range(1, groups):
+                at, v = VALUES + 4 * group, V_IMAGE + (group & 7) * 4 * PLANE + base
+                c0, c1, c2, c3 = splat[at], splat[at + 1], splat[at + 2], splat[at + 3]
+                for i in range(16):
+                    front = c0 * scratch[v + i] + c1 * scratch[v + PLANE + i]
+                    back = c2 * scratch[v + 2 * PLANE + i] + c3 * scratch[v + 3 * PLANE + i]
+                    scratch[DOT + base + i] += front + back
+
+    @inlined
+    def sum_more(scratch, groups, first, last):
+        """Adds up the lane sums of channels beyond the first group, after `unblend_primary`."""
+        for row in range(first, last):
+            base = (row & 15) * 16
+            for group in range(1, groups):
+                v, lanes = V_IMAGE + (group & 7) * 4 * PLANE + base, LANE_VALUES + (group & 7) * 64
+                for i in range(16):
+                    weight = scratch[COVERAGE + base + i]
+                    scratch[lanes + i] += weight * scratch[v + i]
+                    scratch[lanes + 16 + i] += weight * scratch[v + PLANE + i]
+                    scratch[lanes + 32 + i] += weight * scratch[v + 2 * PLANE + i]
+                    scratch[lanes + 48 + i] += weight * scratch[v + 3 * PLANE + i]
+
+    return dot_more, sum_more
+
+
+def _unblend_glass(real: type) -> Scalar:
+    clipped_alpha = blend_maths(real).clipped_alpha
+    zero, half, one, alpha_max = real(0.0), real(0.5), real(1.0), real(ALPHA_MAX)
+    T, T_GLASS, LAST_GLASS, COVERAGE = tile.T, tile.T_GLASS, tile.LAST_GLASS, tile.COVERAGE
+    MEAN_Y = tile.MEAN_Y
+
+    @inlined
+    def unblend_glass(scratch, splat, mark, order, y0, first, last):
         """As `unblend_primary`; the first row of value lanes gets the gradient of the mark."""
-        mean_x, mean_y = splat[0] - real(x0), splat[1] - real(y0)
-        xx, xy, yy, opacity = splat[2], splat[3], splat[4], splat[5]
-        first, last = row_range(mean_y, splat[6], num_rows)
+        mean_y = splat[MEAN_Y] - real(y0)
         for row in range(first, last):
             base = (row & 15) * 16
             dy = real(row) + half - mean_y
-            linear, constant = xy * dy, yy * dy * dy
             for i in range(16):
-                dx = real(np.int32(i)) + half - mean_x
-                coverage = opacity * exp2((xx * dx + linear) * dx + constant)
+                coverage = scratch[COVERAGE + base + i]
                 a = clipped_alpha(coverage) if order <= scratch[LAST_GLASS + base + i] else zero
                 inverse = one / (one - a)
                 t_glass = scratch[T_GLASS + base + i] * inverse
@@ -313,19 +321,19 @@ def _unblend_glass(real: type) -> Scalar:
                 scratch[BEHIND + base + i] += shown
                 scratch[T_GLASS + base + i] = t_glass
                 gain = v_alpha * a if coverage < alpha_max else zero
-                scratch[LANE_GEOMETRY + i] += gain
-                scratch[LANE_GEOMETRY + 16 + i] += gain * dy
-                scratch[LANE_GEOMETRY + 32 + i] += gain * dy * dy
+                scratch[LANES + i] += gain
+                scratch[LANES + 16 + i] += gain * dy
+                scratch[LANES + 32 + i] += gain * dy * dy
                 scratch[LANE_VALUES + i] += a * v_mark
-        return first < last
 
     return unblend_glass
 
 
 @functools.cache
 def _backward(real: type) -> Kernel:
-    _, place, _, _, _, load_state, fetch, geometry_gradient = tile.tile_functions(real)
+    _, place, _, _, _, load_state, fetch, cover, geometry_gradient = tile.tile_functions(real)
     unblend_primary, unblend_glass = _unblend_primary(real), _unblend_glass(real)
+    dot_more, sum_more = _more_channels(real)
     zero = real(0.0)
     T, PLANE, V_VALUES, BATCH = tile.T, tile.PLANE, tile.V_VALUES, tile.BATCH
 
@@ -363,15 +371,21 @@ def _backward(real: type) -> Kernel:
                     p = last - 1 - k
                     order, splat = real(np.int32(p - start)), batch[p - first]
                     glass = pair_splats[p] - camera * splats_per_camera - num_primary
-                    scratch[LANE_GEOMETRY : LANE_VALUES + groups * 64] = zero
-                    if glass < 0:
-                        reached = unblend_primary(scratch, splat, groups, order, x0, y0, rows)
-                    else:
-                        reached = unblend_glass(scratch, splat, marks[camera, glass], order, x0, y0, rows)
-                    if not reached:
+                    top, bottom = cover(scratch, splat, x0, y0, rows)
+                    if top >= bottom:
                         out[p, :] = zero
                         continue
-                    geometry_gradient(out, p, scratch, LANE_GEOMETRY, splat, x0)
+                    for i in range(48 + groups * 64):
+                        scratch[LANES + i] = zero
+                    if glass < 0:
+                        if groups > 1:
+                            dot_more(scratch, splat, groups, top, bottom)
+                        unblend_primary(scratch, splat, order, y0, top, bottom)
+                        if groups > 1:
+                            sum_more(scratch, groups, top, bottom)
+                    else:
+                        unblend_glass(scratch, splat, marks[camera, glass], order, y0, top, bottom)
+                    geometry_gradient(out, p, scratch, LANES, splat, x0)
                     for d in range(num_channels):
                         total = zero
                         for i in range(16):

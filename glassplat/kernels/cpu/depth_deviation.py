@@ -17,13 +17,14 @@ from glassplat.kernels.cpu.pair_gradients import new_pair_rows, sum_pair_rows
 from glassplat.kernels.maths_blend import ALPHA_MAX, TRANSMITTANCE_MIN, Scalar, blend_maths
 from glassplat.kernels.splats import Splats, TileBins
 
-DEPTH, SUM = 4 * tile.PLANE, 5 * tile.PLANE
-FORWARD_PLANES = 6
+DEPTH, SUM = 5 * tile.PLANE, 6 * tile.PLANE
+FORWARD_PLANES = 7
 
-# In the backward pass, LANES holds rows of 16 column sums: g, g dy, g dy^2, then the gradient of the splat's depth.
-BEHIND, V_SUM, V_DEPTH, LANES = 5 * tile.PLANE, 6 * tile.PLANE, 7 * tile.PLANE, 8 * tile.PLANE
+# In the backward pass, LANES holds rows of 16 column sums: g, g dy and g dy^2 as `geometry_gradient` takes them, then
+# the gradient of the splat's depth.
+BEHIND, V_SUM, V_DEPTH, LANES = 6 * tile.PLANE, 7 * tile.PLANE, 8 * tile.PLANE, 9 * tile.PLANE
 LANE_DEPTH = LANES + 48
-BACKWARD_PLANES = 9
+BACKWARD_PLANES = 10
 
 
 class SavedTiles(NamedTuple):
@@ -70,23 +71,17 @@ def depth_deviation_gradients(
 
 
 def _blend(real: type) -> Scalar:
-    maths = blend_maths(real)
-    exp2, clipped_alpha, row_range = maths.exp2, maths.clipped_alpha, maths.row_range
-    zero, half, t_min = real(0.0), real(0.5), real(TRANSMITTANCE_MIN)
-    T, LAST, VALUES = tile.T, tile.LAST, tile.VALUES
+    clipped_alpha = blend_maths(real).clipped_alpha
+    zero, t_min = real(0.0), real(TRANSMITTANCE_MIN)
+    T, LAST, COVERAGE, VALUES = tile.T, tile.LAST, tile.COVERAGE, tile.VALUES
 
     @inlined
-    def blend(scratch, splat, order, x0, y0, num_rows):
-        mean_x, mean_y = splat[0] - real(x0), splat[1] - real(y0)
-        xx, xy, yy, opacity, depth = splat[2], splat[3], splat[4], splat[5], splat[VALUES]
-        first, last = row_range(mean_y, splat[6], num_rows)
+    def blend(scratch, splat, order, first, last):
+        depth = splat[VALUES]
         for row in range(first, last):
             base = (row & 15) * 16
-            dy = real(row) + half - mean_y
-            linear, constant = xy * dy, yy * dy * dy
             for i in range(16):
-                dx = real(np.int32(i)) + half - mean_x
-                a = clipped_alpha(opacity * exp2((xx * dx + linear) * dx + constant))
+                a = clipped_alpha(scratch[COVERAGE + base + i])
                 t = scratch[T + base + i]
                 weight = a * t
                 after = t - weight
@@ -101,7 +96,7 @@ def _blend(real: type) -> Scalar:
 
 @functools.cache
 def _forward(real: type) -> Kernel:
-    pack, place, begin, is_finished, save_state, _, fetch, _ = tile.tile_functions(real)
+    pack, place, begin, is_finished, save_state, _, fetch, cover, _ = tile.tile_functions(real)
     blend = _blend(real)
     zero = real(0.0)
     PLANE, VALUES, BATCH = tile.PLANE, tile.VALUES, tile.BATCH
@@ -132,7 +127,8 @@ def _forward(real: type) -> Kernel:
                 fetch(batch, packed, pair_splats, first, last)
                 for p in range(first, last):
                     if pair_splats[p] - camera * splats_per_camera < num_primary:
-                        blend(scratch, batch[p - first], real(np.int32(p - start)), x0, y0, rows)
+                        top, bottom = cover(scratch, batch[p - first], x0, y0, rows)
+                        blend(scratch, batch[p - first], real(np.int32(p - start)), top, bottom)
             save_state(state, n, scratch)
             for y in range(rows):
                 for x in range(columns):
@@ -142,24 +138,19 @@ def _forward(real: type) -> Kernel:
 
 
 def _unblend(real: type) -> Scalar:
-    maths = blend_maths(real)
-    exp2, clipped_alpha, row_range = maths.exp2, maths.clipped_alpha, maths.row_range
+    clipped_alpha = blend_maths(real).clipped_alpha
     zero, half, one, alpha_max = real(0.0), real(0.5), real(1.0), real(ALPHA_MAX)
-    T, LAST, VALUES = tile.T, tile.LAST, tile.VALUES
+    T, LAST, COVERAGE, VALUES, MEAN_Y = tile.T, tile.LAST, tile.COVERAGE, tile.VALUES, tile.MEAN_Y
 
     @inlined
-    def unblend(scratch, splat, order, x0, y0, num_rows):
-        """Adds up this splat's lane sums; returns whether it reaches any row."""
-        mean_x, mean_y = splat[0] - real(x0), splat[1] - real(y0)
-        xx, xy, yy, opacity, depth = splat[2], splat[3], splat[4], splat[5], splat[VALUES]
-        first, last = row_range(mean_y, splat[6], num_rows)
+    def unblend(scratch, splat, order, y0, first, last):
+        """Takes a splat off the pixels of its rows and adds up its lane sums."""
+        depth, mean_y = splat[VALUES], splat[MEAN_Y] - real(y0)
         for row in range(first, last):
             base = (row & 15) * 16
             dy = real(row) + half - mean_y
-            linear, constant = xy * dy, yy * dy * dy
             for i in range(16):
-                dx = real(np.int32(i)) + half - mean_x
-                coverage = opacity * exp2((xx * dx + linear) * dx + constant)
+                coverage = scratch[COVERAGE + base + i]
                 a = clipped_alpha(coverage) if order <= scratch[LAST + base + i] else zero
                 inverse = one / (one - a)
                 t = scratch[T + base + i] * inverse
@@ -180,14 +171,13 @@ def _unblend(real: type) -> Scalar:
                 v_difference = v_difference if difference != zero else zero
                 scratch[LANE_DEPTH + i] += v_difference
                 scratch[V_DEPTH + base + i] -= v_difference
-        return first < last
 
     return unblend
 
 
 @functools.cache
 def _backward(real: type) -> Kernel:
-    _, place, _, _, _, load_state, fetch, geometry_gradient = tile.tile_functions(real)
+    _, place, _, _, _, load_state, fetch, cover, geometry_gradient = tile.tile_functions(real)
     unblend = _unblend(real)
     zero = real(0.0)
     PLANE, V_VALUES, BATCH = tile.PLANE, tile.V_VALUES, tile.BATCH
@@ -217,11 +207,14 @@ def _backward(real: type) -> Kernel:
                 for k in range(last - first):
                     p = last - 1 - k
                     order, splat = real(np.int32(p - start)), batch[p - first]
-                    scratch[LANES : LANES + 64] = zero
+                    top, bottom = cover(scratch, splat, x0, y0, rows)
                     glass = pair_splats[p] - camera * splats_per_camera >= num_primary
-                    if glass or not unblend(scratch, splat, order, x0, y0, rows):
+                    if glass or top >= bottom:
                         out[p, :] = zero
                         continue
+                    for i in range(64):
+                        scratch[LANES + i] = zero
+                    unblend(scratch, splat, order, y0, top, bottom)
                     geometry_gradient(out, p, scratch, LANES, splat, x0)
                     total = zero
                     for i in range(16):

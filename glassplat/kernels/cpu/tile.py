@@ -25,8 +25,9 @@ PLANE = PIXELS + TILE
 
 # Planes that forward and backward share. T and T_GLASS are negative where the pixel has stopped; LAST and LAST_GLASS
 # hold the position in the tile's list of the last splat that the pixel looked at before it stopped.
-T, LAST, T_GLASS, LAST_GLASS = 0, PLANE, 2 * PLANE, 3 * PLANE
-STATE_PLANES = 4
+# COVERAGE holds opacity times falloff of the current splat, in the rows that it reaches.
+T, LAST, T_GLASS, LAST_GLASS, COVERAGE = 0, PLANE, 2 * PLANE, 3 * PLANE, 4 * PLANE
+STATE_PLANES, SHARED_PLANES = 4, 5
 
 GROUP = 4
 """Channels are blended four at a time."""
@@ -52,6 +53,8 @@ class TileFunctions(NamedTuple):
         is_finished: whether every pixel has stopped.
         save_state, load_state: the planes that the backward pass starts from.
         fetch: copies the packed splats of consecutive pairs next to each other.
+        cover: fills COVERAGE; first and one-past-last row that the splat reaches. A loop of its own, because the
+            processor overlaps more rows of a short computation than of a long one.
         geometry_gradient: gradient of one pair's mean, conic and opacity from three rows of lane sums.
     """
 
@@ -62,6 +65,7 @@ class TileFunctions(NamedTuple):
     save_state: Scalar
     load_state: Scalar
     fetch: Scalar
+    cover: Scalar
     geometry_gradient: Scalar
 
 
@@ -75,6 +79,7 @@ def tile_functions(real: type) -> TileFunctions:
         _save_state(),
         _load_state(),
         _fetch(),
+        _cover(real),
         _geometry_gradient(real),
     )
 
@@ -181,6 +186,28 @@ def _fetch() -> Scalar:
     return fetch
 
 
+def _cover(real: type) -> Scalar:
+    maths = blend_maths(real)
+    exp2, row_range = maths.exp2, maths.row_range
+    half = real(0.5)
+
+    @inlined
+    def cover(scratch, splat, x0, y0, num_rows):
+        mean_x, mean_y = splat[MEAN_X] - real(x0), splat[MEAN_Y] - real(y0)
+        xx, xy, yy, opacity = splat[FORM_XX], splat[FORM_XY], splat[FORM_YY], splat[OPACITY]
+        first, last = row_range(mean_y, splat[REACH], num_rows)
+        for row in range(first, last):
+            base = COVERAGE + (row & 15) * TILE
+            dy = real(row) + half - mean_y
+            linear, constant = xy * dy, yy * dy * dy
+            for i in range(TILE):
+                dx = real(np.int32(i)) + half - mean_x
+                scratch[base + i] = opacity * exp2((xx * dx + linear) * dx + constant)
+        return first, last
+
+    return cover
+
+
 def _geometry_gradient(real: type) -> Scalar:
     zero, half = real(0.0), real(0.5)
     nats, half_nats = real(-math.log(2.0)), real(-2.0 * math.log(2.0))
@@ -188,6 +215,7 @@ def _geometry_gradient(real: type) -> Scalar:
     @inlined
     def geometry_gradient(out, p, scratch, lanes, splat, x0):
         """`lanes`: 3 x 16 column sums of g, g dy and g dy^2, with g = v_alpha alpha and dy the row's offset."""
+        lanes = lanes & 0xFFFF
         offset = half - (splat[MEAN_X] - real(x0))
         g_0, g_x, g_xx, g_y, g_xy, g_yy = zero, zero, zero, zero, zero, zero
         for i in range(TILE):
