@@ -45,20 +45,18 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
     flat = [t.detach().contiguous().numpy() for t in splats]
     means2d, conics, opacities, depths, radii = (a.reshape(count, *a.shape[2:]) for a in flat)
     mask = np.zeros((0, 0, 0), np.bool_) if active_tiles is None else active_tiles.contiguous().numpy()
-    spans, span_offsets, first_rows, counts = tile_spans(real)(
+    spans, span_offsets, first_rows, splat_offsets = tile_spans(real)(
         means2d, conics, opacities, radii, mask, num_cameras, width, height
     )
-    pairs = int(counts.sum(dtype=np.int64))
-    if pairs > MOST_PAIRS:
+    if splat_offsets[-1] > MOST_PAIRS:
         raise ValueError(
-            f"{pairs} (tile, splat) pairs are more than the {MOST_PAIRS} that can be indexed; render fewer cameras at "
-            f"once or a smaller image"
+            f"{splat_offsets[-1]} (tile, splat) pairs are more than the {MOST_PAIRS} that can be indexed; render fewer "
+            f"cameras at once or a smaller image"
         )
-    order, starts = depth_order(KEY_OF[splats.depths.dtype])(
-        depths.view(KEY_OF[splats.depths.dtype]), counts, num_cameras
-    )
-    pair_splats, tile_offsets, pair_slots, splat_offsets = tile_pairs()(
-        order, starts, spans, span_offsets, first_rows, counts, mask, rows, columns
+    keys = depths.view(KEY_OF[splats.depths.dtype])
+    order, starts = depth_order(KEY_OF[splats.depths.dtype])(keys, splat_offsets, num_cameras)
+    pair_splats, tile_offsets, pair_slots = tile_pairs()(
+        order, starts, spans, span_offsets, first_rows, splat_offsets, mask, rows, columns
     )
     tiles = num_cameras * rows * columns
     active = torch.arange(tiles) if active_tiles is None else active_tiles.flatten().nonzero()[:, 0]

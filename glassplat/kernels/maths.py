@@ -271,7 +271,7 @@ def ellipse_maths() -> EllipseMaths:
 
     @inlined
     def half_height(xx, xy, yy, opacity):
-        visible = opacity / ALPHA_MIN
+        xx, xy, yy, visible = np.float64(xx), np.float64(xy), np.float64(yy), np.float64(opacity) / ALPHA_MIN
         if not visible >= 1.0:
             return -1.0
         determinant = xx * yy - xy * xy
@@ -284,6 +284,7 @@ def ellipse_maths() -> EllipseMaths:
 
     @inlined
     def outline(xx, xy, yy, height):
+        xx, xy, yy = np.float64(xx), np.float64(xy), np.float64(yy)
         if not height < np.inf:
             return 0.0, np.inf, height, 0.0
         widening = math.sqrt(xx * yy - xy * xy) / xx

@@ -7,7 +7,9 @@ that they are the same for any number of threads.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numba import prange
@@ -30,17 +32,10 @@ def tile_spans(real: type) -> Kernel:
         spans [R, 2]: first and last tile column; last < first where a row is not touched.
         span_offsets [S + 1]: where the rows of each splat begin in `spans`.
         first_rows [S]: tile row of each splat's first span.
-        counts [S]: active tiles of each splat.
+        splat_offsets [S + 1]: active tiles of all splats before.
     """
     half_height, outline, band = ellipse_maths()
-
-    @inlined
-    def pixel_range(low, high, size):
-        """First and last pixel whose centre lies in [low, high], within an image of that size."""
-        # Clamped before the conversion, so that infinities are well defined.
-        first = np.int64(math.ceil(min(max(low - 0.5, 0.0), float(size))))
-        last = np.int64(math.floor(min(max(high - 0.5, -1.0), float(size - 1))))
-        return first, last
+    pixel_range = _pixel_range()
 
     @kernel("tile_spans", real)
     def spans_of(means2d, conics, opacities, radii, active_tiles, num_cameras, width, height):
@@ -50,17 +45,13 @@ def tile_spans(real: type) -> Kernel:
         masked = active_tiles.size > 0
         heights = np.empty(num_splats)
         first_rows = np.empty(num_splats, np.int32)
-        counts = np.zeros(num_splats, np.int32)
-        span_offsets = np.zeros(num_splats + 1, np.int64)
+        span_offsets, splat_offsets = np.zeros(num_splats + 1, np.int64), np.zeros(num_splats + 1, np.int64)
         for chunk in prange(num_chunks):
             for s in range(chunk * SPAN_CHUNK, min(num_splats, (chunk + 1) * SPAN_CHUNK)):
                 if not (radii[s, 0] > 0 and abs(means2d[s, 0]) + abs(means2d[s, 1]) < np.inf):
                     continue
-                reach = half_height(
-                    np.float64(conics[s, 0]), np.float64(conics[s, 1]), np.float64(conics[s, 2]),
-                    np.float64(opacities[s]),
-                )  # fmt: skip
                 y = np.float64(means2d[s, 1])
+                reach = half_height(conics[s, 0], conics[s, 1], conics[s, 2], opacities[s])
                 first, last = pixel_range(y - reach, y + reach, height)
                 if first <= last and reach >= 0.0:
                     heights[s] = reach
@@ -74,9 +65,8 @@ def tile_spans(real: type) -> Kernel:
                 begin, end = span_offsets[s], span_offsets[s + 1]
                 if begin == end:
                     continue
-                x, y = np.float64(means2d[s, 0]), np.float64(means2d[s, 1])
-                reach = heights[s]
-                shape = outline(np.float64(conics[s, 0]), np.float64(conics[s, 1]), np.float64(conics[s, 2]), reach)
+                x, y, reach = np.float64(means2d[s, 0]), np.float64(means2d[s, 1]), heights[s]
+                shape = outline(conics[s, 0], conics[s, 1], conics[s, 2], reach)
                 first, last = pixel_range(y - reach, y + reach, height)
                 count = 0
                 for i in range(begin, end):
@@ -88,15 +78,28 @@ def tile_spans(real: type) -> Kernel:
                     if first_pixel > last_pixel:
                         continue
                     spans[i, 0], spans[i, 1] = first_pixel // TILE, last_pixel // TILE
+                    count += spans[i, 1] - spans[i, 0] + 1
                     if masked:
                         for column in range(spans[i, 0], spans[i, 1] + 1):
-                            count += active_tiles[s // per_camera, row, column]
-                    else:
-                        count += spans[i, 1] - spans[i, 0] + 1
-                counts[s] = count
-        return spans, span_offsets, first_rows, counts
+                            count -= not active_tiles[s // per_camera, row, column]
+                splat_offsets[s + 1] = count
+        for s in range(num_splats):
+            splat_offsets[s + 1] += splat_offsets[s]
+        return spans, span_offsets, first_rows, splat_offsets
 
     return spans_of
+
+
+def _pixel_range() -> Callable[..., Any]:
+    @inlined
+    def pixel_range(low, high, size):
+        """First and last pixel whose centre lies in [low, high], within an image of that size."""
+        # Clamped before the conversion, so that infinities are well defined.
+        first = np.int64(math.ceil(min(max(low - 0.5, 0.0), float(size))))
+        last = np.int64(math.floor(min(max(high - 0.5, -1.0), float(size - 1))))
+        return first, last
+
+    return pixel_range
 
 
 @cache
@@ -116,7 +119,7 @@ def depth_order(key: type) -> Kernel:
     digit_bits = key(DIGIT_BITS)
 
     @kernel("depth_order", key)
-    def order_of(keys, counts, num_cameras):
+    def order_of(keys, splat_offsets, num_cameras):
         num_splats = keys.size
         per_camera = num_splats // max(1, num_cameras)
         chunk_size = max(SORT_CHUNK, (per_camera + SORT_CHUNKS - 1) // SORT_CHUNKS)
@@ -137,7 +140,7 @@ def depth_order(key: type) -> Kernel:
                     if digit == 0:
                         source_keys[i] = keys[i]
                         source_splats[i] = i
-                    if digit > 0 or counts[i] > 0:
+                    if digit > 0 or splat_offsets[i + 1] > splat_offsets[i]:
                         place[(source_keys[i] >> shift) & digit_mask] += 1
             total = 0
             new_starts = np.empty(num_cameras + 1, np.int64)
@@ -154,7 +157,7 @@ def depth_order(key: type) -> Kernel:
                 begin = starts[camera] + chunk * chunk_size
                 place = places[task]
                 for i in range(begin, min(begin + chunk_size, starts[camera + 1])):
-                    if digit > 0 or counts[i] > 0:
+                    if digit > 0 or splat_offsets[i + 1] > splat_offsets[i]:
                         value = (source_keys[i] >> shift) & digit_mask
                         target = place[value]
                         place[value] = target + 1
@@ -171,16 +174,24 @@ def tile_pairs() -> Kernel:
     """Lists the splats of each tile in depth order: a counting sort of all (splat, tile) pairs by tile.
 
     Returns:
-        pair_splats [P], tile_offsets [C * T + 1], pair_slots [P], splat_offsets [S + 1], as in `TileBins`.
+        pair_splats [P], tile_offsets [C * T + 1], pair_slots [P], as in `TileBins`.
     """
 
     @kernel("tile_pairs", np.int32)
-    def pairs_of(order, starts, spans, span_offsets, first_rows, counts, active_tiles, rows, columns):
-        num_cameras, num_splats, num_tiles = starts.size - 1, counts.size, rows * columns
-        masked = active_tiles.size > 0
-        splat_offsets = np.zeros(num_splats + 1, np.int64)
-        for s in range(num_splats):
-            splat_offsets[s + 1] = splat_offsets[s] + counts[s]
+    def pairs_of(order, starts, spans, span_offsets, first_rows, splat_offsets, active_tiles, rows, columns):
+        num_cameras, num_splats, num_tiles = starts.size - 1, first_rows.size, rows * columns
+        per_camera = num_splats // max(1, num_cameras)
+        # Each splat's tiles in a row, in place of spans: read twice below, in an order that defeats the caches.
+        tiles = np.empty(splat_offsets[num_splats], np.int32)
+        for chunk in prange((num_splats + SPAN_CHUNK - 1) // SPAN_CHUNK):
+            for s in range(chunk * SPAN_CHUNK, min(num_splats, (chunk + 1) * SPAN_CHUNK)):
+                slot = splat_offsets[s]
+                for i in range(span_offsets[s], span_offsets[s + 1] if splat_offsets[s + 1] > slot else 0):
+                    row = first_rows[s] + i - span_offsets[s]
+                    for column in range(spans[i, 0], spans[i, 1] + 1):
+                        if active_tiles.size == 0 or active_tiles[s // per_camera, row, column]:
+                            tiles[slot] = row * columns + column
+                            slot += 1
         longest = 0
         for camera in range(num_cameras):
             longest = max(longest, starts[camera + 1] - starts[camera])
@@ -194,11 +205,8 @@ def tile_pairs() -> Kernel:
             place[:] = 0
             for i in range(begin, min(begin + chunk_size, starts[camera + 1])):
                 s = order[i]
-                for j in range(span_offsets[s], span_offsets[s + 1]):
-                    row = first_rows[s] + j - span_offsets[s]
-                    for column in range(spans[j, 0], spans[j, 1] + 1):
-                        if not masked or active_tiles[camera, row, column]:
-                            place[row * columns + column] += 1
+                for slot in range(splat_offsets[s], splat_offsets[s + 1]):
+                    place[tiles[slot]] += 1
         tile_offsets = np.zeros(num_cameras * num_tiles + 1, np.int64)
         total = 0
         for camera in range(num_cameras):
@@ -216,16 +224,11 @@ def tile_pairs() -> Kernel:
             place = places[task]
             for i in range(begin, min(begin + chunk_size, starts[camera + 1])):
                 s = order[i]
-                slot = splat_offsets[s]
-                for j in range(span_offsets[s], span_offsets[s + 1]):
-                    row = first_rows[s] + j - span_offsets[s]
-                    for column in range(spans[j, 0], spans[j, 1] + 1):
-                        if not masked or active_tiles[camera, row, column]:
-                            pair = place[row * columns + column]
-                            place[row * columns + column] = pair + 1
-                            pair_splats[pair] = s
-                            pair_slots[slot] = pair
-                            slot += 1
-        return pair_splats, tile_offsets, pair_slots, splat_offsets
+                for slot in range(splat_offsets[s], splat_offsets[s + 1]):
+                    pair = place[tiles[slot]]
+                    place[tiles[slot]] = pair + 1
+                    pair_splats[pair] = s
+                    pair_slots[slot] = pair
+        return pair_splats, tile_offsets, pair_slots
 
     return pairs_of
