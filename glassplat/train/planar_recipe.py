@@ -73,18 +73,14 @@ class ReflectionWeights:
 class Perturbation:
     """When and how much the opacity of what lies behind a pane is perturbed (Section III-C3).
 
-    It shares a rhythm with the opacity resets: every third beat is a reset, the other two perturb.
+    It happens at the beats of `Rhythm` that do not reset the opacities.
 
     Attributes:
         amplitude: half width of the uniform noise on the opacity; 0 switches it off.
-        share: distance between beats, as a share of the run.
-        least: fewest iterations between beats.
         stop: share of the run after which nothing is perturbed any more.
     """
 
     amplitude: float = 0.4
-    share: float = 1 / 30
-    least: int = 250
     stop: float = 0.8
 
 
@@ -183,7 +179,7 @@ class PlanarRecipe:
 
     def _joint(self, share: float) -> Stage:
         """Stage 3: everything learns, opacities are perturbed, planes move slowly."""
-        beat = Every(self.perturbation.share, 0.0, self.perturbation.stop, self.perturbation.least)
+        beat = Every(self.rhythm.beat, 0.0, self.perturbation.stop, self.rhythm.least, skip_multiples_of=3)
         return Stage(
             name="3 joint optimisation",
             share=share,
@@ -197,7 +193,7 @@ class PlanarRecipe:
                 *growth_actions(self.rhythm, self.densify),
                 Densify(self.densify, part="glass"),
                 opacity_resets(self.rhythm),
-                PerturbOpacity(replace(beat, skip_multiples_of=3), self.perturbation.amplitude),
+                PerturbOpacity(beat, self.perturbation.amplitude),
             ),
         )
 

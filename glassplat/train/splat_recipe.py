@@ -49,19 +49,22 @@ class GaussianRates:
 
 @dataclass(frozen=True)
 class Rhythm:
-    """When opacities are reset and the SH degree grows, in shares of the run (3DGS: of 30,000 iterations).
+    """When opacities are disturbed and the SH degree grows, in shares of the run (3DGS: of 30,000 iterations).
+
+    Every third beat resets the opacities, as in 3DGS; `planar` perturbs them at the other two, so that
+    the two never meet (TR-Gaussians, Section III-C3).
 
     Attributes:
-        reset_share: distance between opacity resets, as a share of the run.
-        reset_least: fewest iterations between two resets, for short runs.
+        beat: distance between beats, as a share of the run.
+        least: fewest iterations between beats; what a beat disturbs needs as many to recover.
         reset_stop: share of the run after which no reset happens.
-        sh_share: distance between rises of the SH degree, as a share of the run.
+        sh: distance between rises of the SH degree, as a share of the run.
     """
 
-    reset_share: float = 0.1
-    reset_least: int = 1000
+    beat: float = 1 / 30
+    least: int = 250
     reset_stop: float = 0.45
-    sh_share: float = 1 / 30
+    sh: float = 1 / 30
 
 
 def photometric_terms(ssim_weight: float) -> tuple[LossTerm, ...]:
@@ -71,12 +74,12 @@ def photometric_terms(ssim_weight: float) -> tuple[LossTerm, ...]:
 
 def growth_actions(rhythm: Rhythm, densifier: DefaultDensify) -> tuple[Action, ...]:
     """Densification and SH growth of the primary Gaussians."""
-    return Densify(densifier), GrowSh(Every(rhythm.sh_share))
+    return Densify(densifier), GrowSh(Every(rhythm.sh))
 
 
 def opacity_resets(rhythm: Rhythm) -> ResetOpacity:
     """The recurring opacity reset."""
-    return ResetOpacity(Every(rhythm.reset_share, 0.0, rhythm.reset_stop, rhythm.reset_least))
+    return ResetOpacity(Every(rhythm.beat, 0.0, rhythm.reset_stop, rhythm.least, only_multiples_of=3))
 
 
 @dataclass(frozen=True)
