@@ -171,12 +171,15 @@ def _forward(real: type) -> Kernel:
     @inlined
     def write_tile(scratch, image, alpha, mask, camera, x0, y0, columns, rows):
         for y in range(rows):
-            for x in range(columns):
-                i = (y & 15) * 16 + (x & 15)
-                alpha[camera, y0 + y, x0 + x] = one - abs(scratch[T + i])
-                mask[camera, y0 + y, x0 + x] = scratch[MASK + i]
-                for d in range(image.shape[3]):
-                    image[camera, y0 + y, x0 + x, d] = scratch[SUMS + (d & 31) * PLANE + i]
+            base = (y & 15) * 16
+            image_row = image[camera, y0 + y, x0 : x0 + columns]
+            alpha_row, mask_row = alpha[camera, y0 + y, x0 : x0 + columns], mask[camera, y0 + y, x0 : x0 + columns]
+            for x in range(alpha_row.size):
+                alpha_row[x] = one - abs(scratch[T + base + x])
+                mask_row[x] = scratch[MASK + base + x]
+            for d in range(image_row.shape[1]):
+                for x in range(image_row.shape[0]):
+                    image_row[x, d] = scratch[SUMS + (d & 31) * PLANE + base + x]
 
     @kernel("composite_forward", real)
     def forward(
@@ -340,13 +343,16 @@ def _backward(real: type) -> Kernel:
     @inlined
     def load_gradients(scratch, v_image, v_alpha, v_mask, camera, x0, y0, columns, rows):
         for y in range(rows):
-            for x in range(columns):
-                i = (y & 15) * 16 + (x & 15)
+            base = (y & 15) * 16
+            image_row = v_image[camera, y0 + y, x0 : x0 + columns]
+            alpha_row, mask_row = v_alpha[camera, y0 + y, x0 : x0 + columns], v_mask[camera, y0 + y, x0 : x0 + columns]
+            for x in range(alpha_row.size):
                 # alpha = 1 - T: its gradient acts like something behind every splat.
-                scratch[BEHIND + i] = -v_alpha[camera, y0 + y, x0 + x] * scratch[T + i]
-                scratch[V_MASK + i] = v_mask[camera, y0 + y, x0 + x]
-                for d in range(v_image.shape[3]):
-                    scratch[V_IMAGE + (d & 31) * PLANE + i] = v_image[camera, y0 + y, x0 + x, d]
+                scratch[BEHIND + base + x] = -alpha_row[x] * scratch[T + base + x]
+                scratch[V_MASK + base + x] = mask_row[x]
+            for d in range(image_row.shape[1]):
+                for x in range(image_row.shape[0]):
+                    scratch[V_IMAGE + (d & 31) * PLANE + base + x] = image_row[x, d]
 
     @kernel("composite_backward", real)
     def backward(
