@@ -45,6 +45,7 @@ class Dataset:
         truth: folder of known layers and planes for evaluation, where the capture has one.
         warnings: what was assumed or left out, full sentences.
         split: how the test views were chosen.
+        measured_points: False if `points` are random ones, which carry no geometry.
     """
 
     root: Path
@@ -56,6 +57,7 @@ class Dataset:
     truth: Path | None = None
     warnings: tuple[str, ...] = ()
     split: str = ""
+    measured_points: bool = True
 
 
 def load_dataset(

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
+from torch import Tensor
+
 from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify
 from glassplat.init.glass import glass_gaussians
@@ -15,6 +17,7 @@ from glassplat.losses.reflection import gradient_conflict, mask_loss
 from glassplat.losses.term import LossTerm
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
+from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, PerturbOpacity
 from glassplat.train.optimizer import Rate
@@ -94,11 +97,16 @@ class PlaneEntry:
 
     def __call__(self, state: TrainState, dataset: Dataset) -> None:
         """Edits `state`."""
-        annotations = [(v.camera, v.pane_labels) for v in dataset.train if v.pane_labels is not None]
-        planes = fit_planes(state.scene.primary.means, annotations, extent=state.scene.extent, options=self.fit)
+        means, extent = state.scene.primary.means, state.scene.extent
+        planes = fit_planes(means, annotations_of(dataset), extent=extent, options=self.fit)
         glass = glass_gaussians(planes, count=self.glass_count, seed=self.seed)
         state.scene = replace(state.scene, planes=planes, glass=glass)
         state.statistics.clear()
+
+
+def annotations_of(dataset: Dataset) -> list[tuple[Camera, Tensor]]:
+    """Cameras and pane labels [H, W] of the annotated training views."""
+    return [(view.camera, view.pane_labels) for view in dataset.train if view.pane_labels is not None]
 
 
 @dataclass(frozen=True)
@@ -142,7 +150,15 @@ class PlanarRecipe:
     densify: DefaultDensify = field(default_factory=DefaultDensify)
 
     def initialise(self, dataset: Dataset) -> Scene:
-        """The first scene: one Gaussian per point, no planes yet."""
+        """The first scene: one Gaussian per point, no planes yet.
+
+        Raises:
+            PlaneFitError: the masks do not do. The planes are fitted to the measured points once and forgotten,
+                because a bad mask should end a run before the first iteration and not at the second stage.
+        """
+        if dataset.measured_points or not dataset.pane_labels:
+            positions, annotations = dataset.points.positions, annotations_of(dataset)
+            fit_planes(positions, annotations, extent=dataset.extent, options=self.plane_fit)
         return Scene(gaussians_from_points(dataset.points, sh_degree=self.sh_degree), dataset.extent)
 
     def renderer(self) -> Planar:
