@@ -12,6 +12,7 @@ from glassplat.kernels.bin_tiles import TILE, bin_tiles
 from glassplat.kernels.composite import composite
 from glassplat.kernels.depth_deviation import depth_deviation
 from glassplat.kernels.splats import Splats, TileBins
+from glassplat.render.color_space import linear_from_srgb, srgb_from_linear
 from glassplat.render.frame import Frame, ScreenPass
 from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, mean_depth, over_background, project_gaussians
 from glassplat.render.reflectance import constant_strength, nearest_hits, schlick_strength
@@ -20,6 +21,9 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
 from glassplat.scene.pose import mirror_matrices
 from glassplat.scene.scene import Scene
+
+
+Blend = Literal["srgb", "linear"]
 
 
 class FirstPass(NamedTuple):
@@ -65,6 +69,7 @@ class Planar:
         reflection_gradient: what the reflection image's gradient reaches: everything, or the planes alone.
         deviation: also compute the depth deviation, for training.
         deviation_depth_gradient: let the deviation's gradient pass through the mean depth D_t.
+        blend: space in which Eqs. 1 and 13 hold: sRGB as photographed (the paper), or linear radiance.
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -73,6 +78,7 @@ class Planar:
     reflection_gradient: Literal["all", "planes"] = "all"
     deviation: bool = False
     deviation_depth_gradient: bool = False
+    blend: Blend = "srgb"
 
     def __call__(self, scene: Scene, camera: Camera) -> Frame:
         """Renders `scene` from `camera`."""
@@ -92,10 +98,10 @@ class Planar:
         second = self._second_pass(scene, camera, planes, hits & (first.mask.detach() > 0))
         reflection = second.raw_reflection
         if self.intensity:
-            reflection = reflection * second.intensity[..., None]
+            reflection = brightened(reflection, second.intensity[..., None], self.blend)
         raw_strength = schlick_strength(planes, camera) if self.fresnel else constant_strength(planes, camera)
         strength = (raw_strength * hits).sum(dim=0) * first.mask
-        rgb = first.transmission + strength[..., None] * (reflection - first.transmission)
+        rgb = blended(first.transmission, reflection, strength[..., None], self.blend)
         layers |= {"reflection": reflection, "strength": strength, "hit": hit.to(strength.dtype)}
         return Frame(rgb, layers, first.screen + second.screen)
 
@@ -153,6 +159,21 @@ class Planar:
             intensity=(result.image[..., 3] * shown).sum(dim=0),
             screen=(ScreenPass("primary", projected.means2d, projected.radii),),
         )
+
+
+def blended(transmission: Tensor, reflection: Tensor, strength: Tensor, blend: Blend) -> Tensor:
+    """(1 - R) C_t + R C_r of sRGB images in the given space (Eq. 1); sRGB."""
+    if blend == "srgb":
+        return transmission + strength * (reflection - transmission)
+    behind, reflected = linear_from_srgb(transmission), linear_from_srgb(reflection)
+    return srgb_from_linear(behind + strength * (reflected - behind))
+
+
+def brightened(image: Tensor, intensity: Tensor, blend: Blend) -> Tensor:
+    """An sRGB image times an intensity in the given space (Eq. 13); sRGB."""
+    if blend == "srgb":
+        return image * intensity
+    return srgb_from_linear(linear_from_srgb(image) * intensity)
 
 
 def select_planes(planes: Planes, index: list[int]) -> Planes:

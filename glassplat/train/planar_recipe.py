@@ -15,7 +15,7 @@ from glassplat.init.points import gaussians_from_points
 from glassplat.losses.geometry import depth_deviation_loss
 from glassplat.losses.reflection import gradient_conflict, mask_loss
 from glassplat.losses.term import LossTerm
-from glassplat.render.planar import Planar
+from glassplat.render.planar import Blend, Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
@@ -121,6 +121,7 @@ class PlanarRecipe:
         multi_stage: False skips stage 2 (ablation).
         fresnel: False makes the strength independent of the angle (ablation).
         intensity: False drops the reflection intensity a(u) (ablation).
+        blend: space in which transmission and reflection are blended: sRGB (the paper) or linear radiance.
         glass_count: glass Gaussians placed on each pane.
         weights: of the loss terms; zero switches a term off (ablation).
         perturbation: of opacities; amplitude zero switches it off (ablation).
@@ -140,6 +141,7 @@ class PlanarRecipe:
     multi_stage: bool = True
     fresnel: bool = True
     intensity: bool = True
+    blend: Blend = "srgb"
     glass_count: int = 1000
     weights: ReflectionWeights = field(default_factory=ReflectionWeights)
     perturbation: Perturbation = field(default_factory=Perturbation)
@@ -163,7 +165,7 @@ class PlanarRecipe:
 
     def renderer(self) -> Planar:
         """The renderer of the finished scene, with all its layers."""
-        return Planar(self.background, fresnel=self.fresnel, intensity=self.intensity)
+        return Planar(self.background, fresnel=self.fresnel, intensity=self.intensity, blend=self.blend)
 
     def stages(self, seed: int) -> tuple[Stage, ...]:
         """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
@@ -218,6 +220,7 @@ class PlanarRecipe:
             self.background,
             fresnel=self.fresnel,
             intensity=self.intensity,
+            blend=self.blend,
             reflection_gradient="all" if gradient == "all" else "planes",
             deviation=self.weights.depth != 0,
         )
