@@ -1,9 +1,7 @@
-"""How CPU kernels are compiled: one place for the flags, the on-disk cache and its announcement."""
+"""How CPU kernels are compiled: one place for the flags."""
 
 from __future__ import annotations
 
-import logging
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,10 @@ import numba
 import numpy as np
 from numba.extending import register_jitable
 
-log = logging.getLogger("glassplat.kernels")
+from glassplat.kernels.cpu.cache import KernelCache
+
+HOW = Path(__file__).read_text()
+"""This file; how a kernel is compiled decides, with its own code, whether the cache still holds."""
 
 # `nnan` and `ninf` stay out: with them a comparison with NaN is undefined, and culling bad Gaussians relies on it.
 FAST_MATH = frozenset({"contract", "reassoc", "nsz", "arcp", "afn"})
@@ -23,35 +24,21 @@ inlined = register_jitable(forceinline=True, fastmath=set(FAST_MATH), error_mode
 
 
 class Kernel:
-    """A compiled kernel that says so before it makes the user wait for the compiler."""
+    """A compiled kernel and its name."""
 
     def __init__(self, dispatcher: Any, name: str) -> None:
         self.dispatcher = dispatcher
         self.name = name
-        self._ready = False
 
     def __call__(self, *arguments: Any) -> Any:
-        if self._ready:
-            return self.dispatcher(*arguments)
-        self._ready = True
-        if self._is_cached():
-            return self.dispatcher(*arguments)
-        log.info("compiling %s for this machine (first use only, then cached on disk) ...", self.name)
-        start = time.perf_counter()
-        result = self.dispatcher(*arguments)
-        log.info("compiled %s in %.1f s", self.name, time.perf_counter() - start)
-        return result
-
-    def _is_cached(self) -> bool:
-        folder = Path(self.dispatcher.stats.cache_path)
-        return folder.is_dir() and any(folder.glob(f"*.{self.name}-*.nbi"))
+        """Runs the kernel, compiled at the first call unless the disk has it."""
+        return self.dispatcher(*arguments)
 
 
 def kernel(name: str, real: type, *, parallel: bool = True) -> Callable[[Callable[..., Any]], Kernel]:
     """Compiles a kernel function made by a factory for one floating-point type.
 
-    The factory may close over functions marked `inlined` and over typed constants only: a closure
-    over another compiled kernel never hits the on-disk cache.
+    The function may use functions marked `inlined` and typed constants, but no other compiled kernel.
 
     Args:
         name: the operation and direction, such as `composite_forward`.
@@ -63,7 +50,8 @@ def kernel(name: str, real: type, *, parallel: bool = True) -> Callable[[Callabl
         full_name = f"{name}_{np.dtype(real).name}"
         function.__name__ = full_name
         function.__qualname__ = full_name
-        dispatcher = numba.njit(parallel=parallel, fastmath=set(FAST_MATH), error_model="numpy", cache=True)(function)
+        dispatcher = numba.njit(parallel=parallel, fastmath=set(FAST_MATH), error_model="numpy")(function)
+        dispatcher._cache = KernelCache(function, flags=f"parallel={parallel} {HOW}")
         return Kernel(dispatcher, full_name)
 
     return decorate

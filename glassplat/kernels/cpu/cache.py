@@ -1,0 +1,116 @@
+"""The on-disk cache of compiled kernels: what makes a kernel the same one as in an earlier process."""
+
+from __future__ import annotations
+
+import dis
+import hashlib
+import logging
+import time
+from collections.abc import Callable, Iterator
+from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
+from typing import Any
+
+import numpy as np
+from numba.core.caching import FunctionCache
+
+log = logging.getLogger("glassplat.kernels")
+
+PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
+NAMED = (ModuleType, type, BuiltinFunctionType, np.ufunc)
+LIBRARIES = ("numba", "numpy")
+
+
+def fingerprint(function: Callable[..., Any], flags: str) -> str:
+    """Digest of everything a compiled function is made from.
+
+    That is its bytecode and constants, what it closes over, the globals that it reads, and the same of every function
+    among those. Equal sources give equal digests in every process.
+
+    Args:
+        function: a Python function, before compilation.
+        flags: the compiler options, written out.
+
+    Raises:
+        TypeError: the function uses a value that has no stable description.
+    """
+    digest = hashlib.sha256(flags.encode())
+    for part in _described(function, set()):
+        digest.update(part.encode() + b"\0")
+    return digest.hexdigest()
+
+
+def _described(value: Any, seen: set[int]) -> Iterator[str]:
+    """The value as text, part by part; functions are entered once."""
+    if isinstance(value, PLAIN):
+        yield f"{type(value).__name__} {value!r}"
+    elif isinstance(value, tuple | frozenset):
+        parts = [" ".join(_described(item, seen)) for item in value]
+        yield f"{type(value).__name__} of {len(parts)}"
+        yield from sorted(parts) if isinstance(value, frozenset) else parts
+    elif isinstance(value, CodeType):
+        yield value.co_code.hex()
+        yield " ".join(value.co_names)
+        yield from _described(value.co_consts, seen)
+    elif isinstance(value, NAMED) or (isinstance(value, FunctionType) and value.__module__.startswith(LIBRARIES)):
+        yield f"{getattr(value, '__module__', '')} {value.__name__}"
+    elif isinstance(value, FunctionType):
+        if id(value) not in seen:
+            seen.add(id(value))
+            yield from _described_function(value, seen)
+    else:
+        raise TypeError(
+            f"a kernel uses {value!r}, a {type(value).__name__}, whose changes the cache would not notice; expected "
+            "numbers, strings, tuples, types, modules and functions that are plain or marked `inlined`"
+        )
+
+
+def _described_function(function: FunctionType, seen: set[int]) -> Iterator[str]:
+    """Bytecode, defaults, closure and globals of a function."""
+    yield from _described(function.__code__, seen)
+    yield from _described(function.__defaults__, seen)
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        yield f"closes over {name}"
+        yield from _described(cell.cell_contents, seen)
+    for name in sorted(_globals_read(function.__code__) & function.__globals__.keys()):
+        yield f"reads {name}"
+        yield from _described(function.__globals__[name], seen)
+
+
+def _globals_read(code: CodeType) -> set[str]:
+    """Names of the globals that a code object and those nested in it read."""
+    read = {step.argval for step in dis.get_instructions(code) if step.opname == "LOAD_GLOBAL"}
+    nested = (constant for constant in code.co_consts if isinstance(constant, CodeType))
+    return read.union(*map(_globals_read, nested))
+
+
+class KernelCache(FunctionCache):
+    """Numba's on-disk cache, under keys that hold across processes, and with an announcement of each compilation.
+
+    Numba's own key pickles what a function closes over. Those bytes depend on which strings happen to be one object
+    in memory, so that another program that imports in another order compiles everything again.
+    """
+
+    def __init__(self, function: Callable[..., Any], flags: str) -> None:
+        super().__init__(function)
+        self._name_shown = function.__name__
+        self._fingerprint = fingerprint(function, flags)
+        self._started = 0.0
+
+    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, Any, str]:
+        return sig, codegen.magic_tuple(), self._fingerprint
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The compiled kernel for a signature; None, announced, when the compiler has to run."""
+        found = super().load_overload(sig, target_context)
+        if found is None:
+            log.info("compiling %s for this machine (first use only, then cached on disk) ...", self._name_shown)
+            self._started = time.perf_counter()
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keeps what the compiler made; goes on without when the disk refuses."""
+        log.info("compiled %s in %.1f s", self._name_shown, time.perf_counter() - self._started)
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            log.warning("cannot keep %s for the next time: %s", self._name_shown, error)
