@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 from glassplat.data.dataset import Dataset
@@ -10,6 +11,8 @@ from glassplat.densify.edit import forget
 from glassplat.densify.perturb import perturb_opacities
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
+
+MEGAPIXEL = 1e6
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,17 @@ class GrowSh:
         gaussians = state.scene.gaussian_sets()[self.part]
         degree = min(gaussians.active_sh_degree + 1, gaussians.max_sh_degree)
         state.scene = state.scene.with_gaussians(self.part, replace(gaussians, active_sh_degree=degree))
+
+
+def threshold_factor(dataset: Dataset) -> float:
+    """How much higher the densification threshold is on small photographs; 1 from a megapixel on.
+
+    The published threshold was found on photographs of about a megapixel. The loss is a mean over pixels, so a
+    Gaussian a few pixels wide has a larger gradient in a smaller image, and a quarter-megapixel capture would grow
+    more Gaussians than it has pixels (docs/experiments.md).
+    """
+    camera = dataset.train[0].camera
+    return max(1.0, math.sqrt(MEGAPIXEL / (camera.width * camera.height)))
 
 
 @dataclass(frozen=True)
@@ -54,7 +68,8 @@ class Densify:
         gaussians = state.scene.gaussian_sets()[self.part]
         if statistics is None or len(gaussians) == 0:
             return
-        edited, state.optimizer.moments = self.densifier.densify(
+        threshold = self.densifier.gradient_threshold * threshold_factor(dataset)
+        edited, state.optimizer.moments = replace(self.densifier, gradient_threshold=threshold).densify(
             gaussians,
             state.optimizer.moments,
             statistics,
