@@ -19,7 +19,7 @@ class ScreenStatistics:
     Attributes:
         gradient_sum: [N] sum over views of the norm of the loss gradient with respect to the
             centre on screen, in normalised device coordinates (the image spans [-1, 1] both ways).
-        view_count: [N] number of views that saw the Gaussian.
+        view_count: [N] number of views that saw the Gaussian; a view in a mirror counts by its strength.
         max_radius: [N] largest radius on screen, as a share of the longer image side.
     """
 
@@ -40,7 +40,13 @@ class ScreenStatistics:
 
 @torch.no_grad()
 def accumulate(
-    statistics: ScreenStatistics, means2d_gradient: Tensor, radii: Tensor, *, width: int, height: int
+    statistics: ScreenStatistics,
+    means2d_gradient: Tensor,
+    radii: Tensor,
+    *,
+    width: int,
+    height: int,
+    weight: float = 1.0,
 ) -> ScreenStatistics:
     """The statistics with the views of one training step added.
 
@@ -53,6 +59,8 @@ def accumulate(
         radii: [C, N, 2] bounds on screen in pixels; 0 where a view does not see the Gaussian.
         width: image width in pixels.
         height: image height in pixels.
+        weight: share of the image that this pass contributes. A reflection of strength 0.1 has gradients a tenth
+            as large; counted as a full view it would dilute the mean of what is also seen directly.
     """
     visible = (radii > 0).all(dim=-1)
     pixels_per_unit = means2d_gradient.new_tensor([width / 2, height / 2])
@@ -60,7 +68,7 @@ def accumulate(
     shares = torch.where(visible, radii.amax(dim=-1) / max(width, height), 0)
     return ScreenStatistics(
         gradient_sum=statistics.gradient_sum + norms.sum(dim=0),
-        view_count=statistics.view_count + visible.sum(dim=0),
+        view_count=statistics.view_count + weight * visible.sum(dim=0),
         max_radius=torch.maximum(statistics.max_radius, shares.amax(dim=0).to(statistics.max_radius.dtype)),
     )
 

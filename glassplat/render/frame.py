@@ -23,11 +23,13 @@ class ScreenPass:
         part: name of the scene part, as in `Scene.gaussian_sets`.
         means2d: [C, N, 2] projected centres, pixels; part of the autograd graph.
         radii: [C, N, 2] half extents in pixels; 0 where not visible.
+        weight: share of the image that the pass contributes where it is seen.
     """
 
     part: str
     means2d: Tensor
     radii: Tensor
+    weight: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ class SecondPass(NamedTuple):
 
     raw_reflection: Tensor
     intensity: Tensor
-    screen: tuple[ScreenPass, ...]
+    screen: ScreenPass
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,8 @@ class Planar:
         strength = (raw_strength * hits).sum(dim=0) * first.mask
         rgb = blended(first.transmission, reflection, strength[..., None], self.blend)
         layers |= {"reflection": reflection, "strength": strength, "hit": hit.to(strength.dtype)}
-        return Frame(rgb, layers, first.screen + second.screen)
+        mirrored = replace(second.screen, weight=float(strength.detach()[hit].mean()))
+        return Frame(rgb, layers, (*first.screen, mirrored))
 
     def _first_pass(self, scene: Scene, camera: Camera) -> FirstPass:
         near = NEAR_PER_EXTENT * scene.extent
@@ -157,7 +158,7 @@ class Planar:
         return SecondPass(
             raw_reflection=(images * shown[..., None]).sum(dim=0),
             intensity=(result.image[..., 3] * shown).sum(dim=0),
-            screen=(ScreenPass("primary", projected.means2d, projected.radii),),
+            screen=ScreenPass("primary", projected.means2d, projected.radii),
         )
 
 

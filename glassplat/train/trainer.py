@@ -129,7 +129,12 @@ def collect_statistics(state: TrainState, screen: list[tuple[ScreenPass, Tensor]
     for record, gradient in screen:
         known = state.statistics.get(record.part) or ScreenStatistics.zeros(record.means2d.shape[1])
         state.statistics[record.part] = accumulate(
-            known, gradient, record.radii, width=view.camera.width, height=view.camera.height
+            known,
+            gradient,
+            record.radii,
+            width=view.camera.width,
+            height=view.camera.height,
+            weight=record.weight,
         )
 
 
