@@ -6,8 +6,6 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from glassplat.kernels.cpu.jit import inlined
 from glassplat.kernels.maths import screen_maths, shape_maths, vector_maths
 
@@ -23,7 +21,7 @@ class ViewSteps(NamedTuple):
         pose: rows of the upper 3x3 block of a camera matrix, and its translation.
         shape: (usable, opacity, unit quaternion, inverse norm, axes) of a Gaussian.
         view: what a camera sees of a Gaussian before its colour.
-        lenses: per camera the tangent limits and the centre, [C, 7].
+        fill_lenses: writes the tangent limits and the centre of every camera into [C, 7].
         direction: unit vector from a camera's centre to a mean, and its inverse length.
     """
 
@@ -31,7 +29,7 @@ class ViewSteps(NamedTuple):
     pose: Callable[..., Any]
     shape: Callable[..., Any]
     view: Callable[..., Any]
-    lenses: Callable[..., Any]
+    fill_lenses: Callable[..., Any]
     direction: Callable[..., Any]
 
 
@@ -83,9 +81,8 @@ def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
     one = real(1.0)
 
     @inlined
-    def lenses(cam_from_world, intrinsics, width, height):
+    def fill_lenses(lens, cam_from_world, intrinsics, width, height):
         num_cameras = cam_from_world.shape[0]
-        lens = np.empty((num_cameras, 7), real)
         for c in range(num_cameras):
             limits = tangent_limits(
                 intrinsics[c, 0], intrinsics[c, 1], intrinsics[c, 2], intrinsics[c, 3], width, height
@@ -97,7 +94,6 @@ def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
                     + cam_from_world[c, 1, j] * cam_from_world[c, 1, 3]
                     + cam_from_world[c, 2, j] * cam_from_world[c, 2, 3]
                 )
-        return lens
 
     @inlined
     def direction(mean, lens, c):
@@ -105,7 +101,7 @@ def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
         inverse_length = one / math.sqrt(x * x + y * y + z * z)
         return (x * inverse_length, y * inverse_length, z * inverse_length), inverse_length
 
-    return lenses, direction
+    return fill_lenses, direction
 
 
 def _view(real: type) -> Callable[..., Any]:

@@ -18,9 +18,10 @@ HOW = Path(__file__).read_text()
 # `nnan` and `ninf` stay out: with them a comparison with NaN is undefined, and culling bad Gaussians relies on it.
 FAST_MATH = frozenset({"contract", "reassoc", "nsz", "arcp", "afn"})
 
-# Forced, because the compiler balks at functions of many arrays, where a call costs more than the body.
-inlined = register_jitable(forceinline=True, fastmath=set(FAST_MATH), error_model="numpy")
-"""Marks a scalar function that kernels call; compiles for the CPU and for CUDA."""
+# Forced, because the compiler balks at functions of many arrays, where a call costs more than the body. Without
+# reference counting too: one atomic increment per array and call, of counters that all threads share.
+inlined = register_jitable(forceinline=True, _nrt=False, fastmath=set(FAST_MATH), error_model="numpy")
+"""Marks a scalar function that kernels call; it must not create arrays. Compiles for the CPU and for CUDA."""
 
 
 class Kernel:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
+import numpy as np
 from numba import prange
 
 from glassplat.kernels.cpu.gaussian_view import CHUNK, view_steps
@@ -76,7 +77,7 @@ def _culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
 @cache
 def project_forward(real: type) -> Kernel:
     """Fills means2d, conics, depths, opacities, colors and radii; zeros where a Gaussian is culled."""
-    vec3, _, shape, _, lenses, direction = view_steps(real)
+    vec3, _, shape, _, fill_lenses, direction = view_steps(real)
     cull, in_front = _culling(real)
     place = _placing(real)
     is_finite = shape_maths(real).is_finite
@@ -90,7 +91,8 @@ def project_forward(real: type) -> Kernel:
         width, height, degree, near, means2d, conics, depths, opacities, colors, radii,
     ):  # fmt: skip
         count, num_cameras = means.shape[0], cam_from_world.shape[0]
-        lens = lenses(cam_from_world, intrinsics, width, height)
+        lens = np.empty((num_cameras, 7), real)
+        fill_lenses(lens, cam_from_world, intrinsics, width, height)
         clips = clip_planes.shape[0] > 0
         for chunk in prange((count + chunk_size - 1) // chunk_size):
             begin, end = chunk * chunk_size, min(count, (chunk + 1) * chunk_size)

@@ -212,7 +212,7 @@ def _place_backward(real: type) -> Callable[..., Any]:
 @cache
 def project_backward(real: type) -> Kernel:
     """Fills the gradients of the Gaussians; adds those of the cameras to [C, 12], rows of (3x3 block, translation)."""
-    lenses = view_steps(real).lenses
+    fill_lenses = view_steps(real).fill_lenses
     color_backward, place_backward = _color_backward(real), _place_backward(real)
     chunk_size = CHUNK
 
@@ -224,7 +224,8 @@ def project_backward(real: type) -> Kernel:
     ):  # fmt: skip
         count, num_cameras = means.shape[0], cam_from_world.shape[0]
         num_chunks = (count + chunk_size - 1) // chunk_size
-        lens = lenses(cam_from_world, intrinsics, width, height)
+        lens = np.empty((num_cameras, 7), real)
+        fill_lenses(lens, cam_from_world, intrinsics, width, height)
         totals = np.zeros((num_chunks, num_cameras, 12))
         for chunk in prange(num_chunks):
             begin, end = chunk * chunk_size, min(count, (chunk + 1) * chunk_size)
