@@ -41,7 +41,7 @@ def depth_deviation(
     real = tile.real_of(splats)
     count = splats.opacities.numel()
     saved = SavedTiles(
-        np.zeros((count, tile.packed_width(1)), real),
+        np.empty((count, tile.packed_width(1)), real),
         np.empty((len(bins.active), tile.STATE_PLANES, tile.PIXELS), real),
     )
     deviation = torch.zeros_like(depth_map)
