@@ -85,14 +85,14 @@ def kernel_times() -> Table:
         "ssim backward": backward([similarity], [torch.tensor(1.0)], [image]),
     }
     evaluations = visited_pixels(splats, bins)
+    peak = peak_multiply_adds(2)
     table = Table(
         f"Kernels, {COUNT // 1000}k Gaussians (half of them before the camera), SH 3, {WIDTH}x{HEIGHT}",
         ("kernel", "1 thread, ms", "2 threads, ms", "evaluations/s, 2 threads", "share of peak"),
-        f"{len(bins.pair_splats):,} (tile, splat) pairs, {evaluations:,} pixel-Gaussian evaluations. The peak is measured: "
-        f"{peak_multiply_adds(2) / 1e9:.0f} G multiply-adds/s on two threads; an evaluation counts {MULTIPLY_ADDS} forward "
+        f"{len(bins.pair_splats):,} (tile, splat) pairs, {evaluations:,} pixel-Gaussian evaluations. The peak is "
+        f"measured: {peak / 1e9:.0f} G multiply-adds/s on two threads; an evaluation counts {MULTIPLY_ADDS} forward "
         "and twice that backward.",
     )
-    peak = peak_multiply_adds(2)
     for name, work in works.items():
         one, two = at_threads(work, 1), at_threads(work, 2)
         if name.startswith("composite"):

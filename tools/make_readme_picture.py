@@ -1,6 +1,6 @@
 """The README's picture: one test view of a finished `planar` run, taken apart.
 
-    python tools/make_readme_picture.py RUN --view 0016.jpg --output docs/images/showcase.png
+python tools/make_readme_picture.py RUN --view 0016.jpg --output docs/images/showcase.png
 """
 
 from __future__ import annotations

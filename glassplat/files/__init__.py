@@ -1,0 +1,1 @@
+"""Files that others can read: splat PLY, planes, cameras, images."""

@@ -22,7 +22,6 @@ from glassplat.scene.plane import Planes
 from glassplat.scene.pose import mirror_matrices
 from glassplat.scene.scene import Scene
 
-
 Blend = Literal["srgb", "linear"]
 
 

@@ -40,7 +40,7 @@ class Gaussians:
         for name, tensor in self.tensors().items():
             if tensor.shape[0] != count:
                 raise ValueError(
-                    f"{name} has {tensor.shape[0]} rows where means has {count}; every tensor needs one row per Gaussian"
+                    f"{name} has {tensor.shape[0]} rows where means has {count}; expected one row per Gaussian"
                 )
         if not 0 <= self.active_sh_degree <= max(self.max_sh_degree, 0):
             raise ValueError(

@@ -68,8 +68,8 @@ def advance(stage: Stage, dataset: Dataset, state: TrainState, iterations: int) 
     for name, value in result.losses.items():
         if not math.isfinite(value):
             raise TrainingDivergedError(
-                f"loss term {name!r} is {value} at step {state.step + 1} in view {view.name!r}; expected a finite number. "
-                "Lower the learning rates, or look for broken poses or images near that view"
+                f"loss term {name!r} is {value} at step {state.step + 1} in view {view.name!r}; expected a finite "
+                "number. Lower the learning rates, or look for broken poses or images near that view"
             )
     update(stage, state, result.gradients, iterations)
     collect_statistics(state, result.screen, view)
