@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.cpu.adam import adam_step, repeated_rates
-from glassplat.kernels.project import REAL_OF, check_tensors
+from glassplat.kernels.tensor_checks import REAL_OF, check_tensors
 
 BLOCK = 4096
 """Elements per task, about."""

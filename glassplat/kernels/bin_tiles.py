@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.cpu.bin_tiles import TILE, depth_order, tile_pairs, tile_spans
-from glassplat.kernels.project import REAL_OF, check_tensors
 from glassplat.kernels.splats import Splats, TileBins
+from glassplat.kernels.tensor_checks import REAL_OF, check_tensors
 
 KEY_OF = {torch.float32: np.uint32, torch.float64: np.uint64}
 MOST_PAIRS = 2**31 - 1

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.cpu.project import project_forward
 from glassplat.kernels.cpu.project_backward import project_backward
 from glassplat.kernels.maths_sh import MAX_DEGREE
 from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians
-
-REAL_OF = {torch.float32: np.float32, torch.float64: np.float64}
+from glassplat.kernels.tensor_checks import REAL_OF, check_tensors
 
 
 def project(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, near: float) -> Projected:
@@ -76,20 +76,6 @@ def _check(gaussians: RawGaussians, cameras: CameraBatch, sh_degree: int, near: 
         raise ValueError(f"near is {near}; expected a depth of at least 0")
 
 
-def check_tensors(expected: dict[str, tuple[Tensor, tuple[int, ...]]]) -> None:
-    """Raises unless all tensors have their expected shapes, one floating-point type and lie on the CPU."""
-    first_name, (first, _) = next(iter(expected.items()))
-    for name, (tensor, shape) in expected.items():
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} has shape {tuple(tensor.shape)}; expected {shape}")
-        if tensor.dtype not in REAL_OF or tensor.dtype != first.dtype:
-            raise TypeError(
-                f"{name} is {tensor.dtype} and {first_name} is {first.dtype}; expected float32 or float64 throughout"
-            )
-        if tensor.device.type != "cpu":
-            raise TypeError(f"{name} is on {tensor.device}, but only the CPU has kernels; move it there with .cpu()")
-
-
 class _Project(torch.autograd.Function):
     """The kernels as one node of the autograd graph."""
 
@@ -118,6 +104,7 @@ class _Project(torch.autograd.Function):
         return outputs
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         *inputs, radii, conics = ctx.saved_tensors
         cotangents = [gradient.contiguous() for gradient in gradients[:5]]
