@@ -68,7 +68,7 @@ class Planar:
         reflection_gradient: what the reflection image's gradient reaches: everything, or the planes alone.
         deviation: also compute the depth deviation, for training.
         deviation_depth_gradient: let the deviation's gradient pass through the mean depth D_t.
-        blend: space in which Eqs. 1 and 13 hold: sRGB as photographed (the paper), or linear radiance.
+        blend: space in which Eqs. 1 and 13 hold: linear radiance, where light adds up, or sRGB as in the paper.
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -77,7 +77,7 @@ class Planar:
     reflection_gradient: Literal["all", "planes"] = "all"
     deviation: bool = False
     deviation_depth_gradient: bool = False
-    blend: Blend = "srgb"
+    blend: Blend = "linear"
 
     def __call__(self, scene: Scene, camera: Camera) -> Frame:
         """Renders `scene` from `camera`."""
@@ -162,11 +162,15 @@ class Planar:
 
 
 def blended(transmission: Tensor, reflection: Tensor, strength: Tensor, blend: Blend) -> Tensor:
-    """(1 - R) C_t + R C_r of sRGB images in the given space (Eq. 1); sRGB."""
+    """(1 - R) C_t + R C_r of sRGB images in the given space (Eq. 1); sRGB.
+
+    Where R is zero the transmission comes back bit for bit.
+    """
     if blend == "srgb":
         return transmission + strength * (reflection - transmission)
     behind, reflected = linear_from_srgb(transmission), linear_from_srgb(reflection)
-    return srgb_from_linear(behind + strength * (reflected - behind))
+    mixed = srgb_from_linear(behind + strength * (reflected - behind))
+    return torch.where(strength > 0, mixed, transmission)
 
 
 def brightened(image: Tensor, intensity: Tensor, blend: Blend) -> Tensor:

@@ -121,7 +121,7 @@ class PlanarRecipe:
         multi_stage: False skips stage 2 (ablation).
         fresnel: False makes the strength independent of the angle (ablation).
         intensity: False drops the reflection intensity a(u) (ablation).
-        blend: space in which transmission and reflection are blended: sRGB (the paper) or linear radiance.
+        blend: space in which transmission and reflection are blended: linear radiance, or sRGB as in the paper.
         glass_count: glass Gaussians placed on each pane.
         weights: of the loss terms; zero switches a term off (ablation).
         perturbation: of opacities; amplitude zero switches it off (ablation).
@@ -141,7 +141,7 @@ class PlanarRecipe:
     multi_stage: bool = True
     fresnel: bool = True
     intensity: bool = True
-    blend: Blend = "srgb"
+    blend: Blend = "linear"
     glass_count: int = 1000
     weights: ReflectionWeights = field(default_factory=ReflectionWeights)
     perturbation: Perturbation = field(default_factory=Perturbation)

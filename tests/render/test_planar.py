@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from glassplat.render.color_space import linear_from_srgb
 from glassplat.render.planar import Planar, detached
 from glassplat.render.reflectance import nearest_hits, schlick_strength
 from glassplat.render.splat import Splat
@@ -19,12 +20,21 @@ from tests.render.tiny_scene import camera_at, in_single_precision, joined, pane
 CAMERA = camera_at(0.0, 0.0, -0.2)
 
 
-def test_layers_recombine_to_the_image() -> None:
-    layers = (frame := Planar()(showcase(), CAMERA)).layers
+def test_layers_recombine_to_the_image_in_srgb() -> None:
+    layers = (frame := Planar(blend="srgb")(showcase(), CAMERA)).layers
     strength = layers["strength"][..., None]
     recombined = (1 - strength) * layers["transmission"] + strength * layers["reflection"]
     assert float(strength.max()) > 0.1
     torch.testing.assert_close(recombined, frame.rgb)
+
+
+def test_layers_recombine_to_the_image_in_linear_radiance() -> None:
+    layers = (frame := Planar(blend="linear")(showcase(), CAMERA)).layers
+    strength = layers["strength"][..., None]
+    behind, reflected = (linear_from_srgb(layers[name]) for name in ("transmission", "reflection"))
+    expected = (1 - strength) * behind + strength * reflected
+    assert float(strength.max()) > 0.1
+    torch.testing.assert_close(linear_from_srgb(frame.rgb), expected, rtol=1e-4, atol=2e-5)
 
 
 def test_the_reflection_shows_the_room_and_not_what_is_behind_the_pane() -> None:
@@ -53,7 +63,7 @@ def test_a_scene_without_planes_is_splat_bit_for_bit() -> None:
 
 def test_a_perfect_mirror_hides_what_is_behind_it() -> None:
     scene = replace(showcase(), planes=pane(2.0, base_reflectance=1 - 1e-12))
-    frame = Planar()(scene, CAMERA)
+    frame = Planar(blend="srgb")(scene, CAMERA)
     expected = frame.layers["mask"][..., None] * frame.layers["reflection"]
     expected = expected + (1 - frame.layers["mask"][..., None]) * frame.layers["transmission"]
     torch.testing.assert_close(frame.rgb, expected)
