@@ -11,7 +11,7 @@ from pathlib import Path
 from glassplat.commands.stored_run import open_run
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.evaluate.metrics import quantized
-from glassplat.evaluate.sheet import Panel, composed
+from glassplat.evaluate.sheet import TITLE_HEIGHT, Panel, composed
 from glassplat.files.images import write_image
 
 
@@ -34,7 +34,7 @@ def main() -> None:
         Panel("reflected by it", quantized(frame.layers["reflection"])),
     ]
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    write_image(arguments.output, composed([panels], "", ""))
+    write_image(arguments.output, composed([panels], "", "")[TITLE_HEIGHT:])
 
 
 if __name__ == "__main__":
