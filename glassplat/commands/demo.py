@@ -11,6 +11,7 @@ from glassplat.commands.evaluate import evaluate_run, results_table
 from glassplat.commands.stored_run import open_run
 from glassplat.commands.train import Train
 from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.run_directory import RunDirectory
 from glassplat.train.splat_recipe import SplatRecipe
 
 SCENE = Path(__file__).parent.parent / "demo_scene"
@@ -18,7 +19,7 @@ SCENE = Path(__file__).parent.parent / "demo_scene"
 
 @dataclass(frozen=True)
 class Demo:
-    """Train planar and splat on the bundled showcase and compare them.
+    """Train planar and splat on the bundled showcase and compare them; goes on where it was interrupted.
 
     Attributes:
         output: where the two runs go.
@@ -35,7 +36,8 @@ class Demo:
         results = []
         for recipe in (PlanarRecipe(), SplatRecipe()):
             folder = self.output / recipe.method
-            Train(recipe, SCENE, folder, iterations=self.iterations, seed=self.seed).run(console)
+            begun = RunDirectory(folder).checkpoint.is_file()
+            Train(recipe, SCENE, folder, iterations=self.iterations, seed=self.seed, resume=begun).run(console)
             results.append(evaluate_run(open_run(folder)))
         console.print(results_table(*results))
         console.print(f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
