@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
+import torch
 from torch import Tensor
 
 from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify
 from glassplat.init.glass import glass_gaussians
+from glassplat.init.material import mirror_labels
 from glassplat.init.planes import PlaneFit, fit_planes
 from glassplat.init.points import gaussians_from_points
 from glassplat.losses.geometry import depth_deviation_loss
@@ -18,12 +22,15 @@ from glassplat.losses.term import LossTerm
 from glassplat.render.planar import Blend, Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
+from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, PerturbOpacity
 from glassplat.train.optimizer import Rate
 from glassplat.train.splat_recipe import GaussianRates, Rhythm, growth_actions, opacity_resets, photometric_terms
 from glassplat.train.stage import Every, Stage
 from glassplat.train.state import TrainState
+
+log = logging.getLogger("glassplat.train")
 
 
 @dataclass(frozen=True)
@@ -94,14 +101,27 @@ class PlaneEntry:
     fit: PlaneFit
     glass_count: int
     seed: int
+    detect_mirrors: bool = True
 
     def __call__(self, state: TrainState, dataset: Dataset) -> None:
         """Edits `state`."""
         means, extent = state.scene.primary.means, state.scene.extent
         planes = fit_planes(means, annotations_of(dataset), extent=extent, options=self.fit)
         glass = glass_gaussians(planes, count=self.glass_count, seed=self.seed)
-        state.scene = replace(state.scene, planes=planes, glass=glass)
+        scene = replace(state.scene, planes=planes, glass=glass)
+        if self.detect_mirrors and not self.fit.mirror_labels:
+            mirrors = mirror_labels(scene, dataset.train)
+            scene = replace(scene, planes=with_mirrors(planes, mirrors, self.fit.mirror_reflectance))
+            log.info("mirrors among the panes: %s", ", ".join(map(str, mirrors)) or "none")
+        state.scene = scene
         state.statistics.clear()
+
+
+def with_mirrors(planes: Planes, labels: tuple[int, ...], reflectance: float) -> Planes:
+    """The planes with the base reflectance of some of them, by label, set to a mirror's."""
+    mirrors = torch.tensor([label in labels for label in planes.labels], device=planes.centers.device)
+    start = torch.full_like(planes.logit_reflectances, math.log(reflectance / (1 - reflectance)))
+    return planes.with_tensors({"logit_reflectances": torch.where(mirrors, start, planes.logit_reflectances)})
 
 
 def annotations_of(dataset: Dataset) -> list[tuple[Camera, Tensor]]:
@@ -122,6 +142,7 @@ class PlanarRecipe:
         fresnel: False makes the strength independent of the angle (ablation).
         intensity: False drops the reflection intensity a(u) (ablation).
         blend: space in which transmission and reflection are blended: linear radiance, or sRGB as in the paper.
+        detect_mirrors: start panes that look like mirrors as mirrors, unless `plane_fit` names the mirrors.
         glass_count: glass Gaussians placed on each pane.
         weights: of the loss terms; zero switches a term off (ablation).
         perturbation: of opacities; amplitude zero switches it off (ablation).
@@ -142,6 +163,7 @@ class PlanarRecipe:
     fresnel: bool = True
     intensity: bool = True
     blend: Blend = "linear"
+    detect_mirrors: bool = True
     glass_count: int = 1000
     weights: ReflectionWeights = field(default_factory=ReflectionWeights)
     perturbation: Perturbation = field(default_factory=Perturbation)
@@ -170,7 +192,7 @@ class PlanarRecipe:
     def stages(self, seed: int) -> tuple[Stage, ...]:
         """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
         first, second, third = self.stage_shares
-        entry = PlaneEntry(self.plane_fit, self.glass_count, seed)
+        entry = PlaneEntry(self.plane_fit, self.glass_count, seed, self.detect_mirrors)
         initialisation = Stage(
             name="1 initialisation",
             share=first,

@@ -1,0 +1,101 @@
+"""Telling mirrors from glass when planes have just been fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from glassplat.data.dataset import View
+from glassplat.render.planar import Planar
+from glassplat.scene.camera import Camera
+from glassplat.scene.scene import Scene
+
+BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+MIRROR_SLOPE, MIRROR_CORRELATION = 0.5, 0.25
+"""Above these values a pane is taken for a mirror; glass shows slopes near its reflectance, a tenth."""
+LEAST_COVERAGE = 0.95
+"""Coverage of the mirrored image from which a pixel counts; a rough first scene has holes, which are no dark things."""
+WINDOW = 0.15
+"""Side of the window whose mean is taken off, as a share of the image width: it removes differences in brightness."""
+FEWEST_PIXELS = 200
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """How the photographs of a pane depend on what the plane would mirror there.
+
+    Attributes:
+        slope: change of the photograph per change of the mirrored image; 1 for a mirror, R0 for glass.
+        correlation: of the two, over pixels and channels.
+    """
+
+    slope: float
+    correlation: float
+
+    @property
+    def is_mirror(self) -> bool:
+        """Whether the photograph shows the mirrored scene itself."""
+        return self.slope > MIRROR_SLOPE and self.correlation > MIRROR_CORRELATION
+
+
+def mirror_labels(scene: Scene, views: Sequence[View]) -> tuple[int, ...]:
+    """Labels of the panes that are mirrors, judged on the annotated views.
+
+    Nothing is transmitted by a mirror, so its photograph is the mirrored scene; through glass it is mostly what
+    stands behind, which has nothing to do with the mirrored scene. A rough first scene is enough to tell.
+
+    Args:
+        scene: primary Gaussians after the first stage, with fitted planes and glass.
+        views: training views; those without pane labels are passed over.
+    """
+    annotated = [view for view in views if view.is_annotated]
+    pairs = [pane_pixels(scene, view) for view in annotated]
+    found = []
+    for label in scene.planes.labels:
+        mirrored, photographed = (torch.cat([pair[label][side] for pair in pairs]) for side in (0, 1))
+        if len(mirrored) >= FEWEST_PIXELS and likeness(mirrored, photographed).is_mirror:
+            found.append(label)
+    return tuple(found)
+
+
+@torch.no_grad()
+def pane_pixels(scene: Scene, view: View) -> dict[int, tuple[Tensor, Tensor]]:
+    """Mirrored and photographed colours [P, 3] of each pane's pixels in one view, by label, about their local means."""
+    mirrored, coverage = mirrored_image(scene, view.camera)
+    photo = view.photo.to(mirrored.dtype) / 255
+    known = coverage > LEAST_COVERAGE
+    pixels = {}
+    for label in scene.planes.labels:
+        region = known if view.pane_labels is None else known & (view.pane_labels == label)
+        pixels[label] = (about_local_mean(mirrored, region)[region], about_local_mean(photo, region)[region])
+    return pixels
+
+
+def mirrored_image(scene: Scene, camera: Camera) -> tuple[Tensor, Tensor]:
+    """What the panes would mirror at full strength [H, W, 3], and how much of it is covered by Gaussians [H, W]."""
+    before_black, before_white = (
+        Planar(background=color, intensity=False)(scene, camera).layers["reflection"] for color in (BLACK, WHITE)
+    )
+    seen = before_white.amax(dim=-1) > 0
+    return before_black, torch.where(seen, 1 - (before_white - before_black).mean(dim=-1), 0)
+
+
+def about_local_mean(image: Tensor, region: Tensor) -> Tensor:
+    """An image [H, W, 3] minus its mean over the part of a square window that lies in the region [H, W]."""
+    side = 2 * max(round(WINDOW * image.shape[1] / 2), 1) + 1
+    inside = region.to(image.dtype)[..., None]
+    stacked = torch.cat([image * inside, inside], dim=-1).permute(2, 0, 1)[None]
+    sums = torch.nn.functional.avg_pool2d(stacked, side, stride=1, padding=side // 2)[0].permute(1, 2, 0)
+    return image - sums[..., :3] / sums[..., 3:].clamp(min=1e-6)
+
+
+def likeness(mirrored: Tensor, photographed: Tensor) -> Likeness:
+    """Regression of photographed on mirrored values [P, 3], both about their means."""
+    covariance = (mirrored * photographed).sum()
+    spread, target_spread = (mirrored * mirrored).sum(), (photographed * photographed).sum()
+    tiny = torch.finfo(mirrored.dtype).tiny
+    correlation = covariance / torch.sqrt((spread * target_spread).clamp(min=tiny))
+    return Likeness(float(covariance / spread.clamp(min=tiny)), float(correlation))

@@ -1,0 +1,68 @@
+"""Mirrors are told from glass by how the photographs depend on the mirrored scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from glassplat.data.dataset import View
+from glassplat.init.glass import glass_gaussians
+from glassplat.init.material import about_local_mean, likeness, mirror_labels
+from glassplat.render.planar import Planar
+from glassplat.render.reflectance import nearest_hits
+from glassplat.scene.scene import Scene
+from tests.render.tiny_scene import camera_at, in_single_precision, pane, showcase
+
+
+def scene_with(base_reflectance: float) -> Scene:
+    scene = in_single_precision(showcase(pane(2.0, half=0.8, base_reflectance=base_reflectance)))
+    solid = scene.primary.with_tensors(
+        {
+            "logit_opacities": torch.full((len(scene.primary),), 5.0),
+            "log_scales": scene.primary.log_scales + 1.2,
+        }
+    )
+    return replace(scene, glass=glass_gaussians(scene.planes, opacity=0.99), primary=solid)
+
+
+def photographs(scene: Scene) -> list[View]:
+    views = []
+    for x in (-0.4, 0.0, 0.4):
+        camera = camera_at(x, 0.0, -0.3)
+        camera = replace(camera, cam_from_world=camera.cam_from_world.float())
+        with torch.no_grad():
+            photo = (255 * Planar()(scene, camera).rgb.clamp(0, 1)).to(torch.uint8)
+        labels = nearest_hits(scene.planes, camera)[0].to(torch.uint8)
+        views.append(View.in_memory(f"{x}", camera, photo=photo, pane_labels=labels))
+    return views
+
+
+@pytest.mark.parametrize(("base_reflectance", "expected"), [(0.995, (1,)), (0.08, ())])
+def test_a_mirror_is_found_and_glass_is_not(base_reflectance: float, expected: tuple[int, ...]) -> None:
+    views = photographs(scene_with(base_reflectance))
+    unknown = scene_with(0.2)
+    assert mirror_labels(unknown, views) == expected
+
+
+def test_views_without_masks_say_nothing() -> None:
+    scene = scene_with(0.995)
+    bare = [replace(view, read_pane_labels=None) for view in photographs(scene)]
+    assert mirror_labels(scene, [*bare, *photographs(scene)]) == (1,)
+
+
+def test_likeness_is_slope_and_correlation() -> None:
+    mirrored = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    found = likeness(mirrored, 0.1 * mirrored)
+    assert found.slope == pytest.approx(0.1, abs=1e-4)
+    assert found.correlation == pytest.approx(1.0, abs=1e-4)
+    assert not found.is_mirror
+
+
+def test_local_means_ignore_what_lies_outside_the_region() -> None:
+    image = torch.full((20, 30, 3), 0.3)
+    region = torch.zeros(20, 30, dtype=torch.bool)
+    region[:, :15] = True
+    image[:, 15:] = 100.0
+    torch.testing.assert_close(about_local_mean(image, region)[region], torch.zeros(300, 3), atol=1e-6, rtol=0)
