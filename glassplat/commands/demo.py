@@ -28,7 +28,7 @@ class Demo:
     """
 
     output: Path = Path("runs/demo")
-    iterations: int = 2000
+    iterations: int = 1500
     seed: int = 0
 
     def run(self, console: Console) -> None:

@@ -95,15 +95,21 @@ class Planar:
         if self.deviation:
             layers["deviation"] = self._deviation(first, hit, len(scene.primary))
         second = self._second_pass(scene, camera, planes, hits & (first.mask.detach() > 0))
-        reflection = second.raw_reflection
-        if self.intensity:
-            reflection = brightened(reflection, second.intensity[..., None], self.blend)
         raw_strength = schlick_strength(planes, camera) if self.fresnel else constant_strength(planes, camera)
         strength = (raw_strength * hits).sum(dim=0) * first.mask
-        rgb = blended(first.transmission, reflection, strength[..., None], self.blend)
+        rgb, reflection = self._blend(first, second, strength, hit)
         layers |= {"reflection": reflection, "strength": strength, "hit": hit.to(strength.dtype)}
         mirrored = replace(second.screen, weight=float(strength.detach()[hit].mean()))
         return Frame(rgb, layers, (*first.screen, mirrored))
+
+    def _blend(self, first: FirstPass, second: SecondPass, strength: Tensor, hit: Tensor) -> tuple[Tensor, Tensor]:
+        """Image and reflection [H, W, 3]; the curves of colour spaces cost much, so only hit pixels are computed."""
+        behind, reflected = first.transmission[hit], second.raw_reflection[hit]
+        if self.intensity:
+            reflected = brightened(reflected, second.intensity[hit][:, None], self.blend)
+        mixed = blended(behind, reflected, strength[hit][:, None], self.blend)
+        rgb = first.transmission.masked_scatter(hit[..., None], mixed)
+        return rgb, torch.zeros_like(first.transmission).masked_scatter(hit[..., None], reflected)
 
     def _first_pass(self, scene: Scene, camera: Camera) -> FirstPass:
         near = NEAR_PER_EXTENT * scene.extent
@@ -162,7 +168,7 @@ class Planar:
 
 
 def blended(transmission: Tensor, reflection: Tensor, strength: Tensor, blend: Blend) -> Tensor:
-    """(1 - R) C_t + R C_r of sRGB images in the given space (Eq. 1); sRGB.
+    """(1 - R) C_t + R C_r of sRGB colours [P, 3] in the given space, with R [P, 1] (Eq. 1); sRGB.
 
     Where R is zero the transmission comes back bit for bit.
     """
@@ -173,11 +179,11 @@ def blended(transmission: Tensor, reflection: Tensor, strength: Tensor, blend: B
     return torch.where(strength > 0, mixed, transmission)
 
 
-def brightened(image: Tensor, intensity: Tensor, blend: Blend) -> Tensor:
-    """An sRGB image times an intensity in the given space (Eq. 13); sRGB."""
+def brightened(color: Tensor, intensity: Tensor, blend: Blend) -> Tensor:
+    """sRGB colours [P, 3] times an intensity [P, 1] in the given space (Eq. 13); sRGB."""
     if blend == "srgb":
-        return image * intensity
-    return srgb_from_linear(linear_from_srgb(image) * intensity)
+        return color * intensity
+    return srgb_from_linear(linear_from_srgb(color) * intensity)
 
 
 def select_planes(planes: Planes, index: list[int]) -> Planes:
