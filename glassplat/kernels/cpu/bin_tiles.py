@@ -15,6 +15,7 @@ import numpy as np
 from numba import prange
 
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
+from glassplat.kernels.cpu.schedule import even_stride
 from glassplat.kernels.maths import ellipse_maths
 
 TILE = 16
@@ -46,7 +47,9 @@ def tile_spans(real: type) -> Kernel:
         heights = np.empty(num_splats)
         first_rows = np.empty(num_splats, np.int32)
         span_offsets, splat_offsets = np.zeros(num_splats + 1, np.int64), np.zeros(num_splats + 1, np.int64)
-        for chunk in prange(num_chunks):
+        stride = even_stride(num_chunks)
+        for task in prange(num_chunks):
+            chunk = task * stride % num_chunks
             for s in range(chunk * SPAN_CHUNK, min(num_splats, (chunk + 1) * SPAN_CHUNK)):
                 if not (radii[s, 0] > 0 and abs(means2d[s, 0]) + abs(means2d[s, 1]) < np.inf):
                     continue
@@ -60,7 +63,8 @@ def tile_spans(real: type) -> Kernel:
         for s in range(num_splats):
             span_offsets[s + 1] += span_offsets[s]
         spans = np.empty((span_offsets[num_splats], 2), np.int32)
-        for chunk in prange(num_chunks):
+        for task in prange(num_chunks):
+            chunk = task * stride % num_chunks
             for s in range(chunk * SPAN_CHUNK, min(num_splats, (chunk + 1) * SPAN_CHUNK)):
                 begin, end = span_offsets[s], span_offsets[s + 1]
                 if begin == end:
@@ -183,7 +187,10 @@ def tile_pairs() -> Kernel:
         per_camera = num_splats // max(1, num_cameras)
         # Each splat's tiles in a row, in place of spans: read twice below, in an order that defeats the caches.
         tiles = np.empty(splat_offsets[num_splats], np.int32)
-        for chunk in prange((num_splats + SPAN_CHUNK - 1) // SPAN_CHUNK):
+        num_span_chunks = (num_splats + SPAN_CHUNK - 1) // SPAN_CHUNK
+        stride = even_stride(num_span_chunks)
+        for task in prange(num_span_chunks):
+            chunk = task * stride % num_span_chunks
             for s in range(chunk * SPAN_CHUNK, min(num_splats, (chunk + 1) * SPAN_CHUNK)):
                 slot = splat_offsets[s]
                 for i in range(span_offsets[s], span_offsets[s + 1] if splat_offsets[s + 1] > slot else 0):

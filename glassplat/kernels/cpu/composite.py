@@ -15,7 +15,8 @@ from torch import Tensor
 from glassplat.kernels.cpu import tile
 from glassplat.kernels.cpu.composite_backward import composite_backward
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
-from glassplat.kernels.cpu.pair_gradients import new_pair_rows, sum_pair_rows
+from glassplat.kernels.cpu.pair_gradients import CHUNK, new_pair_rows, sum_pair_rows
+from glassplat.kernels.cpu.schedule import even_stride
 from glassplat.kernels.maths_blend import TRANSMITTANCE_MIN, Scalar, blend_maths
 from glassplat.kernels.splats import Splats, TileBins
 
@@ -178,12 +179,18 @@ def _forward(real: type) -> Kernel:
     ):  # fmt: skip
         num_splats, num_channels = channels.shape
         groups = (num_channels + 3) // 4
-        for s in prange(num_splats):
-            if splat_offsets[s + 1] > splat_offsets[s]:
-                pack(packed, s, means, conics, opacities)
-                for d in range(groups * 4):
-                    packed[s, VALUES + d] = channels[s, d] if d < num_channels else zero
-        for n in prange(active.size):
+        num_chunks = (num_splats + CHUNK - 1) // CHUNK
+        pack_stride = even_stride(num_chunks)
+        for task in prange(num_chunks):
+            chunk = task * pack_stride % num_chunks
+            for s in range(chunk * CHUNK, min(num_splats, (chunk + 1) * CHUNK)):
+                if splat_offsets[s + 1] > splat_offsets[s]:
+                    pack(packed, s, means, conics, opacities)
+                    for d in range(groups * 4):
+                        packed[s, VALUES + d] = channels[s, d] if d < num_channels else zero
+        stride = even_stride(active.size)
+        for task in prange(active.size):
+            n = task * stride % active.size
             camera, x0, y0, columns, rows = place(active[n], image.shape[2], image.shape[1])
             scratch = np.empty(SUMS + groups * 4 * PLANE, real)
             scratch[:] = zero

@@ -14,6 +14,7 @@ from numba import prange
 
 from glassplat.kernels.cpu import tile
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
+from glassplat.kernels.cpu.schedule import even_stride
 from glassplat.kernels.maths_blend import ALPHA_MAX, Scalar, blend_maths
 
 # Planes of the backward pass; V_IMAGE has one per channel. BEHIND and BEHIND_GLASS hold what lies behind the current
@@ -164,7 +165,9 @@ def composite_backward(real: type) -> Kernel:
         pair_splats, tile_offsets, active, packed, state, v_image, v_alpha, v_mask, out,
     ):  # fmt: skip
         groups = (num_channels + 3) // 4
-        for n in prange(active.size):
+        stride = even_stride(active.size)
+        for task in prange(active.size):
+            n = task * stride % active.size
             camera, x0, y0, columns, rows = place(active[n], v_image.shape[2], v_image.shape[1])
             scratch = np.empty(V_IMAGE + groups * 4 * PLANE, real)
             scratch[:] = zero

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from glassplat.kernels.cpu import tile
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
-from glassplat.kernels.cpu.pair_gradients import new_pair_rows, sum_pair_rows
+from glassplat.kernels.cpu.pair_gradients import CHUNK, new_pair_rows, sum_pair_rows
+from glassplat.kernels.cpu.schedule import even_stride
 from glassplat.kernels.maths_blend import ALPHA_MAX, TRANSMITTANCE_MIN, Scalar, blend_maths
 from glassplat.kernels.splats import Splats, TileBins
 
@@ -106,11 +107,17 @@ def _forward(real: type) -> Kernel:
         means, conics, opacities, depths, depth_map, splats_per_camera, num_primary,
         pair_splats, tile_offsets, splat_offsets, active, packed, state, deviation,
     ):  # fmt: skip
-        for s in prange(opacities.size):
-            if splat_offsets[s + 1] > splat_offsets[s]:
-                pack(packed, s, means, conics, opacities)
-                packed[s, VALUES] = depths[s]
-        for n in prange(active.size):
+        num_chunks = (opacities.size + CHUNK - 1) // CHUNK
+        pack_stride = even_stride(num_chunks)
+        for task in prange(num_chunks):
+            chunk = task * pack_stride % num_chunks
+            for s in range(chunk * CHUNK, min(opacities.size, (chunk + 1) * CHUNK)):
+                if splat_offsets[s + 1] > splat_offsets[s]:
+                    pack(packed, s, means, conics, opacities)
+                    packed[s, VALUES] = depths[s]
+        stride = even_stride(active.size)
+        for task in prange(active.size):
+            n = task * stride % active.size
             camera, x0, y0, columns, rows = place(active[n], depth_map.shape[2], depth_map.shape[1])
             scratch: NDArray[Any] = np.empty(FORWARD_PLANES * PLANE, real)
             scratch[:] = zero
@@ -187,7 +194,9 @@ def _backward(real: type) -> Kernel:
         depth_map, splats_per_camera, num_primary,
         pair_splats, tile_offsets, active, packed, state, v_deviation, out, v_depth_map,
     ):  # fmt: skip
-        for n in prange(active.size):
+        stride = even_stride(active.size)
+        for task in prange(active.size):
+            n = task * stride % active.size
             camera, x0, y0, columns, rows = place(active[n], depth_map.shape[2], depth_map.shape[1])
             scratch: NDArray[Any] = np.empty(BACKWARD_PLANES * PLANE, real)
             scratch[:] = zero

@@ -12,7 +12,11 @@ from torch import Tensor
 
 from glassplat.kernels.cpu import tile
 from glassplat.kernels.cpu.jit import Kernel, kernel
+from glassplat.kernels.cpu.schedule import even_stride
 from glassplat.kernels.splats import Splats, TileBins
+
+CHUNK = 512
+"""Splats per task."""
 
 
 def new_pair_rows(bins: TileBins, num_values: int, real: type) -> NDArray[Any]:
@@ -47,16 +51,21 @@ def _sum_rows(real: type) -> Kernel:
 
     @kernel("sum_pair_rows", real)
     def sum_rows(rows, slots, offsets, v_means, v_conics, v_opacities, v_values):
-        for s in prange(offsets.size - 1):
-            v_means[s, :], v_conics[s, :], v_opacities[s], v_values[s, :] = zero, zero, zero, zero
-            for k in range(offsets[s], offsets[s + 1]):
-                row = rows[slots[k]]
-                for d in range(2):
-                    v_means[s, d] += row[d]
-                for d in range(3):
-                    v_conics[s, d] += row[V_CONIC + d]
-                v_opacities[s] += row[V_OPACITY]
-                for d in range(v_values.shape[1]):
-                    v_values[s, d] += row[V_VALUES + d]
+        count = offsets.size - 1
+        num_chunks = (count + CHUNK - 1) // CHUNK
+        stride = even_stride(num_chunks)
+        for task in prange(num_chunks):
+            chunk = task * stride % num_chunks
+            for s in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
+                v_means[s, :], v_conics[s, :], v_opacities[s], v_values[s, :] = zero, zero, zero, zero
+                for k in range(offsets[s], offsets[s + 1]):
+                    row = rows[slots[k]]
+                    for d in range(2):
+                        v_means[s, d] += row[d]
+                    for d in range(3):
+                        v_conics[s, d] += row[V_CONIC + d]
+                    v_opacities[s] += row[V_OPACITY]
+                    for d in range(v_values.shape[1]):
+                        v_values[s, d] += row[V_VALUES + d]
 
     return sum_rows

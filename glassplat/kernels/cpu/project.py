@@ -15,6 +15,7 @@ from numba import prange
 
 from glassplat.kernels.cpu.gaussian_view import CHUNK, view_steps
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
+from glassplat.kernels.cpu.schedule import even_stride
 from glassplat.kernels.maths import screen_maths, shape_maths, vector_maths
 from glassplat.kernels.maths_sh import color_maths
 
@@ -94,7 +95,10 @@ def project_forward(real: type) -> Kernel:
         lens = np.empty((num_cameras, 7), real)
         fill_lenses(lens, cam_from_world, intrinsics, width, height)
         clips = clip_planes.shape[0] > 0
-        for chunk in prange((count + chunk_size - 1) // chunk_size):
+        num_chunks = (count + chunk_size - 1) // chunk_size
+        stride = even_stride(num_chunks)
+        for task in prange(num_chunks):
+            chunk = task * stride % num_chunks
             begin, end = chunk * chunk_size, min(count, (chunk + 1) * chunk_size)
             for n in range(begin, end):
                 mean = vec3(means, n)
