@@ -20,7 +20,7 @@ def project(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, ne
     """Projects Gaussians into cameras: activation, EWA splatting, bounds, culling and view-dependent colour.
 
     A Gaussian is culled in a camera when its depth is at most `near`, its centre is not on the kept side of
-    the camera's clip plane, its coverage reaches 1/255 nowhere on the image, or a parameter is not
+    the camera's clip plane, its coverage reaches 1/255 nowhere in the camera's window, or a parameter is not
     finite. Then its radii and all its other values are zero and it gets no gradient from that camera.
 
     A splat's covariance is J A Sigma A^T J^T plus 0.3 px^2 on the diagonal, A the upper 3x3 block of
@@ -32,7 +32,7 @@ def project(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, ne
 
     Args:
         gaussians: raw tensors, float32 or float64.
-        cameras: of the same floating-point type; intrinsics and clip planes get no gradient.
+        cameras: of the same floating-point type; intrinsics, clip planes and windows get no gradient.
         sh_degree: highest degree of the spherical harmonics to evaluate; `gaussians.sh` may hold more, or
             none at all, which makes all colours zero.
         near: smallest depth (camera z, world units), at least 0.
@@ -45,8 +45,12 @@ def project(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, ne
     clip_planes = cameras.clip_planes
     if clip_planes is None:
         clip_planes = gaussians.means.new_empty(0, 4)
+    windows = cameras.windows
+    if windows is None:
+        whole = gaussians.means.new_tensor([0, 0, cameras.width, cameras.height])
+        windows = whole.repeat(cameras.cam_from_world.shape[0], 1)
     outputs = _Project.apply(
-        *gaussians, cameras.cam_from_world, cameras.intrinsics, clip_planes,
+        *gaussians, cameras.cam_from_world, cameras.intrinsics, clip_planes, windows,
         cameras.width, cameras.height, sh_degree, near,
     )  # fmt: skip
     return Projected(*outputs)
@@ -66,6 +70,8 @@ def _check(gaussians: RawGaussians, cameras: CameraBatch, sh_degree: int, near: 
     }
     if cameras.clip_planes is not None:
         expected["clip_planes"] = (cameras.clip_planes, (num_cameras, 4))
+    if cameras.windows is not None:
+        expected["windows"] = (cameras.windows, (num_cameras, 4))
     check_tensors(expected)
     if not 0 <= sh_degree <= MAX_DEGREE or (coefficients and coefficients < (sh_degree + 1) ** 2):
         raise ValueError(
@@ -82,10 +88,10 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, quats: Tensor, log_scales: Tensor, logit_opacities: Tensor, sh: Tensor,
-        cam_from_world: Tensor, intrinsics: Tensor, clip_planes: Tensor,
+        cam_from_world: Tensor, intrinsics: Tensor, clip_planes: Tensor, windows: Tensor,
         width: int, height: int, sh_degree: int, near: float,
     ) -> tuple[Tensor, ...]:  # fmt: skip
-        inputs = (means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, clip_planes)
+        inputs = (means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, clip_planes, windows)
         tensors = [tensor.contiguous() for tensor in inputs]
         real = REAL_OF[means.dtype]
         degree = sh_degree if sh.shape[1] else -1
@@ -120,4 +126,4 @@ class _Project(torch.autograd.Function):
         if needs_camera:
             pose_gradient = torch.zeros_like(cam_from_world)
             pose_gradient[:, :3] = torch.from_numpy(cameras).reshape(-1, 3, 4)
-        return (*found, pose_gradient, None, None, None, None, None, None)
+        return (*found, pose_gradient, None, None, None, None, None, None, None)

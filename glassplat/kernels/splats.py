@@ -25,6 +25,7 @@ class CameraBatch(NamedTuple):
     """Cameras of one image size: cam_from_world [C, 4, 4], intrinsics [C, 4] as (fx, fy, cx, cy), pixels.
 
     `clip_planes` [C, 4] are world planes (n, d): a Gaussian is kept where n . mean + d > 0.
+    `windows` [C, 4] are left, top, right and bottom edge, in pixels, of the part of each image that is wanted.
     """
 
     cam_from_world: Tensor
@@ -32,6 +33,7 @@ class CameraBatch(NamedTuple):
     width: int
     height: int
     clip_planes: Tensor | None = None
+    windows: Tensor | None = None
 
 
 class Projected(NamedTuple):

@@ -9,13 +9,14 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.bin_tiles import TILE, bin_tiles
+from glassplat.kernels.blend_panes import blend_panes
 from glassplat.kernels.composite import composite
 from glassplat.kernels.depth_deviation import depth_deviation
+from glassplat.kernels.pane_hits import pane_hits
+from glassplat.kernels.panes import PaneHits, Panes
 from glassplat.kernels.splats import Splats, TileBins
-from glassplat.render.color_space import linear_from_srgb, srgb_from_linear
 from glassplat.render.frame import Frame, ScreenPass
 from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, mean_depth, over_background, project_gaussians
-from glassplat.render.reflectance import constant_strength, nearest_hits, schlick_strength
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
@@ -38,10 +39,9 @@ class FirstPass(NamedTuple):
 
 
 class SecondPass(NamedTuple):
-    """What the panes mirror, merged over the panes: image [H, W, 3] and intensity [H, W]."""
+    """What the panes mirror: colours and intensity [K, H, W, 4] of each."""
 
-    raw_reflection: Tensor
-    intensity: Tensor
+    reflections: Tensor
     screen: ScreenPass
 
 
@@ -83,33 +83,32 @@ class Planar:
         """Renders `scene` from `camera`."""
         first = self._first_pass(scene, camera)
         layers = {"transmission": first.transmission, "depth": first.depth, "alpha": first.alpha, "mask": first.mask}
-        hits = nearest_hits(scene.planes, camera)
-        seen = [k for k in range(len(scene.planes)) if bool(hits[k].any())]
-        if not seen:
-            zero = torch.zeros_like(first.alpha)
-            layers |= {"reflection": torch.zeros_like(first.transmission), "strength": zero, "hit": zero}
-            layers |= {"deviation": zero} if self.deviation else {}
-            return Frame(first.transmission, layers, first.screen)
-        planes, hits = select_planes(scene.planes, seen), hits[seen]
-        hit = hits.any(dim=0)
+        panes = panes_in_camera(scene.planes, camera)
+        hits = pane_hits(panes, camera.intrinsics, camera.width, camera.height, first.mask)
+        hit = (hits.index >= 0).to(first.mask.dtype)
+        layers["hit"] = hit
         if self.deviation:
             layers["deviation"] = self._deviation(first, hit, len(scene.primary))
-        second = self._second_pass(scene, camera, planes, hits & (first.mask.detach() > 0))
-        raw_strength = schlick_strength(planes, camera) if self.fresnel else constant_strength(planes, camera)
-        strength = (raw_strength * hits).sum(dim=0) * first.mask
-        rgb, reflection = self._blend(first, second, strength, hit)
-        layers |= {"reflection": reflection, "strength": strength, "hit": hit.to(strength.dtype)}
-        mirrored = replace(second.screen, weight=float(strength.detach()[hit].mean()))
-        return Frame(rgb, layers, (*first.screen, mirrored))
-
-    def _blend(self, first: FirstPass, second: SecondPass, strength: Tensor, hit: Tensor) -> tuple[Tensor, Tensor]:
-        """Image and reflection [H, W, 3]; the curves of colour spaces cost much, so only hit pixels are computed."""
-        behind, reflected = first.transmission[hit], second.raw_reflection[hit]
-        if self.intensity:
-            reflected = brightened(reflected, second.intensity[hit][:, None], self.blend)
-        mixed = blended(behind, reflected, strength[hit][:, None], self.blend)
-        rgb = first.transmission.masked_scatter(hit[..., None], mixed)
-        return rgb, torch.zeros_like(first.transmission).masked_scatter(hit[..., None], reflected)
+        if not hits.tiles.any():
+            layers |= {"reflection": torch.zeros_like(first.transmission), "strength": torch.zeros_like(hit)}
+            return Frame(first.transmission, layers, first.screen)
+        planes, hits = those_seen(scene.planes, hits)
+        second = self._second_pass(scene, camera, planes, hits)
+        result = blend_panes(
+            first.transmission,
+            first.mask,
+            second.reflections,
+            hits.index,
+            planes.normals @ camera.cam_from_world[:3, :3].T,
+            planes.base_reflectances,
+            camera.intrinsics,
+            fresnel=self.fresnel,
+            intensity=self.intensity,
+            linear=self.blend == "linear",
+        )
+        layers |= {"reflection": result.reflection, "strength": result.strength}
+        mirrored = replace(second.screen, weight=float(result.strength.detach().sum() / hit.sum()))
+        return Frame(result.rgb, layers, (*first.screen, mirrored))
 
     def _first_pass(self, scene: Scene, camera: Camera) -> FirstPass:
         near = NEAR_PER_EXTENT * scene.extent
@@ -138,12 +137,13 @@ class Planar:
 
     def _deviation(self, first: FirstPass, hit: Tensor, num_primary: int) -> Tensor:
         """Eq. 14 over the tiles that the hit mask touches."""
-        tiles = torch.nonzero(touched_tiles(hit[None]).flatten()).flatten().to(first.bins.active.dtype)
+        touched = torch.nn.functional.max_pool2d(hit[None, None].float(), TILE, ceil_mode=True)
+        tiles = touched.flatten().nonzero().flatten().to(first.bins.active.dtype)
         depth = first.depth if self.deviation_depth_gradient else first.depth.detach()
         bins = first.bins._replace(active=tiles)
         return depth_deviation(first.splats, depth[None].contiguous(), bins, num_primary=num_primary)[0]
 
-    def _second_pass(self, scene: Scene, camera: Camera, planes: Planes, visible: Tensor) -> SecondPass:
+    def _second_pass(self, scene: Scene, camera: Camera, planes: Planes, hits: PaneHits) -> SecondPass:
         primary = scene.primary if self.reflection_gradient == "all" else detached(scene.primary)
         mirrored_poses = camera.cam_from_world @ mirror_matrices(planes.centers, planes.normals)
         projected = project_gaussians(
@@ -152,46 +152,42 @@ class Planar:
             near=NEAR_PER_EXTENT * scene.extent,
             poses=mirrored_poses,
             clip_planes=half_spaces_of(planes, camera),
+            windows=hits.windows,
         )
         splats = joined_splats(projected)
-        bins = bin_tiles(splats, camera.width, camera.height, touched_tiles(visible))
+        bins = bin_tiles(splats, camera.width, camera.height, hits.tiles)
         intensity = torch.exp(primary.channels["log_intensity"]).expand(len(planes), -1)
         channels = torch.cat([projected.colors, intensity[..., None]], dim=-1)
         result = composite(splats, channels, bins)
-        images = over_background(result.image[..., :3], result.alpha, self.background)
-        shown = visible.to(images.dtype)
-        return SecondPass(
-            raw_reflection=(images * shown[..., None]).sum(dim=0),
-            intensity=(result.image[..., 3] * shown).sum(dim=0),
-            screen=ScreenPass("primary", projected.means2d, projected.radii),
+        reflections = result.image
+        if any(self.background):
+            colors = over_background(reflections[..., :3], result.alpha, self.background)
+            reflections = torch.cat([colors, reflections[..., 3:]], dim=-1)
+        return SecondPass(reflections, ScreenPass("primary", projected.means2d, projected.radii))
+
+
+def panes_in_camera(planes: Planes, camera: Camera) -> Panes:
+    """The rectangles in the camera frame; no gradient."""
+    with torch.no_grad():
+        rotation, translation = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
+        centers, normals, axes, half_sizes = (
+            tensor.to(rotation)
+            for tensor in (planes.centers, planes.normals, torch.stack(planes.axes(), 1), planes.half_sizes)
         )
+        return Panes(centers @ rotation.T + translation, normals @ rotation.T, axes @ rotation.T, half_sizes)
 
 
-def blended(transmission: Tensor, reflection: Tensor, strength: Tensor, blend: Blend) -> Tensor:
-    """(1 - R) C_t + R C_r of sRGB colours [P, 3] in the given space, with R [P, 1] (Eq. 1); sRGB.
-
-    Where R is zero the transmission comes back bit for bit.
-    """
-    if blend == "srgb":
-        return transmission + strength * (reflection - transmission)
-    behind, reflected = linear_from_srgb(transmission), linear_from_srgb(reflection)
-    mixed = srgb_from_linear(behind + strength * (reflected - behind))
-    return torch.where(strength > 0, mixed, transmission)
-
-
-def brightened(color: Tensor, intensity: Tensor, blend: Blend) -> Tensor:
-    """sRGB colours [P, 3] times an intensity [P, 1] in the given space (Eq. 13); sRGB."""
-    if blend == "srgb":
-        return color * intensity
-    return srgb_from_linear(linear_from_srgb(color) * intensity)
-
-
-def select_planes(planes: Planes, index: list[int]) -> Planes:
-    """The planes at the given positions."""
-    if index == list(range(len(planes))):
-        return planes
-    chosen = {name: tensor[index] for name, tensor in planes.tensors().items()}
-    return replace(planes, **chosen, labels=tuple(planes.labels[k] for k in index))
+def those_seen(planes: Planes, hits: PaneHits) -> tuple[Planes, PaneHits]:
+    """The planes that some tile shows, and the hits with indices into those."""
+    seen = hits.tiles.flatten(1).any(dim=1)
+    if bool(seen.all()):
+        return planes, hits
+    chosen = {name: tensor[seen] for name, tensor in planes.tensors().items()}
+    labels = tuple(label for label, kept in zip(planes.labels, seen.tolist(), strict=True) if kept)
+    # The last entry is for index -1, pixels without a pane.
+    position = torch.where(torch.cat([seen, seen.new_zeros(1)]), torch.cat([seen.cumsum(0) - 1, seen.new_ones(1)]), -1)
+    index = position[hits.index.long()].to(torch.int32)
+    return replace(planes, **chosen, labels=labels), PaneHits(index, hits.tiles[seen], hits.windows[seen])
 
 
 def detached(gaussians: Gaussians) -> Gaussians:
@@ -206,9 +202,3 @@ def half_spaces_of(planes: Planes, camera: Camera) -> Tensor:
         side = torch.sign(((camera.center - planes.centers) * normals).sum(-1, keepdim=True))
         facing = normals * side
         return torch.cat([facing, -(facing * planes.centers).sum(-1, keepdim=True)], dim=1)
-
-
-def touched_tiles(pixels: Tensor) -> Tensor:
-    """Tiles [K, rows, columns] bool in which any pixel of the masks [K, H, W] is set."""
-    pooled = torch.nn.functional.max_pool2d(pixels[:, None].float(), TILE, ceil_mode=True)
-    return pooled[:, 0] > 0

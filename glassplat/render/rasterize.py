@@ -21,6 +21,7 @@ def project_gaussians(
     near: float,
     poses: Tensor | None = None,
     clip_planes: Tensor | None = None,
+    windows: Tensor | None = None,
 ) -> Projected:
     """Projects a set of Gaussians into one camera, or into several that share its intrinsics.
 
@@ -30,11 +31,17 @@ def project_gaussians(
         near: depth below which a Gaussian is culled, world units.
         poses: [C, 4, 4] `cam_from_world` of the cameras; may be left-handed.
         clip_planes: [C, 4] world planes (n, d); a Gaussian whose centre has n . x + d <= 0 is culled.
+        windows: [C, 4] left, top, right and bottom edge of the part of each image that is wanted, pixels.
     """
     poses = camera.cam_from_world[None] if poses is None else poses
     raw = RawGaussians(gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh)
     cameras = CameraBatch(
-        poses, camera.intrinsics.expand(poses.shape[0], 4).contiguous(), camera.width, camera.height, clip_planes
+        poses,
+        camera.intrinsics.expand(poses.shape[0], 4).contiguous(),
+        camera.width,
+        camera.height,
+        clip_planes,
+        windows,
     )
     return project(raw, cameras, sh_degree=gaussians.active_sh_degree, near=near)
 
@@ -58,7 +65,4 @@ def over_background(image: Tensor, alpha: Tensor, background: tuple[float, float
 
 def mean_depth(depth_sum: Tensor, alpha: Tensor) -> Tensor:
     """Blended depth (TR-Gaussians, Eq. 4): weighted depth sum over total weight; 0 where nothing is."""
-    covered = alpha > 1e-6
-    return torch.where(
-        covered, depth_sum / torch.where(covered, alpha, torch.ones_like(alpha)), torch.zeros_like(alpha)
-    )
+    return torch.where(alpha > 1e-6, depth_sum / alpha.clamp(min=1e-6), 0)

@@ -11,9 +11,8 @@ from glassplat.data.dataset import View
 from glassplat.init.glass import glass_gaussians
 from glassplat.init.material import about_local_mean, likeness, mirror_labels
 from glassplat.render.planar import Planar
-from glassplat.render.reflectance import nearest_hits
 from glassplat.scene.scene import Scene
-from tests.render.tiny_scene import camera_at, in_single_precision, pane, showcase
+from tests.render.tiny_scene import camera_at, in_single_precision, nearest_hits, pane, showcase
 
 
 def scene_with(base_reflectance: float) -> Scene:

@@ -10,9 +10,8 @@ import torch
 
 from glassplat.data.dataset import Dataset, PointCloud, View
 from glassplat.render.planar import Planar
-from glassplat.render.reflectance import nearest_hits
 from glassplat.scene.scene import Scene
-from tests.render.tiny_scene import camera_at, in_single_precision, pane, showcase
+from tests.render.tiny_scene import camera_at, in_single_precision, nearest_hits, pane, showcase
 
 
 def true_scene() -> Scene:

@@ -30,7 +30,7 @@ def _placing(real: type) -> Callable[..., Any]:
 
     @inlined
     def place(
-        n, c, mean, opacity, axes, cam_from_world, intrinsics, lens, width, height,
+        n, c, mean, opacity, axes, cam_from_world, intrinsics, lens, windows,
         means2d, conics, depths, opacities, radii,
     ):  # fmt: skip
         row_x, row_y, row_z, offset = pose(cam_from_world, c)
@@ -42,8 +42,9 @@ def _placing(real: type) -> Callable[..., Any]:
         v = intrinsics[c, 1] * tangent[1] + intrinsics[c, 3]
         reach_x, reach_y = half_extents(xx, yy, opacity)
         # Written so that NaN fails every comparison and the Gaussian stays culled.
-        on_screen = u + reach_x > zero and u - reach_x < width and v + reach_y > zero and v - reach_y < height
-        if on_screen and reach_x > zero and is_finite(determinant) and is_finite(depth):
+        across = u + reach_x > windows[c, 0] and u - reach_x < windows[c, 2]
+        down = v + reach_y > windows[c, 1] and v - reach_y < windows[c, 3]
+        if across and down and reach_x > zero and is_finite(determinant) and is_finite(depth):
             inverse = one / determinant
             means2d[c, n, 0], means2d[c, n, 1] = u, v
             conics[c, n, 0], conics[c, n, 1], conics[c, n, 2] = yy * inverse, -xy * inverse, xx * inverse
@@ -88,7 +89,7 @@ def project_forward(real: type) -> Kernel:
 
     @kernel("project_forward", real)
     def forward(
-        means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, clip_planes,
+        means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, clip_planes, windows,
         width, height, degree, near, means2d, conics, depths, opacities, colors, radii,
     ):  # fmt: skip
         count, num_cameras = means.shape[0], cam_from_world.shape[0]
@@ -112,7 +113,7 @@ def project_forward(real: type) -> Kernel:
                 for c in range(num_cameras):
                     if usable and in_front(c, mean, cam_from_world, near, clip_planes, clips):
                         place(
-                            n, c, mean, opacity, axes, cam_from_world, intrinsics, lens, width, height,
+                            n, c, mean, opacity, axes, cam_from_world, intrinsics, lens, windows,
                             means2d, conics, depths, opacities, radii,
                         )  # fmt: skip
             for c in range(num_cameras if degree >= 0 else 0):

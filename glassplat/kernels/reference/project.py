@@ -124,13 +124,16 @@ def sh_basis(directions: Tensor) -> Tensor:
 
 
 def _visible(projected: Projected, gaussians: RawGaussians, cameras: CameraBatch, near: float) -> Tensor:
-    """What is in front of the near plane, on the kept side of the clip plane and on screen [C, N]."""
+    """What is in front of the near plane, on the kept side of the clip plane and in the window [C, N]."""
     raw = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities[:, None])
     norm = gaussians.quats.square().sum(-1)
     usable = torch.cat(raw, dim=-1).isfinite().all(dim=-1) & norm.isfinite() & (norm > 0)
     visible = usable & (projected.depths > near) & projected.depths.isfinite()
     if cameras.clip_planes is not None:
         visible &= cameras.clip_planes[:, :3] @ gaussians.means.T + cameras.clip_planes[:, 3:] > 0
-    size = torch.tensor([cameras.width, cameras.height], dtype=projected.means2d.dtype)
-    on_screen = (projected.means2d + projected.radii > 0) & (projected.means2d - projected.radii < size)
+    windows = cameras.windows
+    if windows is None:
+        windows = torch.tensor([[0, 0, cameras.width, cameras.height]], dtype=projected.means2d.dtype)
+    first, last = windows[:, None, :2], windows[:, None, 2:]
+    on_screen = (projected.means2d + projected.radii > first) & (projected.means2d - projected.radii < last)
     return visible & on_screen.all(dim=-1) & (projected.radii > 0).all(dim=-1)

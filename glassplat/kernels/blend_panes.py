@@ -1,0 +1,94 @@
+"""Blends what is behind the panes with what they reflect."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from glassplat.kernels.cpu.blend_panes import blend_panes_backward, blend_panes_forward
+from glassplat.kernels.panes import BlendedPanes
+from glassplat.kernels.tensor_checks import REAL_OF, check_tensors
+
+
+def blend_panes(
+    transmission: Tensor, mask: Tensor, reflections: Tensor, index: Tensor,
+    normals: Tensor, base_reflectances: Tensor, intrinsics: Tensor,
+    *, fresnel: bool = True, intensity: bool = True, linear: bool = True,
+) -> BlendedPanes:  # fmt: skip
+    """Blends transmission and reflection by the strength of each pixel's pane (TR-Gaussians, Section III-A).
+
+        R_k = R0 + (1 - R0) (1 - |n . d|)^5          (Eq. 6), d the unit ray of the pixel
+        R = M R_k                                    (Eqs. 5, 19)
+        C_r = C_raw A                                (Eq. 13)
+        C = (1 - R) C_t + R C_r                      (Eq. 1)
+
+    Where no pane is shown or the mask is 0, the image is the transmission, bit for bit, and strength and reflection
+    are 0; also the image where the strength is 0.
+
+    Differentiable in `transmission`, `mask`, `reflections`, `normals` and `base_reflectances`.
+
+    Args:
+        transmission: [H, W, 3] C_t, sRGB.
+        mask: [H, W] M, visibility of the panes.
+        reflections: [K, H, W, 4] what each pane mirrors, C_raw in sRGB and the intensity A.
+        index: [H, W] int32 pane of each pixel, -1 for none, as `pane_hits` gives it.
+        normals: [K, 3] unit normals in the camera frame; the sign does not matter.
+        base_reflectances: [K] R0 in [0, 1].
+        intrinsics: [4] fx, fy, cx, cy in pixels; no gradient.
+        fresnel: strength by Schlick; False uses R0 for every angle.
+        intensity: multiply by A; False sets C_r = C_raw.
+        linear: blend and multiply linear radiance; False does so with sRGB values, as the paper does.
+
+    Raises:
+        ValueError: shapes disagree.
+        TypeError: tensors of different or unsupported floating-point types, an index that is not int32, or not on
+            the CPU.
+    """
+    height, width, count = *mask.shape, normals.shape[0]
+    check_tensors(
+        {
+            "transmission": (transmission, (height, width, 3)),
+            "mask": (mask, (height, width)),
+            "reflections": (reflections, (count, height, width, 4)),
+            "normals": (normals, (count, 3)),
+            "base_reflectances": (base_reflectances, (count,)),
+            "intrinsics": (intrinsics, (4,)),
+        }
+    )
+    if index.dtype != torch.int32 or tuple(index.shape) != (height, width):
+        raise TypeError(f"index is {index.dtype} of shape {tuple(index.shape)}; expected int32 of {(height, width)}")
+    switches = (fresnel, intensity, linear)
+    outputs = _BlendPanes.apply(
+        transmission, mask, reflections, normals, base_reflectances, index, intrinsics, switches
+    )
+    return BlendedPanes(*outputs)
+
+
+class _BlendPanes(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        *tensors, switches = arguments
+        tensors = [tensor.detach().contiguous() for tensor in tensors]
+        transmission, mask = tensors[:2]
+        outputs = tuple(torch.empty_like(like) for like in (transmission, transmission, mask))
+        blend_panes_forward(REAL_OF[mask.dtype])(*_arrays(tensors), *switches, *_arrays(outputs))
+        ctx.save_for_backward(*tensors)
+        ctx.switches = switches
+        return outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        inputs = ctx.saved_tensors
+        found = tuple(torch.zeros_like(tensor) for tensor in inputs[:5])
+        blend_panes_backward(REAL_OF[found[0].dtype])(
+            *_arrays(inputs), *ctx.switches, *_arrays(gradient.contiguous() for gradient in gradients), *_arrays(found)
+        )
+        return (*found, None, None, None)
+
+
+def _arrays(tensors: Any) -> list[Any]:
+    return [tensor.numpy() for tensor in tensors]

@@ -1,0 +1,165 @@
+"""`pane_hits` and `blend_panes` against their twins."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numba
+import pytest
+import torch
+from torch import Tensor
+
+from glassplat.kernels.blend_panes import blend_panes
+from glassplat.kernels.pane_hits import pane_hits
+from glassplat.kernels.panes import BlendedPanes, Panes
+from glassplat.kernels.reference.blend_panes import blend_panes as blend_twin
+from glassplat.kernels.reference.pane_hits import pane_hits as hits_twin
+
+WIDTH, HEIGHT = 53, 37
+INPUTS = ("transmission", "mask", "reflections", "normals", "base_reflectances")
+
+
+def random_panes(count: int, dtype: torch.dtype, seed: int = 0) -> tuple[Panes, Tensor]:
+    """Rectangles of any tilt around the optical axis, some behind the camera, and intrinsics."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    frames = torch.linalg.qr(draw(count, 3, 3))[0]
+    centers = draw(count, 3)
+    centers[:, 2] += 2.5
+    half_sizes = 0.3 + draw(count, 2).abs()
+    intrinsics = torch.tensor([40.0, 42.0, WIDTH / 2 + 0.3, HEIGHT / 2 - 0.4], dtype=torch.float64)
+    panes = Panes(centers, frames[:, 0].contiguous(), frames[:, 1:].contiguous(), half_sizes)
+    return Panes(*(tensor.to(dtype) for tensor in panes)), intrinsics.to(dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("count", [0, 1, 3, 8])
+@pytest.mark.parametrize("masked", [False, True])
+def test_hits_match_their_twin(dtype: torch.dtype, count: int, masked: bool) -> None:
+    panes, intrinsics = random_panes(count, dtype)
+    generator = torch.Generator().manual_seed(1)
+    mask = (torch.rand(HEIGHT, WIDTH, generator=generator) > 0.9).to(dtype) if masked else None
+    found = pane_hits(panes, intrinsics, WIDTH, HEIGHT, mask)
+    expected = hits_twin(panes, intrinsics, WIDTH, HEIGHT, mask)
+    assert count == 0 or len(expected.index.unique()) > min(count, 2)
+    for tensor, twin in zip(found, expected, strict=True):
+        assert torch.equal(tensor, twin)
+
+
+def test_a_plane_through_the_camera_is_not_hit() -> None:
+    panes, intrinsics = random_panes(1, torch.float64)
+    edge_on = Panes(
+        torch.tensor([[0.0, 0.0, 2.0]], dtype=torch.float64),
+        torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64),
+        torch.tensor([[[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]], dtype=torch.float64),
+        panes.half_sizes,
+    )
+    assert bool((pane_hits(edge_on, intrinsics, WIDTH, HEIGHT).index == -1).all())
+
+
+def blend_case(dtype: torch.dtype, count: int = 3) -> dict[str, Tensor]:
+    """Random arguments of `blend_panes`; a tenth of the mask is 0, some colours are dark, some beyond 1."""
+    panes, intrinsics = random_panes(count, dtype)
+    generator = torch.Generator().manual_seed(2)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64).to(dtype)
+
+    mask = draw(HEIGHT, WIDTH)
+    return {
+        "transmission": 1.2 * draw(HEIGHT, WIDTH, 3) ** 3,
+        "mask": torch.where(mask < 0.1, 0, mask),
+        "reflections": 1.2 * draw(count, HEIGHT, WIDTH, 4) ** 3,
+        "index": pane_hits(panes, intrinsics, WIDTH, HEIGHT).index,
+        "normals": panes.normals,
+        "base_reflectances": 0.9 * draw(count),
+        "intrinsics": intrinsics,
+    }
+
+
+def with_gradients(case: dict[str, Tensor], function: Callable[..., BlendedPanes], **switches: bool) -> list[Tensor]:
+    inputs = {name: case[name].detach().requires_grad_() for name in INPUTS}
+    result = function(**(case | inputs), **switches)
+    generator = torch.Generator().manual_seed(3)
+    total = sum(
+        (t * torch.randn(t.shape, generator=generator, dtype=torch.float64).to(t.dtype)).sum() for t in result
+    ) + 0 * sum(t.sum() for t in inputs.values())
+    return [*(t.detach() for t in result), *torch.autograd.grad(total, list(inputs.values()))]
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-5), (torch.float64, 1e-11)])
+@pytest.mark.parametrize("fresnel", [True, False])
+@pytest.mark.parametrize("intensity", [True, False])
+@pytest.mark.parametrize("linear", [True, False])
+def test_blend_matches_its_twin(
+    dtype: torch.dtype, tolerance: float, fresnel: bool, intensity: bool, linear: bool
+) -> None:
+    case = blend_case(dtype)
+    switches = {"fresnel": fresnel, "intensity": intensity, "linear": linear}
+    found, expected = (with_gradients(case, f, **switches) for f in (blend_panes, blend_twin))
+    for tensor, twin in zip(found, expected, strict=True):
+        torch.testing.assert_close(tensor, twin, rtol=tolerance, atol=tolerance * max(1.0, float(twin.abs().max())))
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_blend_gradients_match_finite_differences(name: str) -> None:
+    case = blend_case(torch.float64)
+    if name == "mask":
+        case["mask"] = case["mask"].clamp(min=0.05)
+    values = case[name].requires_grad_()
+    directions = [torch.randn(values.shape, generator=torch.Generator().manual_seed(s)).double() for s in (4, 5)]
+
+    def objective(moved: Tensor) -> Tensor:
+        return sum(
+            (t * torch.cos(torch.arange(t.numel()).reshape(t.shape))).sum()
+            for t in blend_panes(**(case | {name: moved}))
+        )
+
+    (gradient,) = torch.autograd.grad(objective(values), values)
+    with torch.no_grad():
+        for direction in directions:
+            slope = (objective(values + 1e-7 * direction) - objective(values - 1e-7 * direction)) / 2e-7
+            assert math.isclose(float(slope), float((gradient * direction).sum()), rel_tol=1e-4, abs_tol=1e-4)
+
+
+def test_where_there_is_no_pane_the_image_is_the_transmission_bit_for_bit() -> None:
+    case = blend_case(torch.float32)
+    case["base_reflectances"][1] = 0
+    result = blend_panes(**case, fresnel=False)
+    shown = (case["index"] >= 0) & (case["mask"] > 0)
+    assert bool(shown.any()) and not bool(shown.all())
+    plain = ~shown | (case["index"] == 1)
+    assert torch.equal(result.rgb[plain], case["transmission"][plain])
+    assert float(result.strength[~shown].abs().max()) == 0 == float(result.reflection[~shown].abs().max())
+
+
+def test_the_sign_of_a_normal_does_not_matter() -> None:
+    case = blend_case(torch.float64)
+    for tensor, flipped in zip(blend_panes(**case), blend_panes(**(case | {"normals": -case["normals"]})), strict=True):
+        assert torch.equal(tensor, flipped)
+
+
+def test_threads_do_not_change_a_bit() -> None:
+    case = blend_case(torch.float32)
+    many = with_gradients(case, blend_panes)
+    numba.set_num_threads(1)
+    try:
+        one = with_gradients(case, blend_panes)
+    finally:
+        numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    assert all(torch.equal(a, b) for a, b in zip(many, one, strict=True))
+
+
+def test_bad_input_is_named() -> None:
+    case = blend_case(torch.float32)
+    with pytest.raises(ValueError, match="reflections"):
+        blend_panes(**(case | {"reflections": case["reflections"][:1]}))
+    with pytest.raises(TypeError, match="int32"):
+        blend_panes(**(case | {"index": case["index"].long()}))
+    panes, intrinsics = random_panes(2, torch.float32)
+    with pytest.raises(ValueError, match="mask"):
+        pane_hits(panes, intrinsics, WIDTH, HEIGHT, torch.ones(3, 3))
