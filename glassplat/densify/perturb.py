@@ -29,11 +29,11 @@ def behind_panes(points: Tensor, planes: Planes, cameras: Sequence[Camera]) -> T
         return found
     # The views are taken one by one: all of them at once would need views x panes x points values.
     for camera in cameras:
-        found |= _crosses_pane(points, planes, camera.center) & _in_image(points, camera)
+        found |= crosses_pane(points, planes, camera.center) & in_image(points, camera)
     return found
 
 
-def _crosses_pane(points: Tensor, planes: Planes, eye: Tensor) -> Tensor:
+def crosses_pane(points: Tensor, planes: Planes, eye: Tensor) -> Tensor:
     """[N] bool: whether the segment from `eye`, in front of a pane, to the point crosses the pane."""
     normals = planes.normals
     eye_distance = ((eye - planes.centers) * normals).sum(-1)
@@ -48,7 +48,8 @@ def _crosses_pane(points: Tensor, planes: Planes, eye: Tensor) -> Tensor:
     return inside.any(dim=1)
 
 
-def _in_image(points: Tensor, camera: Camera) -> Tensor:
+def in_image(points: Tensor, camera: Camera) -> Tensor:
+    """[N] bool: whether the points lie in the image of a camera, hidden or not."""
     pixels, depths = camera.project(points)
     size = pixels.new_tensor([camera.width, camera.height])
     return (depths > 0) & ((pixels >= 0) & (pixels <= size)).all(dim=1)

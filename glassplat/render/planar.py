@@ -182,12 +182,11 @@ def those_seen(planes: Planes, hits: PaneHits) -> tuple[Planes, PaneHits]:
     seen = hits.tiles.flatten(1).any(dim=1)
     if bool(seen.all()):
         return planes, hits
-    chosen = {name: tensor[seen] for name, tensor in planes.tensors().items()}
-    labels = tuple(label for label, kept in zip(planes.labels, seen.tolist(), strict=True) if kept)
     # The last entry is for index -1, pixels without a pane.
     position = torch.where(torch.cat([seen, seen.new_zeros(1)]), torch.cat([seen.cumsum(0) - 1, seen.new_ones(1)]), -1)
     index = position[hits.index.long()].to(torch.int32)
-    return replace(planes, **chosen, labels=labels), PaneHits(index, hits.tiles[seen], hits.windows[seen])
+    rows = seen.nonzero().flatten().tolist()
+    return planes.select(rows), PaneHits(index, hits.tiles[seen], hits.windows[seen])
 
 
 def detached(gaussians: Gaussians) -> Gaussians:

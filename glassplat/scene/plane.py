@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -72,6 +72,11 @@ class Planes:
         if unknown:
             raise ValueError(f"unknown tensors {sorted(unknown)}; planes have {sorted(self.tensors())}")
         return Planes(**(self.tensors() | dict(tensors)), labels=self.labels)
+
+    def select(self, rows: Sequence[int]) -> Planes:
+        """The planes at the given positions, in that order."""
+        chosen = {name: tensor[list(rows)] for name, tensor in self.tensors().items()}
+        return Planes(**chosen, labels=tuple(self.labels[k] for k in rows))
 
     def to(self, device: torch.device | str) -> Planes:
         """The same planes on another device."""

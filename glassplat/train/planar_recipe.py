@@ -12,10 +12,12 @@ from torch import Tensor
 
 from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify
+from glassplat.densify.edit import apply_edit, keep
 from glassplat.init.glass import glass_gaussians
 from glassplat.init.material import mirror_labels
 from glassplat.init.planes import PlaneFit, fit_planes
 from glassplat.init.points import gaussians_from_points
+from glassplat.init.virtual_scene import virtual_points
 from glassplat.losses.geometry import depth_deviation_loss
 from glassplat.losses.reflection import gradient_conflict, mask_loss
 from glassplat.losses.term import LossTerm
@@ -109,12 +111,14 @@ class PlaneEntry:
         planes = fit_planes(means, annotations_of(dataset), extent=extent, options=self.fit)
         glass = glass_gaussians(planes, count=self.glass_count, seed=self.seed)
         scene = replace(state.scene, planes=planes, glass=glass)
-        if self.detect_mirrors and not self.fit.mirror_labels:
+        mirrors = self.fit.mirror_labels
+        if self.detect_mirrors and not mirrors:
             mirrors = mirror_labels(scene, dataset.train)
             scene = replace(scene, planes=with_mirrors(planes, mirrors, self.fit.mirror_reflectance))
             log.info("mirrors among the panes: %s", ", ".join(map(str, mirrors)) or "none")
         state.scene = scene
         state.statistics.clear()
+        remove_virtual_scene(state, dataset, mirrors)
 
 
 def with_mirrors(planes: Planes, labels: tuple[int, ...], reflectance: float) -> Planes:
@@ -122,6 +126,17 @@ def with_mirrors(planes: Planes, labels: tuple[int, ...], reflectance: float) ->
     mirrors = torch.tensor([label in labels for label in planes.labels], device=planes.centers.device)
     start = torch.full_like(planes.logit_reflectances, math.log(reflectance / (1 - reflectance)))
     return planes.with_tensors({"logit_reflectances": torch.where(mirrors, start, planes.logit_reflectances)})
+
+
+def remove_virtual_scene(state: TrainState, dataset: Dataset, labels: tuple[int, ...]) -> None:
+    """Removes the Gaussians that are seen through the mirrors with these labels."""
+    primary, planes = state.scene.primary, state.scene.planes
+    mirrors = planes.select([k for k, label in enumerate(planes.labels) if label in labels])
+    virtual = virtual_points(primary.means, mirrors, [view.camera for view in dataset.train])
+    if bool(virtual.any()):
+        log.info("removed %d Gaussians that were images in mirrors", int(virtual.sum()))
+        primary, state.optimizer.moments = apply_edit(primary, state.optimizer.moments, keep(~virtual))
+        state.scene = replace(state.scene, primary=primary)
 
 
 def annotations_of(dataset: Dataset) -> list[tuple[Camera, Tensor]]:
