@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from glassplat.densify.perturb import crosses_pane, in_image
 from glassplat.scene.camera import Camera
 from glassplat.scene.plane import Planes
+from glassplat.scene.sight import crosses_pane, in_image
 
 MOST_SEEN_DIRECTLY = 0.5
 """A Gaussian is virtual when fewer than this share of the views that hold it see it past the mirrors."""

@@ -8,32 +8,36 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from glassplat.kernels.blend_inputs import check_splats, check_tensor, primary_count
+from glassplat.kernels.blend_inputs import check_splats, primary_count
 from glassplat.kernels.cpu import composite as cpu
 from glassplat.kernels.cpu.tile import MOST_CHANNELS
-from glassplat.kernels.splats import Splats, TileBins
+from glassplat.kernels.splats import Deviation, Splats, TileBins
+from glassplat.kernels.tensor_checks import check_tensors
 
 
 class Composite(NamedTuple):
     """Blended images.
 
     image [C, H, W, D]: sum of channels. alpha [C, H, W]: coverage by primary splats, 1 - T.
-    mask [C, H, W]: visible marks of glass splats.
+    mask [C, H, W]: visible marks of glass splats. deviation [C, H, W]: empty unless asked for.
     """
 
     image: Tensor
     alpha: Tensor
     mask: Tensor
+    deviation: Tensor
 
 
 def composite(
-    splats: Splats, channels: Tensor, bins: TileBins, *, marks: Tensor | None = None, num_primary: int | None = None
-) -> Composite:
+    splats: Splats, channels: Tensor, bins: TileBins,
+    *, marks: Tensor | None = None, num_primary: int | None = None, deviation: Deviation | None = None,
+) -> Composite:  # fmt: skip
     """Blends depth-sorted splats over each pixel (3DGS; TR-Gaussians, Eqs. 2, 4, 7 and 13).
 
         alpha_i = min(0.99, opacity_i exp(-q_i / 2)), ignored below 1/255
         image   = sum over primary i of channels_i alpha_i T_i
         mask    = sum over glass j of marks_j alpha_j T_j T_glass_j
+        deviation = where sum over primary i of |z_i - mean z| alpha_i T_i,  mean z = image_z / alpha   (Eq. 14)
 
     T_i is the product of (1 - alpha) over the primary splats in front, T_glass_j the same over the glass splats in
     front; their product is the transmittance over both together. A pixel stops before the primary splat that would
@@ -50,6 +54,7 @@ def composite(
         bins: the same splats sorted into tiles, from `bin_tiles`.
         marks: [C, G - num_primary] what a glass splat adds to the mask, in [0, 1]; needed where there is glass.
         num_primary: how many splats are primary; all of them by default.
+        deviation: the channel z whose deviation to compute, and where; the mean is a constant unless it says so.
 
     Raises:
         TypeError: tensors are not all float32 or all float64.
@@ -60,33 +65,44 @@ def composite(
     cameras, count = splats.opacities.shape
     if channels.ndim != 3 or not 1 <= channels.shape[2] <= MOST_CHANNELS:
         raise ValueError(f"channels has shape {list(channels.shape)}, expected [C, G, D] with D in 1..{MOST_CHANNELS}")
-    check_tensor("channels", channels, (cameras, count, channels.shape[2]), like=splats.means2d)
     if marks is None:
         if num_primary < count:
             raise ValueError(
                 f"{count - num_primary} splats are glass, but there are no marks; pass one per glass splat"
             )
         marks = channels.new_zeros(cameras, 0)
-    check_tensor("marks", marks, (cameras, count - num_primary), like=splats.means2d)
-    return Composite(*_Composite.apply(*splats, channels, marks, bins, num_primary))
+    expected = {
+        "means2d": (splats.means2d, tuple(splats.means2d.shape)),
+        "channels": (channels, (cameras, count, channels.shape[2])),
+        "marks": (marks, (cameras, count - num_primary)),
+    }
+    if deviation is not None:
+        expected["deviation.where"] = (deviation.where, (cameras, bins.height, bins.width))
+        if not 0 <= deviation.channel < channels.shape[2]:
+            raise ValueError(f"deviation.channel is {deviation.channel}, but there are {channels.shape[2]} channels")
+    check_tensors(expected)
+    return Composite(*_Composite.apply(*splats, channels, marks, bins, num_primary, deviation))
 
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
-        *tensors, bins, num_primary = arguments
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        *tensors, bins, num_primary, deviation = arguments
         *fields, channels, marks = (tensor.detach().contiguous() for tensor in tensors)
         splats = Splats(*fields)
-        image, alpha, mask, saved = cpu.composite(splats, channels, bins, marks=marks, num_primary=num_primary)
+        *outputs, saved = cpu.composite(
+            splats, channels, bins, marks=marks, num_primary=num_primary, deviation=deviation
+        )
         ctx.save_for_backward(*splats, channels, marks)
-        ctx.bins, ctx.num_primary, ctx.saved = bins, num_primary, saved
-        return image, alpha, mask
+        ctx.bins, ctx.num_primary, ctx.deviation, ctx.saved = bins, num_primary, deviation, saved
+        return tuple(outputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *v_outputs: Tensor) -> tuple[Tensor | None, ...]:
         *fields, channels, marks = ctx.saved_tensors
         v_means, v_conics, v_opacities, v_channels, v_marks = cpu.composite_gradients(
-            Splats(*fields), channels, ctx.bins, ctx.saved, v_outputs, marks=marks, num_primary=ctx.num_primary
-        )
-        return v_means, v_conics, v_opacities, None, None, v_channels, v_marks, None, None
+            Splats(*fields), channels, ctx.bins, ctx.saved, v_outputs,
+            marks=marks, num_primary=ctx.num_primary, deviation=ctx.deviation,
+        )  # fmt: skip
+        return v_means, v_conics, v_opacities, None, None, v_channels, v_marks, None, None, None

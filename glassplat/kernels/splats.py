@@ -62,6 +62,22 @@ class Splats(NamedTuple):
     radii: Tensor
 
 
+LEAST_ALPHA = 1e-6
+"""Coverage up to which a pixel holds nothing, and the mean of its channels is taken for 0."""
+
+
+class Deviation(NamedTuple):
+    """A request for the spread of one channel along each pixel's ray.
+
+    channel: which one. where [C, H, W]: factor on the result; tiles in which it is 0 throughout cost nothing.
+    through_mean: let the gradient pass through the mean too.
+    """
+
+    channel: int
+    where: Tensor
+    through_mean: bool = False
+
+
 class TileBins(NamedTuple):
     """Splats per 16 x 16 tile, front to back.
 

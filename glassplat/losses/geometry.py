@@ -12,7 +12,7 @@ from glassplat.scene.scene import Scene
 def depth_deviation_loss(frame: Frame, view: View, scene: Scene) -> Tensor:
     """Depth variance loss L_d over the hit mask (TR-Gaussians, Eq. 14).
 
-    The image mean of H(u) sum_i |z_i - D_t(u)| w_i, divided by the scene extent so that its weight
-    does not depend on the capture's units. Needs the `deviation` layer.
+    The image mean of H(u) sum_i |z_i - D_t(u)| w_i, the `deviation` layer, divided by the scene extent so that its
+    weight does not depend on the capture's units.
     """
-    return (frame.layers["deviation"] * frame.layers["hit"]).mean() / scene.extent
+    return frame.layers["deviation"].mean() / scene.extent

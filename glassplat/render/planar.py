@@ -8,13 +8,12 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from glassplat.kernels.bin_tiles import TILE, bin_tiles
+from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.blend_panes import blend_panes
 from glassplat.kernels.composite import composite
-from glassplat.kernels.depth_deviation import depth_deviation
 from glassplat.kernels.pane_hits import pane_hits
 from glassplat.kernels.panes import PaneHits, Panes
-from glassplat.kernels.splats import Splats, TileBins
+from glassplat.kernels.splats import Deviation
 from glassplat.render.frame import Frame, ScreenPass
 from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, mean_depth, over_background, project_gaussians
 from glassplat.scene.camera import Camera
@@ -33,8 +32,7 @@ class FirstPass(NamedTuple):
     alpha: Tensor
     depth: Tensor
     mask: Tensor
-    splats: Splats
-    bins: TileBins
+    deviation: Tensor | None
     screen: tuple[ScreenPass, ...]
 
 
@@ -66,7 +64,7 @@ class Planar:
         fresnel: strength by Schlick; False uses R0 for every angle.
         intensity: use the learned intensity a(u); False sets C_r = C_raw.
         reflection_gradient: what the reflection image's gradient reaches: everything, or the planes alone.
-        deviation: also compute the depth deviation, for training.
+        deviation: also compute the depth deviation where a pane is hit (Eq. 14), for training.
         deviation_depth_gradient: let the deviation's gradient pass through the mean depth D_t.
         blend: space in which Eqs. 1 and 13 hold: linear radiance, where light adds up, or sRGB as in the paper.
     """
@@ -81,14 +79,14 @@ class Planar:
 
     def __call__(self, scene: Scene, camera: Camera) -> Frame:
         """Renders `scene` from `camera`."""
-        first = self._first_pass(scene, camera)
-        layers = {"transmission": first.transmission, "depth": first.depth, "alpha": first.alpha, "mask": first.mask}
         panes = panes_in_camera(scene.planes, camera)
+        first = self._first_pass(scene, camera, panes)
+        layers = {"transmission": first.transmission, "depth": first.depth, "alpha": first.alpha, "mask": first.mask}
         hits = pane_hits(panes, camera.intrinsics, camera.width, camera.height, first.mask)
         hit = (hits.index >= 0).to(first.mask.dtype)
         layers["hit"] = hit
-        if self.deviation:
-            layers["deviation"] = self._deviation(first, hit, len(scene.primary))
+        if first.deviation is not None:
+            layers["deviation"] = first.deviation
         if not hits.tiles.any():
             layers |= {"reflection": torch.zeros_like(first.transmission), "strength": torch.zeros_like(hit)}
             return Frame(first.transmission, layers, first.screen)
@@ -110,7 +108,7 @@ class Planar:
         mirrored = replace(second.screen, weight=float(result.strength.detach().sum() / hit.sum()))
         return Frame(result.rgb, layers, (*first.screen, mirrored))
 
-    def _first_pass(self, scene: Scene, camera: Camera) -> FirstPass:
+    def _first_pass(self, scene: Scene, camera: Camera, panes: Panes) -> FirstPass:
         near = NEAR_PER_EXTENT * scene.extent
         primary = project_gaussians(scene.primary, camera, near=near)
         glass = project_gaussians(scene.glass, camera, near=near)
@@ -119,7 +117,11 @@ class Planar:
         colors = torch.cat([primary.colors, primary.depths[..., None]], dim=-1)
         channels = torch.nn.functional.pad(colors, (0, 0, 0, len(scene.glass)))
         marks = torch.sigmoid(scene.glass.channels["logit_mark"])[None]
-        result = composite(splats, channels, bins, marks=marks, num_primary=len(scene.primary))
+        deviation = None
+        if self.deviation:
+            index = pane_hits(panes, camera.intrinsics, camera.width, camera.height).index
+            deviation = Deviation(3, (index >= 0).to(colors.dtype)[None], self.deviation_depth_gradient)
+        result = composite(splats, channels, bins, marks=marks, num_primary=len(scene.primary), deviation=deviation)
         alpha = result.alpha[0]
         screen = (
             ScreenPass("primary", primary.means2d, primary.radii),
@@ -130,18 +132,9 @@ class Planar:
             alpha=alpha,
             depth=mean_depth(result.image[0, ..., 3], alpha),
             mask=result.mask[0],
-            splats=splats,
-            bins=bins,
+            deviation=result.deviation[0] if deviation else None,
             screen=screen,
         )
-
-    def _deviation(self, first: FirstPass, hit: Tensor, num_primary: int) -> Tensor:
-        """Eq. 14 over the tiles that the hit mask touches."""
-        touched = torch.nn.functional.max_pool2d(hit[None, None].float(), TILE, ceil_mode=True)
-        tiles = touched.flatten().nonzero().flatten().to(first.bins.active.dtype)
-        depth = first.depth if self.deviation_depth_gradient else first.depth.detach()
-        bins = first.bins._replace(active=tiles)
-        return depth_deviation(first.splats, depth[None].contiguous(), bins, num_primary=num_primary)[0]
 
     def _second_pass(self, scene: Scene, camera: Camera, planes: Planes, hits: PaneHits) -> SecondPass:
         primary = scene.primary if self.reflection_gradient == "all" else detached(scene.primary)

@@ -3,10 +3,11 @@
 import pytest
 import torch
 
-from glassplat.densify.perturb import behind_panes, perturb_opacities
+from glassplat.densify.perturb import perturb_opacities
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
+from glassplat.scene.sight import behind_panes
 
 PANE = Planes(
     centers=torch.zeros(1, 3),

@@ -71,9 +71,8 @@ from glassplat.kernels.adam import adam
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
 from glassplat.kernels.cpu.jit import Kernel
-from glassplat.kernels.depth_deviation import depth_deviation
 from glassplat.kernels.project import project
-from glassplat.kernels.splats import CameraBatch, RawGaussians, Splats
+from glassplat.kernels.splats import CameraBatch, Deviation, RawGaussians, Splats
 from glassplat.kernels.ssim import ssim
 
 means = torch.tensor([[0.0, 0.0, 2.0], [0.1, 0.0, 3.0]])
@@ -83,8 +82,8 @@ cameras = CameraBatch(torch.eye(4)[None], torch.tensor([[20.0, 20.0, 10.0, 8.0]]
 projected = project(raw, cameras, sh_degree=0, near=0.01)
 splats = Splats(projected.means2d, projected.conics, projected.opacities, projected.depths, projected.radii)
 bins = bin_tiles(splats, 20, 16)
-image = composite(splats, projected.colors, bins).image
-loss = ssim(image[0], torch.zeros(16, 20, 3)) + depth_deviation(splats, torch.ones(1, 16, 20), bins).sum()
+result = composite(splats, projected.colors, bins, deviation=Deviation(0, torch.ones(1, 16, 20)))
+loss = ssim(result.image[0], torch.zeros(16, 20, 3)) + result.deviation.sum()
 loss.backward()
 adam(means, raw.means.grad, torch.zeros(2, 3), torch.zeros(2, 3), lr=1e-3, step=1)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import Composite, composite
 from glassplat.kernels.reference.composite import composite as composite_twin
-from glassplat.kernels.splats import Splats, TileBins
+from glassplat.kernels.splats import Deviation, Splats, TileBins
 
 MakeSplats = Callable[..., Splats]
 INPUTS = ("means2d", "conics", "opacities", "channels", "marks")
@@ -25,9 +25,13 @@ class Blend(NamedTuple):
     marks: Tensor
     num_primary: int
     bins: TileBins
+    deviation: Deviation | None = None
 
     def __call__(self, function: Callable[..., Composite]) -> Composite:
-        return function(self.splats, self.channels, self.bins, marks=self.marks, num_primary=self.num_primary)
+        return function(
+            self.splats, self.channels, self.bins,
+            marks=self.marks, num_primary=self.num_primary, deviation=self.deviation,
+        )  # fmt: skip
 
     def inputs(self) -> list[Tensor]:
         return [self.splats.means2d, self.splats.conics, self.splats.opacities, self.channels, self.marks]
@@ -41,6 +45,15 @@ def blend(splats: Splats, size: tuple[int, int], *, channels: int = 3, glass: in
     values = torch.rand(cameras, count, channels, generator=generator, dtype=torch.float64).to(dtype)
     marks = torch.rand(cameras, glass, generator=generator, dtype=torch.float64).to(dtype)
     return Blend(splats, values, marks, count - glass, bin_tiles(splats, *size))
+
+
+def deviating(case: Blend, channel: int, *, through_mean: bool) -> Blend:
+    """The same call that also asks for a channel's deviation, with a random factor that is 0 in whole tiles."""
+    generator = torch.Generator().manual_seed(7)
+    shape = (case.bins.num_cameras, case.bins.height, case.bins.width)
+    where = torch.rand(*shape, generator=generator, dtype=torch.float64).to(case.channels.dtype)
+    where[:, :17, :16] = 0
+    return case._replace(deviation=Deviation(channel, where, through_mean))
 
 
 def with_gradients(case: Blend, function: Callable[..., Composite], seed: int = 2) -> dict[str, Tensor]:
@@ -88,6 +101,48 @@ def test_kernel_matches_its_twin(
     assert_close(with_gradients(case, composite), with_gradients(case, composite_twin), tolerance)
 
 
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-4), (torch.float64, 1e-11)])
+@pytest.mark.parametrize("through_mean", [False, True])
+@pytest.mark.parametrize(
+    ("cameras", "count", "glass", "channels", "channel"), [(1, 0, 0, 4, 3), (2, 80, 20, 4, 3), (1, 60, 5, 9, 6)]
+)
+def test_deviation_matches_its_twin(
+    random_splats: MakeSplats, dtype: torch.dtype, tolerance: float, through_mean: bool,
+    cameras: int, count: int, glass: int, channels: int, channel: int,
+) -> None:  # fmt: skip
+    size = (40, 37)
+    splats = random_splats((cameras, count), size, dtype=dtype, sigmas=(2.0, 9.0))
+    case = deviating(blend(splats, size, channels=channels, glass=glass), channel, through_mean=through_mean)
+    found = with_gradients(case, composite)
+    assert count == 0 or float(found["deviation"].max()) > 0.05
+    assert not bool(found["deviation"][:, :17, :16].any())
+    assert_close(found, with_gradients(case, composite_twin), tolerance)
+
+
+def test_asking_for_the_deviation_changes_nothing_else(random_splats: MakeSplats) -> None:
+    case = blend(random_splats((1, 80), (40, 37), dtype=torch.float32), (40, 37), channels=4, glass=20)
+    plain, asked = case(composite), deviating(case, 3, through_mean=False)(composite)
+    assert all(torch.equal(a, b) for a, b in zip(plain[:3], asked[:3], strict=True))
+    assert plain.deviation.numel() == 0
+
+
+def test_a_surface_deviates_nowhere(random_splats: MakeSplats) -> None:
+    case = blend(random_splats((1, 30), (20, 20)), (20, 20), channels=4)
+    case.channels[..., 3] = 3.0
+    case = case._replace(deviation=Deviation(3, torch.ones(1, 20, 20, dtype=torch.float64)))
+    assert float(case(composite).deviation.max()) < 1e-12
+
+
+def test_two_layers_deviate_by_their_weighted_distance_from_the_mean() -> None:
+    splats = two_discs(depths=(1.0, 3.0), opacities=(0.5, 0.8))
+    bins = bin_tiles(splats, 16, 16)
+    found = composite(splats, splats.depths[..., None], bins, deviation=Deviation(0, torch.full((1, 16, 16), 2.0)))
+    near, far = 0.5, 0.5 * 0.8
+    mean = (near * 1 + far * 3) / (near + far)
+    expected = 2 * (near * (mean - 1) + far * (3 - mean))
+    torch.testing.assert_close(found.deviation, torch.full((1, 16, 16), expected), rtol=1e-4, atol=0)
+
+
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-4), (torch.float64, 1e-12)])
 def test_an_opaque_pile_stops_where_its_twin_stops(
     random_splats: MakeSplats, dtype: torch.dtype, tolerance: float
@@ -111,13 +166,13 @@ def test_a_pile_of_glass_leaves_finite_gradients(random_splats: MakeSplats) -> N
 def test_gradients_match_finite_differences(random_splats: MakeSplats) -> None:
     size = (19, 18)
     splats = random_splats((1, 7), size, opacities=(0.3, 0.8), sigmas=(2.0, 6.0), seed=3)
-    case = blend(splats, size, channels=2, glass=3)
+    case = deviating(blend(splats, size, channels=2, glass=3), 1, through_mean=True)
 
     cotangents = [torch.randn_like(output) for output in case(composite)]
 
     def weighted(means2d: Tensor, conics: Tensor, opacities: Tensor, channels: Tensor, marks: Tensor) -> Tensor:
         moved = splats._replace(means2d=means2d, conics=conics, opacities=opacities)
-        outputs = composite(moved, channels, case.bins, marks=marks, num_primary=case.num_primary)
+        outputs = case._replace(splats=moved, channels=channels, marks=marks)(composite)
         return torch.stack([(o * c).sum() for o, c in zip(outputs, cotangents, strict=True)])
 
     inputs = [tensor.detach().clone().requires_grad_() for tensor in case.inputs()]
@@ -138,7 +193,7 @@ def test_clamped_coverage_passes_no_gradient_to_geometry() -> None:
 
 def test_only_active_tiles_are_drawn(random_splats: MakeSplats) -> None:
     size = (60, 40)
-    full = blend(random_splats((2, 50), size, dtype=torch.float32), size, glass=10)
+    full = deviating(blend(random_splats((2, 50), size, dtype=torch.float32), size, glass=10), 1, through_mean=True)
     tiles = torch.zeros(2, 3, 4, dtype=torch.bool)
     tiles[0, 1, 2] = tiles[1, 0, 0] = tiles[1, 2, 3] = True
     few = full._replace(bins=bin_tiles(full.splats, *size, tiles))
@@ -231,13 +286,13 @@ def test_wrong_inputs_are_named(random_splats: MakeSplats) -> None:
     splats, channels, bins = case.splats, case.channels, case.bins
     with pytest.raises(ValueError, match="2 splats are glass, but there are no marks"):
         composite(splats, channels, bins, num_primary=3)
-    with pytest.raises(ValueError, match=r"marks has shape \[1, 2\], expected \[1, 1\]"):
+    with pytest.raises(ValueError, match=r"marks has shape \(1, 2\); expected \(1, 1\)"):
         composite(splats, channels, bins, marks=case.marks, num_primary=4)
     with pytest.raises(ValueError, match="num_primary is 6"):
         composite(splats, channels, bins, num_primary=6)
     with pytest.raises(ValueError, match=r"D in 1\.\.32"):
         composite(splats, torch.zeros(1, 5, 33, dtype=torch.float64), bins)
-    with pytest.raises(TypeError, match=r"channels is torch\.float32, expected torch\.float64"):
+    with pytest.raises(TypeError, match=r"channels is torch\.float32 and means2d is torch\.float64"):
         composite(splats, channels.float(), bins)
     fewer = Splats(*(tensor[:, :4] for tensor in splats))
     with pytest.raises(ValueError, match="bin these very splats"):

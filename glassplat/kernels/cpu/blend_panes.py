@@ -1,7 +1,7 @@
 """Blending of panes on the CPU: runs of pixels of one row and one pane.
 
-A run is first copied into *planes* of one flat buffer, one plane per quantity, at offsets known to the compiler; that is
-what lets it turn the curves of the colour space into vector instructions.
+A run is first copied into *planes* of one flat buffer, one plane per quantity, at offsets known to the compiler; that
+is what lets it turn the curves of the colour space into vector instructions.
 """
 
 from __future__ import annotations

@@ -18,51 +18,67 @@ from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
 from glassplat.kernels.cpu.pair_gradients import CHUNK, new_pair_rows, sum_pair_rows
 from glassplat.kernels.cpu.schedule import even_stride
 from glassplat.kernels.maths_blend import TRANSMITTANCE_MIN, Scalar, blend_maths
-from glassplat.kernels.splats import Splats, TileBins
+from glassplat.kernels.splats import LEAST_ALPHA, Deviation, Splats, TileBins
 
-# Planes of the forward pass after those that both directions share; SUMS has one per channel.
-MASK, SUMS = 5 * tile.PLANE, 6 * tile.PLANE
+# Planes of the forward pass after those that both directions share; SUMS has one per channel. CENTER, DEVIATION and
+# LEAN belong to the second traversal, which sums distances from the mean that the first one has found.
+MASK, CENTER, DEVIATION, LEAN, SUMS = (plane * tile.PLANE for plane in range(5, 10))
 
 
-class SavedTiles(NamedTuple):
-    """What the backward pass needs from the forward pass: packed splats and each active tile's final state."""
+class Saved(NamedTuple):
+    """What the backward pass needs from the forward pass.
+
+    Packed splats, each active tile's final state, and of the channel whose deviation was asked for the mean [C, H, W]
+    and the lean [C, H, W]: the weight of what lies above the mean minus that of what lies below.
+    """
 
     packed: NDArray[Any]
     state: NDArray[Any]
+    center: NDArray[Any]
+    lean: NDArray[Any]
 
 
 def composite(
-    splats: Splats, channels: Tensor, bins: TileBins, *, marks: Tensor, num_primary: int
-) -> tuple[Tensor, Tensor, Tensor, SavedTiles]:
-    """Image [C, H, W, D], alpha [C, H, W], mask [C, H, W], and what `composite_gradients` starts from."""
+    splats: Splats, channels: Tensor, bins: TileBins, *, marks: Tensor, num_primary: int, deviation: Deviation | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Saved]:
+    """Image [C, H, W, D], alpha, mask and deviation [C, H, W], and what `composite_gradients` starts from."""
     real = tile.real_of(splats)
     cameras, count, num_channels = channels.shape
     shape = (bins.num_cameras, bins.height, bins.width)
     image, alpha, mask = (torch.zeros(s, dtype=channels.dtype) for s in ((*shape, num_channels), shape, shape))
-    saved = SavedTiles(
+    deviated = torch.zeros(shape if deviation else (0, 0, 0), dtype=channels.dtype)
+    saved = Saved(
         np.empty((cameras * count, tile.packed_width(num_channels)), real),
         np.empty((len(bins.active), tile.STATE_PLANES, tile.PIXELS), real),
+        np.zeros(deviated.shape, real),
+        np.zeros(deviated.shape, real),
     )
+    where = deviation.where.detach().contiguous().numpy() if deviation else saved.center
     _forward(real)(
-        *_flat(splats, channels), marks.numpy(), count, num_primary,
+        *_flat(splats, channels), marks.numpy(), count, num_primary, deviation.channel if deviation else -1, where,
         bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.splat_offsets.numpy(), bins.active.numpy(),
-        saved.packed, saved.state, image.numpy(), alpha.numpy(), mask.numpy(),
+        *saved, image.numpy(), alpha.numpy(), mask.numpy(), deviated.numpy(),
     )  # fmt: skip
-    return image, alpha, mask, saved
+    return image, alpha, mask, deviated, saved
 
 
 def composite_gradients(
-    splats: Splats, channels: Tensor, bins: TileBins, saved: SavedTiles, v_outputs: Sequence[Tensor],
-    *, marks: Tensor, num_primary: int,
+    splats: Splats, channels: Tensor, bins: TileBins, saved: Saved, v_outputs: Sequence[Tensor],
+    *, marks: Tensor, num_primary: int, deviation: Deviation | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Gradients of means2d, conics, opacities, channels and marks, given those of image, alpha and mask."""
+    """Gradients of means2d, conics, opacities, channels and marks, given those of image, alpha, mask and deviation."""
     real = tile.real_of(splats)
     num_channels, count = channels.shape[2], channels.shape[1]
     rows = new_pair_rows(bins, num_channels, real)
+    *v_images, v_deviation = v_outputs
+    channel, through_mean = -1, False
+    if deviation:
+        channel, through_mean = deviation.channel, deviation.through_mean
+        v_deviation = v_deviation * deviation.where
     composite_backward(real)(
-        marks.numpy(), count, num_primary, num_channels,
-        bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), saved.packed, saved.state,
-        *(v.contiguous().numpy() for v in v_outputs), rows,
+        marks.numpy(), count, num_primary, num_channels, channel, through_mean,
+        bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), *saved,
+        *(v.contiguous().numpy() for v in (*v_images, v_deviation)), rows,
     )  # fmt: skip
     v_means, v_conics, v_opacities, v_values = sum_pair_rows(rows, bins, splats)
     v_marks = torch.zeros_like(marks)
@@ -152,12 +168,42 @@ def _blend_glass(real: type) -> Scalar:
     return blend_glass
 
 
+def _deviate(real: type) -> Scalar:
+    clipped_alpha = blend_maths(real).clipped_alpha
+    zero = real(0.0)
+    T, LAST, COVERAGE = tile.T, tile.LAST, tile.COVERAGE
+
+    @inlined
+    def deviate(scratch, value, order, first, last):
+        for row in range(first, last):
+            base = (row & 15) * 16
+            for i in range(16):
+                a = clipped_alpha(scratch[COVERAGE + base + i]) if order <= scratch[LAST + base + i] else zero
+                t = scratch[T + base + i]
+                weight = a * t
+                scratch[T + base + i] = t - weight
+                difference = value - scratch[CENTER + base + i]
+                scratch[DEVIATION + base + i] += weight * abs(difference)
+                leaning = weight if difference > zero else -weight
+                scratch[LEAN + base + i] += leaning if difference != zero else zero
+
+    return deviate
+
+
 @functools.cache
 def _forward(real: type) -> Kernel:
     pack, place, begin, is_finished, save_state, _, fetch, cover, _ = tile.tile_functions(real)
     blend_primary, blend_more, blend_glass = _blend_primary(real), _blend_more(real), _blend_glass(real)
-    one, zero = real(1.0), real(0.0)
-    T, PLANE, VALUES, BATCH = tile.T, tile.PLANE, tile.VALUES, tile.BATCH
+    deviate = _deviate(real)
+    one, zero, least_alpha = real(1.0), real(0.0), real(LEAST_ALPHA)
+    T, LAST, PIXELS, PLANE, VALUES, BATCH = tile.T, tile.LAST, tile.PIXELS, tile.PLANE, tile.VALUES, tile.BATCH
+
+    @inlined
+    def looked_at(scratch):
+        most = -one
+        for i in range(PIXELS):
+            most = max(most, scratch[LAST + i])
+        return int(most) + 1
 
     @inlined
     def write_tile(scratch, image, alpha, mask, camera, x0, y0, columns, rows):
@@ -172,10 +218,34 @@ def _forward(real: type) -> Kernel:
                 for x in range(image_row.shape[0]):
                     image_row[x, d] = scratch[SUMS + (d & 31) * PLANE + base + x]
 
+    @inlined
+    def begin_deviation(scratch, channel, where, camera, x0, y0, columns, rows):
+        """Starts the second traversal of a tile; False where nobody asks for it."""
+        wanted = False
+        for y in range(rows):
+            for x in range(columns):
+                wanted |= where[camera, y0 + y, x0 + x] != zero
+        for i in range(tile.PLANE):
+            covered = one - abs(scratch[T + i])
+            total = scratch[SUMS + (channel & 31) * PLANE + i]
+            scratch[CENTER + i] = total / max(covered, least_alpha) if covered > least_alpha else zero
+            scratch[T + i] = one
+        return wanted
+
+    @inlined
+    def write_deviation(scratch, where, center, lean, deviation, camera, x0, y0, columns, rows):
+        for y in range(rows):
+            for x in range(columns):
+                i, factor = (y & 15) * 16 + (x & 15), where[camera, y0 + y, x0 + x]
+                center[camera, y0 + y, x0 + x] = scratch[CENTER + i]
+                lean[camera, y0 + y, x0 + x] = scratch[LEAN + i]
+                deviation[camera, y0 + y, x0 + x] = scratch[DEVIATION + i] * factor
+
     @kernel("composite_forward", real)
     def forward(
-        means, conics, opacities, channels, marks, splats_per_camera, num_primary,
-        pair_splats, tile_offsets, splat_offsets, active, packed, state, image, alpha, mask,
+        means, conics, opacities, channels, marks, splats_per_camera, num_primary, deviation_channel, where,
+        pair_splats, tile_offsets, splat_offsets, active,
+        packed, state, center, lean, image, alpha, mask, deviation,
     ):  # fmt: skip
         num_splats, num_channels = channels.shape
         groups = (num_channels + 3) // 4
@@ -214,5 +284,19 @@ def _forward(real: type) -> Kernel:
                         blend_glass(scratch, splat, marks[camera, glass], order, top, bottom)
             save_state(state, n, scratch)
             write_tile(scratch, image, alpha, mask, camera, x0, y0, columns, rows)
+            if deviation_channel < 0:
+                continue
+            if not begin_deviation(scratch, deviation_channel, where, camera, x0, y0, columns, rows):
+                continue
+            stop = min(stop, start + looked_at(scratch))
+            for first in range(start, stop, BATCH):
+                last = min(first + BATCH, stop)
+                fetch(batch, packed, pair_splats, first, last)
+                for p in range(first, last):
+                    if pair_splats[p] - camera * splats_per_camera < num_primary:
+                        order, splat = real(np.int32(p - start)), batch[p - first]
+                        top, bottom = cover(scratch, splat, x0, y0, rows)
+                        deviate(scratch, splat[VALUES + deviation_channel], order, top, bottom)
+            write_deviation(scratch, where, center, lean, deviation, camera, x0, y0, columns, rows)
 
     return forward

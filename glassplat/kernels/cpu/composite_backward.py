@@ -16,12 +16,15 @@ from glassplat.kernels.cpu import tile
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
 from glassplat.kernels.cpu.schedule import even_stride
 from glassplat.kernels.maths_blend import ALPHA_MAX, Scalar, blend_maths
+from glassplat.kernels.splats import LEAST_ALPHA
 
 # Planes of the backward pass; V_IMAGE has one per channel. BEHIND and BEHIND_GLASS hold what lies behind the current
-# splat, weighted by the incoming gradients; DOT its channels beyond the first group, so weighted. LANES is rows of 16
-# column sums: g, g dy and g dy^2 as `geometry_gradient` takes them, then one per channel.
+# splat, weighted by the incoming gradients; DOT the current splat's deviation and its channels beyond the first group,
+# so weighted; V_DEVIATION and CENTER the gradient of the deviation and the mean it is measured from. LANES is rows of
+# 16 column sums: g, g dy and g dy^2 as `geometry_gradient` takes them, then one per channel.
 BEHIND, BEHIND_GLASS, V_MASK, DOT = 5 * tile.PLANE, 6 * tile.PLANE, 7 * tile.PLANE, 8 * tile.PLANE
-LANES, V_IMAGE = 9 * tile.PLANE, 12 * tile.PLANE
+V_DEVIATION, CENTER = 9 * tile.PLANE, 10 * tile.PLANE
+LANES, V_IMAGE = 11 * tile.PLANE, 14 * tile.PLANE
 LANE_VALUES = LANES + 48
 
 
@@ -68,15 +71,12 @@ def _unblend_primary(real: type) -> Scalar:
 
 def _more_channels(real: type) -> tuple[Scalar, Scalar]:
     COVERAGE, PLANE, VALUES = tile.COVERAGE, tile.PLANE, tile.VALUES
-    zero = real(0.0)
 
     @inlined
     def dot_more(scratch, splat, groups, first, last):
-        """Fills DOT, before `unblend_primary`."""
+        """Adds to DOT, before `unblend_primary`."""
         for row in range(first, last):
             base = (row & 15) * 16
-            for i in range(16):
-                scratch[DOT + base + i] = zero
             for group in range(1, groups):
                 at, v = VALUES + 4 * group, V_IMAGE + (group & 7) * 4 * PLANE + base
                 c0, c1, c2, c3 = splat[at], splat[at + 1], splat[at + 2], splat[at + 3]
@@ -100,6 +100,58 @@ def _more_channels(real: type) -> tuple[Scalar, Scalar]:
                     scratch[lanes + 48 + i] += weight * scratch[v + 3 * PLANE + i]
 
     return dot_more, sum_more
+
+
+def _deviation(real: type) -> tuple[Scalar, Scalar]:
+    zero = real(0.0)
+    COVERAGE = tile.COVERAGE
+
+    @inlined
+    def dot_deviation(scratch, value, first, last):
+        """Adds to DOT, before `unblend_primary`."""
+        for row in range(first, last):
+            base = (row & 15) * 16
+            for i in range(16):
+                scratch[DOT + base + i] += scratch[V_DEVIATION + base + i] * abs(value - scratch[CENTER + base + i])
+
+    @inlined
+    def sum_deviation(scratch, value, lanes, first, last):
+        """Adds to the lane sums of the channel, after `unblend_primary`."""
+        lanes = lanes & 0xFFFF
+        for row in range(first, last):
+            base = (row & 15) * 16
+            for i in range(16):
+                difference = value - scratch[CENTER + base + i]
+                slope = scratch[COVERAGE + base + i] * scratch[V_DEVIATION + base + i]
+                slope = slope if difference > zero else -slope
+                scratch[lanes + i] += slope if difference != zero else zero
+
+    return dot_deviation, sum_deviation
+
+
+def _load_deviation(real: type) -> Scalar:
+    one, zero, least_alpha = real(1.0), real(0.0), real(LEAST_ALPHA)
+    T, PLANE = tile.T, tile.PLANE
+
+    @inlined
+    def load_deviation(scratch, channel, through_mean, center, lean, v_deviation, camera, x0, y0, columns, rows):
+        """Fills V_DEVIATION and CENTER, after the other gradients; False where the tile has no such gradient."""
+        wanted = False
+        for y in range(rows):
+            for x in range(columns):
+                i, middle = (y & 15) * 16 + (x & 15), center[camera, y0 + y, x0 + x]
+                v = v_deviation[camera, y0 + y, x0 + x]
+                wanted |= v != zero
+                scratch[V_DEVIATION + i], scratch[CENTER + i] = v, middle
+                covered = one - scratch[T + i]
+                if through_mean and covered > least_alpha:
+                    # The mean is the channel's sum over the coverage; alpha's gradient acts as in `load_gradients`.
+                    v_sum = -v * lean[camera, y0 + y, x0 + x] / covered
+                    scratch[V_IMAGE + (channel & 31) * PLANE + i] += v_sum
+                    scratch[BEHIND + i] += v_sum * middle * scratch[T + i]
+        return wanted
+
+    return load_deviation
 
 
 def _unblend_glass(real: type) -> Scalar:
@@ -142,8 +194,10 @@ def composite_backward(real: type) -> Kernel:
     _, place, _, _, _, load_state, fetch, cover, geometry_gradient = tile.tile_functions(real)
     unblend_primary, unblend_glass = _unblend_primary(real), _unblend_glass(real)
     dot_more, sum_more = _more_channels(real)
+    dot_deviation, sum_deviation = _deviation(real)
+    load_deviation = _load_deviation(real)
     zero = real(0.0)
-    T, PLANE, V_VALUES, BATCH = tile.T, tile.PLANE, tile.V_VALUES, tile.BATCH
+    T, PLANE, VALUES, V_VALUES, BATCH = tile.T, tile.PLANE, tile.VALUES, tile.V_VALUES, tile.BATCH
 
     @inlined
     def load_gradients(scratch, v_image, v_alpha, v_mask, camera, x0, y0, columns, rows):
@@ -161,8 +215,8 @@ def composite_backward(real: type) -> Kernel:
 
     @kernel("composite_backward", real)
     def backward(
-        marks, splats_per_camera, num_primary, num_channels,
-        pair_splats, tile_offsets, active, packed, state, v_image, v_alpha, v_mask, out,
+        marks, splats_per_camera, num_primary, num_channels, channel, through_mean,
+        pair_splats, tile_offsets, active, packed, state, center, lean, v_image, v_alpha, v_mask, v_deviation, out,
     ):  # fmt: skip
         groups = (num_channels + 3) // 4
         stride = even_stride(active.size)
@@ -173,6 +227,11 @@ def composite_backward(real: type) -> Kernel:
             scratch[:] = zero
             looked_at = load_state(state, n, scratch)
             load_gradients(scratch, v_image, v_alpha, v_mask, camera, x0, y0, columns, rows)
+            deviates = channel >= 0
+            if deviates:
+                deviates = load_deviation(
+                    scratch, channel, through_mean, center, lean, v_deviation, camera, x0, y0, columns, rows
+                )
             start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
             out[start + looked_at : stop] = zero
             batch = np.empty((BATCH, packed.shape[1]), real)
@@ -191,11 +250,18 @@ def composite_backward(real: type) -> Kernel:
                     for i in range(48 + groups * 64):
                         scratch[LANES + i] = zero
                     if glass < 0:
+                        if groups > 1 or deviates:
+                            scratch[DOT + top * 16 : DOT + bottom * 16] = zero
                         if groups > 1:
                             dot_more(scratch, splat, groups, top, bottom)
+                        if deviates:
+                            dot_deviation(scratch, splat[VALUES + channel], top, bottom)
                         unblend_primary(scratch, splat, order, y0, top, bottom)
                         if groups > 1:
                             sum_more(scratch, groups, top, bottom)
+                        if deviates:
+                            lanes = LANE_VALUES + channel * 16
+                            sum_deviation(scratch, splat[VALUES + channel], lanes, top, bottom)
                     else:
                         unblend_glass(scratch, splat, marks[camera, glass], order, y0, top, bottom)
                     geometry_gradient(out, p, scratch, LANES, splat, x0)

@@ -9,39 +9,56 @@ from torch import Tensor
 
 from glassplat.kernels.composite import Composite
 from glassplat.kernels.maths_blend import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from glassplat.kernels.splats import Splats, TileBins
+from glassplat.kernels.splats import LEAST_ALPHA, Deviation, Splats, TileBins
 
 TILE = 16
 
 
 def composite(
-    splats: Splats, channels: Tensor, bins: TileBins, *, marks: Tensor | None = None, num_primary: int | None = None
-) -> Composite:
+    splats: Splats, channels: Tensor, bins: TileBins,
+    *, marks: Tensor | None = None, num_primary: int | None = None, deviation: Deviation | None = None,
+) -> Composite:  # fmt: skip
     """See `glassplat.kernels.composite.composite`. Of the bins, only the image size and active tiles are used."""
     num_primary = splats.opacities.shape[1] if num_primary is None else num_primary
-    cameras = [
-        _camera_composite(
+    active = active_pixels(bins)
+    images, alphas, masks, deviations = [], [], [], []
+    for c in range(bins.num_cameras):
+        image, alpha, mask, weights = _camera_composite(
             splats_of_camera(splats, c), channels[c], bins, None if marks is None else marks[c], num_primary
         )
-        for c in range(bins.num_cameras)
-    ]
-    image, alpha, mask = (torch.stack(layers) for layers in zip(*cameras, strict=True))
-    active = active_pixels(bins)
-    return Composite(image * active[..., None], alpha * active, mask * active)
+        images.append(image * active[c, ..., None])
+        alphas.append(alpha * active[c])
+        masks.append(mask * active[c])
+        if deviation:
+            values = channels[c, :, deviation.channel]
+            spread = _spread(weights, values, image[..., deviation.channel], alpha, deviation.through_mean)
+            deviations.append(deviation.where[c] * spread * active[c])
+    stacked = torch.stack(deviations) if deviation else channels.new_zeros(0, 0, 0)
+    return Composite(torch.stack(images), torch.stack(alphas), torch.stack(masks), stacked)
+
+
+def _spread(weights: dict[int, Tensor], values: Tensor, total: Tensor, alpha: Tensor, through_mean: bool) -> Tensor:
+    """Sum of w_i |z_i - mean| over the splats, with weights [H, W] by splat and values [G]."""
+    covered = alpha > LEAST_ALPHA
+    mean = torch.where(covered, total / torch.where(covered, alpha, 1), 0)
+    mean = mean if through_mean else mean.detach()
+    return torch.stack([torch.zeros_like(mean), *(w * (values[i] - mean).abs() for i, w in weights.items())]).sum(0)
 
 
 def _camera_composite(
     splats: Splats, channels: Tensor, bins: TileBins, marks: Tensor | None, num_primary: int
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, dict[int, Tensor]]:
+    """Image, alpha, mask and the weight [H, W] of every primary splat."""
     transmittance = splats.means2d.new_ones(bins.height, bins.width)
     image = transmittance[..., None] * channels.new_zeros(channels.shape[-1])
     mask, glass_transmittance = torch.zeros_like(transmittance), torch.ones_like(transmittance)
     running = glass_running = torch.ones_like(transmittance, dtype=torch.bool)
+    weights = {}
     for index, alpha in alphas_front_to_back(splats, bins):
         if index < num_primary:
             after = transmittance * (1 - alpha)
             running = running & (after >= TRANSMITTANCE_MIN)
-            weight = torch.where(running, alpha * transmittance, 0)
+            weights[index] = weight = torch.where(running, alpha * transmittance, 0)
             image = image + torch.where((weight > 0)[..., None], weight[..., None] * channels[index], 0)
             transmittance = torch.where(running, after, transmittance)
         elif marks is not None:
@@ -51,7 +68,7 @@ def _camera_composite(
             shown = alpha * transmittance * glass_transmittance * marks[index - num_primary]
             mask = mask + torch.where(seen, shown, 0)
             glass_transmittance = torch.where(seen, after, glass_transmittance)
-    return image, 1 - transmittance, mask
+    return image, 1 - transmittance, mask, weights
 
 
 def alphas_front_to_back(splats: Splats, bins: TileBins) -> Iterator[tuple[int, Tensor]]:
