@@ -90,6 +90,7 @@ class DefaultDensify:
         dense_fraction: Gaussians whose longest axis is above this share of the scene extent are
             split, smaller ones cloned.
         prune_opacity: Gaussians less opaque than this are removed.
+        prune_large_start: share of the run after which what is too large is removed as well; 1 never does.
         prune_scale_fraction: with `prune_large`, Gaussians with an axis above this share of the
             scene extent are removed.
         prune_radius_fraction: with `prune_large`, Gaussians that any view saw with a radius above
@@ -104,6 +105,7 @@ class DefaultDensify:
     gradient_threshold: float = 2e-4
     dense_fraction: float = 0.01
     prune_opacity: float = 0.005
+    prune_large_start: float = 1.0
     prune_scale_fraction: float = 0.1
     prune_radius_fraction: float | None = None
     cap: int | None = None

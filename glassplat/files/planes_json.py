@@ -23,7 +23,7 @@ VECTORS = {"center": 3, "normal": 3, "tangent": 3, "half_sizes": 2}
 def write_planes(path: Path | str, planes: Planes) -> None:
     """Writes planes as a JSON list, atomically; `read_planes` gives back the same float32 bits.
 
-    Each entry has label, center, normal (unit), tangent, half_sizes and base_reflectance for people
+    Each entry has label, mirror, center, normal (unit), tangent, half_sizes and base_reflectance for people
     and other programs (world units, the capture's frame), and the raw values raw_normal and
     logit_reflectance that training continues from.
 
@@ -66,6 +66,7 @@ def read_planes(path: Path | str) -> Planes:
         tangents=vectors["tangent"],
         half_sizes=vectors["half_sizes"],
         labels=labels,
+        mirrors=tuple(label for label, entry in zip(labels, entries, strict=True) if _is_mirror(entry, path)),
     )
 
 
@@ -73,6 +74,7 @@ def _entry(planes: Planes, index: int) -> dict[str, Any]:
     """One plane as plain numbers; a float32 survives the way through a decimal double unchanged."""
     return {
         "label": int(planes.labels[index]),
+        "mirror": planes.labels[index] in planes.mirrors,
         "center": planes.centers[index].tolist(),
         "normal": planes.normals[index].tolist(),
         "tangent": planes.tangents[index].tolist(),
@@ -106,6 +108,13 @@ def _label(entry: Mapping[str, Any], path: Path) -> int:
     if not isinstance(label, int) or isinstance(label, bool) or label < 1:
         raise ValueError(f"a plane in {path} has the label {label!r}; expected a whole number of at least 1")
     return label
+
+
+def _is_mirror(entry: Mapping[str, Any], path: Path) -> bool:
+    mirror = entry.get("mirror", False)
+    if not isinstance(mirror, bool):
+        raise ValueError(f"plane {entry['label']} in {path} has mirror = {mirror!r}; expected true or false")
+    return mirror
 
 
 def _vector(entry: Mapping[str, Any], key: str, path: Path) -> Tensor:

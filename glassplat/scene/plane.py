@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -26,6 +26,7 @@ class Planes:
         tangents: [K, 3] direction of the rectangle's first side; made orthogonal to the normal in use.
         half_sizes: [K, 2] half the side lengths along tangent and bitangent; world units.
         labels: pane label of each plane, as found in the masks.
+        mirrors: labels of the planes that transmit nothing; their base reflectance gets no gradient.
     """
 
     centers: Tensor
@@ -34,6 +35,7 @@ class Planes:
     tangents: Tensor
     half_sizes: Tensor
     labels: tuple[int, ...]
+    mirrors: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         for name, tensor in self.tensors().items():
@@ -41,6 +43,8 @@ class Planes:
                 raise ValueError(
                     f"{name} has {tensor.shape[0]} rows for {len(self.labels)} plane labels; expected one row per plane"
                 )
+        if not set(self.mirrors) <= set(self.labels):
+            raise ValueError(f"mirrors {self.mirrors} are not all among the plane labels {self.labels}")
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -53,7 +57,11 @@ class Planes:
     @property
     def base_reflectances(self) -> Tensor:
         """[K] reflectance at normal incidence R0, in (0, 1)."""
-        return torch.sigmoid(self.logit_reflectances)
+        logits = self.logit_reflectances
+        if self.mirrors:
+            fixed = torch.tensor([label in self.mirrors for label in self.labels], device=logits.device)
+            logits = torch.where(fixed, logits.detach(), logits)
+        return torch.sigmoid(logits)
 
     def axes(self) -> tuple[Tensor, Tensor]:
         """Unit in-plane axes (tangent, bitangent), each [K, 3]; right-handed with the normal."""
@@ -71,12 +79,13 @@ class Planes:
         unknown = set(tensors) - set(self.tensors())
         if unknown:
             raise ValueError(f"unknown tensors {sorted(unknown)}; planes have {sorted(self.tensors())}")
-        return Planes(**(self.tensors() | dict(tensors)), labels=self.labels)
+        return replace(self, **tensors)
 
     def select(self, rows: Sequence[int]) -> Planes:
         """The planes at the given positions, in that order."""
         chosen = {name: tensor[list(rows)] for name, tensor in self.tensors().items()}
-        return Planes(**chosen, labels=tuple(self.labels[k] for k in rows))
+        labels = tuple(self.labels[k] for k in rows)
+        return Planes(**chosen, labels=labels, mirrors=tuple(label for label in self.mirrors if label in labels))
 
     def to(self, device: torch.device | str) -> Planes:
         """The same planes on another device."""

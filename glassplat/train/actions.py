@@ -76,6 +76,7 @@ class Densify:
             extent=state.scene.extent,
             generator=state.generator(self.name),
             part=self.part,
+            prune_large=self.part == "primary" and clock.progress > self.densifier.prune_large_start,
         )
         state.scene = state.scene.with_gaussians(self.part, edited)
 

@@ -44,6 +44,7 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
         "seconds": state.seconds,
         "extent": scene.extent,
         "labels": list(scene.planes.labels),
+        "mirrors": list(scene.planes.mirrors),
         "active_sh_degree": {part: g.active_sh_degree for part, g in scene.gaussian_sets().items()},
         "updates": state.optimizer.updates,
     }
@@ -82,7 +83,7 @@ def restored_state(header: dict, tensors: dict[str, Tensor]) -> TrainState:
         part: restored_gaussians(under(tensors, f"scene/{part}/"), degree)
         for part, degree in header["active_sh_degree"].items()
     }
-    planes = Planes(**under(tensors, "scene/planes/"), labels=tuple(header["labels"]))
+    planes = Planes(**under(tensors, "scene/planes/"), labels=tuple(header["labels"]), mirrors=tuple(header["mirrors"]))
     first, second = under(tensors, "first/"), under(tensors, "second/")
     statistics = under(tensors, "statistics/")
     parts = {name.partition("/")[0] for name in statistics}

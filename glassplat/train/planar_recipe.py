@@ -114,18 +114,18 @@ class PlaneEntry:
         mirrors = self.fit.mirror_labels
         if self.detect_mirrors and not mirrors:
             mirrors = mirror_labels(scene, dataset.train)
-            scene = replace(scene, planes=with_mirrors(planes, mirrors, self.fit.mirror_reflectance))
             log.info("mirrors among the panes: %s", ", ".join(map(str, mirrors)) or "none")
-        state.scene = scene
+        state.scene = replace(scene, planes=with_mirrors(planes, mirrors, self.fit.mirror_reflectance))
         state.statistics.clear()
         remove_virtual_scene(state, dataset, mirrors)
 
 
 def with_mirrors(planes: Planes, labels: tuple[int, ...], reflectance: float) -> Planes:
-    """The planes with the base reflectance of some of them, by label, set to a mirror's."""
-    mirrors = torch.tensor([label in labels for label in planes.labels], device=planes.centers.device)
-    start = torch.full_like(planes.logit_reflectances, math.log(reflectance / (1 - reflectance)))
-    return planes.with_tensors({"logit_reflectances": torch.where(mirrors, start, planes.logit_reflectances)})
+    """The planes with some of them, by label, made mirrors of a base reflectance that stays."""
+    kept = tuple(label for label in planes.labels if label in labels)
+    mirrors = torch.tensor([label in kept for label in planes.labels], device=planes.centers.device)
+    fixed = torch.full_like(planes.logit_reflectances, math.log(reflectance / (1 - reflectance)))
+    return replace(planes, logit_reflectances=torch.where(mirrors, fixed, planes.logit_reflectances), mirrors=kept)
 
 
 def remove_virtual_scene(state: TrainState, dataset: Dataset, labels: tuple[int, ...]) -> None:

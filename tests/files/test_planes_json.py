@@ -18,6 +18,7 @@ def random_planes(count: int = 3) -> Planes:
         tangents=torch.randn(count, 3, generator=generator),
         half_sizes=torch.rand(count, 2, generator=generator),
         labels=tuple(range(2, 2 + count)),
+        mirrors=(3,) if count > 1 else (),
     )
 
 
@@ -36,7 +37,7 @@ def test_planes_survive_bit_for_bit(tmp_path: Path, count: int) -> None:
     planes = random_planes(count)
     write_planes(tmp_path / "planes.json", planes)
     read = read_planes(tmp_path / "planes.json")
-    assert read.labels == planes.labels
+    assert read.labels == planes.labels and read.mirrors == planes.mirrors
     for name, tensor in planes.tensors().items():
         assert torch.equal(read.tensors()[name], tensor), name
 
@@ -81,6 +82,7 @@ def test_raw_values_may_be_left_out(tmp_path: Path) -> None:
         ({"normal": [0, 0, 0]}, "normal of length 0"),
         ({"label": "left"}, "label 'left'; expected a whole number"),
         ({"label": 3}, "expected every label once"),
+        ({"mirror": "yes"}, "mirror = 'yes'; expected true or false"),
         ({"base_reflectance": 1.5}, "base_reflectance = 1.5; expected a number from 0 to 1"),
     ],
 )

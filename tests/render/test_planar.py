@@ -198,6 +198,16 @@ def test_blocked_reflection_gradient_reaches_the_plane_and_not_the_gaussians() -
     assert float(torch.autograd.grad(free, means)[0].abs().sum()) > 0
 
 
+def test_a_mirror_keeps_its_reflectance() -> None:
+    scene = showcase(joined(pane(2.0, half=0.5, label=1), pane(4.0, label=2)))
+    logits = scene.planes.logit_reflectances.clone().requires_grad_()
+    planes = replace(scene.planes, logit_reflectances=logits, mirrors=(2,))
+    rgb = Planar()(replace(scene, planes=planes), CAMERA).rgb
+    (gradient,) = torch.autograd.grad(rgb.square().sum(), logits)
+    assert gradient[0] != 0 and gradient[1] == 0
+    assert torch.equal(rgb, Planar()(scene, CAMERA).rgb)
+
+
 def test_switches_change_what_they_name() -> None:
     scene = showcase()
     constant = Planar(fresnel=False)(scene, CAMERA).layers
