@@ -21,7 +21,7 @@ def _multiply_add(seeds: np.ndarray, rounds: int) -> float:
             for lane in range(LANES):
                 sums[lane] = sums[lane] * factor + addend
         total += sums.sum()
-    return total
+    return float(total)
 
 
 def peak_multiply_adds(threads: int) -> float:

@@ -14,7 +14,7 @@ from glassplat.kernels.tensor_checks import REAL_OF, check_tensors
 
 
 def blend_panes(
-    transmission: Tensor, mask: Tensor, reflections: Tensor, index: Tensor,
+    transmission: Tensor, mask: Tensor, reflections: Tensor, pane: Tensor,
     normals: Tensor, base_reflectances: Tensor, intrinsics: Tensor,
     *, fresnel: bool = True, intensity: bool = True, linear: bool = True,
 ) -> BlendedPanes:  # fmt: skip
@@ -34,7 +34,7 @@ def blend_panes(
         transmission: [H, W, 3] C_t, sRGB.
         mask: [H, W] M, visibility of the panes.
         reflections: [K, H, W, 4] what each pane mirrors, C_raw in sRGB and the intensity A.
-        index: [H, W] int32 pane of each pixel, -1 for none, as `pane_hits` gives it.
+        pane: [H, W] int32 position of each pixel's pane, -1 for none, as `pane_hits` gives it.
         normals: [K, 3] unit normals in the camera frame; the sign does not matter.
         base_reflectances: [K] R0 in [0, 1].
         intrinsics: [4] fx, fy, cx, cy in pixels; no gradient.
@@ -44,7 +44,7 @@ def blend_panes(
 
     Raises:
         ValueError: shapes disagree.
-        TypeError: tensors of different or unsupported floating-point types, an index that is not int32, or not on
+        TypeError: tensors of different or unsupported floating-point types, an pane that is not int32, or not on
             the CPU.
     """
     height, width, count = *mask.shape, normals.shape[0]
@@ -58,12 +58,10 @@ def blend_panes(
             "intrinsics": (intrinsics, (4,)),
         }
     )
-    if index.dtype != torch.int32 or tuple(index.shape) != (height, width):
-        raise TypeError(f"index is {index.dtype} of shape {tuple(index.shape)}; expected int32 of {(height, width)}")
+    if pane.dtype != torch.int32 or tuple(pane.shape) != (height, width):
+        raise TypeError(f"pane is {pane.dtype} of shape {tuple(pane.shape)}; expected int32 of {(height, width)}")
     switches = (fresnel, intensity, linear)
-    outputs = _BlendPanes.apply(
-        transmission, mask, reflections, normals, base_reflectances, index, intrinsics, switches
-    )
+    outputs = _BlendPanes.apply(transmission, mask, reflections, normals, base_reflectances, pane, intrinsics, switches)
     return BlendedPanes(*outputs)
 
 

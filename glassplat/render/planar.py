@@ -83,7 +83,7 @@ class Planar:
         first = self._first_pass(scene, camera, panes)
         layers = {"transmission": first.transmission, "depth": first.depth, "alpha": first.alpha, "mask": first.mask}
         hits = pane_hits(panes, camera.intrinsics, camera.width, camera.height, first.mask)
-        hit = (hits.index >= 0).to(first.mask.dtype)
+        hit = (hits.pane >= 0).to(first.mask.dtype)
         layers["hit"] = hit
         if first.deviation is not None:
             layers["deviation"] = first.deviation
@@ -96,7 +96,7 @@ class Planar:
             first.transmission,
             first.mask,
             second.reflections,
-            hits.index,
+            hits.pane,
             planes.normals @ camera.cam_from_world[:3, :3].T,
             planes.base_reflectances,
             camera.intrinsics,
@@ -119,7 +119,7 @@ class Planar:
         marks = torch.sigmoid(scene.glass.channels["logit_mark"])[None]
         deviation = None
         if self.deviation:
-            index = pane_hits(panes, camera.intrinsics, camera.width, camera.height).index
+            index = pane_hits(panes, camera.intrinsics, camera.width, camera.height).pane
             deviation = Deviation(3, (index >= 0).to(colors.dtype)[None], self.deviation_depth_gradient)
         result = composite(splats, channels, bins, marks=marks, num_primary=len(scene.primary), deviation=deviation)
         alpha = result.alpha[0]
@@ -177,7 +177,7 @@ def those_seen(planes: Planes, hits: PaneHits) -> tuple[Planes, PaneHits]:
         return planes, hits
     # The last entry is for index -1, pixels without a pane.
     position = torch.where(torch.cat([seen, seen.new_zeros(1)]), torch.cat([seen.cumsum(0) - 1, seen.new_ones(1)]), -1)
-    index = position[hits.index.long()].to(torch.int32)
+    index = position[hits.pane.long()].to(torch.int32)
     rows = seen.nonzero().flatten().tolist()
     return planes.select(rows), PaneHits(index, hits.tiles[seen], hits.windows[seen])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -79,7 +79,7 @@ class Planes:
         unknown = set(tensors) - set(self.tensors())
         if unknown:
             raise ValueError(f"unknown tensors {sorted(unknown)}; planes have {sorted(self.tensors())}")
-        return replace(self, **tensors)
+        return Planes(**(self.tensors() | dict(tensors)), labels=self.labels, mirrors=self.mirrors)
 
     def select(self, rows: Sequence[int]) -> Planes:
         """The planes at the given positions, in that order."""

@@ -45,7 +45,7 @@ def test_hits_match_their_twin(dtype: torch.dtype, count: int, masked: bool) -> 
     mask = (torch.rand(HEIGHT, WIDTH, generator=generator) > 0.9).to(dtype) if masked else None
     found = pane_hits(panes, intrinsics, WIDTH, HEIGHT, mask)
     expected = hits_twin(panes, intrinsics, WIDTH, HEIGHT, mask)
-    assert count == 0 or len(expected.index.unique()) > min(count, 2)
+    assert count == 0 or len(expected.pane.unique()) > min(count, 2)
     for tensor, twin in zip(found, expected, strict=True):
         assert torch.equal(tensor, twin)
 
@@ -58,7 +58,7 @@ def test_a_plane_through_the_camera_is_not_hit() -> None:
         torch.tensor([[[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]], dtype=torch.float64),
         panes.half_sizes,
     )
-    assert bool((pane_hits(edge_on, intrinsics, WIDTH, HEIGHT).index == -1).all())
+    assert bool((pane_hits(edge_on, intrinsics, WIDTH, HEIGHT).pane == -1).all())
 
 
 def blend_case(dtype: torch.dtype, count: int = 3) -> dict[str, Tensor]:
@@ -74,7 +74,7 @@ def blend_case(dtype: torch.dtype, count: int = 3) -> dict[str, Tensor]:
         "transmission": 1.2 * draw(HEIGHT, WIDTH, 3) ** 3,
         "mask": torch.where(mask < 0.1, 0, mask),
         "reflections": 1.2 * draw(count, HEIGHT, WIDTH, 4) ** 3,
-        "index": pane_hits(panes, intrinsics, WIDTH, HEIGHT).index,
+        "pane": pane_hits(panes, intrinsics, WIDTH, HEIGHT).pane,
         "normals": panes.normals,
         "base_reflectances": 0.9 * draw(count),
         "intrinsics": intrinsics,
@@ -130,9 +130,9 @@ def test_where_there_is_no_pane_the_image_is_the_transmission_bit_for_bit() -> N
     case = blend_case(torch.float32)
     case["base_reflectances"][1] = 0
     result = blend_panes(**case, fresnel=False)
-    shown = (case["index"] >= 0) & (case["mask"] > 0)
+    shown = (case["pane"] >= 0) & (case["mask"] > 0)
     assert bool(shown.any()) and not bool(shown.all())
-    plain = ~shown | (case["index"] == 1)
+    plain = ~shown | (case["pane"] == 1)
     assert torch.equal(result.rgb[plain], case["transmission"][plain])
     assert float(result.strength[~shown].abs().max()) == 0 == float(result.reflection[~shown].abs().max())
 
@@ -159,7 +159,7 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(ValueError, match="reflections"):
         blend_panes(**(case | {"reflections": case["reflections"][:1]}))
     with pytest.raises(TypeError, match="int32"):
-        blend_panes(**(case | {"index": case["index"].long()}))
+        blend_panes(**(case | {"pane": case["pane"].long()}))
     panes, intrinsics = random_panes(2, torch.float32)
     with pytest.raises(ValueError, match="mask"):
         pane_hits(panes, intrinsics, WIDTH, HEIGHT, torch.ones(3, 3))

@@ -80,5 +80,5 @@ def in_single_precision(scene: Scene) -> Scene:
 
 def nearest_hits(planes: Planes, camera: Camera) -> Tensor:
     """[K, H, W] bool: the pixels that show each pane, the nearest where panes overlap."""
-    index = pane_hits(panes_in_camera(planes, camera), camera.intrinsics, camera.width, camera.height).index
+    index = pane_hits(panes_in_camera(planes, camera), camera.intrinsics, camera.width, camera.height).pane
     return index == torch.arange(len(planes), dtype=torch.int32)[:, None, None]

@@ -31,11 +31,11 @@ BACKWARD_PLANES = 26
 
 
 @inlined
-def _span(index, row, k):  # type: ignore[no-untyped-def]
+def _span(pane, row, k):
     """First and one-past-last column of a row that shows pane k."""
-    first, last = index.shape[1], 0
-    for column in range(index.shape[1]):
-        if index[row, column] == k:
+    first, last = pane.shape[1], 0
+    for column in range(pane.shape[1]):
+        if pane[row, column] == k:
             first = min(first, column)
             last = column + 1
     return first, last
@@ -45,11 +45,11 @@ def _load(real: type) -> Scalar:
     zero, one = real(0.0), real(1.0)
 
     @inlined
-    def load(run, transmission, mask, reflections, index, intensity, row, k, first, count):
+    def load(run, transmission, mask, reflections, pane, intensity, row, k, first, count):
         """Copies the pixels of a run; what lies beyond its end is not shown."""
         for i in range(RUN):
             column = first + min(i, count - 1)
-            shown = (index[row, column] == k) & (i < count)
+            shown = (pane[row, column] == k) & (i < count)
             run[MASK + i] = mask[row, column] if shown else zero
             run[GAIN + i] = reflections[k, row, column, 3] if intensity else one
             for d in range(3):
@@ -113,20 +113,20 @@ def blend_panes_forward(real: type) -> Kernel:
 
     @kernel("blend_panes_forward", real)
     def forward(
-        transmission, mask, reflections, normals, bases, index, intrinsics, fresnel, intensity, linear,
+        transmission, mask, reflections, normals, bases, pane, intrinsics, fresnel, intensity, linear,
         rgb, reflection, strength,
     ):  # fmt: skip
         height = mask.shape[0]
         stride = even_stride(height)
         for task in prange(height):
             row = task * stride % height
-            run = np.empty(FORWARD_PLANES * RUN, real)
+            run: NDArray[Any] = np.empty(FORWARD_PLANES * RUN, real)
             rgb[row], reflection[row], strength[row] = transmission[row], zero, zero
             for k in range(normals.shape[0]):
-                begin, end = _span(index, row, k)
+                begin, end = _span(pane, row, k)
                 for first in range(begin, end, RUN):
                     count = min(RUN, end - first)
-                    load(run, transmission, mask, reflections, index, intensity, row, k, first, count)
+                    load(run, transmission, mask, reflections, pane, intensity, row, k, first, count)
                     shine(run, normals, bases, k, row, first, intrinsics, fresnel)
                     for d in range(3):
                         mix(run, d, linear)
@@ -209,7 +209,7 @@ def blend_panes_backward(real: type) -> Kernel:
 
     @kernel("blend_panes_backward", real)
     def backward(
-        transmission, mask, reflections, normals, bases, index, intrinsics, fresnel, intensity, linear,
+        transmission, mask, reflections, normals, bases, pane, intrinsics, fresnel, intensity, linear,
         v_rgb, v_reflection, v_strength, v_transmission, v_mask, v_reflections, v_normals, v_bases,
     ):  # fmt: skip
         height, panes = mask.shape[0], normals.shape[0]
@@ -220,10 +220,10 @@ def blend_panes_backward(real: type) -> Kernel:
             run: NDArray[Any] = np.empty(BACKWARD_PLANES * RUN, real)
             v_transmission[row] = v_rgb[row]
             for k in range(panes):
-                begin, end = _span(index, row, k)
+                begin, end = _span(pane, row, k)
                 for first in range(begin, end, RUN):
                     count = min(RUN, end - first)
-                    load(run, transmission, mask, reflections, index, intensity, row, k, first, count)
+                    load(run, transmission, mask, reflections, pane, intensity, row, k, first, count)
                     y = shine(run, normals, bases, k, row, first, intrinsics, fresnel)
                     for i in range(RUN):
                         column = first + min(i, count - 1)

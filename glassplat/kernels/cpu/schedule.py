@@ -13,7 +13,7 @@ GOLDEN = 0.6180339887498949
 
 
 @inlined
-def even_stride(count):  # type: ignore[no-untyped-def]
+def even_stride(count):
     """A stride near the golden section of `count` and coprime to it: task `t` does piece `t * stride % count`."""
     stride = max(1, int(count * GOLDEN))
     while True:

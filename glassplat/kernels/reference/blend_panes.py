@@ -11,7 +11,7 @@ from glassplat.kernels.reference.pane_hits import ray_grid
 
 
 def blend_panes(
-    transmission: Tensor, mask: Tensor, reflections: Tensor, index: Tensor,
+    transmission: Tensor, mask: Tensor, reflections: Tensor, pane: Tensor,
     normals: Tensor, base_reflectances: Tensor, intrinsics: Tensor,
     *, fresnel: bool = True, intensity: bool = True, linear: bool = True,
 ) -> BlendedPanes:  # fmt: skip
@@ -20,7 +20,7 @@ def blend_panes(
     rays = torch.nn.functional.normalize(ray_grid(intrinsics, width, height), dim=-1)
     strength, reflection = torch.zeros_like(mask), torch.zeros_like(transmission)
     for k in range(len(normals)):
-        shown = (index == k) & (mask > 0)
+        shown = (pane == k) & (mask > 0)
         cosine = (rays @ normals[k]).abs().clamp(max=1)
         base = base_reflectances[k]
         raw = base + (1 - base) * (1 - cosine) ** 5 if fresnel else base
