@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from glassplat.data.dataset import View
 from glassplat.render.planar import Planar
 from glassplat.scene.camera import Camera
+from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -64,7 +66,7 @@ def mirror_labels(scene: Scene, views: Sequence[View]) -> tuple[int, ...]:
 @torch.no_grad()
 def pane_pixels(scene: Scene, view: View) -> dict[int, tuple[Tensor, Tensor]]:
     """Mirrored and photographed colours [P, 3] of each pane's pixels in one view, by label, about their local means."""
-    mirrored, coverage = mirrored_image(scene, view.camera)
+    mirrored, coverage, _ = mirrored_image(scene, view.camera)
     photo = view.photo.to(mirrored.dtype) / 255
     known = coverage > LEAST_COVERAGE
     pixels = {}
@@ -74,13 +76,35 @@ def pane_pixels(scene: Scene, view: View) -> dict[int, tuple[Tensor, Tensor]]:
     return pixels
 
 
-def mirrored_image(scene: Scene, camera: Camera) -> tuple[Tensor, Tensor]:
-    """What the panes would mirror at full strength [H, W, 3], and how much of it is covered by Gaussians [H, W]."""
+class MirroredImage(NamedTuple):
+    """What the panes would mirror at full strength.
+
+    color [H, W, 3]; coverage [H, W], how much of it is covered by Gaussians; seen [H, W] bool, where there is a pane.
+    """
+
+    color: Tensor
+    coverage: Tensor
+    seen: Tensor
+
+
+def mirrored_image(scene: Scene, camera: Camera) -> MirroredImage:
+    """Renders before black and before white, whose difference is what is not covered."""
     before_black, before_white = (
         Planar(background=color, intensity=False)(scene, camera).layers["reflection"] for color in (BLACK, WHITE)
     )
     seen = before_white.amax(dim=-1) > 0
-    return before_black, torch.where(seen, 1 - (before_white - before_black).mean(dim=-1), 0)
+    return MirroredImage(before_black, torch.where(seen, 1 - (before_white - before_black).mean(dim=-1), 0), seen)
+
+
+@torch.no_grad()
+def mirrored_coverage(scene: Scene, pane: Planes, cameras: Sequence[Camera]) -> float:
+    """Share of what a pane could mirror, over all views, that Gaussians cover; 1 where no view shows the pane."""
+    covered, whole = 0.0, 0
+    for camera in cameras:
+        mirrored = mirrored_image(replace(scene, planes=pane), camera)
+        covered += float(mirrored.coverage.sum())
+        whole += int(mirrored.seen.sum())
+    return covered / whole if whole else 1.0
 
 
 def about_local_mean(image: Tensor, region: Tensor) -> Tensor:

@@ -2,37 +2,24 @@
 
 from __future__ import annotations
 
-import logging
-import math
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
-import torch
-from torch import Tensor
-
 from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify
-from glassplat.densify.edit import apply_edit, keep
-from glassplat.init.glass import glass_gaussians
-from glassplat.init.material import mirror_labels
 from glassplat.init.planes import PlaneFit, fit_planes
 from glassplat.init.points import gaussians_from_points
-from glassplat.init.virtual_scene import virtual_points
 from glassplat.losses.geometry import depth_deviation_loss
 from glassplat.losses.reflection import gradient_conflict, mask_loss
 from glassplat.losses.term import LossTerm
 from glassplat.render.planar import Blend, Planar
 from glassplat.render.splat import Splat
-from glassplat.scene.camera import Camera
-from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, PerturbOpacity
 from glassplat.train.optimizer import Rate
+from glassplat.train.plane_entry import PlaneEntry, annotations_of
 from glassplat.train.splat_recipe import GaussianRates, Rhythm, growth_actions, opacity_resets, photometric_terms
 from glassplat.train.stage import Every, Stage
-from glassplat.train.state import TrainState
-
-log = logging.getLogger("glassplat.train")
 
 
 @dataclass(frozen=True)
@@ -97,54 +84,6 @@ class Perturbation:
 
 
 @dataclass(frozen=True)
-class PlaneEntry:
-    """Fits the planes and places the glass when reflections begin (Appendix A)."""
-
-    fit: PlaneFit
-    glass_count: int
-    seed: int
-    detect_mirrors: bool = True
-
-    def __call__(self, state: TrainState, dataset: Dataset) -> None:
-        """Edits `state`."""
-        means, extent = state.scene.primary.means, state.scene.extent
-        planes = fit_planes(means, annotations_of(dataset), extent=extent, options=self.fit)
-        glass = glass_gaussians(planes, count=self.glass_count, seed=self.seed)
-        scene = replace(state.scene, planes=planes, glass=glass)
-        mirrors = self.fit.mirror_labels
-        if self.detect_mirrors and not mirrors:
-            mirrors = mirror_labels(scene, dataset.train)
-            log.info("mirrors among the panes: %s", ", ".join(map(str, mirrors)) or "none")
-        state.scene = replace(scene, planes=with_mirrors(planes, mirrors, self.fit.mirror_reflectance))
-        state.statistics.clear()
-        remove_virtual_scene(state, dataset, mirrors)
-
-
-def with_mirrors(planes: Planes, labels: tuple[int, ...], reflectance: float) -> Planes:
-    """The planes with some of them, by label, made mirrors of a base reflectance that stays."""
-    kept = tuple(label for label in planes.labels if label in labels)
-    mirrors = torch.tensor([label in kept for label in planes.labels], device=planes.centers.device)
-    fixed = torch.full_like(planes.logit_reflectances, math.log(reflectance / (1 - reflectance)))
-    return replace(planes, logit_reflectances=torch.where(mirrors, fixed, planes.logit_reflectances), mirrors=kept)
-
-
-def remove_virtual_scene(state: TrainState, dataset: Dataset, labels: tuple[int, ...]) -> None:
-    """Removes the Gaussians that are seen through the mirrors with these labels."""
-    primary, planes = state.scene.primary, state.scene.planes
-    mirrors = planes.select([k for k, label in enumerate(planes.labels) if label in labels])
-    virtual = virtual_points(primary.means, mirrors, [view.camera for view in dataset.train])
-    if bool(virtual.any()):
-        log.info("removed %d Gaussians that were images in mirrors", int(virtual.sum()))
-        primary, state.optimizer.moments = apply_edit(primary, state.optimizer.moments, keep(~virtual))
-        state.scene = replace(state.scene, primary=primary)
-
-
-def annotations_of(dataset: Dataset) -> list[tuple[Camera, Tensor]]:
-    """Cameras and pane labels [H, W] of the annotated training views."""
-    return [(view.camera, view.pane_labels) for view in dataset.train if view.pane_labels is not None]
-
-
-@dataclass(frozen=True)
 class PlanarRecipe:
     """TR-Gaussians: transmission, reflection and planes, trained in three stages.
 
@@ -157,7 +96,8 @@ class PlanarRecipe:
         fresnel: False makes the strength independent of the angle (ablation).
         intensity: False drops the reflection intensity a(u) (ablation).
         blend: space in which transmission and reflection are blended: linear radiance, or sRGB as in the paper.
-        detect_mirrors: start panes that look like mirrors as mirrors, unless `plane_fit` names the mirrors.
+        detect_mirrors: treat panes that look like mirrors as mirrors, unless `plane_fit` names the mirrors.
+        seed_reflections: start what no photograph shows directly from the virtual points behind the panes.
         glass_count: glass Gaussians placed on each pane.
         weights: of the loss terms; zero switches a term off (ablation).
         perturbation: of opacities; amplitude zero switches it off (ablation).
@@ -179,6 +119,7 @@ class PlanarRecipe:
     intensity: bool = True
     blend: Blend = "linear"
     detect_mirrors: bool = True
+    seed_reflections: bool = True
     glass_count: int = 1000
     weights: ReflectionWeights = field(default_factory=ReflectionWeights)
     perturbation: Perturbation = field(default_factory=Perturbation)
@@ -207,7 +148,7 @@ class PlanarRecipe:
     def stages(self, seed: int) -> tuple[Stage, ...]:
         """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
         first, second, third = self.stage_shares
-        entry = PlaneEntry(self.plane_fit, self.glass_count, seed, self.detect_mirrors)
+        entry = PlaneEntry(self.plane_fit, self.glass_count, seed, self.detect_mirrors, self.seed_reflections)
         initialisation = Stage(
             name="1 initialisation",
             share=first,
