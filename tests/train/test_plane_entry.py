@@ -1,0 +1,71 @@
+"""What is done with the virtual scene behind a pane when reflections begin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from glassplat.scene.pose import mirror_matrices
+from glassplat.scene.scene import Scene
+from glassplat.train.plane_entry import seed_reflection, turn_virtual_scene_round, with_mirrors
+from glassplat.train.state import TrainState
+from tests.render.tiny_scene import in_single_precision, joined, pane, showcase
+from tests.train.tiny_capture import tiny_capture, true_scene
+
+PANE = true_scene().planes
+
+
+def state_of(scene: Scene) -> TrainState:
+    """The scene with moments of ones for its means."""
+    state = TrainState(scene, seed=0)
+    ones = torch.ones_like(scene.primary.means)
+    state.optimizer.moments["primary.means"] = (ones, ones.clone())
+    return state
+
+
+def mirrored(points: torch.Tensor) -> torch.Tensor:
+    matrix = mirror_matrices(PANE.centers, PANE.normals)[0]
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def test_what_is_behind_a_mirror_moves_to_its_front() -> None:
+    scene = true_scene()
+    state = state_of(scene)
+    turn_virtual_scene_round(state, tiny_capture(), PANE)
+    means, before = state.scene.primary.means, scene.primary.means
+    kept = (before[:, None] == means).all(dim=-1).any(dim=1)
+    moved = int((~kept).sum())
+    assert 5 < moved < len(before) and len(means) == len(before)
+    assert bool((before[~kept, 2] > 1.5).all())
+    torch.testing.assert_close(means[-moved:], mirrored(before[~kept]))
+    first_moment = state.optimizer.moments["primary.means"][0]
+    assert not bool(first_moment[-moved:].any()) and bool((first_moment[:-moved] == 1).all())
+
+
+def test_a_capture_that_shows_the_room_needs_no_seeds() -> None:
+    scene = true_scene()
+    room = scene.primary.with_tensors({"logit_opacities": torch.full((len(scene.primary),), 6.0)})
+    room = room.with_tensors({"log_scales": torch.full((len(room), 3), 0.5)})
+    state = state_of(replace(scene, primary=room))
+    seed_reflection(state, tiny_capture(), PANE)
+    assert len(state.scene.primary) == len(scene.primary)
+
+
+def test_a_capture_from_the_front_gets_the_mirrored_points() -> None:
+    scene = true_scene()
+    case = scene.primary.select(scene.primary.means[:, 2] > 1.5)
+    state = state_of(replace(scene, primary=case))
+    seed_reflection(state, tiny_capture(), PANE)
+    added = state.scene.primary.means[len(case) :]
+    assert len(added) > 5
+    assert bool((added[:, 2] < 2.0).all())
+    points = mirrored(tiny_capture().points.positions)
+    assert bool(torch.isclose(added[:, None], points, atol=1e-5).all(dim=-1).any(dim=1).all())
+
+
+def test_mirrors_are_named_and_start_at_their_reflectance() -> None:
+    planes = in_single_precision(showcase(joined(pane(2.0, label=1), pane(4.0, label=2)))).planes
+    found = with_mirrors(planes, (2, 7), 0.99)
+    assert found.mirrors == (2,)
+    torch.testing.assert_close(found.base_reflectances, torch.tensor([0.3, 0.99]))
