@@ -21,6 +21,8 @@ from glassplat.train.trainer import train
 
 Listener = Callable[[Message], None]
 LOG_EVERY = 10
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+"""Ctrl-C, and what a shut-down or a job scheduler sends before it kills."""
 
 
 @dataclass
@@ -32,7 +34,7 @@ class StopRequest:
 
 @contextmanager
 def stop_on_interrupt() -> Iterator[StopRequest]:
-    """Turns the first Ctrl-C into a request to stop after the step; a second one interrupts at once."""
+    """Turns the first Ctrl-C or termination into a request to stop after the step; a second one interrupts at once."""
     request = StopRequest()
 
     def ask(number: int, frame: FrameType | None) -> None:
@@ -40,11 +42,12 @@ def stop_on_interrupt() -> Iterator[StopRequest]:
             raise KeyboardInterrupt
         request.requested = True
 
-    previous = signal.signal(signal.SIGINT, ask)
+    previous = {number: signal.signal(number, ask) for number in STOP_SIGNALS}
     try:
         yield request
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def prepare(recipe: Any, settings: RunSettings, directory: RunDirectory, dataset: Dataset, resume: bool) -> TrainState:

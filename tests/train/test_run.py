@@ -24,18 +24,21 @@ SETTINGS = RunSettings("tiny", iterations=12)
 RECIPE = SplatRecipe(sh_degree=1)
 
 
-def run(path: Path, *, resume: bool = False, interrupt_at: int | None = None) -> Any:
+def run(
+    path: Path, *, resume: bool = False, interrupt_at: int | None = None, by: signal.Signals = signal.SIGINT
+) -> Any:
     def listen(message: Message) -> None:
         if isinstance(message, StepDone) and message.step == interrupt_at:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(by)
 
     return run_training(RECIPE, SETTINGS, RunDirectory(path), tiny_capture(), resume=resume, listen=listen)
 
 
-def test_an_interrupted_run_resumes_to_the_same_scene(tmp_path: Path) -> None:
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_resumes_to_the_same_scene(tmp_path: Path, by: signal.Signals) -> None:
     whole = run(tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "stopped", interrupt_at=5)
+        run(tmp_path / "stopped", interrupt_at=5, by=by)
     assert load_checkpoint(RunDirectory(tmp_path / "stopped").checkpoint).step == 5
     resumed = run(tmp_path / "stopped", resume=True)
     for name, tensor in whole.scene.parameters().items():
