@@ -83,7 +83,9 @@ def restored_state(header: dict, tensors: dict[str, Tensor]) -> TrainState:
         part: restored_gaussians(under(tensors, f"scene/{part}/"), degree)
         for part, degree in header["active_sh_degree"].items()
     }
-    planes = Planes(**under(tensors, "scene/planes/"), labels=tuple(header["labels"]), mirrors=tuple(header.get("mirrors", ())))
+    planes = Planes(
+        **under(tensors, "scene/planes/"), labels=tuple(header["labels"]), mirrors=tuple(header.get("mirrors", ()))
+    )
     first, second = under(tensors, "first/"), under(tensors, "second/")
     statistics = under(tensors, "statistics/")
     parts = {name.partition("/")[0] for name in statistics}

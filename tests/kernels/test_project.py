@@ -166,6 +166,22 @@ def test_the_clip_plane_cuts_by_centre() -> None:
     assert (cut != whole).any(dim=1).all()
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_window_keeps_what_reaches_into_it(dtype: torch.dtype) -> None:
+    gaussians, cameras = random_gaussians(400, dtype=dtype), random_cameras(3, dtype=dtype)
+    windows = torch.tensor([[5.0, 8.0, 12.0, 30.0], [0.0, 0.0, 44.0, 36.0], [20.0, 3.0, 21.0, 4.0]], dtype=dtype)
+    whole = project(gaussians, cameras, sh_degree=1, near=NEAR)
+    found = project(gaussians, cameras._replace(windows=windows), sh_degree=1, near=NEAR)
+    low, high = whole.means2d - whole.radii, whole.means2d + whole.radii
+    reaches = ((high > windows[:, None, :2]) & (low < windows[:, None, 2:])).all(dim=-1) & (whole.radii[..., 0] > 0)
+    assert 0 < int(reaches[2].sum()) < int(reaches[0].sum()) < int(reaches[1].sum())
+    for tensor, full in zip(found, whole, strict=True):
+        chosen = reaches.reshape(reaches.shape + (1,) * (full.dim() - 2))
+        assert torch.equal(tensor, torch.where(chosen, full, 0))
+    theirs = reference_project(gaussians, cameras._replace(windows=windows), sh_degree=1, near=NEAR)
+    assert torch.equal(found.radii > 0, theirs.radii > 0)
+
+
 def test_coverage_sinks_to_the_bound_at_the_edge_of_the_extents() -> None:
     """On the ellipse's rightmost and topmost points, opacity exp(-q / 2) is 1/255."""
     ours = project(random_gaussians(300), random_cameras(1), sh_degree=0, near=NEAR)

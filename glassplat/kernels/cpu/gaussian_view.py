@@ -11,6 +11,8 @@ from glassplat.kernels.maths import screen_maths, shape_maths, vector_maths
 
 CHUNK = 512
 """Gaussians per task; part of the result's rounding, so not to be tuned per machine."""
+LENS_VALUES = 9
+"""Tangent limits (4), camera centre (3), and how much longer than a sphere its footprint may get along x and y (2)."""
 
 
 class ViewSteps(NamedTuple):
@@ -21,7 +23,7 @@ class ViewSteps(NamedTuple):
         pose: rows of the upper 3x3 block of a camera matrix, and its translation.
         shape: (usable, opacity, unit quaternion, inverse norm, axes) of a Gaussian.
         view: what a camera sees of a Gaussian before its colour.
-        fill_lenses: writes the tangent limits and the centre of every camera into [C, 7].
+        fill_lenses: writes `LENS_VALUES` numbers per camera.
         direction: unit vector from a camera's centre to a mean, and its inverse length.
     """
 
@@ -78,7 +80,16 @@ def _shape(real: type) -> Callable[..., Any]:
 
 def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
     tangent_limits, *_ = screen_maths(real)
+    vectors = vector_maths()
+    dot, blend = vectors.dot, vectors.blend
+    _, pose = _loads()
     one = real(1.0)
+
+    @inlined
+    def skewed(row, row_z, tangent):
+        """Length of a footprint in multiples of focal length over depth."""
+        w = blend(one, row, -tangent, row_z)
+        return math.sqrt(dot(w, w))
 
     @inlined
     def fill_lenses(lens, cam_from_world, intrinsics, width, height):
@@ -88,6 +99,10 @@ def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
                 intrinsics[c, 0], intrinsics[c, 1], intrinsics[c, 2], intrinsics[c, 3], width, height
             )
             lens[c, 0], lens[c, 1], lens[c, 2], lens[c, 3] = limits
+            # A footprint's length is convex in the tangent, so it is greatest at one of the limits.
+            row_x, row_y, row_z, _ = pose(cam_from_world, c)
+            lens[c, 7] = max(skewed(row_x, row_z, limits[0]), skewed(row_x, row_z, limits[1]))
+            lens[c, 8] = max(skewed(row_y, row_z, limits[2]), skewed(row_y, row_z, limits[3]))
             for j in range(3):
                 lens[c, 4 + j] = -(
                     cam_from_world[c, 0, j] * cam_from_world[c, 0, 3]

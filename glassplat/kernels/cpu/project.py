@@ -6,6 +6,7 @@ a Gaussian's memory, and a loop that only fetches them lets the processor wait f
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -13,10 +14,10 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from glassplat.kernels.cpu.gaussian_view import CHUNK, view_steps
+from glassplat.kernels.cpu.gaussian_view import CHUNK, LENS_VALUES, view_steps
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
 from glassplat.kernels.cpu.schedule import even_stride
-from glassplat.kernels.maths import screen_maths, shape_maths, vector_maths
+from glassplat.kernels.maths import ALPHA_MIN, LOW_PASS, screen_maths, shape_maths, vector_maths
 from glassplat.kernels.maths_sh import color_maths
 
 
@@ -55,9 +56,11 @@ def _placing(real: type) -> Callable[..., Any]:
 
 
 def _culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    vec3, *_ = view_steps(real)
+    vec3, pose, *_ = view_steps(real)
     dot = vector_maths().dot
-    zero = real(0.0)
+    zero, one, low_pass = real(0.0), real(1.0), real(LOW_PASS)
+    # A coverage of at most 1 sinks to ALPHA_MIN within this squared number of standard deviations; a percent is slack.
+    most_deviations = real(1.01 * 2.0 * math.log(1.0 / ALPHA_MIN))
 
     @inlined
     def cull(n, c, means2d, conics, depths, opacities, colors, radii):
@@ -67,24 +70,36 @@ def _culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
             conics[c, n, j] = colors[c, n, j] = zero
 
     @inlined
-    def in_front(c, mean, cam_from_world, near, clip_planes, clips):
-        row_z = cam_from_world[c, 2, 0], cam_from_world[c, 2, 1], cam_from_world[c, 2, 2]
-        if not dot(row_z, mean) + cam_from_world[c, 2, 3] > near:
+    def may_show(n, c, mean, log_scales, cam_from_world, intrinsics, lens, near, clip_planes, clips, windows):
+        """Whether a Gaussian is on the kept sides, and a sphere around it comes near the window: cheap and safe."""
+        row_x, row_y, row_z, offset = pose(cam_from_world, c)
+        depth = dot(row_z, mean) + offset[2]
+        if not depth > near:
             return False
-        return not clips or dot(vec3(clip_planes, c), mean) + clip_planes[c, 3] > zero
+        if clips and not dot(vec3(clip_planes, c), mean) + clip_planes[c, 3] > zero:
+            return False
+        inverse_depth = one / depth
+        u = intrinsics[c, 0] * (dot(row_x, mean) + offset[0]) * inverse_depth + intrinsics[c, 2]
+        v = intrinsics[c, 1] * (dot(row_y, mean) + offset[1]) * inverse_depth + intrinsics[c, 3]
+        past_x, past_y = max(windows[c, 0] - u, u - windows[c, 2]), max(windows[c, 1] - v, v - windows[c, 3])
+        size = math.exp(max(log_scales[n, 0], log_scales[n, 1], log_scales[n, 2])) * inverse_depth
+        wide, high = size * intrinsics[c, 0] * lens[c, 7], size * intrinsics[c, 1] * lens[c, 8]
+        # Written so that NaN leaves the decision to the exact test.
+        beside = past_x > zero and past_x * past_x > most_deviations * (wide * wide + low_pass)
+        return not (beside or (past_y > zero and past_y * past_y > most_deviations * (high * high + low_pass)))
 
-    return cull, in_front
+    return cull, may_show
 
 
 @cache
 def project_forward(real: type) -> Kernel:
     """Fills means2d, conics, depths, opacities, colors and radii; zeros where a Gaussian is culled."""
     vec3, _, shape, _, fill_lenses, direction = view_steps(real)
-    cull, in_front = _culling(real)
+    cull, may_show = _culling(real)
     place = _placing(real)
     is_finite = shape_maths(real).is_finite
     color = color_maths(real).color
-    zero, half = real(0.0), real(0.5)
+    zero, half, candidate = real(0.0), real(0.5), real(-1.0)
     chunk_size = CHUNK
 
     @kernel("project_forward", real)
@@ -93,7 +108,7 @@ def project_forward(real: type) -> Kernel:
         width, height, degree, near, means2d, conics, depths, opacities, colors, radii,
     ):  # fmt: skip
         count, num_cameras = means.shape[0], cam_from_world.shape[0]
-        lens = np.empty((num_cameras, 7), real)
+        lens = np.empty((num_cameras, LENS_VALUES), real)
         fill_lenses(lens, cam_from_world, intrinsics, width, height)
         clips = clip_planes.shape[0] > 0
         num_chunks = (count + chunk_size - 1) // chunk_size
@@ -106,12 +121,19 @@ def project_forward(real: type) -> Kernel:
                 wanted = False
                 for c in range(num_cameras):
                     cull(n, c, means2d, conics, depths, opacities, colors, radii)
-                    wanted |= in_front(c, mean, cam_from_world, near, clip_planes, clips)
+                    if may_show(
+                        n, c, mean, log_scales, cam_from_world, intrinsics, lens, near, clip_planes, clips, windows
+                    ):
+                        radii[c, n, 0] = candidate
+                        wanted = True
                 if not wanted:
                     continue
                 usable, opacity, _, _, axes = shape(means, quats, log_scales, logit_opacities, n)
                 for c in range(num_cameras):
-                    if usable and in_front(c, mean, cam_from_world, near, clip_planes, clips):
+                    if not radii[c, n, 0] < zero:
+                        continue
+                    radii[c, n, 0] = zero
+                    if usable:
                         place(
                             n, c, mean, opacity, axes, cam_from_world, intrinsics, lens, windows,
                             means2d, conics, depths, opacities, radii,

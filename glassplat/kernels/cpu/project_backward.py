@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from glassplat.kernels.cpu.gaussian_view import CHUNK, view_steps
+from glassplat.kernels.cpu.gaussian_view import CHUNK, LENS_VALUES, view_steps
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
 from glassplat.kernels.cpu.schedule import even_stride
 from glassplat.kernels.maths import screen_maths, shape_maths, vector_maths
@@ -225,7 +225,7 @@ def project_backward(real: type) -> Kernel:
     ):  # fmt: skip
         count, num_cameras = means.shape[0], cam_from_world.shape[0]
         num_chunks = (count + chunk_size - 1) // chunk_size
-        lens = np.empty((num_cameras, 7), real)
+        lens = np.empty((num_cameras, LENS_VALUES), real)
         fill_lenses(lens, cam_from_world, intrinsics, width, height)
         totals = np.zeros((num_chunks, num_cameras, 12))
         stride = even_stride(num_chunks)
