@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -77,6 +77,7 @@ class Capture:
         format_name: for messages, such as "COLMAP".
         warnings: full sentences.
         random_points: how to place points when `points` is None; None takes the default.
+        masks: mask file by name of the photograph where the format fixes it; None looks for them by name.
     """
 
     shots: tuple[Shot, ...]
@@ -85,6 +86,7 @@ class Capture:
     format_name: str
     warnings: tuple[str, ...] = ()
     random_points: Callable[[], PointCloud] | None = None
+    masks: Mapping[str, Path] | None = None
 
 
 Loader = Callable[[Path], Capture | None]

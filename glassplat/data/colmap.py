@@ -1,4 +1,8 @@
-"""COLMAP captures: a sparse model, binary or text, beside a folder of images."""
+"""COLMAP captures: a sparse model, binary or text, beside a folder of images.
+
+With label images `masks/<photograph's stem>.png` for the annotated photographs only, this is also the layout for
+captures of transparent panes such as RTR's, whose own files were never published.
+"""
 
 from __future__ import annotations
 

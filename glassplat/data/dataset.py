@@ -9,10 +9,11 @@ from pathlib import Path
 
 import torch
 
-from glassplat.data import colmap, transforms
+from glassplat.data import colmap, mirror_nerf, transforms
+from glassplat.data.axes import evidence_of_masks, evidence_of_points
 from glassplat.data.capture import Capture, Loader, PointCloud, Shot
 from glassplat.data.errors import InputError, first_names
-from glassplat.data.masks import Polarity, find_masks
+from glassplat.data.masks import MaskSet, Polarity, find_masks, known_masks
 from glassplat.data.random_points import points_in_view
 from glassplat.data.view import WHITE, PreparedView, Rgb, View, ViewOptions, prepare_view
 
@@ -26,6 +27,7 @@ SAME_PLACE = 1e-6
 
 LOADERS: tuple[tuple[Loader, str], ...] = (
     (colmap.load_colmap, colmap.LOOKED_FOR),
+    (mirror_nerf.load_mirror_nerf, mirror_nerf.LOOKED_FOR),
     (transforms.load_transforms, transforms.LOOKED_FOR),
 )
 """Tried in this order; each with what it looks for, for the message when none fits."""
@@ -63,7 +65,7 @@ class Dataset:
 def load_dataset(
     root: Path | str, *, downscale: float = 1.0, background: Rgb = WHITE, mask_polarity: Polarity = "auto"
 ) -> Dataset:
-    """Read a capture: COLMAP, or transforms.json in any of its dialects; photographs are read later.
+    """Read a capture: COLMAP, Mirror-NeRF, or transforms.json in any of its dialects; photographs are read later.
 
     Args:
         root: the capture's folder.
@@ -81,12 +83,14 @@ def load_dataset(
     capture = _load_capture(root)
     shots = sorted((*capture.shots, *(capture.test_shots or ())), key=lambda shot: shot.name)
     _check_names(shots)
-    masks = find_masks(root, {shot.name: shot.image_path for shot in shots}, mask_polarity)
+    masks = _masks(root, capture, shots, mask_polarity)
     options = ViewOptions(downscale, background)
     prepared = [prepare_view(shot, masks.masks.get(shot.name), options) for shot in shots]
     train, test, split = _split([p.view for p in prepared], capture)
     points, point_warnings = _points(capture, train)
     extent = _extent(train)
+    measured = capture.points is not None
+    _check_axes(train, points if measured else None, capture.format_name)
     warnings = (
         *capture.warnings,
         *masks.warnings,
@@ -95,7 +99,18 @@ def load_dataset(
         *_far_off(train, extent),
     )
     truth = root / "gt"
-    return Dataset(root, train, test, points, extent, masks.labels, truth if truth.is_dir() else None, warnings, split)
+    return Dataset(
+        root=root,
+        train=train,
+        test=test,
+        points=points,
+        extent=extent,
+        pane_labels=masks.labels,
+        truth=truth if truth.is_dir() else None,
+        warnings=warnings,
+        split=split,
+        measured_points=measured,
+    )
 
 
 def _load_capture(root: Path) -> Capture:
@@ -109,6 +124,28 @@ def _load_capture(root: Path) -> Capture:
     looked_for = "; ".join(text for _, text in LOADERS)
     found = first_names(sorted(path.name for path in root.iterdir()), limit=8) or "nothing"
     raise InputError(f"{root} is no capture that can be read. Looked for: {looked_for}. Found: {found}.")
+
+
+def _masks(root: Path, capture: Capture, shots: list[Shot], polarity: Polarity) -> MaskSet:
+    """The masks that the format names, or else those whose names fit."""
+    if capture.masks is not None:
+        return known_masks(root, capture.masks, polarity)
+    return find_masks(root, {shot.name: shot.image_path for shot in shots}, polarity)
+
+
+def _check_axes(train: tuple[View, ...], points: PointCloud | None, format_name: str) -> None:
+    """Refuse poses with which everything lies behind the cameras, where turning them round would mend that."""
+    if points is None:
+        evidence = evidence_of_masks(train)
+    else:
+        evidence = evidence_of_points([view.camera for view in train], points.positions)
+    if evidence is not None and evidence.contradicts:
+        raise InputError(
+            f"the cameras of the {format_name} capture look away from the scene: {evidence.as_read:.0%} of the "
+            f"{evidence.source} lie in front of them, {evidence.flipped:.0%} if they looked the other way. Expected +y "
+            "down and +z forward in a COLMAP model, +y up and -z forward in transforms.json; turn the y and z axes of "
+            "the poses round"
+        )
 
 
 def _check_names(shots: list[Shot]) -> None:

@@ -59,6 +59,23 @@ def read_mask_values(path: Path) -> MaskValues:
     return MaskValues("binary" if pixels.any() else "empty", pixels)
 
 
+def read_mask_at_threshold(path: Path) -> MaskValues:
+    """Read one mask file of a format that is known to split its greys at one half; label images stay as they are.
+
+    Raises:
+        InputError: the file is no image.
+    """
+    try:
+        image = open_image(path)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    shades = _shades(image, path)
+    if path.suffix.lower() not in LOSSY_SUFFIXES and not (shades > HIGHEST_LABEL).any():
+        return MaskValues("labels" if shades.any() else "empty", shades)
+    pixels = (shades >= THRESHOLD).astype(np.uint8)
+    return MaskValues("binary" if pixels.any() else "empty", pixels)
+
+
 def _shades(image: Image.Image, path: Path) -> NDArray[np.uint8]:
     """[H, W] grey values, or the indices of a palette."""
     if image.mode == "1" or (image.mode == "P" and not _is_black_and_white(image)):

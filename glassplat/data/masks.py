@@ -7,7 +7,7 @@ polarities; which one is decided over the whole set, because one mask alone cann
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from glassplat.data.errors import InputError, first_names
-from glassplat.data.mask_values import MaskValues, read_mask_values
+from glassplat.data.mask_values import MaskValues, read_mask_at_threshold, read_mask_values
 from glassplat.files.images import IMAGE_SUFFIXES
 
 MASK_FOLDER = "masks"
@@ -35,14 +35,16 @@ class PaneMask:
     Attributes:
         path: the file.
         inverted: dark pixels are the pane.
+        read: what the stored values mean.
     """
 
     path: Path
     inverted: bool
+    read: Callable[[Path], MaskValues] = read_mask_values
 
     def labels(self) -> NDArray[np.uint8]:
         """[H, W] pane label of every pixel of the file, 0 for no pane."""
-        return _labels(read_mask_values(self.path), self.inverted)
+        return _labels(self.read(self.path), self.inverted)
 
 
 @dataclass(frozen=True)
@@ -74,10 +76,32 @@ def find_masks(root: Path, photographs: Mapping[str, Path], polarity: Polarity =
         if (root / MASK_FOLDER).is_dir():
             raise InputError(f"{root / MASK_FOLDER} holds no mask images; add masks, or remove the folder")
         return MaskSet({})
-    values = {name: read_mask_values(path) for name, path in paths.items()}
+    return _understood(root, paths, polarity, read_mask_values)
+
+
+def known_masks(root: Path, paths: Mapping[str, Path], polarity: Polarity = "auto") -> MaskSet:
+    """The masks of a format that says which file belongs to which photograph, that white is the pane, and that
+    greys are split at one half.
+
+    Args:
+        root: the capture's folder.
+        paths: mask by name of the photograph.
+        polarity: `auto` is what the format says.
+
+    Raises:
+        InputError: a file that is no image, or no pane in any.
+    """
+    return _understood(root, paths, "bright" if polarity == "auto" else polarity, read_mask_at_threshold)
+
+
+def _understood(
+    root: Path, paths: Mapping[str, Path], polarity: Polarity, read: Callable[[Path], MaskValues]
+) -> MaskSet:
+    """Reads all masks once, for what only the whole set can tell."""
+    values = {name: read(path) for name, path in paths.items()}
     _check_same_kind(values, paths)
     inverted, warnings = _decide_polarity(list(values.values()), polarity)
-    masks = {name: PaneMask(path, inverted) for name, path in paths.items()}
+    masks = {name: PaneMask(path, inverted, read) for name, path in paths.items()}
     found = {name: _present(_labels(mask_values, inverted)) for name, mask_values in values.items()}
     labels = sorted(set().union(*found.values()))
     if not labels:

@@ -135,6 +135,7 @@ def test_two_poses_for_one_photograph(capture) -> None:
 def test_coordinates_too_large_for_float32_are_mentioned(capture) -> None:
     for pose in capture.poses:
         pose[:3, 3] -= pose[:3, :3] @ [1e6, 0.0, 0.0]
+    capture.points[:, 0] += 1e6
     capture.write_colmap()
     assert any("from the origin" in warning for warning in load_dataset(capture.root).warnings)
 
