@@ -10,8 +10,8 @@ from torch import Tensor
 
 from bench.peak import peak_multiply_adds
 from bench.scene import bench_camera, room
-from bench.table import Table
 from bench.timing import Work, interleaved_seconds, median_seconds, paired_ratio
+from glassplat.files.markdown_table import Table
 from glassplat.kernels import bin_tiles as bin_tiles_module
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite

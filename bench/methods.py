@@ -7,9 +7,9 @@ import statistics
 import torch
 
 from bench.scene import bench_camera, bench_scene
-from bench.table import Table
 from bench.timing import Work, interleaved_seconds, median_seconds, paired_ratio
 from glassplat.data.dataset import View
+from glassplat.files.markdown_table import Table
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera

@@ -1,4 +1,4 @@
-"""Results as markdown."""
+"""Tables as markdown."""
 
 from __future__ import annotations
 
