@@ -16,7 +16,7 @@ Item = TypeVar("Item")
 LEAST_SEEN = 0.05
 """Largest share that counts as nothing seen; stray points lie in front of some camera whatever the axes."""
 MOST_SEEN = 0.5
-MOST_CAMERAS, MOST_POINTS = 64, 2000
+MOST_CAMERAS, MOST_POINTS, MOST_MASKS = 64, 2000, 24
 LEAST_SIGHTINGS = 3
 LEAST_CROSSING = 1e-3
 """Smallest eigenvalue of the mean of I - d d^T for which rays towards a pane are taken to cross."""
@@ -57,6 +57,21 @@ class _Sighting(NamedTuple):
     box: Tensor
 
 
+def axes_evidence(views: Sequence[View], measured: Tensor | None) -> AxesEvidence | None:
+    """Judges axes by masks, or by points where the masks say nothing; None where neither does.
+
+    Masks come first: in a room photographed all around, cameras that look the wrong way see as many points.
+
+    Args:
+        views: the training views.
+        measured: [P, 3] points that were triangulated; None for random ones.
+    """
+    evidence = evidence_of_masks(views)
+    if evidence is not None or measured is None or not len(measured):
+        return evidence
+    return evidence_of_points([view.camera for view in views], measured)
+
+
 def evidence_of_points(cameras: Sequence[Camera], points: Tensor) -> AxesEvidence:
     """Judges axes by measured points [P, 3]: every one of them was seen by a camera."""
     some_cameras = [_double(camera) for camera in _spread(cameras, MOST_CAMERAS)]
@@ -71,10 +86,10 @@ def evidence_of_points(cameras: Sequence[Camera], points: Tensor) -> AxesEvidenc
 def evidence_of_masks(views: Sequence[View]) -> AxesEvidence | None:
     """Judges axes by annotated views: the rays through the middles of one pane's masks meet in the pane.
 
-    None where the views say nothing: fewer than three show any one pane, or their rays are parallel. At most 64
+    None where the views say nothing: fewer than three show any one pane, or their rays are parallel. At most 24
     of the views are looked at.
     """
-    annotated = _spread([view for view in views if view.is_annotated], MOST_CAMERAS)
+    annotated = _spread([view for view in views if view.is_annotated], MOST_MASKS)
     shares = [
         (len(sightings), _share_of_masks(sightings), _share_of_masks([_turned(s) for s in sightings]))
         for sightings in _sightings(annotated).values()

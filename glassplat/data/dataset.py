@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from glassplat.data import colmap, mirror_nerf, transforms
-from glassplat.data.axes import evidence_of_masks, evidence_of_points
+from glassplat.data.axes import axes_evidence
 from glassplat.data.capture import Capture, Loader, PointCloud, Shot
 from glassplat.data.errors import InputError, first_names
 from glassplat.data.masks import MaskSet, Polarity, find_masks, known_masks
@@ -135,10 +135,7 @@ def _masks(root: Path, capture: Capture, shots: list[Shot], polarity: Polarity) 
 
 def _check_axes(train: tuple[View, ...], points: PointCloud | None, format_name: str) -> None:
     """Refuse poses with which everything lies behind the cameras, where turning them round would mend that."""
-    if points is None:
-        evidence = evidence_of_masks(train)
-    else:
-        evidence = evidence_of_points([view.camera for view in train], points.positions)
+    evidence = axes_evidence(train, None if points is None else points.positions)
     if evidence is not None and evidence.contradicts:
         raise InputError(
             f"the cameras of the {format_name} capture look away from the scene: {evidence.as_read:.0%} of the "

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from glassplat.data.axes import AxesEvidence, evidence_of_masks, evidence_of_points
+from glassplat.data.axes import AxesEvidence, axes_evidence
 from glassplat.data.capture import Capture, PointCloud, Shot
 from glassplat.data.errors import InputError, first_names
 from glassplat.data.mask_values import read_mask_at_threshold
@@ -45,7 +45,6 @@ LOOKED_FOR = f"a Mirror-NeRF scene ({TRAIN} and {MASK_FOLDER}/)"
 SYNTHETIC_MASK = "MirrorMask_"
 SAME_SIZE = 0.1
 """Relative deviation up to which twice the principal point is the size of the photograph."""
-MASKS_ASKED = 24
 
 
 def load_mirror_nerf(root: Path) -> Capture | None:
@@ -177,12 +176,9 @@ def _mask_names(photograph: Path) -> list[str]:
 
 
 def _evidence(shots: tuple[Shot, ...], masks: Mapping[str, Path], points: PointCloud | None) -> AxesEvidence | None:
-    """What the points, or else some of the masks, say about the axes of the poses."""
-    annotated = [shot for shot in shots if shot.name in masks]
-    asked = annotated[:: -(-len(annotated) // MASKS_ASKED) or 1]
-    if points is not None:
-        return evidence_of_points([_view(shot, None).camera for shot in shots], points.positions)
-    return evidence_of_masks([_view(shot, masks[shot.name]) for shot in asked])
+    """What some of the masks, or else the points, say about the axes of the poses."""
+    views = [_view(shot, masks.get(shot.name)) for shot in shots]
+    return axes_evidence(views, None if points is None else points.positions)
 
 
 def _view(shot: Shot, mask: Path | None) -> View:

@@ -90,8 +90,10 @@ def test_without_masks_to_tell_the_axes_are_assumed(capture) -> None:
     assert any("OpenGL is assumed" in warning for warning in data.warnings)
 
 
-def test_points_tell_the_axes_too(capture) -> None:
+def test_points_tell_the_axes_where_there_are_too_few_masks(capture) -> None:
     write_real(capture, axes="opencv")
+    for name in capture.names[2:]:
+        (capture.root / "masks" / name).unlink()
     capture.reconstruction().export_PLY(capture.root / "points3d.ply")
     data = load_dataset(capture.root)
     assert data.measured_points
