@@ -1,4 +1,4 @@
-"""The command line: `glassplat train | eval | render | demo`."""
+"""The command line: `glassplat train | eval | render | demo | bench`."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 from rich.logging import RichHandler
 
+from glassplat.commands.bench import Bench
 from glassplat.commands.demo import Demo
 from glassplat.commands.evaluate import Evaluate
 from glassplat.commands.render import Render
@@ -24,8 +25,10 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 INPUT_ERRORS = (InputError, PlaneFitError, FileNotFoundError, NotADirectoryError, PermissionError)
+GOES_ON = "interrupted; everything saved so far is intact: train --resume, or the same demo or bench command, goes on"
 INPUT_ERROR_CODE, FAILURE_CODE, INTERRUPTED_CODE = 2, 1, 130
 
 
@@ -45,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return guarded(command, console)
 
 
-def guarded(command: Train | Evaluate | Render | Demo, console: Console) -> int:
+def guarded(command: Train | Evaluate | Render | Demo | Bench, console: Console) -> int:
     """Runs a command and turns expected errors into one readable message and an exit code."""
     try:
         command.run(console)
@@ -56,7 +59,7 @@ def guarded(command: Train | Evaluate | Render | Demo, console: Console) -> int:
         Console(stderr=True).print(f"[red]stopped:[/red] {error}", highlight=False)
         return FAILURE_CODE
     except KeyboardInterrupt:
-        Console(stderr=True).print("interrupted; everything saved so far is intact, --resume goes on", highlight=False)
+        Console(stderr=True).print(GOES_ON, highlight=False)
         return INTERRUPTED_CODE
     return 0
 

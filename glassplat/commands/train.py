@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -56,9 +56,7 @@ class Train:
             raise InputError(f"--iterations is {self.iterations}; expected at least 1")
         dataset = load_dataset(self.data, downscale=self.downscale, mask_polarity=self.mask_polarity)
         describe(dataset, console)
-        settings = RunSettings(
-            str(self.data), self.iterations, self.downscale, self.seed, self.device, self.mask_polarity
-        )
+        settings = self.settings()
         directory = RunDirectory(self.output)
         with TrainingProgress(console, self.iterations) as progress:
             state = run_training(self.recipe, settings, directory, dataset, resume=self.resume, listen=progress.show)
@@ -67,6 +65,14 @@ class Train:
             f"{len(state.scene.primary)} Gaussians, {len(state.scene.planes)} panes -> {self.output}"
         )
         console.print(f"next: glassplat eval {self.output}")
+
+    def settings(self) -> RunSettings:
+        """What the run's directory records beside the recipe."""
+        return RunSettings(str(self.data), self.iterations, self.downscale, self.seed, self.device, self.mask_polarity)
+
+    def resuming(self, begun: bool) -> Train:
+        """The same run, going on from its checkpoint if it has begun."""
+        return replace(self, resume=begun)
 
 
 def describe(dataset: Dataset, console: Console) -> None:

@@ -1,0 +1,248 @@
+"""`glassplat bench`: methods over scenes, and what each part of `planar` is worth."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+
+from glassplat.commands.bench_runs import FinishedRun, PlannedRun, execute, scene_names
+from glassplat.commands.bench_tables import (
+    Measured,
+    Pair,
+    Row,
+    differences,
+    differences_table,
+    means,
+    means_table,
+    plain_rows,
+    values_of,
+)
+from glassplat.commands.train import Train
+from glassplat.data.errors import InputError
+from glassplat.data.masks import Polarity
+from glassplat.train.ablations import ABLATIONS, SWITCHES, Switch
+from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.recipe import RECIPES
+from glassplat.train.run_directory import write_text
+
+Method = Literal["splat", "planar"]
+Strategy = Literal["default", "mcmc"]
+FULL = "full"
+SPREAD_NOTE = "Means over the seeds ± their standard deviation."
+COMPARED_NOTE = (
+    "Seed against equal seed; counts and times as quotients. `mean` is over the scenes that have a value. "
+    + SPREAD_NOTE
+)
+
+
+@dataclass(frozen=True)
+class BenchScenes:
+    """Train and evaluate methods on scenes and write one table; repeat the command to go on after an interrupt.
+
+    Attributes:
+        data: directories of the captures.
+        output: where the tables and one directory per run go.
+        methods: which methods.
+        strategies: how Gaussians are added and removed.
+        seeds: one run for each.
+        iterations: length of each run.
+        downscale: shrink the photographs by this factor.
+        mask_polarity: which value of black-and-white masks is the pane.
+    """
+
+    data: tuple[Path, ...]
+    output: Path
+    methods: tuple[Method, ...] = ("splat", "planar")
+    strategies: tuple[Strategy, ...] = ("default",)
+    seeds: tuple[int, ...] = (0,)
+    iterations: int = 7000
+    downscale: float = 1.0
+    mask_polarity: Polarity = "auto"
+
+    def run(self, console: Console) -> None:
+        """Runs what is missing and writes `scenes.md` and `scenes.json`."""
+        recipes = {
+            variant_name(method, strategy): with_strategy(RECIPES[method](), strategy)
+            for strategy in unique(self.strategies, "strategies")
+            for method in unique(self.methods, "methods")
+        }
+        pairs = [
+            Pair(f"{planar} - {splat}", planar, splat)
+            for strategy in self.strategies
+            if (planar := variant_name("planar", strategy)) in recipes
+            and (splat := variant_name("splat", strategy)) in recipes
+        ]
+        runs = planned_runs(self, recipes)
+        execute(runs, console, partial(write_scenes, self.output, pairs))
+        console.print(f"tables: {self.output / 'scenes.md'}, {self.output / 'scenes.json'}")
+
+
+@dataclass(frozen=True)
+class BenchAblation:
+    """Train `planar` with each of its parts switched off and write the differences to the full method.
+
+    Attributes:
+        data: directories of the captures.
+        output: where the tables and one directory per run go.
+        switches: which parts, one at a time; the first seven are the rows of the paper's Table IV.
+        seeds: one run for each.
+        iterations: length of each run.
+        downscale: shrink the photographs by this factor.
+        mask_polarity: which value of black-and-white masks is the pane.
+    """
+
+    data: tuple[Path, ...]
+    output: Path
+    switches: tuple[Switch, ...] = SWITCHES
+    seeds: tuple[int, ...] = (0,)
+    iterations: int = 7000
+    downscale: float = 1.0
+    mask_polarity: Polarity = "auto"
+
+    def run(self, console: Console) -> None:
+        """Runs what is missing and writes `ablation.md` and `ablation.json`."""
+        full = PlanarRecipe()
+        switches = unique(self.switches, "switches")
+        recipes = {FULL: full} | {f"no-{switch}": ABLATIONS[switch].off(full) for switch in switches}
+        runs = planned_runs(self, recipes)
+        execute(runs, console, partial(write_ablation, self.output, switches))
+        console.print(f"tables: {self.output / 'ablation.md'}, {self.output / 'ablation.json'}")
+
+
+AnyBench = (
+    Annotated[BenchScenes, tyro.conf.subcommand("scenes")] | Annotated[BenchAblation, tyro.conf.subcommand("ablation")]
+)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Compare methods over scenes, or the parts of `planar` with each other.
+
+    Attributes:
+        comparison: what to compare.
+    """
+
+    comparison: Annotated[AnyBench, tyro.conf.arg(name="")]
+
+    def run(self, console: Console) -> None:
+        """Runs the comparison."""
+        self.comparison.run(console)
+
+
+def variant_name(method: str, strategy: str) -> str:
+    """What tables and directories call a method with a strategy."""
+    return method if strategy == "default" else f"{method}-{strategy}"
+
+
+def with_strategy(recipe: Any, strategy: str) -> Any:
+    """The recipe with a densification strategy.
+
+    Raises:
+        InputError: the recipe knows no strategies and another one than the default is asked for.
+    """
+    if any(field.name == "strategy" for field in dataclasses.fields(recipe)):
+        return dataclasses.replace(recipe, strategy=strategy)
+    if strategy != "default":
+        raise InputError(
+            f"{recipe.method} has no strategy {strategy!r} in this version of glassplat; expected --strategies default"
+        )
+    return recipe
+
+
+def unique(choices: Sequence[Any], option: str) -> list[Any]:
+    """The choices of an option, in order.
+
+    Raises:
+        InputError: one is named twice, or none is.
+    """
+    if len(set(choices)) < len(choices) or not choices:
+        raise InputError(f"--{option} is {list(choices)}; expected at least one, and each once")
+    return list(choices)
+
+
+def planned_runs(bench: BenchScenes | BenchAblation, recipes: dict[str, Any]) -> list[PlannedRun]:
+    """A run per capture, variant and seed; the paths are absolute, so that a bench goes on from any folder."""
+    captures = zip(scene_names(bench.data), bench.data, strict=True)
+    seeds = unique(bench.seeds, "seeds")
+    return [
+        PlannedRun(
+            scene,
+            variant,
+            Train(
+                recipe,
+                data.resolve(),
+                bench.output / "runs" / scene / f"{variant}-seed{seed}",
+                iterations=bench.iterations,
+                downscale=bench.downscale,
+                seed=seed,
+                mask_polarity=bench.mask_polarity,
+            ),
+        )
+        for scene, data in captures
+        for seed in seeds
+        for variant, recipe in recipes.items()
+    ]
+
+
+def write_scenes(output: Path, pairs: Sequence[Pair], finished: Sequence[FinishedRun]) -> None:
+    """Writes what is finished."""
+    measured = measured_runs(finished)
+    reached, compared = means(measured), differences(measured, pairs)
+    tables = [means_table(reached, "Scenes", " ".join([SPREAD_NOTE, *remarks(finished)]))]
+    if compared:
+        tables.append(differences_table(compared, "Differences", COMPARED_NOTE))
+    write_text(output / "scenes.md", "\n".join(table.markdown() for table in tables))
+    write_json(output / "scenes.json", finished, reached, compared)
+
+
+def write_ablation(output: Path, switches: Sequence[Switch], finished: Sequence[FinishedRun]) -> None:
+    """Writes what is finished."""
+    measured = measured_runs(finished)
+    pairs = [Pair(ABLATIONS[switch].title, f"no-{switch}", FULL) for switch in switches]
+    reached, compared = means(measured), differences(measured, pairs)
+    published = [ABLATIONS[s] for s in switches if ABLATIONS[s].paper_psnr is not None]
+    paper = "; ".join(f"{ablation.title} {ablation.paper_psnr:+.2f}" for ablation in published)
+    note = f"Each part left out, minus the full method. {COMPARED_NOTE}"
+    if paper:
+        note += f" The paper's psnr, on its own scenes: {paper}."
+    tables = [
+        differences_table(compared, "Ablation", note),
+        means_table(reached, "Absolute values", " ".join([SPREAD_NOTE, *remarks(finished)])),
+    ]
+    write_text(output / "ablation.md", "\n".join(table.markdown() for table in tables))
+    write_json(output / "ablation.json", finished, reached, compared)
+
+
+def measured_runs(finished: Sequence[FinishedRun]) -> list[Measured]:
+    """The columns of finished runs."""
+    return [Measured(f.run.scene, f.run.variant, f.run.train.seed, values_of(f.results)) for f in finished]
+
+
+def remarks(finished: Sequence[FinishedRun]) -> list[str]:
+    """What the reader of a table must know: where the pane was, and which planes the errors leave out."""
+    regions = dict.fromkeys(f.results["pane_region"] for f in finished if f.results.get("pane_region"))
+    found = [f"The pane: {', '.join(regions)}."] if regions else []
+    found += [
+        f"{f.run.title}: panes {f.results['missing_panes']} were not found and count in no plane error."
+        for f in finished
+        if f.results.get("missing_panes")
+    ]
+    return found
+
+
+def write_json(output: Path, finished: Sequence[FinishedRun], reached: list[Row], compared: list[Row]) -> None:
+    """Writes every run's results and the rows of the tables."""
+    runs = [
+        {"scene": f.run.scene, "variant": f.run.variant, "directory": str(f.run.train.output), **f.results}
+        for f in finished
+    ]
+    contents = {"runs": runs, "means": plain_rows(reached), "differences": plain_rows(compared)}
+    write_text(output, json.dumps(contents, indent=2))

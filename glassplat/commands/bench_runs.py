@@ -1,0 +1,198 @@
+"""The runs of a comparison: each trained and evaluated once, however often the command is stopped and repeated."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from glassplat.commands.evaluate import evaluate_run
+from glassplat.commands.stored_run import open_run
+from glassplat.commands.train import Train
+from glassplat.data.dataset import load_dataset
+from glassplat.data.errors import InputError, first_names
+from glassplat.init.planes import PlaneFitError
+from glassplat.train.run_directory import RunDirectory
+from glassplat.train.trainer import TrainingDivergedError
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run of a comparison.
+
+    Attributes:
+        scene: the capture's name in the tables.
+        variant: what is compared, such as a method.
+        train: the command that trains it; its output is the run's directory.
+    """
+
+    scene: str
+    variant: str
+    train: Train
+
+    @property
+    def directory(self) -> RunDirectory:
+        """Where the run is."""
+        return RunDirectory(self.train.output)
+
+    @property
+    def title(self) -> str:
+        """What the progress calls it."""
+        return f"{self.scene}, {self.variant}, seed {self.train.seed}"
+
+    def begun(self) -> bool:
+        """Whether there is something to go on from."""
+        return self.directory.checkpoint.is_file() or self.directory.results.is_file()
+
+    def check(self) -> None:
+        """Refuse a directory that holds something else.
+
+        Raises:
+            InputError: the run in it was made from other data, or with another recipe, length or seed.
+        """
+        directory = self.directory
+        if self.begun() and (directory.settings(), directory.recipe()) != (self.train.settings(), self.train.recipe):
+            raise InputError(
+                f"{directory.path} holds a run with {directory.settings()} or with another recipe; expected "
+                f"{self.train.settings()} and the recipe of this version. Choose another --output, or move the run away"
+            )
+
+    def results(self) -> dict[str, Any] | None:
+        """The metrics of the finished run, None before it is finished."""
+        try:
+            results = json.loads(self.directory.results.read_text())
+        except (FileNotFoundError, json.JSONDecodeError):
+            return None
+        made = (results.get("method"), results.get("iterations"), results.get("seed"))
+        wanted = (self.train.recipe.method, self.train.iterations, self.train.seed)
+        return results if made == wanted else None
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """A run with its metrics, as `results.json` holds them."""
+
+    run: PlannedRun
+    results: dict[str, Any]
+
+
+def scene_names(captures: Sequence[Path]) -> list[str]:
+    """A short name for every capture: its folder, with as many folders above as tell them apart.
+
+    Raises:
+        InputError: a capture is given twice, or none is given.
+    """
+    folders = [path.resolve() for path in captures]
+    twice = [str(path) for path, count in Counter(folders).items() if count > 1]
+    if twice or not folders:
+        raise InputError(
+            f"--data names {first_names(twice) or 'no capture'}{' twice' if twice else ''}; name each once"
+        )
+    depth = 1
+    while len({path.parts[-depth:] for path in folders}) < len(folders):
+        depth += 1
+    return ["-".join(part.strip("/") for part in path.parts[-depth:]) for path in folders]
+
+
+def execute(
+    runs: Sequence[PlannedRun], console: Console, after_each: Callable[[list[FinishedRun]], None]
+) -> list[FinishedRun]:
+    """Trains and evaluates what is not finished yet, and returns everything in order.
+
+    Args:
+        runs: what to run.
+        console: for the progress.
+        after_each: gets all that is finished, at the start and after every run.
+
+    Raises:
+        InputError: a directory holds another run (before anything is started), or runs failed (after all others).
+        KeyboardInterrupt: the user stopped; the same command goes on.
+    """
+    for run in runs:
+        run.check()
+    finished = _finished(runs)
+    after_each(finished)
+    if finished:
+        console.print(f"{len(finished)} of {len(runs)} runs are finished already")
+    _check_captures([run for run in runs if run.results() is None])
+    clock, failures = RunClock(finished), []
+    for number, run in enumerate(runs, start=1):
+        if run.results() is not None:
+            continue
+        waiting = [other for other in runs[number - 1 :] if other.results() is None]
+        console.rule(f"run {number} of {len(runs)}: {run.title} ({clock.left(waiting)})")
+        try:
+            clock.measure(run, lambda run=run: _train_and_evaluate(run, console))  # type: ignore[misc]
+        except (PlaneFitError, TrainingDivergedError) as error:
+            # One scene that cannot be trained must not cost the night that the others take.
+            failures.append(f"{run.title}: {error}")
+            console.print(f"[red]failed:[/red] {error}", highlight=False)
+        except KeyboardInterrupt:
+            console.print(f"stopped in run {number} of {len(runs)}; the same command goes on from here")
+            raise
+        after_each(_finished(runs))
+    if failures:
+        raise InputError(
+            f"{len(failures)} of {len(runs)} runs failed, the tables hold the others. {' '.join(failures)}"
+        )
+    return _finished(runs)
+
+
+def _finished(runs: Sequence[PlannedRun]) -> list[FinishedRun]:
+    return [FinishedRun(run, results) for run in runs if (results := run.results()) is not None]
+
+
+def _check_captures(runs: Sequence[PlannedRun]) -> None:
+    """Reads every capture once: a mistyped name should end a bench in its first minute, not in its last hour."""
+    for train in {run.train.data: run.train for run in runs}.values():
+        load_dataset(train.data, downscale=train.downscale, mask_polarity=train.mask_polarity)
+
+
+def _train_and_evaluate(run: PlannedRun, console: Console) -> None:
+    """What `train` and `eval` do, from the checkpoint where there is one."""
+    run.train.resuming(run.directory.checkpoint.is_file()).run(console)
+    with console.status("evaluating"):
+        evaluate_run(open_run(run.train.output))
+
+
+class RunClock:
+    """How long runs take, and how long the others will, judged by the most similar ones."""
+
+    def __init__(self, finished: Sequence[FinishedRun]) -> None:
+        self._seconds: list[tuple[PlannedRun, float]] = [
+            (f.run, f.results["train_seconds"]) for f in finished if f.results.get("train_seconds") is not None
+        ]
+
+    def measure(self, run: PlannedRun, work: Callable[[], None]) -> None:
+        """Does the work and remembers its time, if it ends."""
+        started = time.perf_counter()
+        work()
+        self._seconds.append((run, time.perf_counter() - started))
+
+    def left(self, waiting: Sequence[PlannedRun]) -> str:
+        """The time that some runs will take, in words."""
+        if not self._seconds:
+            return "time left is known after the first run"
+        return f"about {in_words(sum(self._expected(run) for run in waiting))} left"
+
+    def _expected(self, run: PlannedRun) -> float:
+        """Mean time of the runs of the same scene and variant, of the same method, or of all."""
+        same = [s for other, s in self._seconds if (other.scene, other.variant) == (run.scene, run.variant)]
+        method = [s for other, s in self._seconds if other.train.recipe.method == run.train.recipe.method]
+        return statistics.fmean(same or method or [s for _, s in self._seconds])
+
+
+def in_words(seconds: float) -> str:
+    """A duration as someone who waits would say it."""
+    minutes = round(seconds / 60)
+    if minutes < 1:
+        return f"{seconds:.0f} s"
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min"
