@@ -19,16 +19,20 @@ SMALLEST_SCALE = 1e-6
 MORTON_BITS = 21
 
 
-def gaussians_from_points(points: PointCloud, *, sh_degree: int = 3, opacity: float = 0.1) -> Gaussians:
+def gaussians_from_points(
+    points: PointCloud, *, sh_degree: int = 3, opacity: float = 0.1, spread: float = 1.0
+) -> Gaussians:
     """One isotropic Gaussian for every point, in Morton order, so that neighbours in space are neighbours in memory.
 
-    The standard deviation is the mean distance to the three nearest points, the constant SH coefficient reproduces the
-    point's colour, all other coefficients are zero. The channel `log_intensity` starts at zero (intensity one).
+    The standard deviation is `spread` times the mean distance to the three nearest points, the constant SH coefficient
+    reproduces the point's colour, all other coefficients are zero. The channel `log_intensity` starts at zero
+    (intensity one).
 
     Args:
         points: at least one.
         sh_degree: highest degree to make room for, 0 to 3; degree 0 is active.
         opacity: of every Gaussian, in (0, 1).
+        spread: standard deviation as a share of that distance, positive.
 
     Raises:
         ValueError: no points, a position that is not finite, or an argument out of range.
@@ -40,6 +44,8 @@ def gaussians_from_points(points: PointCloud, *, sh_degree: int = 3, opacity: fl
         raise ValueError(f"{count} of {len(points)} points are not finite; remove them first")
     if not 0 <= sh_degree <= 3 or not 0 < opacity < 1:
         raise ValueError(f"sh_degree is {sh_degree} and opacity {opacity}; expected 0..3 and a number between 0 and 1")
+    if not spread > 0:
+        raise ValueError(f"spread is {spread}; expected a positive share of the distance between points")
     order = torch.from_numpy(morton_order(points.positions.numpy()))
     means = points.positions[order].clone()
     count = len(points)
@@ -48,7 +54,7 @@ def gaussians_from_points(points: PointCloud, *, sh_degree: int = 3, opacity: fl
     return Gaussians(
         means=means,
         quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        log_scales=torch.log(_spacing(means)).float()[:, None].repeat(1, 3),
+        log_scales=torch.log(spread * _spacing(means)).float()[:, None].repeat(1, 3),
         logit_opacities=torch.full((count,), math.log(opacity / (1 - opacity))),
         sh=sh,
         channels={"log_intensity": torch.zeros(count)},

@@ -8,11 +8,15 @@ from dataclasses import dataclass, replace
 from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify, reset_opacity
 from glassplat.densify.edit import forget
+from glassplat.densify.mcmc import McmcDensify
 from glassplat.densify.perturb import perturb_opacities
+from glassplat.train.optimizer import Rate
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
 
 MEGAPIXEL = 1e6
+GAUSSIANS_PER_PIXEL = 0.5
+"""Where `McmcDensify` stops to grow unless told otherwise; default densification ends near it (docs/experiments.md)."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,58 @@ class Densify:
             prune_large=self.part == "primary" and clock.progress > self.densifier.prune_large_start,
         )
         state.scene = state.scene.with_gaussians(self.part, edited)
+
+
+def cap_of(densifier: McmcDensify, dataset: Dataset) -> int:
+    """The number of Gaussians to grow to: the one that was asked for, or one that suits the photographs."""
+    if densifier.cap is not None:
+        return densifier.cap
+    camera = dataset.train[0].camera
+    return round(GAUSSIANS_PER_PIXEL * camera.width * camera.height)
+
+
+@dataclass(frozen=True)
+class Relocate:
+    """Moves dead primary Gaussians onto live ones and adds new ones (3DGS-MCMC)."""
+
+    densifier: McmcDensify
+    name: str = "densify primary"
+
+    def due(self, clock: Clock) -> bool:
+        """Whether to act after this step."""
+        return Every(0.0, self.densifier.start, self.densifier.stop, self.densifier.interval).due(clock)
+
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
+        """Edits `state`."""
+        edited, state.optimizer.moments = self.densifier.densify(
+            state.scene.primary,
+            state.optimizer.moments,
+            cap=cap_of(self.densifier, dataset),
+            generator=state.generator(self.name),
+        )
+        state.scene = replace(state.scene, primary=edited)
+        # Nothing here reads the screen gradients, but what was gathered no longer fits the rows.
+        state.statistics.pop("primary", None)
+
+
+@dataclass(frozen=True)
+class Explore:
+    """Moves the primary Gaussians at random, the transparent ones most (3DGS-MCMC).
+
+    Attributes:
+        densifier: holds how strong the noise is.
+        rate: learning rate of the positions, which the noise follows.
+    """
+
+    densifier: McmcDensify
+    rate: Rate
+
+    def __call__(self, state: TrainState, clock: Clock) -> None:
+        """Edits `state`."""
+        primary, extent = state.scene.primary, state.scene.extent
+        rate = self.rate.at(clock.progress, 1.0)
+        offsets = self.densifier.noise(primary, rate=rate, extent=extent, generator=state.generator("explore"))
+        state.scene = replace(state.scene, primary=primary.with_tensors({"means": primary.means + offsets}))
 
 
 @dataclass(frozen=True)

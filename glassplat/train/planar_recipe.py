@@ -7,19 +7,20 @@ from typing import ClassVar
 
 from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify
+from glassplat.densify.mcmc import McmcDensify
 from glassplat.init.planes import PlaneFit, fit_planes
-from glassplat.init.points import gaussians_from_points
 from glassplat.losses.geometry import depth_deviation_loss
 from glassplat.losses.reflection import gradient_conflict, mask_loss
 from glassplat.losses.term import LossTerm
 from glassplat.render.planar import Blend, Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
-from glassplat.train.actions import Densify, PerturbOpacity
+from glassplat.train.actions import Densify, GrowSh, PerturbOpacity
 from glassplat.train.optimizer import Rate
 from glassplat.train.plane_entry import PlaneEntry, annotations_of
-from glassplat.train.splat_recipe import GaussianRates, Rhythm, growth_actions, opacity_resets, photometric_terms
+from glassplat.train.splat_recipe import GaussianRates, photometric_terms
 from glassplat.train.stage import Every, Stage
+from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,11 @@ class PlanarRecipe:
         plane_rates: learning rates of planes and glass.
         plane_fit: how planes are found from masks.
         rhythm: when opacities are reset and the SH degree grows.
-        densify: when and how Gaussians are added and pruned.
+        strategy: what decides how many primary Gaussians there are and where. With `mcmc` its relocation takes the
+            place of densification and its regularisers join the loss (Eq. 20), from the first stage on; the
+            perturbation keeps its beats. The glass is densified by `densify` either way.
+        densify: when and how Gaussians are added and pruned under `default`.
+        mcmc: when and how Gaussians are relocated and added under `mcmc`.
     """
 
     method: ClassVar[str] = "planar"
@@ -127,7 +132,9 @@ class PlanarRecipe:
     plane_rates: PlaneRates = field(default_factory=PlaneRates)
     plane_fit: PlaneFit = field(default_factory=PlaneFit)
     rhythm: Rhythm = field(default_factory=Rhythm)
+    strategy: Strategy = "default"
     densify: DefaultDensify = field(default_factory=DefaultDensify)
+    mcmc: McmcDensify = field(default_factory=McmcDensify)
 
     def initialise(self, dataset: Dataset) -> Scene:
         """The first scene: one Gaussian per point, no planes yet.
@@ -139,7 +146,7 @@ class PlanarRecipe:
         if dataset.measured_points or not dataset.pane_labels:
             positions, annotations = dataset.points.positions, annotations_of(dataset)
             fit_planes(positions, annotations, extent=dataset.extent, options=self.plane_fit)
-        return Scene(gaussians_from_points(dataset.points, sh_degree=self.sh_degree), dataset.extent)
+        return Scene(self._population().initial(dataset.points, self.sh_degree), dataset.extent)
 
     def renderer(self) -> Planar:
         """The renderer of the finished scene, with all its layers."""
@@ -148,14 +155,16 @@ class PlanarRecipe:
     def stages(self, seed: int) -> tuple[Stage, ...]:
         """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
         first, second, third = self.stage_shares
+        population = self._population()
         entry = PlaneEntry(self.plane_fit, self.glass_count, seed, self.detect_mirrors, self.seed_reflections)
         initialisation = Stage(
             name="1 initialisation",
             share=first,
             renderer=Splat(self.background, depth=False),
-            losses=photometric_terms(self.ssim_weight),
+            losses=(*photometric_terms(self.ssim_weight), *population.terms),
             rates=self.rates.of("primary"),
-            actions=growth_actions(self.rhythm, self.densify),
+            actions=(*population.edits, GrowSh(Every(self.rhythm.sh))),
+            motions=population.motions,
         )
         if not self.multi_stage:
             return initialisation, replace(self._joint(second + third), entry=entry)
@@ -163,34 +172,45 @@ class PlanarRecipe:
 
     def _adjustment(self, share: float, entry: PlaneEntry) -> Stage:
         """Stage 2: the reflection's gradient reaches the planes, not the Gaussians."""
+        population = self._population()
         return Stage(
             name="2 plane adjustment",
             share=share,
             renderer=self._training_renderer("planes"),
-            losses=(*photometric_terms(self.ssim_weight), *self.weights.terms()),
+            losses=(*photometric_terms(self.ssim_weight), *self.weights.terms(), *population.terms),
             rates=self.rates.of("primary") | self.rates.of("glass") | self.plane_rates.of(1.0),
-            actions=(*growth_actions(self.rhythm, self.densify), Densify(self.densify, part="glass")),
+            actions=(*population.edits, GrowSh(Every(self.rhythm.sh)), Densify(self.densify, part="glass")),
+            motions=population.motions,
             entry=entry,
         )
 
     def _joint(self, share: float) -> Stage:
         """Stage 3: everything learns, opacities are perturbed, planes move slowly."""
+        population = self._population()
         beat = Every(self.rhythm.beat, 0.0, self.perturbation.stop, self.rhythm.least, skip_multiples_of=3)
         return Stage(
             name="3 joint optimisation",
             share=share,
             renderer=self._training_renderer("all"),
-            losses=(*photometric_terms(self.ssim_weight), *self.weights.terms()),
+            losses=(*photometric_terms(self.ssim_weight), *self.weights.terms(), *population.terms),
             rates=self.rates.of("primary")
             | self.rates.of("glass")
             | self.plane_rates.of(self.plane_rates.joint_factor)
             | ({"primary.log_intensity": Rate(self.rates.intensity)} if self.intensity else {}),
             actions=(
-                *growth_actions(self.rhythm, self.densify),
+                *population.edits,
+                GrowSh(Every(self.rhythm.sh)),
                 Densify(self.densify, part="glass"),
-                opacity_resets(self.rhythm),
+                *population.resets,
                 PerturbOpacity(beat, self.perturbation.amplitude),
             ),
+            motions=population.motions,
+        )
+
+    def _population(self) -> Population:
+        means_rate = self.rates.of("primary")["primary.means"]
+        return population_of(
+            self.strategy, default=self.densify, mcmc=self.mcmc, rhythm=self.rhythm, means_rate=means_rate
         )
 
     def _training_renderer(self, gradient: str) -> Planar:

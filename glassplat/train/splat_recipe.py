@@ -7,14 +7,15 @@ from typing import ClassVar
 
 from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify
-from glassplat.init.points import gaussians_from_points
+from glassplat.densify.mcmc import McmcDensify
 from glassplat.losses.photometric import dssim, l1
 from glassplat.losses.term import LossTerm
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
-from glassplat.train.actions import Densify, GrowSh, ResetOpacity
+from glassplat.train.actions import GrowSh
 from glassplat.train.optimizer import Rate
-from glassplat.train.stage import Action, Every, Stage
+from glassplat.train.stage import Every, Stage
+from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
 
 
 @dataclass(frozen=True)
@@ -47,39 +48,9 @@ class GaussianRates:
         }
 
 
-@dataclass(frozen=True)
-class Rhythm:
-    """When opacities are disturbed and the SH degree grows, in shares of the run (3DGS: of 30,000 iterations).
-
-    Every third beat resets the opacities, as in 3DGS; `planar` perturbs them at the other two, so that
-    the two never meet (TR-Gaussians, Section III-C3).
-
-    Attributes:
-        beat: distance between beats, as a share of the run.
-        least: fewest iterations between beats; what a beat disturbs needs as many to recover.
-        reset_stop: share of the run after which no reset happens.
-        sh: distance between rises of the SH degree, as a share of the run.
-    """
-
-    beat: float = 1 / 30
-    least: int = 250
-    reset_stop: float = 0.45
-    sh: float = 1 / 30
-
-
 def photometric_terms(ssim_weight: float) -> tuple[LossTerm, ...]:
     """(1 - lambda) L1 + lambda D-SSIM (TR-Gaussians, Eq. 18)."""
     return LossTerm("l1", 1 - ssim_weight, l1), LossTerm("dssim", ssim_weight, dssim)
-
-
-def growth_actions(rhythm: Rhythm, densifier: DefaultDensify) -> tuple[Action, ...]:
-    """Densification and SH growth of the primary Gaussians."""
-    return Densify(densifier), GrowSh(Every(rhythm.sh))
-
-
-def opacity_resets(rhythm: Rhythm) -> ResetOpacity:
-    """The recurring opacity reset."""
-    return ResetOpacity(Every(rhythm.beat, 0.0, rhythm.reset_stop, rhythm.least, only_multiples_of=3))
 
 
 @dataclass(frozen=True)
@@ -92,7 +63,9 @@ class SplatRecipe:
         background: colour behind everything, sRGB.
         rates: learning rates.
         rhythm: when opacities are reset and the SH degree grows.
-        densify: when and how Gaussians are added and pruned.
+        strategy: what decides how many Gaussians there are and where; `densify` or `mcmc` holds its options.
+        densify: when and how Gaussians are added and pruned under `default`.
+        mcmc: when and how Gaussians are relocated and added under `mcmc`.
     """
 
     method: ClassVar[str] = "splat"
@@ -102,11 +75,13 @@ class SplatRecipe:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rates: GaussianRates = field(default_factory=GaussianRates)
     rhythm: Rhythm = field(default_factory=Rhythm)
+    strategy: Strategy = "default"
     densify: DefaultDensify = field(default_factory=DefaultDensify)
+    mcmc: McmcDensify = field(default_factory=McmcDensify)
 
     def initialise(self, dataset: Dataset) -> Scene:
         """The first scene: one Gaussian per point."""
-        return Scene(gaussians_from_points(dataset.points, sh_degree=self.sh_degree), dataset.extent)
+        return Scene(self._population().initial(dataset.points, self.sh_degree), dataset.extent)
 
     def renderer(self) -> Splat:
         """The renderer of the finished scene, with all its layers."""
@@ -114,16 +89,21 @@ class SplatRecipe:
 
     def stages(self, seed: int) -> tuple[Stage, ...]:
         """One stage."""
+        population = self._population()
         return (
             Stage(
                 name="splat",
                 share=1.0,
                 renderer=Splat(self.background, depth=False),
-                losses=photometric_terms(self.ssim_weight),
+                losses=(*photometric_terms(self.ssim_weight), *population.terms),
                 rates=self.rates.of("primary"),
-                actions=(
-                    *growth_actions(self.rhythm, self.densify),
-                    opacity_resets(self.rhythm),
-                ),
+                actions=(*population.edits, GrowSh(Every(self.rhythm.sh)), *population.resets),
+                motions=population.motions,
             ),
+        )
+
+    def _population(self) -> Population:
+        means_rate = self.rates.of("primary")["primary.means"]
+        return population_of(
+            self.strategy, default=self.densify, mcmc=self.mcmc, rhythm=self.rhythm, means_rate=means_rate
         )

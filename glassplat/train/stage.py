@@ -80,6 +80,14 @@ class Action(Protocol):
         ...
 
 
+class Motion(Protocol):
+    """A change of values that belongs to every step, like the noise of Langevin dynamics; no message reports it."""
+
+    def __call__(self, state: TrainState, clock: Clock) -> None:
+        """Edits `state`."""
+        ...
+
+
 class Entry(Protocol):
     """Prepares the state when a stage begins (fitting planes, adding an environment)."""
 
@@ -99,6 +107,7 @@ class Stage:
         losses: terms of the objective.
         rates: learning rate of every parameter that learns; one that is missing is frozen.
         actions: recurring edits, in the order in which they act.
+        motions: what follows the optimiser at every step, before the actions.
         entry: what to do once when the stage begins.
     """
 
@@ -108,6 +117,7 @@ class Stage:
     losses: tuple[LossTerm, ...]
     rates: Mapping[str, Rate]
     actions: tuple[Action, ...] = ()
+    motions: tuple[Motion, ...] = ()
     entry: Entry | None = None
 
 

@@ -75,6 +75,8 @@ def advance(stage: Stage, dataset: Dataset, state: TrainState, iterations: int) 
     collect_statistics(state, result.screen, view)
     state.step += 1
     clock = Clock(state.step, iterations, len(dataset.train))
+    for motion in stage.motions:
+        motion(state, clock)
     due = [action for action in stage.actions if action.due(clock)]
     for action in due:
         action.apply(state, dataset, clock)
@@ -98,8 +100,9 @@ def differentiate(stage: Stage, scene: Scene, view: View) -> Differentiated:
         for name, tensor in scene.parameters().items()
         if name in stage.rates and tensor.numel() > 0
     }
-    frame = stage.renderer(scene.with_parameters(leaves), view.camera)
-    terms = weighted_terms(stage, frame, view, scene)
+    learning = scene.with_parameters(leaves)
+    frame = stage.renderer(learning, view.camera)
+    terms = weighted_terms(stage, frame, view, learning)
     total = torch.stack(list(terms.values())).sum()
     tracked = [screen for screen in frame.screen if screen.means2d.requires_grad and screen.means2d.numel() > 0]
     inputs = [*leaves.values(), *(screen.means2d for screen in tracked)]

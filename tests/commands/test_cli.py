@@ -60,6 +60,16 @@ def test_a_run_is_not_overwritten_and_resumes_only_as_it_was_started(
     assert train("splat", run, "--iterations", "3", "--resume") == 0
 
 
+def test_the_strategy_and_its_cap_are_chosen_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tmp_path / "run"
+    assert train("splat", run, "--iterations", "3", "--strategy", "mcmc", "--cap", "5000") == 0
+    recipe = json.loads((run / "recipe.json").read_text())
+    assert recipe["strategy"] == "mcmc" and recipe["mcmc"]["cap"] == 5000
+    with pytest.raises(SystemExit):
+        train("planar", run, "--strategy", "genetic")
+    assert "genetic" in capsys.readouterr().err
+
+
 def fails_with(arguments: list[str], capsys: pytest.CaptureFixture[str], *words: str) -> None:
     assert main(arguments) == 2
     message = " ".join(capsys.readouterr().err.split())

@@ -75,6 +75,11 @@ def test_order_follows_the_z_curve(cells: list[tuple[int, int, int]]) -> None:
     assert sorted(order.tolist()) == list(range(len(cells)))
 
 
+def test_the_spread_is_a_share_of_the_distance() -> None:
+    whole, tenth = (gaussians_from_points(cloud(5), spread=spread).log_scales.exp() for spread in (1.0, 0.1))
+    torch.testing.assert_close(tenth, 0.1 * whole)
+
+
 def test_points_that_cannot_be_used() -> None:
     with pytest.raises(ValueError, match="no points"):
         gaussians_from_points(cloud(0))
@@ -86,6 +91,8 @@ def test_points_that_cannot_be_used() -> None:
     for arguments in ({"sh_degree": 4}, {"sh_degree": -1}, {"opacity": 0.0}, {"opacity": 1.0}):
         with pytest.raises(ValueError, match="sh_degree is"):
             gaussians_from_points(cloud(4), **arguments)
+    with pytest.raises(ValueError, match="spread is 0"):
+        gaussians_from_points(cloud(4), spread=0.0)
 
 
 def test_point_cloud_checks_itself() -> None:

@@ -1,0 +1,103 @@
+"""Strategies for the number of primary Gaussians: how they begin, and which edits and loss terms steer them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from glassplat.data.capture import PointCloud
+from glassplat.densify.default import DefaultDensify
+from glassplat.densify.mcmc import McmcDensify
+from glassplat.init.points import gaussians_from_points
+from glassplat.losses.parsimony import mean_opacity, mean_scale
+from glassplat.losses.term import LossTerm
+from glassplat.scene.gaussians import Gaussians
+from glassplat.train.actions import Densify, Explore, Relocate, ResetOpacity
+from glassplat.train.optimizer import Rate
+from glassplat.train.stage import Action, Every, Motion
+
+Strategy = Literal["default", "mcmc"]
+
+
+@dataclass(frozen=True)
+class Rhythm:
+    """When opacities are disturbed and the SH degree grows, in shares of the run (3DGS: of 30,000 iterations).
+
+    Every third beat resets the opacities, as in 3DGS; `planar` perturbs them at the other two, so that
+    the two never meet (TR-Gaussians, Section III-C3).
+
+    Attributes:
+        beat: distance between beats, as a share of the run.
+        least: fewest iterations between beats; what a beat disturbs needs as many to recover.
+        reset_stop: share of the run after which no reset happens; the `mcmc` strategy has none.
+        sh: distance between rises of the SH degree, as a share of the run.
+    """
+
+    beat: float = 1 / 30
+    least: int = 250
+    reset_stop: float = 0.45
+    sh: float = 1 / 30
+
+
+@dataclass(frozen=True)
+class Population:
+    """What a strategy contributes to every stage of a recipe.
+
+    Attributes:
+        opacity: of the first Gaussians.
+        spread: standard deviation of the first Gaussians, as a share of the distance to their neighbours.
+        edits: what changes the number of primary Gaussians.
+        resets: opacity resets; a recipe decides in which stages they happen.
+        motions: what moves the primary Gaussians besides the optimiser.
+        terms: regularisers of the objective.
+    """
+
+    opacity: float = 0.1
+    spread: float = 1.0
+    edits: tuple[Action, ...] = ()
+    resets: tuple[Action, ...] = ()
+    motions: tuple[Motion, ...] = ()
+    terms: tuple[LossTerm, ...] = ()
+
+    def initial(self, points: PointCloud, sh_degree: int) -> Gaussians:
+        """The first primary Gaussians, one per point."""
+        return gaussians_from_points(points, sh_degree=sh_degree, opacity=self.opacity, spread=self.spread)
+
+
+def population_of(
+    strategy: Strategy, *, default: DefaultDensify, mcmc: McmcDensify, rhythm: Rhythm, means_rate: Rate
+) -> Population:
+    """What the strategy of this name contributes; the options of the other one are not looked at.
+
+    Args:
+        strategy: name on the command line.
+        default: options of `default`.
+        mcmc: options of `mcmc`.
+        rhythm: when opacities are reset.
+        means_rate: learning rate of the positions, which the noise of `mcmc` follows.
+    """
+    return mcmc_population(mcmc, means_rate) if strategy == "mcmc" else default_population(default, rhythm)
+
+
+def default_population(densifier: DefaultDensify, rhythm: Rhythm) -> Population:
+    """3DGS: clone, split, prune, and reset the opacities."""
+    reset = ResetOpacity(Every(rhythm.beat, 0.0, rhythm.reset_stop, rhythm.least, only_multiples_of=3))
+    return Population(edits=(Densify(densifier),), resets=(reset,))
+
+
+def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
+    """3DGS-MCMC: relocate, add, explore, and regularise opacities and scales; opacities are never reset.
+
+    The regularisers are those of TR-Gaussians, Eq. 20, which adds them to whatever the objective is otherwise.
+    """
+    terms = (
+        LossTerm("opacity", densifier.opacity_weight, mean_opacity),
+        LossTerm("scale", densifier.scale_weight, mean_scale),
+    )
+    return Population(
+        opacity=densifier.initial_opacity,
+        spread=densifier.initial_spread,
+        edits=(Relocate(densifier),),
+        motions=(Explore(densifier, means_rate),) if densifier.noise_rate != 0 else (),
+        terms=tuple(term for term in terms if term.weight != 0),
+    )

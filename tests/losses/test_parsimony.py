@@ -1,0 +1,51 @@
+"""Opacity and scale regularisation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from glassplat.losses.parsimony import mean_opacity, mean_scale
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Scene
+
+UNUSED: Any = None
+
+
+def scene_of(opacities: list[float], scale: float, extent: float = 1.0) -> Scene:
+    count = len(opacities)
+    gaussians = Gaussians(
+        means=torch.zeros(count, 3),
+        quats=torch.ones(count, 4),
+        log_scales=torch.full((count, 3), scale).log().requires_grad_(),
+        logit_opacities=torch.logit(torch.tensor(opacities)).requires_grad_(),
+        sh=torch.zeros(count, 1, 3),
+    )
+    return Scene(gaussians, extent)
+
+
+def test_the_terms_are_means_of_activated_values() -> None:
+    scene = scene_of([0.2, 0.6], scale=0.3)
+    assert mean_opacity(UNUSED, UNUSED, scene).item() == pytest.approx(0.4)
+    assert mean_scale(UNUSED, UNUSED, scene).item() == pytest.approx(0.3)
+
+
+def test_the_scale_term_does_not_depend_on_the_units_of_the_capture() -> None:
+    metres, millimetres = scene_of([0.5], 0.3, extent=2.0), scene_of([0.5], 300.0, extent=2000.0)
+    assert mean_scale(UNUSED, UNUSED, metres).item() == pytest.approx(mean_scale(UNUSED, UNUSED, millimetres).item())
+
+
+def test_gradients_reach_the_raw_values() -> None:
+    scene = scene_of([0.2, 0.6], scale=0.3)
+    (mean_opacity(UNUSED, UNUSED, scene) + mean_scale(UNUSED, UNUSED, scene)).backward()
+    assert scene.primary.logit_opacities.grad is not None and scene.primary.log_scales.grad is not None
+    assert scene.primary.logit_opacities.grad.tolist() == pytest.approx([0.2 * 0.8 / 2, 0.6 * 0.4 / 2])
+    assert scene.primary.log_scales.grad.flatten().tolist() == pytest.approx([0.3 / 6] * 6)
+
+
+def test_no_gaussians_cost_nothing() -> None:
+    scene = scene_of([], scale=0.3)
+    assert mean_opacity(UNUSED, UNUSED, scene).item() == 0
+    assert mean_scale(UNUSED, UNUSED, scene).item() == 0

@@ -1,0 +1,141 @@
+"""The MCMC strategy in both recipes: wiring, a short run, determinism and resuming."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from glassplat.densify.mcmc import McmcDensify
+from glassplat.train.actions import Densify, Relocate, ResetOpacity, cap_of
+from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
+from glassplat.train.messages import ActionDone, Message, StepDone
+from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.recipe import recipe_from_json, recipe_to_json
+from glassplat.train.splat_recipe import SplatRecipe
+from glassplat.train.stage import Clock, Stage
+from glassplat.train.state import TrainState
+from glassplat.train.trainer import differentiate, train
+from tests.train.tiny_capture import tiny_capture, true_scene
+
+OFTEN = McmcDensify(interval=2, start=0.1, cap=45)
+RECIPES: list[Any] = [
+    SplatRecipe(sh_degree=1, strategy="mcmc", mcmc=OFTEN),
+    PlanarRecipe(sh_degree=1, stage_shares=(0.2, 0.3, 0.5), strategy="mcmc", mcmc=OFTEN),
+]
+BOTH = pytest.mark.parametrize("recipe", RECIPES, ids=["splat", "planar"])
+
+
+def place_true_planes(state: TrainState, dataset: object) -> None:
+    """Stands in for the plane fit, which needs more masks than the tiny capture has."""
+    truth = true_scene()
+    state.scene = replace(state.scene, planes=truth.planes, glass=truth.glass)
+    state.statistics.clear()
+
+
+def stages_of(recipe: Any) -> tuple[Stage, ...]:
+    return tuple(replace(s, entry=place_true_planes) if s.entry else s for s in recipe.stages(seed=0))
+
+
+def fresh_state(recipe: Any, seed: int = 0) -> TrainState:
+    scene = SplatRecipe(sh_degree=1, strategy="mcmc", mcmc=recipe.mcmc).initialise(tiny_capture())
+    return TrainState(scene, seed)
+
+
+def run(state: TrainState, recipe: Any, iterations: int = 20, until: int | None = None) -> list[Message]:
+    messages = []
+    for message in train(stages_of(recipe), tiny_capture(), state, iterations):
+        messages.append(message)
+        if isinstance(message, StepDone) and message.step == until:
+            break
+    return messages
+
+
+@BOTH
+def test_a_short_run_relocates_grows_and_regularises(recipe: Any) -> None:
+    state = fresh_state(recipe)
+    before = len(state.scene.primary)
+    messages = run(state, recipe)
+    actions = {m.action for m in messages if isinstance(m, ActionDone)}
+    assert "densify primary" in actions and "reset opacity" not in actions
+    assert before < len(state.scene.primary) <= OFTEN.cap
+    steps = [m for m in messages if isinstance(m, StepDone)]
+    assert all({"opacity", "scale"} <= set(m.losses) for m in steps)
+    assert all(torch.isfinite(tensor).all() for tensor in state.scene.parameters().values())
+
+
+@BOTH
+@pytest.mark.parametrize("pause", [3, 4, 11])
+def test_resuming_continues_to_the_same_result(recipe: Any, pause: int, tmp_path: Path) -> None:
+    whole, interrupted = fresh_state(recipe), fresh_state(recipe)
+    run(whole, recipe)
+    run(interrupted, recipe, until=pause)
+    save_checkpoint(tmp_path / "checkpoint.safetensors", interrupted)
+    resumed = load_checkpoint(tmp_path / "checkpoint.safetensors")
+    run(resumed, recipe)
+    for name, tensor in whole.scene.parameters().items():
+        assert torch.equal(tensor, resumed.scene.parameters()[name]), name
+
+
+@BOTH
+def test_the_strategy_decides_what_happens_to_the_primary_gaussians(recipe: Any) -> None:
+    for stage in recipe.stages(seed=0):
+        kinds = [type(action) for action in stage.actions]
+        assert kinds.count(Relocate) == 1 and ResetOpacity not in kinds and len(stage.motions) == 1
+        assert all(action.part == "glass" for action in stage.actions if isinstance(action, Densify))
+    for stage in replace(recipe, strategy="default").stages(seed=0):
+        assert not stage.motions and not any(isinstance(action, Relocate) for action in stage.actions)
+        assert not {"opacity", "scale"} & {term.name for term in stage.losses}
+
+
+def test_the_planar_objective_is_that_of_equation_20() -> None:
+    *_, joint = RECIPES[1].stages(seed=0)
+    assert {term.name: term.weight for term in joint.losses} == pytest.approx(
+        {"l1": 0.8, "dssim": 0.2, "depth": 0.005, "conflict": 0.2, "mask": 0.5, "opacity": 0.01, "scale": 0.01}
+    )
+
+
+def test_the_regularisers_reach_the_gaussians() -> None:
+    (stage,) = RECIPES[0].stages(seed=0)
+    scene, view = fresh_state(RECIPES[0]).scene, tiny_capture().train[0]
+    plain = replace(stage, losses=tuple(term for term in stage.losses if term.name not in ("opacity", "scale")))
+    gradients = [differentiate(s, scene, view).gradients for s in (stage, plain)]
+    opacities, scales = torch.sigmoid(scene.primary.logit_opacities), scene.primary.log_scales.exp()
+    expected = {
+        "primary.logit_opacities": 0.01 * opacities * (1 - opacities) / len(opacities),
+        "primary.log_scales": 0.01 * scales / scales.numel() / scene.extent,
+    }
+    for name, gradient in expected.items():
+        assert torch.allclose(gradients[0][name] - gradients[1][name], gradient, rtol=1e-3, atol=1e-8), name
+
+
+def test_the_first_gaussians_are_small_and_half_opaque() -> None:
+    sampled, default = (SplatRecipe(strategy=name).initialise(tiny_capture()).primary for name in ("mcmc", "default"))
+    assert torch.sigmoid(sampled.logit_opacities).mean().item() == pytest.approx(0.5)
+    assert torch.allclose(sampled.log_scales.exp(), 0.1 * default.log_scales.exp())
+
+
+def test_the_default_cap_follows_the_photographs() -> None:
+    camera = tiny_capture().train[0].camera
+    assert cap_of(McmcDensify(), tiny_capture()) == round(camera.width * camera.height / 2)
+    assert cap_of(McmcDensify(cap=7), tiny_capture()) == 7
+
+
+def test_relocation_keeps_its_share_of_the_run() -> None:
+    action = Relocate(McmcDensify())
+    due = [step for step in range(1, 30_001) if action.due(Clock(step, 30_000, views=10))]
+    assert (due[0], due[1], due[-1]) == (600, 700, 25_000)
+
+
+def test_weights_and_noise_of_zero_are_left_out() -> None:
+    bare = McmcDensify(noise_rate=0.0, opacity_weight=0.0, scale_weight=0.0)
+    (stage,) = SplatRecipe(strategy="mcmc", mcmc=bare).stages(seed=0)
+    assert not stage.motions and {term.name for term in stage.losses} == {"l1", "dssim"}
+
+
+@BOTH
+def test_a_recipe_survives_its_file(recipe: Any) -> None:
+    assert recipe_from_json(recipe_to_json(recipe)) == recipe
