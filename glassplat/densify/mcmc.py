@@ -43,7 +43,8 @@ class McmcDensify:
         opacity_weight: lambda_o, weight of the mean opacity in the objective.
         scale_weight: lambda_Sigma, weight of the mean standard deviation in the objective.
         initial_opacity: opacity of the first Gaussians.
-        initial_spread: standard deviation of the first Gaussians, as a share of the distance to their neighbours.
+        initial_spread: standard deviation of the first Gaussians, as a share of the distance to their neighbours. The
+            published 0.1 takes a thousand steps or more to grow over the gaps (docs/experiments.md).
     """
 
     cap: Annotated[int | None, tyro.conf.arg(aliases=("--cap",))] = None
@@ -57,7 +58,7 @@ class McmcDensify:
     opacity_weight: float = 0.01
     scale_weight: float = 0.01
     initial_opacity: float = 0.5
-    initial_spread: float = 0.1
+    initial_spread: float = 1.0
 
     @torch.no_grad()
     def densify(

@@ -112,8 +112,10 @@ def test_the_regularisers_reach_the_gaussians() -> None:
         assert torch.allclose(gradients[0][name] - gradients[1][name], gradient, rtol=1e-3, atol=1e-8), name
 
 
-def test_the_first_gaussians_are_small_and_half_opaque() -> None:
-    sampled, default = (SplatRecipe(strategy=name).initialise(tiny_capture()).primary for name in ("mcmc", "default"))
+def test_the_strategy_decides_how_the_first_gaussians_look() -> None:
+    options = McmcDensify(initial_opacity=0.5, initial_spread=0.1)
+    recipes = SplatRecipe(strategy="mcmc", mcmc=options), SplatRecipe(mcmc=options)
+    sampled, default = (recipe.initialise(tiny_capture()).primary for recipe in recipes)
     assert torch.sigmoid(sampled.logit_opacities).mean().item() == pytest.approx(0.5)
     assert torch.allclose(sampled.log_scales.exp(), 0.1 * default.log_scales.exp())
 
