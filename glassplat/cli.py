@@ -1,4 +1,4 @@
-"""The command line: `glassplat train | eval | render | demo`."""
+"""The command line: `glassplat train | eval | render | dereflect | demo`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from glassplat.commands.demo import Demo
+from glassplat.commands.dereflect import Dereflect
 from glassplat.commands.evaluate import Evaluate
 from glassplat.commands.render import Render
 from glassplat.commands.train import Train
@@ -23,6 +24,7 @@ Command = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Dereflect, tyro.conf.subcommand("dereflect")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
 INPUT_ERRORS = (InputError, PlaneFitError, FileNotFoundError, NotADirectoryError, PermissionError)
@@ -45,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return guarded(command, console)
 
 
-def guarded(command: Train | Evaluate | Render | Demo, console: Console) -> int:
+def guarded(command: Train | Evaluate | Render | Dereflect | Demo, console: Console) -> int:
     """Runs a command and turns expected errors into one readable message and an exit code."""
     try:
         command.run(console)
@@ -56,7 +58,9 @@ def guarded(command: Train | Evaluate | Render | Demo, console: Console) -> int:
         Console(stderr=True).print(f"[red]stopped:[/red] {error}", highlight=False)
         return FAILURE_CODE
     except KeyboardInterrupt:
-        Console(stderr=True).print("interrupted; everything saved so far is intact, --resume goes on", highlight=False)
+        Console(stderr=True).print(
+            "interrupted; what is written is intact, and `train` goes on with --resume", highlight=False
+        )
         return INTERRUPTED_CODE
     return 0
 
