@@ -1,4 +1,4 @@
-"""The command line: `glassplat train | eval | render | demo | bench`."""
+"""The command line: `glassplat train | eval | render | dereflect | demo | bench`."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from rich.logging import RichHandler
 
 from glassplat.commands.bench import Bench
 from glassplat.commands.demo import Demo
+from glassplat.commands.dereflect import Dereflect
 from glassplat.commands.evaluate import Evaluate
 from glassplat.commands.render import Render
 from glassplat.commands.train import Train
@@ -24,6 +25,7 @@ Command = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Dereflect, tyro.conf.subcommand("dereflect")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
@@ -48,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return guarded(command, console)
 
 
-def guarded(command: Train | Evaluate | Render | Demo | Bench, console: Console) -> int:
+def guarded(command: Train | Evaluate | Render | Dereflect | Demo | Bench, console: Console) -> int:
     """Runs a command and turns expected errors into one readable message and an exit code."""
     try:
         command.run(console)

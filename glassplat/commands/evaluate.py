@@ -12,8 +12,9 @@ from rich.table import Table
 
 from glassplat.commands.stored_run import StoredRun, open_run
 from glassplat.evaluate.evaluate import Evaluation, evaluate
-from glassplat.evaluate.report import write_report
-from glassplat.train.checkpoint import load_checkpoint
+from glassplat.evaluate.report import Report
+from glassplat.render.planar import Planar
+from glassplat.train.checkpoint import recorded_seconds
 from glassplat.train.run_directory import write_text
 
 SHOWN = (
@@ -49,8 +50,10 @@ class Evaluate:
 
 def evaluate_run(stored: StoredRun) -> dict:
     """Evaluates a run, writes `results.json`, `per_view.json`, sheets and overview; returns the results."""
-    evaluation: Evaluation = evaluate(stored.scene, stored.renderer, stored.dataset)
     settings, path = stored.directory.settings(), stored.directory.path
+    blend = stored.renderer.blend if isinstance(stored.renderer, Planar) else None
+    report = Report(path, stored.dataset, blend)
+    evaluation: Evaluation = evaluate(stored.scene, stored.renderer, stored.dataset, listen=report.add)
     results = {
         "method": stored.recipe.method,
         "iterations": stored.iterations,
@@ -61,14 +64,14 @@ def evaluate_run(stored: StoredRun) -> dict:
     }
     write_text(path / "results.json", json.dumps(results, indent=2))
     write_text(path / "per_view.json", json.dumps(evaluation.per_view, indent=2))
-    write_report(path, stored.scene, stored.renderer, stored.dataset, results, evaluation.per_view)
+    report.finish(results, evaluation.per_view)
     return results
 
 
 def train_seconds(stored: StoredRun) -> float | None:
     """Training time as the checkpoint recorded it."""
     file = stored.directory.checkpoint
-    return load_checkpoint(file).seconds if file.is_file() else None
+    return recorded_seconds(file) if file.is_file() else None
 
 
 def results_table(*results: dict) -> Table:

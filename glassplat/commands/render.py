@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-import torch
 import tyro
 from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
-from glassplat.commands.stored_run import open_run
+from glassplat.commands.output_folder import claim_folder, picture_paths
+from glassplat.commands.scene_edits import SceneEdits
+from glassplat.commands.stored_run import Split, chosen_views, open_run
 from glassplat.data.errors import InputError
 from glassplat.evaluate.colormap import depth_colors
+from glassplat.evaluate.evaluate import timed_render
 from glassplat.files.images import write_image
 from glassplat.render.frame import Frame
 
@@ -23,31 +25,37 @@ Layer = Literal["rgb", "transmission", "reflection", "strength", "mask", "depth"
 
 @dataclass(frozen=True)
 class Render:
-    """Render the layers of a run from its cameras.
+    """Render the layers of a run from its cameras, with its panes as they are or edited.
 
     Attributes:
         run_directory: the run's directory.
-        output: where the images go, one folder per layer.
+        output: where the images go, one folder per layer; a new folder, or one that this command wrote.
         layers: which layers.
         split: which cameras.
+        edits: changes to the panes.
     """
 
     run_directory: tyro.conf.Positional[Path]
     output: Path
     layers: tuple[Layer, ...] = ("rgb",)
-    split: Literal["train", "test"] = "test"
+    split: Split = "test"
+    edits: Annotated[SceneEdits, tyro.conf.arg(name="")] = field(default_factory=SceneEdits)
 
     def run(self, console: Console) -> None:
         """Renders."""
         stored = open_run(self.run_directory)
-        views = stored.dataset.train if self.split == "train" else stored.dataset.test
+        scene = self.edits.applied(stored.scene)
+        views = chosen_views(stored.dataset, self.split)
+        paths = picture_paths([view.name for view in views])
+        if claim_folder(self.output, "render", self.run_directory):
+            console.print(
+                f"adding to {self.output}, which `glassplat render` wrote earlier; images of one name are replaced"
+            )
         for view in track(views, "rendering", console=console):
-            with torch.no_grad():
-                frame = stored.renderer(stored.scene, view.camera)
+            frame, _ = timed_render(stored.renderer, scene, view)
             for layer in self.layers:
-                file = self.output / layer / Path(view.name).with_suffix(".png")
-                file.parent.mkdir(parents=True, exist_ok=True)
-                write_image(file, layer_image(frame, layer, stored.recipe.method))
+                image = layer_image(frame, layer, stored.recipe.method)
+                write_image(self.output / layer / paths[view.name], image)
         console.print(f"{len(views)} views x {len(self.layers)} layers -> {self.output}")
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-from glassplat.data.dataset import Dataset, load_dataset
+from glassplat.data.dataset import Dataset, View, load_dataset
+from glassplat.data.errors import InputError
 from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
 from glassplat.train.run_directory import RunDirectory
+
+Split = Literal["train", "test", "all"]
 
 
 class StoredRun(NamedTuple):
@@ -34,3 +37,15 @@ def open_run(path: Path) -> StoredRun:
     scene, iterations = directory.latest_scene()
     dataset = load_dataset(Path(settings.data), downscale=settings.downscale, mask_polarity=settings.mask_polarity)
     return StoredRun(directory, recipe, scene, recipe.renderer(), dataset, iterations)
+
+
+def chosen_views(dataset: Dataset, split: Split) -> tuple[View, ...]:
+    """The views of a split, by name.
+
+    Raises:
+        InputError: there are none.
+    """
+    parts = {"train": dataset.train, "test": dataset.test, "all": (*dataset.train, *dataset.test)}
+    if not parts[split]:
+        raise InputError(f"{dataset.root} has no {split} views; choose another --split")
+    return tuple(sorted(parts[split], key=lambda view: view.name))

@@ -7,7 +7,7 @@ import resource
 import statistics
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,8 @@ TOO_FEW = f"fewer than {SMALLEST_REGION} pixels show a pane"
 
 Outcome = float | str
 """A metric's value, or a sentence on why there is none."""
+Truths = tuple[GroundTruth | None, TrueView | None]
+"""What is known of the data set, and of one view."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,30 @@ class Evaluation:
 
 
 @dataclass(frozen=True)
+class EvaluatedView:
+    """A test view while its frame is at hand.
+
+    Attributes:
+        view: the photograph and its camera.
+        frame: what was rendered, on the CPU.
+        truth: the true layers, where they are known.
+        metrics: as in `Evaluation.per_view`, without the reflection's, which needs all views.
+    """
+
+    view: View
+    frame: Frame
+    truth: TrueView | None
+    metrics: Mapping[str, Any]
+
+
+ViewListener = Callable[[EvaluatedView], None]
+
+
+def _nobody(evaluated: EvaluatedView) -> None:
+    """Listens to nothing."""
+
+
+@dataclass(frozen=True)
 class _Measurement:
     """What one view contributes; `reflection` holds rendered and true pane pixels until the gain is known."""
 
@@ -59,7 +85,14 @@ class _Measurement:
     reflection: tuple[Tensor, Tensor] | str
 
 
-def evaluate(scene: Scene, renderer: Renderer, dataset: Dataset, *, lpips_weights: Path | None = None) -> Evaluation:
+def evaluate(
+    scene: Scene,
+    renderer: Renderer,
+    dataset: Dataset,
+    *,
+    lpips_weights: Path | None = None,
+    listen: ViewListener = _nobody,
+) -> Evaluation:
     """Renders every test view and measures it, on uint8-quantised sRGB at the data set's resolution.
 
     `psnr`, `ssim` and `lpips` are means over the views. The region metrics are means over the views in
@@ -74,6 +107,7 @@ def evaluate(scene: Scene, renderer: Renderer, dataset: Dataset, *, lpips_weight
         renderer: how; called under `no_grad`. The median of its times is `seconds_per_frame`.
         dataset: the test views; ground truth is read where it has some.
         lpips_weights: folder with LPIPS weights; None looks in the usual places.
+        listen: called once per view with its frame, which is not kept afterwards; draws pictures of it.
 
     Raises:
         InputError: no test views, a render that is not finite, or broken ground truth.
@@ -84,7 +118,12 @@ def evaluate(scene: Scene, renderer: Renderer, dataset: Dataset, *, lpips_weight
     lpips = _available_lpips(lpips_weights)
     # The first frame may wait for the compiler; it must not count.
     timed_render(renderer, scene, dataset.test[0])
-    measurements = {view.name: _measure(scene, renderer, view, truth, lpips) for view in dataset.test}
+    measurements = {}
+    for view in dataset.test:
+        frame, seconds = timed_render(renderer, scene, view)
+        true_view = truth.view(view.name, view.camera.width, view.camera.height) if truth else None
+        measurements[view.name] = measured = _measure(frame, seconds, view.photo, truth=(truth, true_view), lpips=lpips)
+        listen(EvaluatedView(view, frame, true_view, plain(measured.metrics)))
     gain = _add_reflection(measurements.values())
     per_view = {name: plain(m.metrics) | {"seconds": m.seconds} for name, m in measurements.items()}
     results = _description(scene, dataset)
@@ -141,22 +180,17 @@ def _available_lpips(folder: Path | None) -> Lpips | str:
         return str(error)
 
 
-def _measure(
-    scene: Scene, renderer: Renderer, view: View, truth: GroundTruth | None, lpips: Lpips | str
-) -> _Measurement:
-    """Renders one view and takes every metric except the reflection's, which needs all views."""
-    frame, seconds = timed_render(renderer, scene, view)
-    photo = view.photo
-    true_view = truth.view(view.name, view.camera.width, view.camera.height) if truth else None
-    pane = _pane(frame, truth, true_view)
+def _measure(frame: Frame, seconds: float, photo: Tensor, *, truth: Truths, lpips: Lpips | str) -> _Measurement:
+    """Every metric of one view except the reflection's, which needs all views."""
+    pane = _pane(frame, *truth)
     metrics: dict[str, Outcome] = {
         "psnr": psnr(frame.rgb, photo),
         "ssim": ssim(frame.rgb, photo),
         "lpips": NO_WEIGHTS if isinstance(lpips, str) else lpips(quantized(frame.rgb), quantized(photo)),
         "pane_psnr": pane if isinstance(pane, str) else _region_psnr(frame.rgb, photo, pane, TOO_FEW),
-        "transmission_psnr": _transmission_psnr(frame, truth, true_view),
+        "transmission_psnr": _transmission_psnr(frame, *truth),
     }
-    return _Measurement(metrics, seconds, _reflection_pixels(frame, truth, true_view))
+    return _Measurement(metrics, seconds, _reflection_pixels(frame, *truth))
 
 
 def _pane(frame: Frame, truth: GroundTruth | None, true_view: TrueView | None) -> Tensor | str:

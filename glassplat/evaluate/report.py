@@ -8,14 +8,13 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from glassplat.data.dataset import Dataset
-from glassplat.evaluate.evaluate import timed_render
+from glassplat.evaluate.evaluate import EvaluatedView
 from glassplat.evaluate.overview_style import SCRIPT, STYLE
 from glassplat.evaluate.sheet import comparison_sheet
-from glassplat.evaluate.truth import load_truth
+from glassplat.evaluate.uses import Uses
 from glassplat.files.atomic import atomic_write
 from glassplat.files.images import write_image
-from glassplat.render.frame import Renderer
-from glassplat.scene.scene import Scene
+from glassplat.render.planar import Blend
 
 METRICS = {
     "psnr": ("PSNR", "{:.2f} dB"),
@@ -29,7 +28,9 @@ FACTS = {
     "num_gaussians": ("Gaussians", "{:,}"),
     "train_seconds": ("training", "{:.0f} s"),
     "seconds_per_frame": ("per frame", "{:.3f} s"),
+    "reflection_gain": ("reflection gain", "{:.2f}"),
 }
+USES_FILE = "uses.png"
 SETTINGS = ("iterations", "seed", "resolution", "split", "lpips_backbone", "pane_region")
 PLANE_COLUMNS = {
     "label": ("pane", "{}"),
@@ -40,39 +41,47 @@ PLANE_COLUMNS = {
 }
 
 
-def write_report(
-    folder: Path,
-    scene: Scene,
-    renderer: Renderer,
-    dataset: Dataset,
-    results: Mapping[str, Any],
-    per_view: Mapping[str, Mapping[str, Any]],
-) -> None:
-    """Writes `sheets/<view>.png` for every test view, and `index.html` that shows them all.
+class Report:
+    """The pictures of an evaluation, drawn while it runs: each view's frame is used once and let go.
 
-    Args:
-        folder: a run's directory; nothing outside it is referred to, so it can be moved or sent.
-        scene: what is rendered, once more, view by view.
-        renderer: how.
-        dataset: the test views.
-        results: as `evaluate` returns them, with what the caller added.
-        per_view: as `evaluate` returns it.
+    Writes `sheets/<view>.png` for every test view, `uses.png` for a method that separates the reflection, and
+    `index.html` that shows them all. Nothing outside the folder is referred to, so it can be moved or sent.
     """
-    truth = load_truth(dataset.truth)
-    sheets = sheet_names([view.name for view in dataset.test])
-    for view in dataset.test:
-        frame, _ = timed_render(renderer, scene, view)
-        sheet = comparison_sheet(
-            frame,
-            view.photo,
-            truth.view(view.name, view.camera.width, view.camera.height) if truth else None,
-            title=view.name,
-            subtitle=_metrics_line(per_view.get(view.name, {})),
-            gain=results.get("reflection_gain"),
-        )
-        write_image(folder / sheets[view.name], sheet)
-    with atomic_write(folder / "index.html") as temporary:
-        temporary.write_text(overview_page(results, per_view, sheets), encoding="utf-8")
+
+    def __init__(self, folder: Path, dataset: Dataset, blend: Blend | None) -> None:
+        """Prepares for the test views of a data set.
+
+        Args:
+            folder: a run's directory.
+            dataset: the test views that will come.
+            blend: the space in which the run blends the reflection; None for a method without reflection.
+        """
+        self._folder = folder
+        self._sheets = sheet_names([view.name for view in dataset.test])
+        self._uses = Uses(blend) if blend is not None else None
+
+    def add(self, evaluated: EvaluatedView) -> None:
+        """Draws one view; for `evaluate` to call."""
+        view, frame = evaluated.view, evaluated.frame
+        subtitle = _metrics_line(evaluated.metrics)
+        sheet = comparison_sheet(frame, view.photo, evaluated.truth, title=view.name, subtitle=subtitle)
+        write_image(self._folder / self._sheets[view.name], sheet)
+        if self._uses is not None:
+            self._uses.add(evaluated)
+
+    def finish(self, results: Mapping[str, Any], per_view: Mapping[str, Mapping[str, Any]]) -> None:
+        """Writes the overview.
+
+        Args:
+            results: as `evaluate` returns them, with what the caller added.
+            per_view: as `evaluate` returns it.
+        """
+        uses = self._uses.picture() if self._uses is not None else None
+        if uses is not None:
+            write_image(self._folder / USES_FILE, uses)
+        page = overview_page(results, per_view, self._sheets, uses=None if uses is None else USES_FILE)
+        with atomic_write(self._folder / "index.html") as temporary:
+            temporary.write_text(page, encoding="utf-8")
 
 
 def sheet_names(names: list[str]) -> dict[str, str]:
@@ -84,17 +93,22 @@ def sheet_names(names: list[str]) -> dict[str, str]:
 
 
 def overview_page(
-    results: Mapping[str, Any], per_view: Mapping[str, Mapping[str, Any]], sheets: Mapping[str, str]
+    results: Mapping[str, Any],
+    per_view: Mapping[str, Mapping[str, Any]],
+    sheets: Mapping[str, str],
+    *,
+    uses: str | None = None,
 ) -> str:
-    """The overview as one HTML page; its only references are the sheets, by relative path."""
+    """The overview as one HTML page; its only references are the pictures, by relative path."""
     title = f"glassplat: {results.get('method', 'evaluation')}"
     parts = [
         f"<h1>{_escaped(title)}</h1>",
         f'<p class="settings">{_settings_line(results)}</p>',
         _cards(results),
+        _figure("uses", uses, "photographs without reflections, and panes as mirrors") if uses else "",
         _plane_table(results.get("planes") or []),
         _view_table(per_view, sheets),
-        *(_figure(name, path) for name, path in sheets.items()),
+        *(_figure(name, path, f"comparison sheet of {name}") for name, path in sheets.items()),
         '<dialog id="large"><img alt=""></dialog>',
     ]
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{_escaped(title)}</title>'
@@ -147,10 +161,10 @@ def _link(name: str, sheets: Mapping[str, str]) -> str:
     return f'<a href="#{_escaped(name)}">{_escaped(name)}</a>' if name in sheets else _escaped(name)
 
 
-def _figure(name: str, path: str) -> str:
+def _figure(name: str, path: str, description: str) -> str:
     return (
         f'<figure id="{_escaped(name)}"><a href="{_escaped(path)}">'
-        f'<img src="{_escaped(path)}" alt="comparison sheet of {_escaped(name)}" loading="lazy"></a></figure>'
+        f'<img src="{_escaped(path)}" alt="{_escaped(description)}" loading="lazy"></a></figure>'
     )
 
 

@@ -34,7 +34,7 @@ class Panel:
 
 
 def comparison_sheet(
-    frame: Frame, photo: Tensor, truth: TrueView | None, *, title: str, subtitle: str = "", gain: float | None = None
+    frame: Frame, photo: Tensor, truth: TrueView | None, *, title: str, subtitle: str = ""
 ) -> NDArray[np.uint8]:
     """The sheet [H, W, 3] of one view.
 
@@ -47,9 +47,8 @@ def comparison_sheet(
         truth: the true layers.
         title: set in large type; usually the view's name.
         subtitle: set in small type beside it; usually the metrics.
-        gain: factor on the reflection that its metric was taken with; None shows the layer as it is.
     """
-    rows = [_image_row(frame, photo), _layer_row(frame, truth, gain), _truth_row(frame, truth)]
+    rows = [_image_row(frame, photo), _layer_row(frame, truth), _truth_row(frame, truth)]
     return composed([row for row in rows if row], title, subtitle)
 
 
@@ -85,12 +84,11 @@ def _image_row(frame: Frame, photo: Tensor) -> list[Panel]:
     return row
 
 
-def _layer_row(frame: Frame, truth: TrueView | None, gain: float | None) -> list[Panel]:
+def _layer_row(frame: Frame, truth: TrueView | None) -> list[Panel]:
     layers = frame.layers
     row = [Panel("transmission", layers["transmission"])] if "transmission" in layers else []
     if "reflection" in layers:
-        caption = "reflection" if gain is None else f"reflection x {gain:.2f}"
-        row.append(Panel(caption, layers["reflection"] * (1.0 if gain is None else gain)))
+        row.append(Panel("reflection", layers["reflection"]))
     if "strength" in layers:
         scale = _strength_scale(frame, truth)
         row.append(Panel(f"strength (white: {scale:.2f})", _grey(layers["strength"] / scale)))

@@ -17,6 +17,15 @@ def rotation_from_quat(quats: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).reshape(*quats.shape[:-1], 3, 3)
 
 
+def quat_product(left: Tensor, right: Tensor) -> Tensor:
+    """Quaternions [..., 4], `wxyz`, of the rotations by `right` followed by `left`."""
+    left_real, left_vector = left[..., :1], left[..., 1:]
+    right_real, right_vector = right[..., :1], right[..., 1:]
+    real = left_real * right_real - (left_vector * right_vector).sum(-1, keepdim=True)
+    crossed = torch.linalg.cross(left_vector, right_vector)
+    return torch.cat([real, left_real * right_vector + right_real * left_vector + crossed], dim=-1)
+
+
 def mirror_matrices(centers: Tensor, normals: Tensor) -> Tensor:
     """Householder reflections [K, 4, 4] about planes through `centers` with unit `normals`.
 

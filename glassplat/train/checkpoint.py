@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -60,21 +63,40 @@ def load_checkpoint(path: Path) -> TrainState:
         InputError: the file is truncated, or is no checkpoint of glassplat.
         FileNotFoundError: there is no such file.
     """
+    with opened_checkpoint(path) as (header, file):
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    return restored_state(header, tensors)
+
+
+def recorded_seconds(path: Path) -> float:
+    """Training time up to a checkpoint; reads its header and no tensor, so it costs nothing.
+
+    Raises:
+        InputError: the file is truncated, or is no checkpoint of glassplat.
+        FileNotFoundError: there is no such file.
+    """
+    with opened_checkpoint(path) as (header, _):
+        return float(header["seconds"])
+
+
+@contextmanager
+def opened_checkpoint(path: Path) -> Iterator[tuple[dict, Any]]:
+    """The header of a checkpoint, checked, and the open file that its tensors can be read from."""
     if not path.is_file():
         raise FileNotFoundError(f"no checkpoint at {path}; expected the file that training writes there")
     try:
-        with safe_open(path, framework="pt") as opened:
-            header = json.loads((opened.metadata() or {}).get("glassplat", "{}"))
-            tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+        with safe_open(path, framework="pt") as file:
+            header = json.loads((file.metadata() or {}).get("glassplat", "{}"))
+            if header.get("format") == FORMAT:
+                yield header, file
+                return
     except (SafetensorError, ValueError) as error:
         raise InputError(
             f"{path} is truncated or not a checkpoint ({error}); use an older one or train again"
         ) from error
-    if header.get("format") != FORMAT:
-        raise InputError(
-            f"{path} has format {header.get('format')!r}; expected {FORMAT!r}, as glassplat's training writes it"
-        )
-    return restored_state(header, tensors)
+    raise InputError(
+        f"{path} has format {header.get('format')!r}; expected {FORMAT!r}, as glassplat's training writes it"
+    )
 
 
 def restored_state(header: dict, tensors: dict[str, Tensor]) -> TrainState:

@@ -50,7 +50,7 @@ class RunDirectory:
     cameras.json                       all cameras
     point_cloud/iteration_N/           point_cloud.ply, glass.ply, scene.json
     results.json  per_view.json        metrics
-    sheets/  index.html                pictures
+    sheets/  uses.png  index.html      pictures
     ```
     """
 

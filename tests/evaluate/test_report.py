@@ -7,9 +7,11 @@ import torch
 
 from glassplat.evaluate.colormap import depth_colors, heat_colors, label_colors
 from glassplat.evaluate.evaluate import evaluate
-from glassplat.evaluate.report import overview_page, sheet_names, write_report
+from glassplat.evaluate.report import Report, overview_page, sheet_names
 from glassplat.evaluate.sheet import CAPTION_HEIGHT, MARGIN, TITLE_HEIGHT, comparison_sheet
 from glassplat.files.images import read_image
+from glassplat.render.dereflect import dereflected_photo
+from glassplat.render.planar import Blend
 from glassplat.scene.plane import Planes
 
 
@@ -37,20 +39,47 @@ def references(page: str) -> set[str]:
     return parser.links
 
 
-def written_report(case, folder: Path) -> str:
-    evaluation = evaluate(case.scene, case.renderer, case.dataset)
+def written_report(case, folder: Path, blend: Blend | None = "linear") -> str:
+    report = Report(folder, case.dataset, blend)
+    evaluation = evaluate(case.scene, case.renderer, case.dataset, listen=report.add)
     results = {"method": "planar <&>", "iterations": 30, **evaluation.results}
-    write_report(folder, case.scene, case.renderer, case.dataset, results, evaluation.per_view)
+    report.finish(results, evaluation.per_view)
     return (folder / "index.html").read_text(encoding="utf-8")
 
 
 def test_every_view_has_a_sheet_and_the_page_shows_it(case, tmp_path: Path) -> None:
     page = written_report(case, tmp_path / "run")
     sheets = {"sheets/a.png", "sheets/b.png", "sheets/c.png"}
-    assert references(page) == sheets | {"#a.jpg", "#b.jpg", "#c.jpg"}
-    assert {str(path.relative_to(tmp_path / "run")) for path in (tmp_path / "run").rglob("*.png")} == sheets
+    assert references(page) == sheets | {"uses.png", "#a.jpg", "#b.jpg", "#c.jpg"}
+    pictures = {str(path.relative_to(tmp_path / "run")) for path in (tmp_path / "run").rglob("*.png")}
+    assert pictures == sheets | {"uses.png"}
     assert "planar &lt;&amp;&gt;" in page
     assert "http" not in page
+
+
+def test_every_view_is_rendered_once_and_the_first_once_more_to_warm_up(case, tmp_path: Path) -> None:
+    written_report(case, tmp_path / "run")
+    assert case.renderer.calls == [40.0, 40.0, 41.0, 42.0]
+
+
+def test_the_uses_are_shown_of_the_views_with_the_largest_panes(case, tmp_path: Path) -> None:
+    written_report(case, tmp_path / "run")
+    uses = read_image(tmp_path / "run" / "uses.png")
+    row = CAPTION_HEIGHT + 32 * 6
+    assert uses.shape == (2 * MARGIN + TITLE_HEIGHT + 2 * row + 10, 2 * MARGIN + 3 * 48 * 6 + 20, 3)
+    top = MARGIN + TITLE_HEIGHT + CAPTION_HEIGHT
+    first = uses[top : top + 32 * 6 : 6, MARGIN : MARGIN + 48 * 6 : 6]
+    np.testing.assert_array_equal(first, case.dataset.test[0].photo.numpy())
+    beside = MARGIN + 48 * 6 + 10
+    dereflected = uses[top : top + 32 * 6 : 6, beside : beside + 48 * 6 : 6]
+    expected = dereflected_photo(case.renderer.frames[40.0], case.dataset.test[0].photo, "linear")
+    np.testing.assert_array_equal(dereflected, expected.numpy())
+
+
+def test_without_a_pane_in_view_there_are_no_uses_to_show(case, tmp_path: Path) -> None:
+    unseen = replace(case, renderer=case.renderer.with_layers(strength=torch.zeros(32, 48)))
+    assert "uses.png" not in references(written_report(unseen, tmp_path / "run"))
+    assert not (tmp_path / "run" / "uses.png").exists()
 
 
 def test_panels_lie_where_their_captions_say(case) -> None:
@@ -79,7 +108,7 @@ def test_large_photographs_give_sheets_of_a_bearable_size(case) -> None:
 
 def test_a_method_without_layers_is_reported_too(case, tmp_path: Path) -> None:
     plain = replace(case, renderer=case.renderer.without_layers(), scene=replace(case.scene, planes=Planes.empty()))
-    assert "PSNR, transmission" in written_report(plain, tmp_path / "run")
+    assert "PSNR, transmission" in written_report(plain, tmp_path / "run", blend=None)
     assert read_image(tmp_path / "run" / "sheets" / "a.png").shape[2] == 3
 
 

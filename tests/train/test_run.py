@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 import torch
 
-from glassplat.train.checkpoint import load_checkpoint
+from glassplat.data.errors import InputError
+from glassplat.train.checkpoint import load_checkpoint, recorded_seconds
 from glassplat.train.messages import Message, StepDone
 from glassplat.train.planar_recipe import PlanarRecipe, ReflectionWeights
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
@@ -52,6 +53,19 @@ def test_the_log_has_every_tenth_step_once(tmp_path: Path) -> None:
     run(tmp_path, resume=True)
     lines = [json.loads(line) for line in RunDirectory(tmp_path).log.read_text().splitlines()]
     assert [line["step"] for line in lines if line["message"] == "StepDone"] == [10]
+
+
+def test_the_training_time_is_read_without_the_tensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    state = run(tmp_path)
+    monkeypatch.setattr("glassplat.train.checkpoint.restored_state", None)
+    assert recorded_seconds(RunDirectory(tmp_path).checkpoint) == state.seconds > 0
+
+
+@pytest.mark.parametrize("content", [b"", b"no checkpoint at all"])
+def test_the_time_of_a_broken_checkpoint_is_not_guessed(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "broken").write_bytes(content)
+    with pytest.raises(InputError, match="truncated or not a checkpoint"):
+        recorded_seconds(tmp_path / "broken")
 
 
 def test_the_exported_scene_is_the_trained_one(tmp_path: Path) -> None:

@@ -1,0 +1,85 @@
+"""`glassplat dereflect`: the photographs without what the panes reflect."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import track
+from torch import Tensor
+
+from glassplat.commands.output_folder import claim_folder, picture_paths
+from glassplat.commands.stored_run import Split, StoredRun, chosen_views, open_run
+from glassplat.data.errors import InputError
+from glassplat.data.view import View
+from glassplat.evaluate.evaluate import timed_render
+from glassplat.evaluate.metrics import quantized
+from glassplat.files.images import write_image
+from glassplat.render.dereflect import dereflected_photo
+from glassplat.render.planar import Planar
+
+
+@dataclass(frozen=True)
+class Dereflect:
+    """Take the reflections out of a planar run's photographs; one PNG per photograph, under its name.
+
+    Attributes:
+        run_directory: the run's directory.
+        output: where the images go; a new folder, or one that this command wrote.
+        split: which photographs.
+        source: photo keeps the photograph, and takes the rendered reflection off it where a pane is; render shows
+            the rendered scene without its panes.
+    """
+
+    run_directory: tyro.conf.Positional[Path]
+    output: Path
+    split: Split = "all"
+    source: Literal["photo", "render"] = "photo"
+
+    def run(self, console: Console) -> None:
+        """Writes the images."""
+        stored = open_run(self.run_directory)
+        renderer = planar_renderer(stored)
+        views = chosen_views(stored.dataset, self.split)
+        paths = picture_paths([view.name for view in views])
+        if claim_folder(self.output, "dereflect", self.run_directory):
+            console.print(f"replacing the images of an earlier run of this command in {self.output}")
+        for warning in mirror_warnings(stored):
+            console.print(f"[yellow]warning:[/yellow] {warning}")
+        for view in track(views, "taking reflections off", console=console):
+            write_image(self.output / paths[view.name], self._image(stored, renderer, view))
+        console.print(f"{len(views)} images without reflections -> {self.output}")
+
+    def _image(self, stored: StoredRun, renderer: Planar, view: View) -> Tensor:
+        frame, _ = timed_render(renderer, stored.scene, view)
+        if self.source == "render":
+            return quantized(frame.layers["transmission"])
+        # Not `view.photo`, which stays in memory: a capture may be larger than that.
+        return dereflected_photo(frame, view.read_photo(), renderer.blend)
+
+
+def planar_renderer(stored: StoredRun) -> Planar:
+    """The renderer of a run that has reflections to take off.
+
+    Raises:
+        InputError: it has none.
+    """
+    renderer = stored.renderer
+    if isinstance(renderer, Planar) and len(stored.scene.planes):
+        return renderer
+    raise InputError(
+        f"{stored.directory.path} is a {stored.recipe.method} run without panes, so it knows no reflection; train one "
+        f"that does, with pane masks: glassplat train planar --data {stored.directory.settings().data} --output RUN"
+    )
+
+
+def mirror_warnings(stored: StoredRun) -> list[str]:
+    """What to expect of panes that transmit nothing."""
+    return [
+        f"pane {label} is a mirror, and nothing is seen through it; without its reflection it shows what the scene "
+        "happens to hold behind it"
+        for label in stored.scene.planes.mirrors
+    ]

@@ -1,0 +1,64 @@
+"""Options that change a scene before it is rendered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from glassplat.data.errors import InputError
+from glassplat.scene.plane_edits import as_mirrors, shifted, tilted, with_reflectance, without_glass
+from glassplat.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class SceneEdits:
+    """Changes to the panes; the run itself stays as it is. Pane labels are those of the masks.
+
+    Attributes:
+        remove_glass: no reflections at all, only what is behind the panes.
+        as_mirror: labels of panes that become perfect mirrors.
+        reflectance: pane label and its reflectance at normal incidence, 0 to 1; `--reflectance 1 0.5 2 0`.
+        tilt: pane label and two angles in degrees, about the pane's first and second side; `--tilt 1 10 0`.
+        shift: pane label and a distance along the pane's normal in world units, those of the capture's poses;
+            the normal is in results.json, and a negative distance goes the other way; `--shift 1 0.05`.
+    """
+
+    remove_glass: bool = False
+    as_mirror: tuple[int, ...] = ()
+    reflectance: dict[int, float] = field(default_factory=dict)
+    tilt: dict[int, tuple[float, float]] = field(default_factory=dict)
+    shift: dict[int, float] = field(default_factory=dict)
+
+    @property
+    def any(self) -> bool:
+        """Whether anything is to be changed."""
+        return self != SceneEdits()
+
+    def applied(self, scene: Scene) -> Scene:
+        """The edited scene.
+
+        Raises:
+            InputError: there are no panes, no pane has a label, a value is out of range, or edits contradict.
+        """
+        if not self.any:
+            return scene
+        self._check(scene)
+        try:
+            for label, reflectance in self.reflectance.items():
+                scene = with_reflectance(scene, label, reflectance)
+            for label, angles in self.tilt.items():
+                scene = tilted(scene, label, *angles)
+            for label, distance in self.shift.items():
+                scene = shifted(scene, label, distance)
+            scene = as_mirrors(scene, self.as_mirror)
+        except ValueError as error:
+            raise InputError(str(error)) from error
+        return without_glass(scene) if self.remove_glass else scene
+
+    def _check(self, scene: Scene) -> None:
+        if not len(scene.planes):
+            raise InputError("the run has no panes to edit; train it with `glassplat train planar` and pane masks")
+        if self.remove_glass and self != SceneEdits(remove_glass=True):
+            raise InputError("--remove-glass leaves no pane to edit; give it without the other edits")
+        twice = sorted(set(self.as_mirror) & set(self.reflectance))
+        if twice:
+            raise InputError(f"panes {twice} have a --reflectance and are --as-mirror; give one of the two")

@@ -1,0 +1,101 @@
+"""What a frame's layers make of its pane: a photograph without the reflection, and the pane as a mirror."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from glassplat.kernels.reference.color_space import linear_from_srgb, srgb_from_linear
+from glassplat.render.frame import Frame
+from glassplat.render.planar import Blend
+
+TRUSTED_STRENGTH, DISTRUSTED_STRENGTH = 0.35, 0.65
+"""Between these shares of reflected light, the photograph gives way to the rendered transmission."""
+CLIPPING_BEGINS = 0.96
+"""From this sRGB value on, a photograph's brightest channel says less and less about the light."""
+FAINT_LIGHT, PLAIN_LIGHT = 0.01, 0.05
+"""Reflected light, of 1, that a clipped pixel may hide without harm, and that it may not."""
+TRUSTED_PART, DISTRUSTED_PART = 0.3, 0.8
+"""Between these parts of the photographed light, taking the reflection off leaves less and less that is certain."""
+TRUST_WINDOW = 5
+"""Pixels over which trust is averaged, so that noise does not switch it from pixel to pixel."""
+DARKEST = 1e-3
+
+
+def dereflected_photo(frame: Frame, photo: Tensor, blend: Blend) -> Tensor:
+    """The photograph [H, W, 3] uint8 with the reflection taken off where the frame shows a pane.
+
+    Solves Eq. 1, C = (1 - R) C_t + R C_r, for C_t from the photographed C and the rendered R and C_r, so
+    that detail the scene does not hold survives. The rendered C_t takes over smoothly where most of the
+    light is reflected, and where the photograph is clipped and the reflection can be seen; there, the
+    difference would show the errors of the rendered reflection instead. Pixels without a pane are the
+    photograph's, bit for bit.
+
+    Args:
+        frame: a view rendered by `planar`, with `transmission`, `reflection` and `strength`; on the CPU.
+        photo: [H, W, 3] uint8, of that view.
+        blend: the space in which the run holds Eq. 1.
+
+    Raises:
+        ValueError: photograph and frame differ in size.
+    """
+    if photo.shape != frame.rgb.shape:
+        raise ValueError(f"the photograph is {list(photo.shape)}, the frame {list(frame.rgb.shape)}; expected one size")
+    decode, encode = _curves(blend)
+    strength = frame.layers["strength"]
+    share = strength[..., None]
+    photographed = photo.to(torch.float32) / 255
+    light, reflected = decode(photographed), share * decode(frame.layers["reflection"])
+    # The trust is almost zero before this division would blow up noise.
+    solved = (light - reflected) / (1 - share).clamp(min=1 - DISTRUSTED_STRENGTH)
+    rendered = decode(frame.layers["transmission"].clamp(0, 1))
+    trust = _trust(photographed, light, reflected, strength)
+    behind = rendered + trust[..., None] * (solved - rendered)
+    pixels = torch.round(encode(behind.clamp(0, 1)).clamp(0, 1) * 255).to(torch.uint8)
+    return torch.where(share > 0, pixels, photo)
+
+
+def as_mirror_image(frame: Frame, blend: Blend) -> Tensor:
+    """The image [H, W, 3] that the frame would be if its panes reflected everything (R0 = 1), sRGB.
+
+    Costs no rendering: the reflection layer already holds what the panes mirror, at full strength.
+
+    Args:
+        frame: a view rendered by `planar`, with all its layers.
+        blend: the space in which the run holds Eq. 1.
+    """
+    decode, encode = _curves(blend)
+    layers = frame.layers
+    share = (layers["mask"] * (layers["strength"] > 0))[..., None]
+    behind, mirrored = decode(layers["transmission"]), decode(layers["reflection"])
+    return encode(behind + share * (mirrored - behind))
+
+
+def _trust(photographed: Tensor, light: Tensor, reflected: Tensor, strength: Tensor) -> Tensor:
+    """How far [H, W] the photograph is believed over the rendered transmission, in [0, 1]."""
+    overwhelmed = _smooth_step(strength, TRUSTED_STRENGTH, DISTRUSTED_STRENGTH)
+    clipped = _smooth_step(photographed.amax(-1), CLIPPING_BEGINS, 1.0)
+    visible = _smooth_step(reflected.amax(-1), FAINT_LIGHT, PLAIN_LIGHT)
+    # A small difference of two large amounts of light is mostly the error of the rendered one.
+    drowned = _smooth_step(reflected.mean(-1) / (light.mean(-1) + DARKEST), TRUSTED_PART, DISTRUSTED_PART)
+    trust = (1 - overwhelmed) * (1 - clipped * visible) * (1 - drowned)
+    return torch.nn.functional.avg_pool2d(
+        trust[None], TRUST_WINDOW, stride=1, padding=TRUST_WINDOW // 2, count_include_pad=False
+    )[0]
+
+
+def _smooth_step(values: Tensor, low: float, high: float) -> Tensor:
+    """0 up to `low`, 1 from `high` on, and a curve without kinks between."""
+    share = ((values - low) / (high - low)).clamp(0, 1)
+    return share * share * (3 - 2 * share)
+
+
+def _curves(blend: Blend) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
+    """Into the space in which light is blended, and back to sRGB."""
+    return (linear_from_srgb, srgb_from_linear) if blend == "linear" else (_unchanged, _unchanged)
+
+
+def _unchanged(color: Tensor) -> Tensor:
+    return color

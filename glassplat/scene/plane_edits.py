@@ -1,0 +1,146 @@
+"""Edits of a finished scene's panes: without the glass, as mirrors, with another reflectance, place or tilt."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.plane import Planes
+from glassplat.scene.pose import quat_product, rotation_from_quat
+from glassplat.scene.scene import Scene
+
+LARGEST_LOGIT = 50.0
+"""Its sigmoid is 1 in both precisions, and it is finite, so that the scene can still be written."""
+
+
+def without_glass(scene: Scene) -> Scene:
+    """The scene without panes: what is seen when nothing reflects."""
+    return replace(
+        scene, glass=scene.glass.select(torch.zeros(len(scene.glass), dtype=torch.bool)), planes=Planes.empty()
+    )
+
+
+def as_mirrors(scene: Scene, labels: Sequence[int]) -> Scene:
+    """The panes with these labels reflect everything, from every angle.
+
+    Raises:
+        ValueError: no pane has one of the labels.
+    """
+    for label in labels:
+        scene = with_reflectance(scene, label, 1.0)
+    mirrors = {*scene.planes.mirrors, *labels}
+    return replace(scene, planes=replace(scene.planes, mirrors=tuple(k for k in scene.planes.labels if k in mirrors)))
+
+
+def with_reflectance(scene: Scene, label: int, base_reflectance: float) -> Scene:
+    """The pane reflects this share of light at normal incidence; Schlick's law adds to it at an angle.
+
+    Raises:
+        ValueError: no pane has the label, or the reflectance is not in [0, 1].
+    """
+    if not 0 <= base_reflectance <= 1:
+        raise ValueError(f"a reflectance of {base_reflectance} for pane {label}; expected a number in [0, 1]")
+    row = row_of(scene.planes, label)
+    logits = scene.planes.logit_reflectances.clone()
+    logits[row] = torch.logit(logits.new_tensor(base_reflectance)).clamp(-LARGEST_LOGIT, LARGEST_LOGIT)
+    return replace(scene, planes=scene.planes.with_tensors({"logit_reflectances": logits}))
+
+
+def tilted(scene: Scene, label: int, about_tangent: float, about_bitangent: float) -> Scene:
+    """The pane and its glass, turned about the rectangle's middle; zero angles change no bit.
+
+    Args:
+        scene: what to edit; it is left as it is.
+        label: which pane.
+        about_tangent: degrees about the rectangle's first side, right-handed.
+        about_bitangent: degrees about its second side. Two angles together are one rotation vector.
+
+    Raises:
+        ValueError: no pane has the label, or an angle is not finite.
+    """
+    row = row_of(scene.planes, label)
+    _check_finite(label, about_tangent, about_bitangent)
+    angle = math.radians(math.hypot(about_tangent, about_bitangent))
+    if angle == 0:
+        return scene
+    tangent, bitangent = (axes[row] for axes in scene.planes.axes())
+    axis = torch.nn.functional.normalize(about_tangent * tangent + about_bitangent * bitangent, dim=0)
+    turn = torch.cat([axis.new_tensor([math.cos(angle / 2)]), math.sin(angle / 2) * axis])
+    rotation = rotation_from_quat(turn)
+    planes = scene.planes
+    turned = {name: _with_row(getattr(planes, name), row, rotation) for name in ("raw_normals", "tangents")}
+    glass, of_pane = scene.glass, glass_of_pane(scene, row)[:, None]
+    center = planes.centers[row].to(glass.means)
+    means = (glass.means - center) @ rotation.to(glass.means).T + center
+    quats = quat_product(turn.to(glass.quats).expand_as(glass.quats), glass.quats)
+    moved = {"means": torch.where(of_pane, means, glass.means), "quats": torch.where(of_pane, quats, glass.quats)}
+    return replace(scene, glass=glass.with_tensors(moved), planes=planes.with_tensors(turned))
+
+
+def shifted(scene: Scene, label: int, distance: float) -> Scene:
+    """The pane and its glass, moved along the pane's normal; zero changes no bit.
+
+    Args:
+        scene: what to edit; it is left as it is.
+        label: which pane.
+        distance: world units, positive to where the normal points.
+
+    Raises:
+        ValueError: no pane has the label, or the distance is not finite.
+    """
+    row = row_of(scene.planes, label)
+    _check_finite(label, distance)
+    if distance == 0:
+        return scene
+    step = distance * scene.planes.normals[row]
+    centers = scene.planes.centers.clone()
+    centers[row] += step
+    means = scene.glass.means
+    moved = torch.where(glass_of_pane(scene, row)[:, None], means + step.to(means), means)
+    planes = scene.planes.with_tensors({"centers": centers})
+    return replace(scene, glass=scene.glass.with_tensors({"means": moved}), planes=planes)
+
+
+def glass_of_pane(scene: Scene, row: int) -> Tensor:
+    """[N] bool: the glass Gaussians that are nearer to this pane's rectangle than to any other."""
+    distances = torch.stack([_distances(scene.planes, k, scene.glass) for k in range(len(scene.planes))])
+    return distances.argmin(dim=0) == row
+
+
+def row_of(planes: Planes, label: int) -> int:
+    """The position of the pane with a label.
+
+    Raises:
+        ValueError: there is none; lists the labels there are.
+    """
+    if label not in planes.labels:
+        there_are = f"the panes are {', '.join(map(str, sorted(planes.labels)))}" if len(planes) else "it has no panes"
+        raise ValueError(f"the scene has no pane {label}; {there_are}")
+    return planes.labels.index(label)
+
+
+def _distances(planes: Planes, row: int, glass: Gaussians) -> Tensor:
+    """[N] distance of every glass Gaussian's centre from one rectangle; world units."""
+    offsets = glass.means - planes.centers[row].to(glass.means)
+    inside = torch.zeros_like(offsets)
+    for axes, half in zip(planes.axes(), planes.half_sizes[row].tolist(), strict=True):
+        axis = axes[row].to(offsets)
+        inside = inside + (offsets @ axis).clamp(-half, half)[:, None] * axis
+    return (offsets - inside).norm(dim=1)
+
+
+def _with_row(vectors: Tensor, row: int, rotation: Tensor) -> Tensor:
+    """The vectors [K, 3] with one of them rotated."""
+    turned = vectors.clone()
+    turned[row] = rotation @ vectors[row]
+    return turned
+
+
+def _check_finite(label: int, *numbers: float) -> None:
+    if not all(math.isfinite(number) for number in numbers):
+        raise ValueError(f"pane {label} cannot be moved by {numbers}; expected finite numbers")

@@ -1,0 +1,109 @@
+"""Taking a reflection off a photograph, and making a mirror of a pane."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from glassplat.kernels.reference.color_space import linear_from_srgb, srgb_from_linear
+from glassplat.render.dereflect import as_mirror_image, dereflected_photo
+from glassplat.render.frame import Frame
+from glassplat.render.planar import Blend, Planar
+from glassplat.scene.plane_edits import as_mirrors
+from tests.render.tiny_scene import camera_at, in_single_precision, showcase
+
+SIZE = (24, 32)
+BLENDS: tuple[Blend, ...] = ("srgb", "linear")
+
+
+def uint8(image: torch.Tensor) -> torch.Tensor:
+    return torch.round(image.clamp(0, 1) * 255).to(torch.uint8)
+
+
+def mixed(behind: torch.Tensor, mirrored: torch.Tensor, share: torch.Tensor, blend: Blend) -> torch.Tensor:
+    if blend == "srgb":
+        return (1 - share) * behind + share * mirrored
+    return srgb_from_linear((1 - share) * linear_from_srgb(behind) + share * linear_from_srgb(mirrored))
+
+
+def case(strength: float, blend: Blend, reflection: float = 0.3) -> tuple[Frame, torch.Tensor, torch.Tensor]:
+    """A blurred model of a pane in the left half, a photograph, and what is really behind the pane."""
+    truth = 0.3 + 0.4 * torch.rand(*SIZE, 3)
+    layers = {
+        "transmission": truth.mean(dim=(0, 1), keepdim=True).expand(*SIZE, 3),
+        "reflection": torch.full((*SIZE, 3), reflection),
+        "strength": torch.where(torch.arange(SIZE[1]) < 16, strength, 0.0).expand(*SIZE),
+    }
+    share = layers["strength"][..., None]
+    frame = Frame(mixed(layers["transmission"], layers["reflection"], share, blend), layers)
+    return frame, uint8(mixed(truth, layers["reflection"], share, blend)), truth
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_detail_that_the_scene_does_not_hold_survives(blend: Blend) -> None:
+    frame, photo, truth = case(0.1, blend)
+    result = dereflected_photo(frame, photo, blend).float() / 255
+    torch.testing.assert_close(result, truth, rtol=0, atol=2.5 / 255)
+    assert float((photo.float() / 255 - truth).abs().max()) > 4 / 255
+
+
+def test_without_a_pane_the_photograph_stays_bit_for_bit() -> None:
+    frame, photo, _ = case(0.1, "linear")
+    result = dereflected_photo(frame, photo, "linear")
+    assert result.dtype == torch.uint8
+    assert torch.equal(result[:, 16:], photo[:, 16:])
+    assert not torch.equal(result[:, :16], photo[:, :16])
+
+
+def test_where_most_light_is_reflected_the_render_takes_over() -> None:
+    frame, photo, _ = case(0.95, "linear")
+    result = dereflected_photo(frame, photo, "linear")
+    assert torch.equal(result[:, :12], uint8(frame.layers["transmission"])[:, :12])
+
+
+def test_where_the_photograph_is_clipped_under_a_reflection_the_render_takes_over() -> None:
+    frame, photo, _ = case(0.1, "linear", reflection=1.0)
+    white = torch.full_like(photo, 255)
+    result = dereflected_photo(frame, white, "linear")
+    assert torch.equal(result[:, :12], uint8(frame.layers["transmission"])[:, :12])
+    assert torch.equal(result[:, 16:], white[:, 16:])
+
+
+def test_a_clipped_pixel_without_visible_reflection_is_kept() -> None:
+    frame, photo, _ = case(0.05, "linear", reflection=0.1)
+    result = dereflected_photo(frame, torch.full_like(photo, 255), "linear")
+    assert int(result.min()) == 255
+
+
+def test_too_bright_a_model_of_the_reflection_leaves_no_black_holes() -> None:
+    frame, photo, _ = case(0.3, "linear", reflection=0.3)
+    glaring = replace(frame, layers={**frame.layers, "reflection": torch.ones(*SIZE, 3)})
+    result = dereflected_photo(glaring, photo // 2, "linear")
+    torch.testing.assert_close(
+        result[:, :12].float(), uint8(frame.layers["transmission"])[:, :12].float(), rtol=0, atol=12
+    )
+
+
+def test_the_way_from_trust_to_distrust_has_no_steps() -> None:
+    frame, photo, _ = case(0.1, "linear")
+    rising = torch.linspace(0.01, 0.99, SIZE[1]).expand(*SIZE)
+    flat = torch.full_like(photo, 120)
+    result = dereflected_photo(replace(frame, layers={**frame.layers, "strength": rising}), flat, "linear")
+    assert int(result.int().diff(dim=1).abs().max()) < 16
+
+
+def test_a_photograph_of_another_size_is_refused() -> None:
+    frame, photo, _ = case(0.1, "linear")
+    with pytest.raises(ValueError, match="expected one size"):
+        dereflected_photo(frame, photo[1:], "linear")
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_the_mirror_made_of_layers_is_the_mirror_rendered(blend: Blend) -> None:
+    scene, camera = in_single_precision(showcase()), camera_at(0.0, 0.0, -0.2)
+    camera = replace(camera, cam_from_world=camera.cam_from_world.float())
+    renderer = Planar(blend=blend)
+    rendered = renderer(as_mirrors(scene, [1]), camera).rgb
+    torch.testing.assert_close(as_mirror_image(renderer(scene, camera), blend), rendered, rtol=1e-3, atol=1e-4)

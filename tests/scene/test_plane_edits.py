@@ -1,0 +1,153 @@
+"""Edits of panes, by what they do to the picture and to the plane."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+
+from glassplat.render.planar import Planar
+from glassplat.scene.plane import Planes
+from glassplat.scene.plane_edits import as_mirrors, glass_of_pane, shifted, tilted, with_reflectance, without_glass
+from glassplat.scene.scene import Scene
+from tests.render.tiny_scene import (
+    camera_at,
+    concatenated,
+    in_single_precision,
+    joined,
+    pane,
+    random_gaussians,
+    showcase,
+)
+
+CAMERA = camera_at(0.0, 0.0, -0.2)
+SMALL_PANE = pane(2.0, half=0.8)
+
+
+def assert_same(first: Scene, second: Scene) -> None:
+    for name, tensor in first.parameters().items():
+        assert torch.equal(tensor, second.parameters()[name]), name
+    assert torch.equal(first.planes.tangents, second.planes.tangents)
+
+
+def two_panes() -> Scene:
+    """A second pane, labelled 7, with glass of its own, far to the side."""
+    scene = showcase()
+    other = replace(SMALL_PANE, centers=SMALL_PANE.centers + torch.tensor([20.0, 0, 0]), labels=(7,))
+    glass = concatenated(scene.glass, random_gaussians(5, (20.0, 0.0, 2.0), seed=9, glass=True))
+    return replace(scene, glass=glass, planes=joined(SMALL_PANE, other))
+
+
+def test_removing_the_glass_gives_the_transmission() -> None:
+    scene = showcase()
+    frame, bare = Planar()(scene, CAMERA), Planar()(without_glass(scene), CAMERA)
+    assert float(frame.layers["strength"].max()) > 0.1
+    assert torch.equal(bare.rgb, frame.layers["transmission"])
+    assert float(bare.layers["strength"].max()) == float(bare.layers["mask"].max()) == 0
+
+
+def test_a_mirror_hides_what_is_behind_it() -> None:
+    scene = as_mirrors(showcase(), [1])
+    assert scene.planes.mirrors == (1,)
+    assert scene.planes.base_reflectances.tolist() == [1.0]
+    assert as_mirrors(in_single_precision(showcase()), [1]).planes.base_reflectances.tolist() == [1.0]
+    frame = Planar(blend="srgb")(scene, CAMERA)
+    share = frame.layers["mask"][..., None]
+    torch.testing.assert_close(frame.layers["strength"], frame.layers["mask"])
+    expected = share * frame.layers["reflection"] + (1 - share) * frame.layers["transmission"]
+    torch.testing.assert_close(frame.rgb, expected)
+
+
+@pytest.mark.parametrize("reflectance", [0.0, 0.25, 1.0])
+def test_the_reflectance_is_what_was_asked_for(reflectance: float) -> None:
+    edited = with_reflectance(two_panes(), 7, reflectance)
+    assert edited.planes.base_reflectances.tolist() == pytest.approx([0.3, reflectance], abs=1e-12)
+    assert bool(torch.isfinite(edited.planes.logit_reflectances).all())
+
+
+def test_no_motion_changes_no_bit() -> None:
+    scene = showcase()
+    assert_same(tilted(scene, 1, 0.0, 0.0), scene)
+    assert_same(shifted(scene, 1, 0.0), scene)
+    assert torch.equal(Planar()(tilted(scene, 1, 0, 0), CAMERA).rgb, Planar()(scene, CAMERA).rgb)
+
+
+def test_a_quarter_turn_about_a_side_turns_the_normal_into_the_other_side() -> None:
+    scene = showcase()
+    (tangent,), (bitangent,) = scene.planes.axes()
+    (normal,) = scene.planes.normals
+    about_tangent, about_bitangent = tilted(scene, 1, 90.0, 0.0).planes, tilted(scene, 1, 0.0, 90.0).planes
+    torch.testing.assert_close(about_tangent.normals[0], -bitangent)
+    torch.testing.assert_close(about_tangent.axes()[0][0], tangent)
+    torch.testing.assert_close(about_bitangent.normals[0], tangent)
+    torch.testing.assert_close(about_bitangent.axes()[0][0], -normal)
+    torch.testing.assert_close(about_tangent.centers, scene.planes.centers)
+
+
+def test_there_and_back_is_the_identity() -> None:
+    scene = showcase()
+    back = shifted(shifted(tilted(tilted(scene, 1, 12.0, -5.0), 1, -12.0, 5.0), 1, 0.3), 1, -0.3)
+    torch.testing.assert_close(back.planes.raw_normals, scene.planes.raw_normals)
+    torch.testing.assert_close(back.glass.means, scene.glass.means)
+    before, after = Planar()(scene, CAMERA), Planar()(back, CAMERA)
+    torch.testing.assert_close(after.rgb, before.rgb, rtol=1e-6, atol=1e-8)
+
+
+def test_a_shift_goes_along_the_normal_in_world_units() -> None:
+    scene = showcase()
+    step = shifted(scene, 1, 0.25).planes.centers - scene.planes.centers
+    torch.testing.assert_close(step, 0.25 * scene.planes.normals)
+
+
+@pytest.mark.parametrize("move", [lambda s: tilted(s, 7, 30.0, 0.0), lambda s: shifted(s, 7, 0.5)])
+def test_a_pane_moves_with_its_own_glass_and_no_other(move: Callable[[Scene], Scene]) -> None:
+    scene = two_panes()
+    own = glass_of_pane(scene, 1)
+    assert own.tolist() == [False] * 12 + [True] * 5
+    edited = move(scene)
+    assert torch.equal(edited.glass.means[~own], scene.glass.means[~own])
+    assert torch.equal(edited.planes.raw_normals[0], scene.planes.raw_normals[0])
+    assert not torch.equal(edited.glass.means[own], scene.glass.means[own])
+
+    def height(planes_of: Scene) -> torch.Tensor:
+        return (planes_of.glass.means[own] - planes_of.planes.centers[1]) @ planes_of.planes.normals[1]
+
+    torch.testing.assert_close(height(edited), height(scene))
+
+
+def test_the_scene_that_is_edited_stays_as_it_is() -> None:
+    scene, untouched = showcase(), showcase()
+    for edit in (lambda: as_mirrors(scene, [1]), lambda: tilted(scene, 1, 5, 5), lambda: shifted(scene, 1, 1.0)):
+        edit()
+        assert_same(scene, untouched)
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda s: as_mirrors(s, [3]),
+        lambda s: with_reflectance(s, 3, 0.5),
+        lambda s: tilted(s, 3, 1.0, 0.0),
+        lambda s: shifted(s, 3, 1.0),
+    ],
+)
+def test_an_unknown_label_lists_those_there_are(edit: Callable[[Scene], Scene]) -> None:
+    with pytest.raises(ValueError, match="no pane 3; the panes are 1, 7"):
+        edit(two_panes())
+    with pytest.raises(ValueError, match="no pane 3; it has no panes"):
+        edit(replace(showcase(), planes=Planes.empty()))
+
+
+@pytest.mark.parametrize("reflectance", [-0.1, 1.5, float("nan")])
+def test_an_impossible_reflectance_is_refused(reflectance: float) -> None:
+    with pytest.raises(ValueError, match=r"expected a number in \[0, 1\]"):
+        with_reflectance(showcase(), 1, reflectance)
+
+
+def test_an_infinite_motion_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected finite numbers"):
+        shifted(showcase(), 1, float("inf"))
+    with pytest.raises(ValueError, match="expected finite numbers"):
+        tilted(showcase(), 1, float("nan"), 0.0)
