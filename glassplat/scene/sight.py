@@ -15,8 +15,8 @@ from glassplat.scene.plane import Planes
 def behind_panes(points: Tensor, planes: Planes, cameras: Sequence[Camera]) -> Tensor:
     """[N] bool: which points some camera sees through some pane.
 
-    A point counts if a camera on the front side of a pane (where its normal points) has the point
-    in its image and the segment from the camera's centre to the point crosses the pane's rectangle.
+    A point counts if a camera, on either side of a pane, has the point in its image and the segment from the camera's
+    centre to the point crosses the pane's rectangle.
 
     Args:
         points: [N, 3] world positions.
@@ -33,11 +33,11 @@ def behind_panes(points: Tensor, planes: Planes, cameras: Sequence[Camera]) -> T
 
 
 def crosses_pane(points: Tensor, planes: Planes, eye: Tensor) -> Tensor:
-    """[N] bool: whether the segment from `eye`, in front of a pane, to the point crosses the pane."""
+    """[N] bool: whether the segment from `eye` to the point crosses any of the panes."""
     normals = planes.normals
     eye_distance = ((eye - planes.centers) * normals).sum(-1)
     distances = points @ normals.T - (planes.centers * normals).sum(-1)
-    behind = (eye_distance > 0) & (distances < 0)
+    behind = eye_distance * distances < 0
     share = torch.where(behind, eye_distance / (eye_distance - distances), 0)
     inside = behind
     for axis, half in zip(planes.axes(), planes.half_sizes.T, strict=True):

@@ -48,9 +48,11 @@ def test_selection_follows_the_ray_through_the_rectangle(point: tuple[float, ...
     assert behind_panes(torch.tensor([point]), PANE, [FRONT]).tolist() == [selected]
 
 
-def test_cameras_behind_the_pane_select_nothing() -> None:
+def test_a_pane_is_looked_through_from_either_side() -> None:
     points = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    assert not behind_panes(points, PANE, [camera_at(2.0, backwards=True)]).any()
+    backwards = camera_at(2.0, backwards=True)
+    assert behind_panes(points, PANE, [backwards]).tolist() == [False, True]
+    assert behind_panes(points, PANE, [backwards, FRONT]).all()
 
 
 def test_points_outside_of_the_image_are_not_seen() -> None:

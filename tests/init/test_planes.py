@@ -130,6 +130,16 @@ def test_every_label_gets_its_own_pane() -> None:
     assert planes.base_reflectances.tolist() == pytest.approx([0.2, 0.99])
 
 
+def test_a_pane_photographed_all_the_way_round_is_found() -> None:
+    behind = ((0.4, 0.2, 4.6), (-0.9, -0.3, 4.2))
+    annotations = scene_of([FRONT], (*EYES, *behind))
+    assert all(bool((labels == 1).any()) for _, labels in annotations)
+    planes = fit_planes(frame_and_clutter([FRONT]), annotations, extent=EXTENT, options=QUICK)
+    assert normal_error(planes, 0, FRONT) < 0.5
+    assert offset_error(planes, 0, FRONT) < 0.01
+    assert covers(planes, 0, FRONT)
+
+
 def test_scale_and_rotation_of_the_world_change_nothing() -> None:
     points, annotations = frame_and_clutter([FRONT]), scene_of([FRONT])
     first = fit_planes(points, annotations, extent=EXTENT, options=QUICK)

@@ -14,7 +14,7 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.plane import Planes
 from glassplat.scene.pose import mirror_matrices, rotation_from_quat
 from glassplat.scene.scene import Scene
-from tests.render.tiny_scene import camera_at, in_single_precision, joined, nearest_hits, pane, showcase
+from tests.render.tiny_scene import camera_at, in_single_precision, joined, nearest_hits, pane, quat_product, showcase
 
 CAMERA = camera_at(0.0, 0.0, -0.2)
 
@@ -101,13 +101,6 @@ def moved(scene: Scene, camera: Camera, turn: torch.Tensor, shift: torch.Tensor)
     )
     pose = camera.cam_from_world @ torch.linalg.inv(motion)
     return replace(scene, **parts, planes=planes), replace(camera, cam_from_world=pose)
-
-
-def quat_product(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-    w, v = left[0], left[1:]
-    rw, rv = right[:, :1], right[:, 1:]
-    vector = w * rv + rw * v + torch.linalg.cross(v.expand_as(rv), rv)
-    return torch.cat([w * rw - (rv * v).sum(-1, keepdim=True), vector], dim=1)
 
 
 def test_mirroring_twice_is_the_identity() -> None:

@@ -82,3 +82,11 @@ def nearest_hits(planes: Planes, camera: Camera) -> Tensor:
     """[K, H, W] bool: the pixels that show each pane, the nearest where panes overlap."""
     index = pane_hits(panes_in_camera(planes, camera), camera.intrinsics, camera.width, camera.height).pane
     return index == torch.arange(len(planes), dtype=torch.int32)[:, None, None]
+
+
+def quat_product(left: Tensor, right: Tensor) -> Tensor:
+    """Rotations `right` [N, 4] followed by the rotation `left` [4]."""
+    w, v = left[0], left[1:]
+    rw, rv = right[:, :1], right[:, 1:]
+    vector = w * rv + rw * v + torch.linalg.cross(v.expand_as(rv), rv)
+    return torch.cat([w * rw - (rv * v).sum(-1, keepdim=True), vector], dim=1)
