@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import statistics
+from collections.abc import Iterator
+from contextlib import contextmanager
 
+import numba
 import torch
 
 from bench.scene import bench_camera, bench_scene
@@ -90,16 +93,40 @@ def method_costs() -> Table:
 
 
 def scaling() -> Table:
-    """Frame time over Gaussians, pixels, panes."""
-    table = Table("Scaling of a frame, two threads", ("what", "Gaussians", "pixels", "panes", "ms", "frames/s"))
+    """Frame time over Gaussians, pixels, panes and threads."""
+    everything = numba.config.NUMBA_NUM_THREADS
+    table = Table("Scaling of a frame", ("what", "Gaussians", "pixels", "panes", "threads", "ms", "frames/s"))
     cases = [
-        *(("Gaussians", count, (480, 360), 0) for count in (10_000, 100_000, 1_000_000)),
-        *(("pixels", COUNT, size, 0) for size in ((240, 180), (480, 360), (960, 720))),
-        *(("panes over half of the image", COUNT, (480, 360), number) for number in (1, 2, 4, 8)),
+        *(("Gaussians", count, (480, 360), 0, everything) for count in (10_000, 100_000, 1_000_000)),
+        *(("pixels", COUNT, size, 0, everything) for size in ((240, 180), (480, 360), (960, 720))),
+        *(("panes over half of the image", COUNT, (480, 360), number, everything) for number in (1, 2, 4, 8)),
+        *(("threads", COUNT, (480, 360), 1, threads) for threads in doublings(everything)),
     ]
-    for what, count, (width, height), number in cases:
+    for what, count, (width, height), panes, threads in cases:
         camera = bench_camera(width, height)
-        scene = bench_scene(count, number, 0.5, camera)
-        seconds = median_seconds(frame_work(scene, Planar() if number else Splat(depth=False), camera))
-        table.add(what, f"{count:,}", f"{width}x{height}", number, 1e3 * seconds, 1 / seconds)
+        scene = bench_scene(count, panes, 0.5, camera)
+        with thread_count(threads):
+            seconds = median_seconds(frame_work(scene, Planar() if panes else Splat(depth=False), camera))
+        table.add(what, f"{count:,}", f"{width}x{height}", panes, threads, 1e3 * seconds, 1 / seconds)
     return table
+
+
+def doublings(most: int) -> list[int]:
+    """1, 2, 4, ... and `most`."""
+    counts = [1]
+    while 2 * counts[-1] < most:
+        counts.append(2 * counts[-1])
+    return [*counts, most] if most > 1 else counts
+
+
+@contextmanager
+def thread_count(threads: int) -> Iterator[None]:
+    """Runs kernels and PyTorch on so many threads."""
+    before = numba.get_num_threads(), torch.get_num_threads()
+    numba.set_num_threads(threads)
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before[0])
+        torch.set_num_threads(before[1])
