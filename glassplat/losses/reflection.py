@@ -5,17 +5,9 @@ from __future__ import annotations
 from torch import Tensor
 
 from glassplat.data.dataset import View
+from glassplat.kernels.gradient_conflict import gradient_conflict as shared_edges
 from glassplat.render.frame import Frame
 from glassplat.scene.scene import Scene
-
-
-def sobel(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Horizontal and vertical Sobel derivatives [H-2, W-2, C] of an image [H, W, C], borders left out."""
-    across = image[:, 2:] - image[:, :-2]
-    down = image[2:] - image[:-2]
-    horizontal = across[:-2] + 2 * across[1:-1] + across[2:]
-    vertical = down[:, :-2] + 2 * down[:, 1:-1] + down[:, 2:]
-    return horizontal, vertical
 
 
 def gradient_conflict(frame: Frame, view: View, scene: Scene) -> Tensor:
@@ -24,10 +16,8 @@ def gradient_conflict(frame: Frame, view: View, scene: Scene) -> Tensor:
     The image mean of H |grad C_t . sg(grad C_r)|, per colour channel: an edge of the reflection should
     not appear in the transmission. No gradient reaches the reflection.
     """
-    transmission = sobel(frame.layers["transmission"])
-    reflection = sobel(frame.layers["reflection"].detach())
-    product = transmission[0] * reflection[0] + transmission[1] * reflection[1]
-    return (product.abs() * frame.layers["hit"][1:-1, 1:-1, None]).mean()
+    layers = frame.layers
+    return shared_edges(layers["transmission"], layers["reflection"], layers["hit"])
 
 
 def mask_loss(frame: Frame, view: View, scene: Scene) -> Tensor | None:

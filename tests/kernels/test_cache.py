@@ -69,8 +69,12 @@ import torch
 
 from glassplat.kernels.adam import adam
 from glassplat.kernels.bin_tiles import bin_tiles
+from glassplat.kernels.blend_panes import blend_panes
 from glassplat.kernels.composite import composite
 from glassplat.kernels.cpu.jit import Kernel
+from glassplat.kernels.gradient_conflict import gradient_conflict
+from glassplat.kernels.pane_hits import pane_hits
+from glassplat.kernels.panes import Panes
 from glassplat.kernels.project import project
 from glassplat.kernels.splats import CameraBatch, Deviation, RawGaussians, Splats
 from glassplat.kernels.ssim import ssim
@@ -83,7 +87,14 @@ projected = project(raw, cameras, sh_degree=0, near=0.01)
 splats = Splats(projected.means2d, projected.conics, projected.opacities, projected.depths, projected.radii)
 bins = bin_tiles(splats, 20, 16)
 result = composite(splats, projected.colors, bins, deviation=Deviation(0, torch.ones(1, 16, 20)))
-loss = ssim(result.image[0], torch.zeros(16, 20, 3)) + result.deviation.sum()
+intrinsics = cameras.intrinsics[0]
+normal = torch.tensor([[0.0, 0.0, 1.0]])
+panes = Panes(2 * normal, normal, torch.eye(3)[None, :2].contiguous(), torch.ones(1, 2))
+pane = pane_hits(panes, intrinsics, 20, 16).pane
+reflections = torch.ones(1, 16, 20, 4)
+blended = blend_panes(result.image[0], result.alpha[0], reflections, pane, normal, torch.ones(1), intrinsics)
+loss = ssim(blended.rgb, torch.zeros(16, 20, 3)) + result.deviation.sum()
+loss = loss + gradient_conflict(result.image[0], blended.reflection, result.alpha[0])
 loss.backward()
 adam(means, raw.means.grad, torch.zeros(2, 3), torch.zeros(2, 3), lr=1e-3, step=1)
 
