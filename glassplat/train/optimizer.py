@@ -36,10 +36,6 @@ class Rate:
             return self.start * scale
         return float(self.start ** (1 - progress) * self.end**progress * scale)
 
-    def scaled(self, factor: float) -> Rate:
-        """The same schedule times a factor."""
-        return Rate(self.start * factor, None if self.end is None else self.end * factor, self.per_extent, self.rest)
-
 
 @dataclass
 class Optimizer:

@@ -42,5 +42,4 @@ def test_a_rate_decays_exponentially_and_scales_with_the_extent() -> None:
     assert rate.at(0.0, 5.0) == pytest.approx(5e-2)
     assert rate.at(0.5, 5.0) == pytest.approx(5e-3)
     assert rate.at(1.0, 5.0) == pytest.approx(5e-4)
-    assert rate.scaled(0.1).at(0.0, 5.0) == pytest.approx(5e-3)
     assert Rate(1e-3).at(0.7, 5.0) == 1e-3
