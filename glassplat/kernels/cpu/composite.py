@@ -268,13 +268,16 @@ def _forward(real: type) -> Kernel:
             batch = np.empty((BATCH, packed.shape[1]), real)
             start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
             for first in range(start, stop, BATCH):
-                if is_finished(scratch):
+                finished, glass_finished = is_finished(scratch)
+                if finished:
                     break
                 last = min(first + BATCH, stop)
                 fetch(batch, packed, pair_splats, first, last)
                 for p in range(first, last):
                     order, splat = real(np.int32(p - start)), batch[p - first]
                     glass = pair_splats[p] - camera * splats_per_camera - num_primary
+                    if glass >= 0 and glass_finished:
+                        continue
                     top, bottom = cover(scratch, splat, x0, y0, rows)
                     if glass < 0:
                         blend_primary(scratch, splat, order, top, bottom)

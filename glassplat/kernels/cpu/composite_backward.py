@@ -197,7 +197,14 @@ def composite_backward(real: type) -> Kernel:
     dot_deviation, sum_deviation = _deviation(real)
     load_deviation = _load_deviation(real)
     zero = real(0.0)
-    T, PLANE, VALUES, V_VALUES, BATCH = tile.T, tile.PLANE, tile.VALUES, tile.V_VALUES, tile.BATCH
+    T, LAST_GLASS, PLANE, VALUES, V_VALUES, BATCH = (
+        tile.T,
+        tile.LAST_GLASS,
+        tile.PLANE,
+        tile.VALUES,
+        tile.V_VALUES,
+        tile.BATCH,
+    )
 
     @inlined
     def load_gradients(scratch, v_image, v_alpha, v_mask, camera, x0, y0, columns, rows):
@@ -213,6 +220,14 @@ def composite_backward(real: type) -> Kernel:
                 for x in range(image_row.shape[0]):
                     scratch[V_IMAGE + (d & 31) * PLANE + base + x] = image_row[x, d]
 
+    @inlined
+    def last_glass_of(scratch):
+        """Position of the last glass splat that any pixel of the tile looked at."""
+        last = scratch[LAST_GLASS]
+        for i in range(tile.PIXELS):
+            last = max(last, scratch[LAST_GLASS + i])
+        return last
+
     @kernel("composite_backward", real)
     def backward(
         marks, splats_per_camera, num_primary, num_channels, channel, through_mean,
@@ -226,6 +241,7 @@ def composite_backward(real: type) -> Kernel:
             scratch = np.empty(V_IMAGE + groups * 4 * PLANE, real)
             scratch[:] = zero
             looked_at = load_state(state, n, scratch)
+            last_glass = last_glass_of(scratch)
             load_gradients(scratch, v_image, v_alpha, v_mask, camera, x0, y0, columns, rows)
             deviates = channel >= 0
             if deviates:
@@ -243,7 +259,9 @@ def composite_backward(real: type) -> Kernel:
                     p = last - 1 - k
                     order, splat = real(np.int32(p - start)), batch[p - first]
                     glass = pair_splats[p] - camera * splats_per_camera - num_primary
-                    top, bottom = cover(scratch, splat, x0, y0, rows)
+                    top, bottom = 0, 0
+                    if glass < 0 or order <= last_glass:
+                        top, bottom = cover(scratch, splat, x0, y0, rows)
                     if top >= bottom:
                         out[p, :] = zero
                         continue

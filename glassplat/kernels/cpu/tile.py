@@ -50,7 +50,7 @@ class TileFunctions(NamedTuple):
         pack: copies one splat's geometry into its packed row.
         place: camera, first column, first row, columns and rows of a tile.
         begin: fresh transmittances; pixels beyond the image's edge start as stopped.
-        is_finished: whether every pixel has stopped.
+        is_finished: whether every pixel has stopped, for all splats and for glass.
         save_state, load_state: the planes that the backward pass starts from.
         fetch: copies the packed splats of consecutive pairs next to each other.
         cover: fills COVERAGE; first and one-past-last row that the splat reaches. A loop of its own, because the
@@ -140,11 +140,13 @@ def _is_finished(real: type) -> Scalar:
 
     @inlined
     def is_finished(scratch):
-        left = zero
+        left, left_for_glass = zero, zero
         for i in range(PIXELS):
-            t = scratch[T + i]
-            left += t if t > zero else zero
-        return left == zero
+            t, t_glass = scratch[T + i], scratch[T_GLASS + i]
+            t = t if t > zero else zero
+            left += t
+            left_for_glass += t if t_glass > zero else zero
+        return left == zero, left_for_glass == zero
 
     return is_finished
 
