@@ -6,21 +6,53 @@ a Gaussian's memory, and a loop that only fetches them lets the processor wait f
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
 import numpy as np
+import torch
 from numba import prange
+from torch import Tensor
 
 from glassplat.kernels.cpu.gaussian_view import CHUNK, view_steps
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
+from glassplat.kernels.cpu.project_backward import project_backward
 from glassplat.kernels.cpu.schedule import even_stride
 from glassplat.kernels.maths import screen_maths, shape_maths, vector_maths
 from glassplat.kernels.maths_sh import color_maths
+from glassplat.kernels.tensor_checks import REAL_OF
 
 
-def _placing(real: type) -> Callable[..., Any]:
+def project(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, near: float) -> tuple[Tensor, ...]:
+    """Fields of `Projected` from raw Gaussians, poses, intrinsics, clip planes and windows; degree -1 is no colour."""
+    means, cam_from_world = inputs[0], inputs[5]
+    real, leading = REAL_OF[means.dtype], (cam_from_world.shape[0], means.shape[0])
+    outputs = tuple(means.new_empty(*leading, *rest) for rest in ((2,), (3,), (), (), (3,), (2,)))
+    project_forward(real)(
+        *(tensor.numpy() for tensor in inputs), real(width), real(height), degree, real(near),
+        *(tensor.numpy() for tensor in outputs),
+    )  # fmt: skip
+    return outputs
+
+
+def project_gradients(
+    inputs: Sequence[Tensor], width: int, height: int, degree: int,
+    *, seen: tuple[Tensor, Tensor], cotangents: Sequence[Tensor], needs_camera: bool,
+) -> tuple[list[Tensor], Tensor]:  # fmt: skip
+    """Gradients of raw Gaussians and of each camera [C, 12]; `seen` are the radii and conics of the forward pass."""
+    real = REAL_OF[inputs[0].dtype]
+    found = [torch.empty_like(tensor) for tensor in inputs[:5]]
+    cameras = torch.zeros(inputs[5].shape[0], 12, dtype=torch.float64)
+    project_backward(real)(
+        *(tensor.numpy() for tensor in inputs), real(width), real(height), degree,
+        *(tensor.numpy() for tensor in (*seen, *cotangents)), needs_camera,
+        *(tensor.numpy() for tensor in (*found, cameras)),
+    )  # fmt: skip
+    return found, cameras
+
+
+def placing(real: type) -> Callable[..., Any]:
     """One Gaussian in one camera: fills everything but the colour, where it is visible."""
     _, pose, _, view, *_ = view_steps(real)
     dot = vector_maths().dot
@@ -54,7 +86,8 @@ def _placing(real: type) -> Callable[..., Any]:
     return place
 
 
-def _culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Writing zeros for one Gaussian in one camera, and whether it is before the camera and the clip plane."""
     vec3, *_ = view_steps(real)
     dot = vector_maths().dot
     zero = real(0.0)
@@ -80,8 +113,8 @@ def _culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
 def project_forward(real: type) -> Kernel:
     """Fills means2d, conics, depths, opacities, colors and radii; zeros where a Gaussian is culled."""
     vec3, _, shape, _, fill_lenses, direction = view_steps(real)
-    cull, in_front = _culling(real)
-    place = _placing(real)
+    cull, in_front = culling(real)
+    place = placing(real)
     is_finite = shape_maths(real).is_finite
     color = color_maths(real).color
     zero, half = real(0.0), real(0.5)

@@ -52,11 +52,11 @@ def ssim(image: Tensor, target: Tensor, *, with_slopes: bool) -> tuple[Tensor, T
     return image.new_tensor(sums.sum() / image.numel()), similarity, slopes
 
 
-def ssim_gradient(image: Tensor, target: Tensor, slopes: Tensor, v_mean: float) -> Tensor:
+def ssim_gradient(image: Tensor, target: Tensor, slopes: Tensor, v_mean: Tensor) -> Tensor:
     """Gradient of the mean similarity with respect to the image, times `v_mean`."""
     real = _real_of(image)
     v_image = torch.empty_like(image)
-    _backward(real)(_rows(image), _rows(target), _planes(slopes), real(v_mean / image.numel()), _rows(v_image))
+    _backward(real)(_rows(image), _rows(target), _planes(slopes), real(v_mean.item() / image.numel()), _rows(v_image))
     return v_image
 
 
