@@ -65,7 +65,7 @@ def chosen_device(name: DeviceName) -> torch.device:
 def cuda_problem() -> str | None:
     """Why no GPU can be used, with the remedy; None where one can."""
     if torch.version.cuda is None:
-        return "PyTorch is a build without CUDA; install one with CUDA (https://pytorch.org/get-started) or use --device cpu"
+        return "PyTorch is built without CUDA; install another build (https://pytorch.org) or use --device cpu"
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         available = torch.cuda.is_available()

@@ -47,8 +47,16 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
     )
     tiles = num_cameras * rows * columns
     active = torch.arange(tiles) if active_tiles is None else active_tiles.flatten().nonzero()[:, 0]
-    lists = (torch.from_numpy(array) for array in (pair_splats, tile_offsets, pair_slots, splat_offsets))
-    return TileBins(*lists, active.to(torch.int32), width, height, num_cameras)
+    return TileBins(
+        pair_splats=torch.from_numpy(pair_splats),
+        tile_offsets=torch.from_numpy(tile_offsets),
+        pair_slots=torch.from_numpy(pair_slots),
+        splat_offsets=torch.from_numpy(splat_offsets),
+        active=active.to(torch.int32),
+        width=width,
+        height=height,
+        num_cameras=num_cameras,
+    )
 
 
 @cache

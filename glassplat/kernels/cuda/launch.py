@@ -41,13 +41,18 @@ class Kernel:
         name: the operation and direction, such as `composite_forward_float32`.
         function: the kernel before compilation.
         signature: the Numba types of its arguments.
+        bounds: threads of a block, and how many blocks a multiprocessor should hold at once; caps the registers.
     """
 
-    def __init__(self, function: Callable[..., None], name: str, signature: tuple[Any, ...]) -> None:
+    def __init__(
+        self, function: Callable[..., None], name: str, signature: tuple[Any, ...], bounds: tuple[int, int] | None
+    ) -> None:
         self.name = name
         self.function = function
         self.signature = signature
-        self.dispatcher = cuda.jit(function)
+        self.bounds = bounds
+        # The simulator knows no bounds.
+        self.dispatcher = cuda.jit(function) if SIMULATED else cuda.jit(function, launch_bounds=bounds)
 
     def __call__(self, blocks: int, threads: int, *arguments: Any) -> None:
         """Launches on torch's current stream of the device of the first tensor; does nothing for no blocks.
@@ -81,7 +86,9 @@ class Kernel:
         log.info("compiled %s in %.1f s", self.name, time.perf_counter() - started)
 
 
-def kernel(name: str, real: type, arguments: str) -> Callable[[Callable[..., None]], Kernel]:
+def kernel(
+    name: str, real: type, arguments: str, *, bounds: tuple[int, int] | None = None
+) -> Callable[[Callable[..., None]], Kernel]:
     """Declares a kernel function made by a factory for one floating-point type.
 
     Args:
@@ -89,13 +96,14 @@ def kernel(name: str, real: type, arguments: str) -> Callable[[Callable[..., Non
         real: `np.float32` or `np.float64`.
         arguments: the type of each argument: `bool`, `short`, `int`, `long`, `float`, `double` or `real`, with a digit
             for a C-contiguous array of so many dimensions: `"real2 int1 real"`.
+        bounds: threads of a block, and how many blocks a multiprocessor should hold at once.
     """
     full_name = f"{name}_{np.dtype(real).name}"
 
     def decorate(function: Callable[..., None]) -> Kernel:
         function.__name__ = full_name
         function.__qualname__ = full_name
-        return Kernel(function, full_name, tuple(_numba_type(token, real) for token in arguments.split()))
+        return Kernel(function, full_name, tuple(_numba_type(token, real) for token in arguments.split()), bounds)
 
     return decorate
 
