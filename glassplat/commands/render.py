@@ -16,6 +16,7 @@ from glassplat.commands.stored_run import open_run
 from glassplat.data.errors import InputError
 from glassplat.evaluate.colormap import depth_colors
 from glassplat.files.images import write_image
+from glassplat.kernels.devices import DeviceName
 from glassplat.render.frame import Frame
 
 Layer = Literal["rgb", "transmission", "reflection", "strength", "mask", "depth", "alpha"]
@@ -30,16 +31,18 @@ class Render:
         output: where the images go, one folder per layer.
         layers: which layers.
         split: which cameras.
+        device: where to render; auto takes an NVIDIA GPU where one can be used.
     """
 
     run_directory: tyro.conf.Positional[Path]
     output: Path
     layers: tuple[Layer, ...] = ("rgb",)
     split: Literal["train", "test"] = "test"
+    device: DeviceName = "auto"
 
     def run(self, console: Console) -> None:
         """Renders."""
-        stored = open_run(self.run_directory)
+        stored = open_run(self.run_directory, self.device)
         views = stored.dataset.train if self.split == "train" else stored.dataset.test
         for view in track(views, "rendering", console=console):
             with torch.no_grad():
