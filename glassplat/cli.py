@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from typing import Annotated
 
+import torch
 import tyro
 from rich.console import Console
 from rich.logging import RichHandler
@@ -19,6 +20,7 @@ from glassplat.commands.render import Render
 from glassplat.commands.train import Train
 from glassplat.data.errors import InputError
 from glassplat.init.planes import PlaneFitError
+from glassplat.kernels.devices import CudaUnavailableError
 from glassplat.train.trainer import TrainingDivergedError
 
 Command = (
@@ -29,7 +31,14 @@ Command = (
     | Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
-INPUT_ERRORS = (InputError, PlaneFitError, FileNotFoundError, NotADirectoryError, PermissionError)
+INPUT_ERRORS = (
+    InputError,
+    PlaneFitError,
+    CudaUnavailableError,
+    FileNotFoundError,
+    NotADirectoryError,
+    PermissionError,
+)
 GOES_ON = "interrupted; everything saved so far is intact: train --resume, or the same demo or bench command, goes on"
 INPUT_ERROR_CODE, FAILURE_CODE, INTERRUPTED_CODE = 2, 1, 130
 
@@ -59,6 +68,11 @@ def guarded(command: Train | Evaluate | Render | Dereflect | Demo | Bench, conso
         return INPUT_ERROR_CODE
     except (TrainingDivergedError, OSError) as error:
         Console(stderr=True).print(f"[red]stopped:[/red] {error}", highlight=False)
+        return FAILURE_CODE
+    except torch.OutOfMemoryError as error:
+        reason = str(error).split(". ")[0]
+        remedy = "pass a larger --downscale, cap the Gaussians, or use --device cpu; the last checkpoint stays"
+        Console(stderr=True).print(f"[red]stopped:[/red] {reason}; {remedy}", highlight=False)
         return FAILURE_CODE
     except KeyboardInterrupt:
         Console(stderr=True).print(GOES_ON, highlight=False)

@@ -10,6 +10,7 @@ from rich.console import Console
 from glassplat.commands.evaluate import evaluate_run, results_table
 from glassplat.commands.stored_run import open_run
 from glassplat.commands.train import Train
+from glassplat.kernels.devices import DeviceName
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.run_directory import RunDirectory
 from glassplat.train.splat_recipe import SplatRecipe
@@ -25,11 +26,13 @@ class Demo:
         output: where the two runs go.
         iterations: length of each run.
         seed: fixes every random choice.
+        device: where to train; auto takes an NVIDIA GPU where one can be used.
     """
 
     output: Path = Path("runs/demo")
     iterations: int = 1500
     seed: int = 0
+    device: DeviceName = "auto"
 
     def run(self, console: Console) -> None:
         """Trains both methods, evaluates them and says where the pictures are."""
@@ -37,7 +40,8 @@ class Demo:
         for recipe in (PlanarRecipe(), SplatRecipe()):
             folder = self.output / recipe.method
             begun = RunDirectory(folder).checkpoint.is_file()
-            Train(recipe, SCENE, folder, iterations=self.iterations, seed=self.seed, resume=begun).run(console)
-            results.append(evaluate_run(open_run(folder)))
+            run = Train(recipe, SCENE, folder, self.iterations, seed=self.seed, device=self.device, resume=begun)
+            run.run(console)
+            results.append(evaluate_run(open_run(folder, self.device)))
         console.print(results_table(*results))
         console.print(f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")

@@ -13,6 +13,7 @@ from rich.table import Table
 from glassplat.commands.stored_run import StoredRun, open_run
 from glassplat.evaluate.evaluate import Evaluation, evaluate
 from glassplat.evaluate.report import Report
+from glassplat.kernels.devices import DeviceName
 from glassplat.render.planar import Planar
 from glassplat.train.checkpoint import recorded_seconds
 from glassplat.train.run_directory import write_text
@@ -34,14 +35,16 @@ class Evaluate:
     """Measure a run on its test views and write comparison sheets.
 
     Attributes:
-        run: the run's directory.
+        run_directory: the run's directory.
+        device: where to render; auto takes an NVIDIA GPU where one can be used.
     """
 
     run_directory: tyro.conf.Positional[Path]
+    device: DeviceName = "auto"
 
     def run(self, console: Console) -> None:
         """Evaluates and reports."""
-        stored = open_run(self.run_directory)
+        stored = open_run(self.run_directory, self.device)
         with console.status(f"rendering {len(stored.dataset.test)} test views"):
             results = evaluate_run(stored)
         console.print(results_table(results))

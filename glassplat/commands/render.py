@@ -18,6 +18,7 @@ from glassplat.data.errors import InputError
 from glassplat.evaluate.colormap import depth_colors
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.files.images import write_image
+from glassplat.kernels.devices import DeviceName
 from glassplat.render.frame import Frame
 
 Layer = Literal["rgb", "transmission", "reflection", "strength", "mask", "depth", "alpha"]
@@ -33,6 +34,7 @@ class Render:
         layers: which layers.
         split: which cameras.
         edits: changes to the panes.
+        device: where to render; auto takes an NVIDIA GPU where one can be used.
     """
 
     run_directory: tyro.conf.Positional[Path]
@@ -40,10 +42,11 @@ class Render:
     layers: tuple[Layer, ...] = ("rgb",)
     split: Split = "test"
     edits: Annotated[SceneEdits, tyro.conf.arg(name="")] = field(default_factory=SceneEdits)
+    device: DeviceName = "auto"
 
     def run(self, console: Console) -> None:
         """Renders."""
-        stored = open_run(self.run_directory)
+        stored = open_run(self.run_directory, self.device)
         scene = self.edits.applied(stored.scene)
         views = chosen_views(stored.dataset, self.split)
         paths = picture_paths([view.name for view in views])

@@ -7,6 +7,7 @@ from typing import Any, Literal, NamedTuple
 
 from glassplat.data.dataset import Dataset, View, load_dataset
 from glassplat.data.errors import InputError
+from glassplat.kernels.devices import DeviceName, chosen_device
 from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
 from glassplat.train.run_directory import RunDirectory
@@ -25,16 +26,22 @@ class StoredRun(NamedTuple):
     iterations: int
 
 
-def open_run(path: Path) -> StoredRun:
+def open_run(path: Path, device: DeviceName = "auto") -> StoredRun:
     """Opens the run in a directory, with the capture it was trained on.
 
+    Args:
+        path: the run's directory.
+        device: where to render.
+
     Raises:
+        CudaUnavailableError: the GPU was asked for and cannot be used.
         InputError: the directory holds no finished run.
         FileNotFoundError: the capture is no longer where it was.
     """
     directory = RunDirectory(path)
     recipe, settings = directory.recipe(), directory.settings()
     scene, iterations = directory.latest_scene()
+    scene = scene.to(chosen_device(device))
     dataset = load_dataset(Path(settings.data), downscale=settings.downscale, mask_polarity=settings.mask_polarity)
     return StoredRun(directory, recipe, scene, recipe.renderer(), dataset, iterations)
 

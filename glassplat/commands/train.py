@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from glassplat.data.dataset import Dataset, load_dataset
 from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
+from glassplat.kernels.devices import DeviceName, chosen_device
 from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.run import run_training
@@ -35,7 +36,7 @@ class Train:
         iterations: length of the run; every schedule stretches with it.
         downscale: shrink the photographs by this factor.
         seed: fixes every random choice.
-        device: where to train.
+        device: where to train; auto takes an NVIDIA GPU where one can be used.
         resume: go on with the run in `output`.
         mask_polarity: which value of black-and-white masks is the pane.
     """
@@ -46,7 +47,7 @@ class Train:
     iterations: int = 30_000
     downscale: float = 1.0
     seed: int = 0
-    device: Literal["cpu"] = "cpu"
+    device: DeviceName = "auto"
     resume: bool = False
     mask_polarity: Polarity = "auto"
 
@@ -68,7 +69,8 @@ class Train:
 
     def settings(self) -> RunSettings:
         """What the run's directory records beside the recipe."""
-        return RunSettings(str(self.data), self.iterations, self.downscale, self.seed, self.device, self.mask_polarity)
+        device = str(chosen_device(self.device))
+        return RunSettings(str(self.data), self.iterations, self.downscale, self.seed, device, self.mask_polarity)
 
     def resuming(self, begun: bool) -> Train:
         """The same run, going on from its checkpoint if it has begun."""

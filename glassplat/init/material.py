@@ -67,11 +67,12 @@ def mirror_labels(scene: Scene, views: Sequence[View]) -> tuple[int, ...]:
 def pane_pixels(scene: Scene, view: View) -> dict[int, tuple[Tensor, Tensor]]:
     """Mirrored and photographed colours [P, 3] of each pane's pixels in one view, by label, about their local means."""
     mirrored, coverage, _ = mirrored_image(scene, view.camera)
-    photo = view.photo.to(mirrored.dtype) / 255
+    photo = view.photo.to(mirrored.device).to(mirrored.dtype) / 255
+    labels = None if view.pane_labels is None else view.pane_labels.to(mirrored.device)
     known = coverage > LEAST_COVERAGE
     pixels = {}
     for label in scene.planes.labels:
-        region = known if view.pane_labels is None else known & (view.pane_labels == label)
+        region = known if labels is None else known & (labels == label)
         pixels[label] = (about_local_mean(mirrored, region)[region], about_local_mean(photo, region)[region])
     return pixels
 

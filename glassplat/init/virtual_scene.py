@@ -28,9 +28,9 @@ def virtual_points(points: Tensor, mirrors: Planes, cameras: Sequence[Camera]) -
         cameras: the training views.
     """
     if len(mirrors) == 0:
-        return torch.zeros(points.shape[0], dtype=torch.bool)
-    held, through = torch.zeros(points.shape[0]), torch.zeros(points.shape[0])
-    for camera in cameras:
+        return torch.zeros(points.shape[0], dtype=torch.bool, device=points.device)
+    held, through = (torch.zeros(points.shape[0], device=points.device) for _ in range(2))
+    for camera in (camera.to(points.device) for camera in cameras):
         inside = in_image(points, camera)
         held += inside
         through += inside & crosses_pane(points, mirrors, camera.center)

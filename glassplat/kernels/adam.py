@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from glassplat.kernels.cpu.adam import adam_step, repeated_rates
-from glassplat.kernels.tensor_checks import REAL_OF, check_tensors
-
-BLOCK = 4096
-"""Elements per task, about."""
+from glassplat.kernels.devices import kernels_for
+from glassplat.kernels.tensor_checks import check_tensors
 
 
 @torch.no_grad()
@@ -43,20 +39,15 @@ def adam(
     Raises:
         ValueError: shapes differ, `lr` has not one entry per column, `step` is below 1, or a tensor
             that changes in place is not contiguous.
-        TypeError: floating-point types differ or are not supported, or a tensor is not on the CPU.
+        TypeError: floating-point types differ or are not supported, or tensors are on different devices.
     """
     columns = math.prod(parameter.shape[1:])
     _check(parameter, gradient, first_moment, second_moment, lr, columns, step)
     if parameter.numel() == 0:
         return
-    real = REAL_OF[parameter.dtype]
-    rates = np.full(1, lr) if isinstance(lr, float | int) else lr.detach().numpy().astype(np.float64)
-    rates = repeated_rates((rates / (1 - betas[0] ** step)).astype(real), BLOCK)
-    second_scale = 1 / math.sqrt(1 - betas[1] ** step)
-    flat = [t.detach().reshape(-1).numpy() for t in (parameter, gradient.contiguous(), first_moment, second_moment)]
-    # 1 - 0.999 loses half of its digits in single precision, so the gains are rounded from the double.
-    decays, gains = tuple(real(b) for b in betas), tuple(real(1 - b) for b in betas)
-    adam_step(real)(*flat, rates, decays, gains, real(second_scale), real(eps))
+    flat = [t.detach().reshape(-1) for t in (parameter, gradient.contiguous(), first_moment, second_moment)]
+    corrections = 1 / (1 - betas[0] ** step), 1 / math.sqrt(1 - betas[1] ** step)
+    kernels_for("adam", parameter.device).adam(flat, lr, betas, eps, corrections=corrections)
 
 
 def _check(

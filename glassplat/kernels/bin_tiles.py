@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from glassplat.kernels.cpu.bin_tiles import TILE, depth_order, tile_pairs, tile_spans
-from glassplat.kernels.splats import Splats, TileBins
-from glassplat.kernels.tensor_checks import REAL_OF, check_tensors
-
-KEY_OF = {torch.float32: np.uint32, torch.float64: np.uint64}
-MOST_PAIRS = 2**31 - 1
+from glassplat.kernels.devices import kernels_for
+from glassplat.kernels.splats import TILE, Splats, TileBins
+from glassplat.kernels.tensor_checks import check_device, check_tensors
 
 __all__ = ["TILE", "bin_tiles", "tile_grid"]
 
@@ -36,40 +32,13 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
 
     Raises:
         ValueError: a shape or the image size is wrong, or there are more pairs than an int32 can count.
-        TypeError: tensors of different or unsupported types, or not on the CPU.
+        TypeError: tensors of different or unsupported types, or on different devices.
     """
     _check(splats, width, height, active_tiles)
-    num_cameras, per_camera = splats.depths.shape
-    (rows, columns), count = tile_grid(width, height), num_cameras * per_camera
-    real = REAL_OF[splats.depths.dtype]
-    flat = [t.detach().contiguous().numpy() for t in splats]
-    means2d, conics, opacities, depths, radii = (a.reshape(count, *a.shape[2:]) for a in flat)
-    mask = np.zeros((0, 0, 0), np.bool_) if active_tiles is None else active_tiles.contiguous().numpy()
-    spans, span_offsets, first_rows, splat_offsets = tile_spans(real)(
-        means2d, conics, opacities, radii, mask, num_cameras, width, height
-    )
-    if splat_offsets[-1] > MOST_PAIRS:
-        raise ValueError(
-            f"{splat_offsets[-1]} (tile, splat) pairs are more than the {MOST_PAIRS} that can be indexed; render fewer "
-            f"cameras at once or a smaller image"
-        )
-    keys = depths.view(KEY_OF[splats.depths.dtype])
-    order, starts = depth_order(KEY_OF[splats.depths.dtype])(keys, splat_offsets, num_cameras)
-    pair_splats, tile_offsets, pair_slots = tile_pairs()(
-        order, starts, spans, span_offsets, first_rows, splat_offsets, mask, rows, columns
-    )
-    tiles = num_cameras * rows * columns
-    active = torch.arange(tiles) if active_tiles is None else active_tiles.flatten().nonzero()[:, 0]
-    return TileBins(
-        pair_splats=torch.from_numpy(pair_splats),
-        tile_offsets=torch.from_numpy(tile_offsets),
-        pair_slots=torch.from_numpy(pair_slots),
-        splat_offsets=torch.from_numpy(splat_offsets),
-        active=active.to(torch.int32),
-        width=width,
-        height=height,
-        num_cameras=num_cameras,
-    )
+    plain = Splats(*(tensor.detach().contiguous() for tensor in splats))
+    mask = None if active_tiles is None else active_tiles.contiguous()
+    bins: TileBins = kernels_for("bin_tiles", splats.depths.device).bin_tiles(plain, width, height, mask)
+    return bins
 
 
 def _check(splats: Splats, width: int, height: int, active_tiles: Tensor | None) -> None:
@@ -82,6 +51,7 @@ def _check(splats: Splats, width: int, height: int, active_tiles: Tensor | None)
     check_tensors({name: (getattr(splats, name), leading + rest) for name, rest in trailing.items()})
     if active_tiles is None:
         return
+    check_device("active_tiles", active_tiles, "depths", splats.depths)
     expected = (leading[0], *tile_grid(width, height))
     if tuple(active_tiles.shape) != expected or active_tiles.dtype != torch.bool:
         raise ValueError(

@@ -10,7 +10,7 @@ def check_splats(splats: Splats, bins: TileBins) -> None:
     """Raises where splats and bins do not belong together, or where no kernel exists for them.
 
     Raises:
-        TypeError: the type is neither float32 nor float64, differs between tensors, or they are not on the CPU.
+        TypeError: the type is neither float32 nor float64, differs between tensors, or they are on different devices.
         ValueError: shapes disagree.
     """
     cameras, count = splats.opacities.shape

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from glassplat.kernels.cpu.blend_panes import blend_panes_backward, blend_panes_forward
+from glassplat.kernels.devices import kernels_for
 from glassplat.kernels.panes import BlendedPanes
-from glassplat.kernels.tensor_checks import REAL_OF, check_tensors
+from glassplat.kernels.tensor_checks import check_device, check_tensors
 
 
 def blend_panes(
@@ -44,8 +44,8 @@ def blend_panes(
 
     Raises:
         ValueError: shapes disagree.
-        TypeError: tensors of different or unsupported floating-point types, an pane that is not int32, or not on
-            the CPU.
+        TypeError: tensors of different or unsupported floating-point types, a pane that is not int32, or on
+            different devices.
     """
     height, width, count = *mask.shape, normals.shape[0]
     check_tensors(
@@ -60,6 +60,7 @@ def blend_panes(
     )
     if pane.dtype != torch.int32 or tuple(pane.shape) != (height, width):
         raise TypeError(f"pane is {pane.dtype} of shape {tuple(pane.shape)}; expected int32 of {(height, width)}")
+    check_device("pane", pane, "mask", mask)
     switches = (fresnel, intensity, linear)
     outputs = _BlendPanes.apply(transmission, mask, reflections, normals, base_reflectances, pane, intrinsics, switches)
     return BlendedPanes(*outputs)
@@ -70,9 +71,7 @@ class _BlendPanes(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         *tensors, switches = arguments
         tensors = [tensor.detach().contiguous() for tensor in tensors]
-        transmission, mask = tensors[:2]
-        outputs = tuple(torch.empty_like(like) for like in (transmission, transmission, mask))
-        blend_panes_forward(REAL_OF[mask.dtype])(*_arrays(tensors), *switches, *_arrays(outputs))
+        outputs: tuple[Tensor, ...] = kernels_for("blend_panes", tensors[0].device).blend_panes(tensors, switches)
         ctx.save_for_backward(*tensors)
         ctx.switches = switches
         return outputs
@@ -80,13 +79,6 @@ class _BlendPanes(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        inputs = ctx.saved_tensors
-        found = tuple(torch.zeros_like(tensor) for tensor in inputs[:5])
-        blend_panes_backward(REAL_OF[found[0].dtype])(
-            *_arrays(inputs), *ctx.switches, *_arrays(gradient.contiguous() for gradient in gradients), *_arrays(found)
-        )
-        return (*found, None, None, None)
-
-
-def _arrays(tensors: Any) -> list[Any]:
-    return [tensor.numpy() for tensor in tensors]
+        inputs, cotangents = ctx.saved_tensors, [gradient.contiguous() for gradient in gradients]
+        kernels = kernels_for("blend_panes", cotangents[0].device)
+        return (*kernels.blend_panes_gradients(inputs, ctx.switches, cotangents), None, None, None)

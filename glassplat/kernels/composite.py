@@ -9,9 +9,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.blend_inputs import check_splats, primary_count
-from glassplat.kernels.cpu import composite as cpu
-from glassplat.kernels.cpu.tile import MOST_CHANNELS
-from glassplat.kernels.splats import Deviation, Splats, TileBins
+from glassplat.kernels.devices import kernels_for
+from glassplat.kernels.splats import MOST_CHANNELS, Deviation, Splats, TileBins
 from glassplat.kernels.tensor_checks import check_tensors
 
 
@@ -58,7 +57,7 @@ def composite(
 
     Raises:
         TypeError: tensors are not all float32 or all float64.
-        ValueError: shapes disagree, glass has no marks, or the tensors are not on the CPU.
+        ValueError: shapes disagree, glass has no marks, or tensors are on different devices.
     """
     check_splats(splats, bins)
     num_primary = primary_count(num_primary, splats)
@@ -90,7 +89,7 @@ class _Composite(torch.autograd.Function):
         *tensors, bins, num_primary, deviation = arguments
         *fields, channels, marks = (tensor.detach().contiguous() for tensor in tensors)
         splats = Splats(*fields)
-        *outputs, saved = cpu.composite(
+        *outputs, saved = kernels_for("composite", channels.device).composite(
             splats, channels, bins, marks=marks, num_primary=num_primary, deviation=deviation
         )
         ctx.save_for_backward(*splats, channels, marks)
@@ -101,7 +100,8 @@ class _Composite(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *v_outputs: Tensor) -> tuple[Tensor | None, ...]:
         *fields, channels, marks = ctx.saved_tensors
-        v_means, v_conics, v_opacities, v_channels, v_marks = cpu.composite_gradients(
+        kernels = kernels_for("composite", channels.device)
+        v_means, v_conics, v_opacities, v_channels, v_marks = kernels.composite_gradients(
             Splats(*fields), channels, ctx.bins, ctx.saved, v_outputs,
             marks=marks, num_primary=ctx.num_primary, deviation=ctx.deviation,
         )  # fmt: skip

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.cpu.gradient_conflict import conflict_backward, conflict_forward
+from glassplat.kernels.reference import gradient_conflict as reference
 from glassplat.kernels.tensor_checks import REAL_OF, check_tensors
 
 
@@ -35,6 +36,9 @@ def gradient_conflict(transmission: Tensor, reflection: Tensor, hit: Tensor) -> 
     check_tensors(
         {"transmission": (transmission, shape), "reflection": (reflection, shape), "hit": (hit, (height, width))}
     )
+    if transmission.device.type != "cpu":
+        # On a GPU these few sums over an image are no bottleneck, so that there they stay PyTorch's.
+        return reference.gradient_conflict(transmission, reflection, hit)
     mean: Tensor = _GradientConflict.apply(transmission, reflection, hit)
     return mean
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from glassplat.kernels.bin_tiles import tile_grid
-from glassplat.kernels.cpu.pane_hits import pane_hits_forward
+from glassplat.kernels.devices import kernels_for
 from glassplat.kernels.panes import PaneHits, Panes
-from glassplat.kernels.tensor_checks import REAL_OF, check_tensors
+from glassplat.kernels.tensor_checks import check_tensors
 
 
 @torch.no_grad()
@@ -26,7 +25,7 @@ def pane_hits(panes: Panes, intrinsics: Tensor, width: int, height: int, mask: T
 
     Raises:
         ValueError: shapes disagree.
-        TypeError: tensors of different or unsupported floating-point types, or not on the CPU.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     count = panes.centers.shape[0]
     expected = {
@@ -39,12 +38,7 @@ def pane_hits(panes: Panes, intrinsics: Tensor, width: int, height: int, mask: T
     if mask is not None:
         expected["mask"] = (mask, (height, width))
     check_tensors(expected)
-    index = torch.empty(height, width, dtype=torch.int32)
-    tiles = torch.zeros(count, *tile_grid(width, height), dtype=torch.bool)
-    windows = panes.centers.new_zeros(count, 4)
-    visible = panes.centers.new_empty(0, 0) if mask is None else mask
-    inputs = (*panes, intrinsics, visible)
-    pane_hits_forward(REAL_OF[panes.centers.dtype])(
-        *(tensor.detach().contiguous().numpy() for tensor in inputs), index.numpy(), tiles.numpy(), windows.numpy()
-    )
-    return PaneHits(index, tiles, windows)
+    inputs = [tensor.detach().contiguous() for tensor in (*panes, intrinsics)]
+    visible = None if mask is None else mask.detach().contiguous()
+    hits: PaneHits = kernels_for("pane_hits", intrinsics.device).pane_hits(inputs, width, height, visible)
+    return hits

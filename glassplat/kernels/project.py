@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from glassplat.kernels.cpu.project import project_forward
-from glassplat.kernels.cpu.project_backward import project_backward
+from glassplat.kernels.devices import kernels_for
 from glassplat.kernels.maths_sh import MAX_DEGREE
 from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians
-from glassplat.kernels.tensor_checks import REAL_OF, check_tensors
+from glassplat.kernels.tensor_checks import check_tensors
 
 
 def project(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, near: float) -> Projected:
@@ -39,7 +37,7 @@ def project(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, ne
 
     Raises:
         ValueError: a shape, the degree or `near` is out of range.
-        TypeError: tensors of different or unsupported floating-point types, or not on the CPU.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     _check(gaussians, cameras, sh_degree, near)
     clip_planes = cameras.clip_planes
@@ -92,20 +90,13 @@ class _Project(torch.autograd.Function):
         width: int, height: int, sh_degree: int, near: float,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         inputs = (means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, clip_planes, windows)
-        tensors = [tensor.contiguous() for tensor in inputs]
-        real = REAL_OF[means.dtype]
+        tensors = [tensor.detach().contiguous() for tensor in inputs]
         degree = sh_degree if sh.shape[1] else -1
-        leading = (cam_from_world.shape[0], means.shape[0])
-        means2d, conics, depths, opacities, colors, radii = (
-            means.new_empty(*leading, *rest) for rest in ((2,), (3,), (), (), (3,), (2,))
-        )
-        outputs = (means2d, conics, depths, opacities, colors, radii)
-        project_forward(real)(
-            *(tensor.detach().numpy() for tensor in tensors),
-            real(width), real(height), degree, real(near), *(tensor.numpy() for tensor in outputs),
-        )  # fmt: skip
+        kernels = kernels_for("project", means.device)
+        outputs: tuple[Tensor, ...] = kernels.project(tensors, width, height, degree=degree, near=near)
+        conics, radii = outputs[1], outputs[5]
         ctx.save_for_backward(*tensors[:7], radii, conics)
-        ctx.size_and_degree = (real(width), real(height), degree)
+        ctx.size_and_degree = (width, height, degree)
         ctx.mark_non_differentiable(radii)
         return outputs
 
@@ -114,16 +105,12 @@ class _Project(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         *inputs, radii, conics = ctx.saved_tensors
         cotangents = [gradient.contiguous() for gradient in gradients[:5]]
-        found = [torch.empty_like(tensor) for tensor in inputs[:5]]
-        cam_from_world = inputs[5]
-        needs_camera = bool(ctx.needs_input_grad[5])
-        cameras = np.zeros((cam_from_world.shape[0], 12))
-        project_backward(REAL_OF[cam_from_world.dtype])(
-            *(tensor.detach().numpy() for tensor in inputs), *ctx.size_and_degree, radii.numpy(), conics.numpy(),
-            *(tensor.numpy() for tensor in cotangents), needs_camera, *(tensor.numpy() for tensor in found), cameras,
-        )  # fmt: skip
+        cam_from_world, needs_camera = inputs[5], bool(ctx.needs_input_grad[5])
+        found, cameras = kernels_for("project", radii.device).project_gradients(
+            inputs, *ctx.size_and_degree, seen=(radii, conics), cotangents=cotangents, needs_camera=needs_camera
+        )
         pose_gradient = None
         if needs_camera:
             pose_gradient = torch.zeros_like(cam_from_world)
-            pose_gradient[:, :3] = torch.from_numpy(cameras).reshape(-1, 3, 4)
+            pose_gradient[:, :3] = cameras.reshape(-1, 3, 4)
         return (*found, pose_gradient, None, None, None, None, None, None, None)

@@ -62,6 +62,15 @@ class Splats(NamedTuple):
     radii: Tensor
 
 
+MOST_CHANNELS = 32
+"""Channels of a splat that can be blended at once."""
+
+TILE = 16
+"""Edge of a tile in pixels."""
+
+MOST_PAIRS = 2**31 - 1
+"""(tile, splat) pairs that their index type can count."""
+
 LEAST_ALPHA = 1e-6
 """Coverage up to which a pixel holds nothing, and the mean of its channels is taken for 0."""
 
@@ -96,3 +105,12 @@ class TileBins(NamedTuple):
     width: int
     height: int
     num_cameras: int
+
+
+def check_pair_count(count: int) -> None:
+    """Raises ValueError where there are more (tile, splat) pairs than can be indexed."""
+    if count > MOST_PAIRS:
+        raise ValueError(
+            f"{count} (tile, splat) pairs are more than the {MOST_PAIRS} that can be indexed; render fewer cameras at "
+            "once or a smaller image"
+        )

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from glassplat.kernels.cpu import ssim as cpu
+from glassplat.kernels.devices import kernels_for
+from glassplat.kernels.tensor_checks import check_device
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
@@ -25,8 +26,8 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
         Scalar in [-1, 1]; 1 for equal images.
 
     Raises:
-        TypeError: a type is not supported.
-        ValueError: shapes disagree, there is no pixel, or the images are not on the CPU.
+        TypeError: a type is not supported, or the images are on different devices or one without kernels.
+        ValueError: shapes disagree, or there is no pixel.
     """
     _check_images(image, target)
     mean: Tensor = _Ssim.apply(image, _as_real(target, image))
@@ -37,7 +38,7 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     """Structural similarity of each pixel [H, W], mean over channels; arguments as `ssim`, not differentiable."""
     _check_images(image, target)
     image, target = image.detach().contiguous(), _as_real(target, image)
-    _, similarity, _ = cpu.ssim(image, target, with_slopes=False)
+    _, similarity, _ = kernels_for("ssim", image.device).ssim(image, target, with_slopes=False)
     return similarity.mean(dim=-1)
 
 
@@ -45,7 +46,8 @@ class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:
         image = image.detach().contiguous()
-        mean, _, slopes = cpu.ssim(image, target, with_slopes=ctx.needs_input_grad[0])
+        kernels = kernels_for("ssim", image.device)
+        mean, _, slopes = kernels.ssim(image, target, with_slopes=ctx.needs_input_grad[0])
         ctx.save_for_backward(image, target, slopes)
         return mean
 
@@ -53,7 +55,7 @@ class _Ssim(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, v_mean: Tensor) -> tuple[Tensor, None]:
         image, target, slopes = ctx.saved_tensors
-        return cpu.ssim_gradient(image, target, slopes, v_mean.item()), None
+        return kernels_for("ssim", image.device).ssim_gradient(image, target, slopes, v_mean), None
 
 
 def _as_real(target: Tensor, image: Tensor) -> Tensor:
@@ -69,5 +71,5 @@ def _check_images(image: Tensor, target: Tensor) -> None:
             f"got an image of {image.dtype} and a target of {target.dtype}; the image is float32 or float64, "
             "the target of the same type or uint8"
         )
-    if image.device.type != "cpu" or target.device.type != "cpu":
-        raise ValueError(f"images are on {image.device} and {target.device}, but ssim has a CPU kernel only")
+    check_device("image", image, "image", image)
+    check_device("target", target, "image", image)

@@ -1,4 +1,4 @@
-"""What every operation on the CPU asks of its tensors."""
+"""What every operation asks of its tensors."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from torch import Tensor
 
 REAL_OF = {torch.float32: np.float32, torch.float64: np.float64}
 """Floating-point types that kernels are built for."""
+DEVICES = ("cpu", "cuda")
 
 
 def check_tensors(expected: dict[str, tuple[Tensor, tuple[int, ...]]]) -> None:
-    """Raises unless all tensors have their expected shapes, one floating-point type and lie on the CPU."""
+    """Raises unless all tensors have their expected shapes, one floating-point type and one device with kernels."""
     first_name, (first, _) = next(iter(expected.items()))
     for name, (tensor, shape) in expected.items():
         if tuple(tensor.shape) != shape:
@@ -20,5 +21,14 @@ def check_tensors(expected: dict[str, tuple[Tensor, tuple[int, ...]]]) -> None:
             raise TypeError(
                 f"{name} is {tensor.dtype} and {first_name} is {first.dtype}; expected float32 or float64 throughout"
             )
-        if tensor.device.type != "cpu":
-            raise TypeError(f"{name} is on {tensor.device}, but only the CPU has kernels; move it there with .cpu()")
+        check_device(name, tensor, first_name, first)
+
+
+def check_device(name: str, tensor: Tensor, other_name: str, other: Tensor) -> None:
+    """Raises unless a tensor is where another one is, on a device that has kernels."""
+    if tensor.device.type not in DEVICES:
+        raise TypeError(
+            f"{name} is on {tensor.device}, but only the CPU and NVIDIA GPUs have kernels; move it there with .cpu()"
+        )
+    if tensor.device != other.device:
+        raise TypeError(f"{name} is on {tensor.device} and {other_name} on {other.device}; expected one device for all")

@@ -78,7 +78,8 @@ class Planar:
     blend: Blend = "linear"
 
     def __call__(self, scene: Scene, camera: Camera) -> Frame:
-        """Renders `scene` from `camera`."""
+        """Renders `scene` from `camera`, where the scene's tensors are."""
+        camera = camera.to(scene.primary.means.device)
         panes = panes_in_camera(scene.planes, camera)
         first = self._first_pass(scene, camera, panes)
         layers = {"transmission": first.transmission, "depth": first.depth, "alpha": first.alpha, "mask": first.mask}

@@ -31,7 +31,8 @@ class Splat:
     depth: bool = True
 
     def __call__(self, scene: Scene, camera: Camera) -> Frame:
-        """Renders `scene` from `camera`."""
+        """Renders `scene` from `camera`, where the scene's tensors are."""
+        camera = camera.to(scene.primary.means.device)
         projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
         splats = joined_splats(projected)
         channels = projected.colors

@@ -38,6 +38,11 @@ class Camera:
         """[3] camera centre in the world."""
         return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
 
+    def to(self, device: torch.device | str) -> Camera:
+        """The same camera on another device."""
+        pose = self.cam_from_world.to(device)
+        return self if pose is self.cam_from_world else replace(self, cam_from_world=pose)
+
     def resized(self, width: int, height: int) -> Camera:
         """The same camera over another pixel grid that spans the same image."""
         sx, sy = width / self.width, height / self.height

@@ -27,7 +27,7 @@ def behind_panes(points: Tensor, planes: Planes, cameras: Sequence[Camera]) -> T
     if len(planes) == 0:
         return found
     # The views are taken one by one: all of them at once would need views x panes x points values.
-    for camera in cameras:
+    for camera in (camera.to(points.device) for camera in cameras):
         found |= crosses_pane(points, planes, camera.center) & in_image(points, camera)
     return found
 

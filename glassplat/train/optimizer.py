@@ -76,6 +76,6 @@ def rate_tensor(rate: Rate, parameter: Tensor, progress: float, extent: float) -
     value = rate.at(progress, extent)
     if rate.rest is None:
         return value
-    columns = torch.full(parameter.shape[1:], value * rate.rest, dtype=parameter.dtype)
+    columns = torch.full(parameter.shape[1:], value * rate.rest, dtype=parameter.dtype, device=parameter.device)
     columns[:1] = value
     return columns.flatten()

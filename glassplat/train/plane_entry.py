@@ -101,12 +101,13 @@ def seed_reflection(state: TrainState, dataset: Dataset, pane: Planes) -> None:
     if mirrored_coverage(state.scene, pane, cameras) >= LEAST_COVERAGE:
         return
     points = dataset.points
-    virtual = virtual_points(points.positions, pane, cameras)
+    device = pane.centers.device
+    virtual = virtual_points(points.positions.to(device), pane, cameras).cpu()
     if not dataset.measured_points or not bool(virtual.any()):
         return
     behind = replace(points, positions=points.positions[virtual], colors=points.colors[virtual])
     primary = state.scene.primary
-    seeds = gaussians_from_points(behind, sh_degree=primary.max_sh_degree)
+    seeds = gaussians_from_points(behind, sh_degree=primary.max_sh_degree).to(device)
     seeds = replace(seeds, active_sh_degree=primary.active_sh_degree)
     seeds = mirrored_gaussians(seeds, pane.centers[0], pane.normals[0])
     primary, state.optimizer.moments = append(primary, state.optimizer.moments, seeds)

@@ -7,7 +7,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import FrameType
 from typing import Any, TextIO
 
@@ -57,18 +57,20 @@ def prepare(recipe: Any, settings: RunSettings, directory: RunDirectory, dataset
         InputError: a fresh run would overwrite another one, or a resumed one was recorded with other settings.
     """
     if resume:
-        if directory.settings() != settings or directory.recipe() != recipe:
+        # A run may go on on another device.
+        recorded = replace(directory.settings(), device=settings.device)
+        if recorded != settings or directory.recipe() != recipe:
             raise InputError(
                 f"{directory.path} was started with {directory.settings()} and its own recipe; expected the same to "
                 f"resume it, got {settings}. Repeat the original options, or choose another --output"
             )
-        return load_checkpoint(directory.checkpoint)
+        return load_checkpoint(directory.checkpoint).to(settings.device)
     if directory.checkpoint.exists() or directory.results.exists():
         raise InputError(
             f"{directory.path} already holds a run; pass --resume to go on with it, or choose another --output"
         )
     directory.begin(recipe, settings, dataset)
-    return TrainState(recipe.initialise(dataset), settings.seed)
+    return TrainState(recipe.initialise(dataset), settings.seed).to(settings.device)
 
 
 def run_training(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 
@@ -35,7 +35,20 @@ class TrainState:
     def generator(self, purpose: str) -> torch.Generator:
         """A random generator for one purpose at this step.
 
-        It depends on the seed, the step and the purpose alone, so that a resumed run draws the same numbers.
+        It depends on the seed, the step and the purpose alone, so that a resumed run draws the same numbers, and is
+        for tensors on the scene's device; each kind of device has numbers of its own.
         """
         key = zlib.crc32(f"{self.seed}/{self.step}/{purpose}".encode())
-        return torch.Generator().manual_seed(key)
+        return torch.Generator(self.scene.primary.means.device).manual_seed(key)
+
+    def to(self, device: torch.device | str) -> TrainState:
+        """The same state on another device."""
+        moments = {
+            name: (first.to(device), second.to(device)) for name, (first, second) in self.optimizer.moments.items()
+        }
+        statistics = {
+            part: ScreenStatistics(**{name: tensor.to(device) for name, tensor in vars(known).items()})
+            for part, known in self.statistics.items()
+        }
+        optimizer = Optimizer(moments, self.optimizer.updates)
+        return replace(self, scene=self.scene.to(device), optimizer=optimizer, statistics=statistics)

@@ -130,7 +130,9 @@ def update(stage: Stage, state: TrainState, gradients: Mapping[str, Tensor], ite
 def collect_statistics(state: TrainState, screen: list[tuple[ScreenPass, Tensor]], view: View) -> None:
     """Adds the step's screen gradients to the statistics that densification reads."""
     for record, gradient in screen:
-        known = state.statistics.get(record.part) or ScreenStatistics.zeros(record.means2d.shape[1])
+        known = state.statistics.get(record.part)
+        if known is None:
+            known = ScreenStatistics.zeros(record.means2d.shape[1], device=gradient.device)
         state.statistics[record.part] = accumulate(
             known,
             gradient,

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 
 from glassplat.cli import main
 from glassplat.commands.demo import SCENE
@@ -117,3 +118,24 @@ def test_the_demo_compares_both_methods_and_can_be_repeated(tmp_path: Path, caps
         shown = capsys.readouterr().out
         assert "planar" in shown and "splat" in shown and "index.html" in shown
     assert (tmp_path / "planar" / "index.html").is_file()
+
+
+def test_a_gpu_that_cannot_be_used_is_explained(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.version, "cuda", None)
+    assert train("splat", tmp_path / "run", "--iterations", "3", "--device", "cuda") == 2
+    assert "or use --device cpu" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_full_gpu_is_explained(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*arguments: object, **options: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB.")
+
+    monkeypatch.setattr("glassplat.commands.train.run_training", full)
+    assert train("splat", tmp_path / "run", "--iterations", "3") == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert "CUDA out of memory; pass a larger --downscale" in said

@@ -11,7 +11,7 @@ WIDTH, HEIGHT = 44, 36
 
 
 def draw(*shape: int, seed: int) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def random_gaussians(count: int, *, coefficients: int = 16, dtype: torch.dtype = torch.float64) -> RawGaussians:

@@ -231,7 +231,11 @@ def test_inputs_need_not_be_contiguous() -> None:
         ({"sh": torch.zeros(5, 4, 3)}, ValueError, "sh_degree is 2, .* sh holds 4 coefficients"),
         ({"log_scales": torch.zeros(5, 3, dtype=torch.float64)}, TypeError, "log_scales is torch.float64"),
         ({"means": torch.zeros(5, 3, dtype=torch.int32)}, TypeError, "expected float32 or float64"),
-        ({"means": torch.zeros(5, 3, device="meta")}, TypeError, "means is on meta, but only the CPU has kernels"),
+        (
+            {"means": torch.zeros(5, 3, device="meta")},
+            TypeError,
+            "means is on meta, but only the CPU and NVIDIA GPUs have kernels",
+        ),
     ],
 )
 def test_bad_gaussians_are_refused(change: dict[str, Tensor], error: type[Exception], message: str) -> None:

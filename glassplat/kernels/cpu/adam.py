@@ -3,12 +3,31 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
 from numba import prange
+from torch import Tensor
 
 from glassplat.kernels.cpu.jit import Kernel, kernel
+from glassplat.kernels.tensor_checks import REAL_OF
+
+BLOCK = 4096
+"""Elements per task, about."""
+
+
+def adam(
+    flat: Sequence[Tensor], lr: float | Tensor, betas: tuple[float, float], eps: float,
+    *, corrections: tuple[float, float],
+) -> None:  # fmt: skip
+    """Updates flat parameter and moments; `corrections` are the factors on the step size and on the root moment."""
+    real = REAL_OF[flat[0].dtype]
+    rates = lr.detach().numpy().astype(np.float64) if isinstance(lr, Tensor) else np.full(1, lr)
+    rates = repeated_rates((rates * corrections[0]).astype(real), BLOCK)
+    # 1 - 0.999 loses half of its digits in single precision, so the gains are rounded from the double.
+    decays, gains = tuple(real(b) for b in betas), tuple(real(1 - b) for b in betas)
+    adam_step(real)(*(t.numpy() for t in flat), rates, decays, gains, real(corrections[1]), real(eps))
 
 
 @cache

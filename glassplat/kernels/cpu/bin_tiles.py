@@ -12,17 +12,51 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import torch
 from numba import prange
+from torch import Tensor
 
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
 from glassplat.kernels.cpu.schedule import even_stride
 from glassplat.kernels.maths import ellipse_maths
+from glassplat.kernels.splats import TILE, Splats, TileBins, check_pair_count
+from glassplat.kernels.tensor_checks import REAL_OF
 
-TILE = 16
+KEY_OF = {torch.float32: np.uint32, torch.float64: np.uint64}
 SPAN_CHUNK = 1024
 DIGIT_BITS = 11
 SORT_CHUNKS, SORT_CHUNK = 16, 8192
 PAIR_CHUNKS, PAIR_CHUNK = 64, 2048
+
+
+def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | None) -> TileBins:
+    """Lists the splats of every tile; contiguous tensors."""
+    num_cameras, per_camera = splats.depths.shape
+    rows, columns, count = -(-height // TILE), -(-width // TILE), num_cameras * per_camera
+    real, key = REAL_OF[splats.depths.dtype], KEY_OF[splats.depths.dtype]
+    arrays = (tensor.numpy() for tensor in splats)
+    means2d, conics, opacities, depths, radii = (a.reshape(count, *a.shape[2:]) for a in arrays)
+    mask = np.zeros((0, 0, 0), np.bool_) if active_tiles is None else active_tiles.numpy()
+    spans, span_offsets, first_rows, splat_offsets = tile_spans(real)(
+        means2d, conics, opacities, radii, mask, num_cameras, width, height
+    )
+    check_pair_count(int(splat_offsets[-1]))
+    order, starts = depth_order(key)(depths.view(key), splat_offsets, num_cameras)
+    pair_splats, tile_offsets, pair_slots = tile_pairs()(
+        order, starts, spans, span_offsets, first_rows, splat_offsets, mask, rows, columns
+    )
+    tiles = num_cameras * rows * columns
+    active = torch.arange(tiles) if active_tiles is None else active_tiles.flatten().nonzero()[:, 0]
+    return TileBins(
+        pair_splats=torch.from_numpy(pair_splats),
+        tile_offsets=torch.from_numpy(tile_offsets),
+        pair_slots=torch.from_numpy(pair_slots),
+        splat_offsets=torch.from_numpy(splat_offsets),
+        active=active.to(torch.int32),
+        width=width,
+        height=height,
+        num_cameras=num_cameras,
+    )
 
 
 @cache
@@ -36,7 +70,7 @@ def tile_spans(real: type) -> Kernel:
         splat_offsets [S + 1]: active tiles of all splats before.
     """
     half_height, outline, band = ellipse_maths()
-    pixel_range = _pixel_range()
+    pixel_range = pixel_ranges()
 
     @kernel("tile_spans", real)
     def spans_of(means2d, conics, opacities, radii, active_tiles, num_cameras, width, height):
@@ -94,7 +128,9 @@ def tile_spans(real: type) -> Kernel:
     return spans_of
 
 
-def _pixel_range() -> Callable[..., Any]:
+def pixel_ranges() -> Callable[..., Any]:
+    """Builds the function that finds the pixels between two coordinates."""
+
     @inlined
     def pixel_range(low, high, size):
         """First and last pixel whose centre lies in [low, high], within an image of that size."""

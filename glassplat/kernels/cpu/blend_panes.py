@@ -6,18 +6,22 @@ is what lets it turn the curves of the colour space into vector instructions.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
 import numpy as np
+import torch
 from numba import prange
 from numpy.typing import NDArray
+from torch import Tensor
 
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
 from glassplat.kernels.cpu.schedule import even_stride
 from glassplat.kernels.maths_blend import Scalar
 from glassplat.kernels.maths_color import color_space_maths
 from glassplat.kernels.maths_pane import pane_maths
+from glassplat.kernels.tensor_checks import REAL_OF
 
 RUN = 64
 """Pixels of a run."""
@@ -28,6 +32,27 @@ BEHIND, MIRRORED, RGB, BRIGHT = (plane * RUN for plane in (6, 9, 12, 15))
 FORWARD_PLANES = 18
 V_RGB, V_BRIGHT, V_SHARE, V_GAIN = (plane * RUN for plane in (18, 21, 24, 25))
 BACKWARD_PLANES = 26
+
+
+def blend_panes(inputs: Sequence[Tensor], switches: tuple[bool, bool, bool]) -> tuple[Tensor, ...]:
+    """The fields of `BlendedPanes`; inputs in the order of the kernel, switches (fresnel, intensity, linear)."""
+    transmission, mask = inputs[:2]
+    outputs = tuple(torch.empty_like(like) for like in (transmission, transmission, mask))
+    blend_panes_forward(REAL_OF[mask.dtype])(*_arrays(inputs), *switches, *_arrays(outputs))
+    return outputs
+
+
+def blend_panes_gradients(
+    inputs: Sequence[Tensor], switches: tuple[bool, bool, bool], cotangents: Sequence[Tensor]
+) -> tuple[Tensor, ...]:
+    """Gradients of the first five inputs."""
+    found = tuple(torch.zeros_like(tensor) for tensor in inputs[:5])
+    blend_panes_backward(REAL_OF[found[0].dtype])(*_arrays(inputs), *switches, *_arrays(cotangents), *_arrays(found))
+    return found
+
+
+def _arrays(tensors: Sequence[Tensor]) -> list[Any]:
+    return [tensor.numpy() for tensor in tensors]
 
 
 @inlined

@@ -2,15 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
 import numpy as np
+import torch
 from numba import prange
 from numpy.typing import NDArray
+from torch import Tensor
 
 from glassplat.kernels.cpu.jit import Kernel, kernel
 from glassplat.kernels.cpu.tile import TILE
+from glassplat.kernels.panes import PaneHits
+from glassplat.kernels.tensor_checks import REAL_OF
+
+
+def pane_hits(inputs: Sequence[Tensor], width: int, height: int, mask: Tensor | None) -> PaneHits:
+    """Nearest panes, from the fields of `Panes` and the intrinsics."""
+    centers = inputs[0]
+    count, real = centers.shape[0], REAL_OF[centers.dtype]
+    index = torch.empty(height, width, dtype=torch.int32)
+    tiles = torch.zeros(count, -(-height // TILE), -(-width // TILE), dtype=torch.bool)
+    windows = centers.new_zeros(count, 4)
+    visible = centers.new_empty(0, 0) if mask is None else mask
+    tensors = (*inputs, visible, index, tiles, windows)
+    pane_hits_forward(real)(*(tensor.numpy() for tensor in tensors))
+    return PaneHits(index, tiles, windows)
 
 
 @cache

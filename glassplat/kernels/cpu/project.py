@@ -7,21 +7,53 @@ a Gaussian's memory, and a loop that only fetches them lets the processor wait f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
 import numpy as np
+import torch
 from numba import prange
+from torch import Tensor
 
 from glassplat.kernels.cpu.gaussian_view import CHUNK, LENS_VALUES, view_steps
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
+from glassplat.kernels.cpu.project_backward import project_backward
 from glassplat.kernels.cpu.schedule import even_stride
 from glassplat.kernels.maths import ALPHA_MIN, LOW_PASS, screen_maths, shape_maths, vector_maths
 from glassplat.kernels.maths_sh import color_maths
+from glassplat.kernels.tensor_checks import REAL_OF
 
 
-def _placing(real: type) -> Callable[..., Any]:
+def project(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, near: float) -> tuple[Tensor, ...]:
+    """Fields of `Projected` from raw Gaussians, poses, intrinsics, clip planes and windows; degree -1 is no colour."""
+    means, cam_from_world = inputs[0], inputs[5]
+    real, leading = REAL_OF[means.dtype], (cam_from_world.shape[0], means.shape[0])
+    outputs = tuple(means.new_empty(*leading, *rest) for rest in ((2,), (3,), (), (), (3,), (2,)))
+    project_forward(real)(
+        *(tensor.numpy() for tensor in inputs), real(width), real(height), degree, real(near),
+        *(tensor.numpy() for tensor in outputs),
+    )  # fmt: skip
+    return outputs
+
+
+def project_gradients(
+    inputs: Sequence[Tensor], width: int, height: int, degree: int,
+    *, seen: tuple[Tensor, Tensor], cotangents: Sequence[Tensor], needs_camera: bool,
+) -> tuple[list[Tensor], Tensor]:  # fmt: skip
+    """Gradients of raw Gaussians and of each camera [C, 12]; `seen` are the radii and conics of the forward pass."""
+    real = REAL_OF[inputs[0].dtype]
+    found = [torch.empty_like(tensor) for tensor in inputs[:5]]
+    cameras = torch.zeros(inputs[5].shape[0], 12, dtype=torch.float64)
+    project_backward(real)(
+        *(tensor.numpy() for tensor in inputs), real(width), real(height), degree,
+        *(tensor.numpy() for tensor in (*seen, *cotangents)), needs_camera,
+        *(tensor.numpy() for tensor in (*found, cameras)),
+    )  # fmt: skip
+    return found, cameras
+
+
+def placing(real: type) -> Callable[..., Any]:
     """One Gaussian in one camera: fills everything but the colour, where it is visible."""
     _, pose, _, view, *_ = view_steps(real)
     dot = vector_maths().dot
@@ -55,7 +87,8 @@ def _placing(real: type) -> Callable[..., Any]:
     return place
 
 
-def _culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
+    """Writing zeros for one Gaussian in one camera, whether it is on the kept sides, and whether it may show at all."""
     vec3, pose, *_ = view_steps(real)
     dot = vector_maths().dot
     zero, one, low_pass = real(0.0), real(1.0), real(LOW_PASS)
@@ -70,14 +103,19 @@ def _culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
             conics[c, n, j] = colors[c, n, j] = zero
 
     @inlined
+    def in_front(c, mean, cam_from_world, near, clip_planes, clips):
+        row_z = cam_from_world[c, 2, 0], cam_from_world[c, 2, 1], cam_from_world[c, 2, 2]
+        if not dot(row_z, mean) + cam_from_world[c, 2, 3] > near:
+            return False
+        return not clips or dot(vec3(clip_planes, c), mean) + clip_planes[c, 3] > zero
+
+    @inlined
     def may_show(n, c, mean, log_scales, cam_from_world, intrinsics, lens, near, clip_planes, clips, windows):
         """Whether a Gaussian is on the kept sides, and a sphere around it comes near the window: cheap and safe."""
+        if not in_front(c, mean, cam_from_world, near, clip_planes, clips):
+            return False
         row_x, row_y, row_z, offset = pose(cam_from_world, c)
         depth = dot(row_z, mean) + offset[2]
-        if not depth > near:
-            return False
-        if clips and not dot(vec3(clip_planes, c), mean) + clip_planes[c, 3] > zero:
-            return False
         inverse_depth = one / depth
         u = intrinsics[c, 0] * (dot(row_x, mean) + offset[0]) * inverse_depth + intrinsics[c, 2]
         v = intrinsics[c, 1] * (dot(row_y, mean) + offset[1]) * inverse_depth + intrinsics[c, 3]
@@ -88,15 +126,15 @@ def _culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
         beside = past_x > zero and past_x * past_x > most_deviations * (wide * wide + low_pass)
         return not (beside or (past_y > zero and past_y * past_y > most_deviations * (high * high + low_pass)))
 
-    return cull, may_show
+    return cull, in_front, may_show
 
 
 @cache
 def project_forward(real: type) -> Kernel:
     """Fills means2d, conics, depths, opacities, colors and radii; zeros where a Gaussian is culled."""
     vec3, _, shape, _, fill_lenses, direction = view_steps(real)
-    cull, may_show = _culling(real)
-    place = _placing(real)
+    cull, _, may_show = culling(real)
+    place = placing(real)
     is_finite = shape_maths(real).is_finite
     color = color_maths(real).color
     zero, half, candidate = real(0.0), real(0.5), real(-1.0)

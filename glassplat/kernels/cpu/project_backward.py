@@ -20,7 +20,8 @@ from glassplat.kernels.maths import screen_maths, shape_maths, vector_maths
 from glassplat.kernels.maths_sh import color_maths
 
 
-def _place_gradient(real: type) -> Callable[..., Any]:
+def place_gradients(real: type) -> Callable[..., Any]:
+    """One Gaussian in one camera, without its colour."""
     dot, blend = vector_maths().dot, vector_maths().blend
     covariance_gradient, footprint_gradient = (
         screen_maths(real).covariance_gradient,
@@ -49,7 +50,7 @@ def _place_gradient(real: type) -> Callable[..., Any]:
     return place_gradient
 
 
-def _camera_sums(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def camera_sums(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Adding to a camera's gradient [12], rows of (3x3 block, translation), in double precision."""
     dot, blend = vector_maths().dot, vector_maths().blend
     one = real(1.0)
@@ -79,7 +80,8 @@ def _camera_sums(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
     return add_place, add_view
 
 
-def _view_gradient(real: type) -> Callable[..., Any]:
+def view_gradients(real: type) -> Callable[..., Any]:
+    """The colour of one Gaussian in one camera."""
     direction = view_steps(real).direction
     color, color_gradient = color_maths(real)
     zero, half = real(0.0), real(0.5)
@@ -105,7 +107,8 @@ def _view_gradient(real: type) -> Callable[..., Any]:
     return view_gradient
 
 
-def _shape_gradient(real: type) -> Callable[..., Any]:
+def shape_gradients(real: type) -> Callable[..., Any]:
+    """From the gradients of opacity and axes to those of the raw parameters."""
     dot, blend = vector_maths().dot, vector_maths().blend
     maths = shape_maths(real)
     rotation, unit_quat_gradient = maths.rotation, maths.unit_quat_gradient
@@ -135,7 +138,7 @@ def _shape_gradient(real: type) -> Callable[..., Any]:
 def _color_backward(real: type) -> Callable[..., Any]:
     vec3 = view_steps(real).vec3
     blend = vector_maths().blend
-    view_gradient, add_view = _view_gradient(real), _camera_sums(real)[1]
+    view_gradient, add_view = view_gradients(real), camera_sums(real)[1]
     zero, one = real(0.0), real(1.0)
 
     @inlined
@@ -163,9 +166,9 @@ def _place_backward(real: type) -> Callable[..., Any]:
     vec3, pose, shape, view, *_ = view_steps(real)
     dot, blend, scaled_sum = vector_maths().dot, vector_maths().blend, vector_maths().scaled_sum
     place_gradient, store_shape_gradient, add_place = (
-        _place_gradient(real),
-        _shape_gradient(real),
-        _camera_sums(real)[0],
+        place_gradients(real),
+        shape_gradients(real),
+        camera_sums(real)[0],
     )
     zero, one = real(0.0), real(1.0)
 

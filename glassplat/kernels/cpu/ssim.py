@@ -7,7 +7,6 @@ runs over contiguous memory. Squares need no blur of their own per image: simila
 from __future__ import annotations
 
 import functools
-import math
 from typing import Any
 
 import numpy as np
@@ -18,10 +17,8 @@ from torch import Tensor
 
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
 from glassplat.kernels.maths_blend import Scalar
+from glassplat.kernels.maths_ssim import RADIUS, ssim_maths
 
-RADIUS = 5
-SIGMA = 1.5
-C1, C2 = 0.01**2, 0.03**2
 CHANNELS = 3
 
 ROWS = 32
@@ -52,18 +49,12 @@ def ssim(image: Tensor, target: Tensor, *, with_slopes: bool) -> tuple[Tensor, T
     return image.new_tensor(sums.sum() / image.numel()), similarity, slopes
 
 
-def ssim_gradient(image: Tensor, target: Tensor, slopes: Tensor, v_mean: float) -> Tensor:
+def ssim_gradient(image: Tensor, target: Tensor, slopes: Tensor, v_mean: Tensor) -> Tensor:
     """Gradient of the mean similarity with respect to the image, times `v_mean`."""
     real = _real_of(image)
     v_image = torch.empty_like(image)
-    _backward(real)(_rows(image), _rows(target), _planes(slopes), real(v_mean / image.numel()), _rows(v_image))
+    _backward(real)(_rows(image), _rows(target), _planes(slopes), real(v_mean.item() / image.numel()), _rows(v_image))
     return v_image
-
-
-def window() -> list[float]:
-    """The 11 weights of the Gaussian window; they sum to one."""
-    weights = [math.exp(-0.5 * (offset / SIGMA) ** 2) for offset in range(-RADIUS, RADIUS + 1)]
-    return [weight / sum(weights) for weight in weights]
 
 
 def _real_of(image: Tensor) -> Any:
@@ -78,23 +69,8 @@ def _planes(slopes: Tensor) -> NDArray[Any]:
     return slopes.numpy().reshape(*slopes.shape[:2], slopes.shape[2] * CHANNELS)
 
 
-def _blur(real: type) -> Scalar:
-    w0, w1, w2, w3, w4, w5 = (real(weight) for weight in window()[: RADIUS + 1])
-
-    @inlined
-    def blur(values, at, step):
-        """Weighted sum of 11 values, `step` apart, the first of them at `at`."""
-        outer = w0 * (values[at] + values[at + 10 * step]) + w1 * (values[at + step] + values[at + 9 * step])
-        middle = w2 * (values[at + 2 * step] + values[at + 8 * step]) + w3 * (
-            values[at + 3 * step] + values[at + 7 * step]
-        )
-        return outer + middle + w4 * (values[at + 4 * step] + values[at + 6 * step]) + w5 * values[at + 5 * step]
-
-    return blur
-
-
 def _blur_row(real: type) -> Scalar:
-    blur = _blur(real)
+    blur = ssim_maths(real).blur
 
     @inlined
     def blur_row(scratch, row, planes):
@@ -126,8 +102,8 @@ def _load_row(real: type) -> Scalar:
 
 @functools.cache
 def _forward(real: type) -> Kernel:
-    blur, blur_row, load_row = _blur(real), _blur_row(real), _load_row(real)
-    zero, one, two, c1, c2 = real(0.0), real(1.0), real(2.0), real(C1), real(C2)
+    (blur, compare), blur_row, load_row = ssim_maths(real), _blur_row(real), _load_row(real)
+    zero = real(0.0)
 
     @inlined
     def load(scratch, image, target, top, left):
@@ -148,14 +124,11 @@ def _forward(real: type) -> Kernel:
             mean_b = blur(scratch, BLURRED + STRIDE + j, CHANNELS)
             squares = blur(scratch, BLURRED + 2 * STRIDE + j, CHANNELS)
             product = blur(scratch, BLURRED + 3 * STRIDE + j, CHANNELS)
-            means, mean_squares = mean_a * mean_b, mean_a * mean_a + mean_b * mean_b
-            a1, a2 = two * means + c1, two * (product - means) + c2
-            b1, b2 = one / (mean_squares + c1), one / (squares - mean_squares + c2)
-            value = a1 * a2 * b1 * b2
+            value, by_mean, by_squares, by_product = compare(mean_a, mean_b, squares, product)
             scratch[RESULTS + j] = value
-            scratch[RESULTS + STRIDE + j] = two * (mean_b * (a2 - a1) * b1 * b2 + mean_a * value * (b2 - b1))
-            scratch[RESULTS + 2 * STRIDE + j] = -value * b2
-            scratch[RESULTS + 3 * STRIDE + j] = two * a1 * b1 * b2
+            scratch[RESULTS + STRIDE + j] = by_mean
+            scratch[RESULTS + 2 * STRIDE + j] = by_squares
+            scratch[RESULTS + 3 * STRIDE + j] = by_product
 
     @kernel("ssim_forward", real)
     def forward(image, target, similarity, slopes, sums):
@@ -184,7 +157,7 @@ def _forward(real: type) -> Kernel:
 
 @functools.cache
 def _backward(real: type) -> Kernel:
-    blur, blur_row, load_row = _blur(real), _blur_row(real), _load_row(real)
+    blur, blur_row, load_row = ssim_maths(real).blur, _blur_row(real), _load_row(real)
     two = real(2.0)
 
     @kernel("ssim_backward", real)

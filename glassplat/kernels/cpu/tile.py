@@ -16,9 +16,8 @@ import torch
 
 from glassplat.kernels.cpu.jit import inlined
 from glassplat.kernels.maths_blend import Scalar, blend_maths
-from glassplat.kernels.splats import Splats
+from glassplat.kernels.splats import TILE, Splats
 
-TILE = 16
 PIXELS = TILE * TILE
 PLANE = PIXELS + TILE
 """Floats from one plane to the next; the extra row keeps planes from competing for the same cache sets."""
@@ -31,7 +30,6 @@ STATE_PLANES, SHARED_PLANES = 4, 5
 
 GROUP = 4
 """Channels are blended four at a time."""
-MOST_CHANNELS = 32
 
 BATCH = 16
 """Splats that a tile fetches at once. They lie anywhere in memory: fetched one at a time, each would be waited for."""

@@ -1,0 +1,212 @@
+"""`python -m bench.gpu`: checks the CUDA kernels on this machine's GPU and times them, beside gsplat if installed.
+
+Within ten minutes. gsplat compiles itself when it is first called; `pip install gsplat==1.5.3`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import importlib.util
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bench.kernels import backward, batch_of, raw_of, visited_pixels
+from bench.methods import frame_work, step_work, view_of
+from bench.scene import bench_camera, bench_scene
+from bench.timing import Work, interleaved_seconds, paired_ratio
+from glassplat.files.markdown_table import Table
+from glassplat.kernels.bin_tiles import bin_tiles
+from glassplat.kernels.composite import composite
+from glassplat.kernels.devices import cuda_problem
+from glassplat.kernels.project import project
+from glassplat.kernels.ssim import ssim
+from glassplat.render.planar import Planar
+from glassplat.render.rasterize import joined_splats
+from glassplat.render.splat import Splat
+from glassplat.scene.camera import Camera
+from glassplat.scene.scene import Scene
+from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.splat_recipe import SplatRecipe
+
+ROOT = Path(__file__).parent.parent
+WIDTH, HEIGHT, COUNT = 960, 720, 560_000
+PARITY = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/kernels/cuda/test_parity.py"]
+REPEATS = 15
+
+
+def main() -> int:
+    """Checks, measures and prints; 1 where there is no GPU or a kernel is wrong."""
+    parser = argparse.ArgumentParser(prog="python -m bench.gpu", description=__doc__)
+    parser.add_argument("--count", type=int, default=COUNT, help="Gaussians")
+    arguments = parser.parse_args()
+    problem = cuda_problem()
+    if problem is not None:
+        print(f"no GPU to measure: {problem}", file=sys.stderr)
+        return 1
+    print(f"Machine: {torch.cuda.get_device_name()}, torch {torch.__version__}, CUDA {torch.version.cuda}.\n")
+    if subprocess.run([sys.executable, *PARITY], cwd=ROOT, check=False).returncode:
+        print("the kernels disagree with their twins; no times are worth taking", file=sys.stderr)
+        return 1
+    print(measured(arguments.count).markdown())
+    print(kernel_times(arguments.count).markdown())
+    return 0
+
+
+def measured(count: int) -> Table:
+    """Frames, gradients and steps of both methods, and gsplat's."""
+    camera = bench_camera(WIDTH, HEIGHT).to("cuda")
+    scene = bench_scene(count, 1, 0.5, camera.to("cpu")).to("cuda")
+    view, recipe = view_of(camera), PlanarRecipe()
+    works: dict[str, Work] = {
+        "splat frame": frame_work(scene, Splat(depth=False), camera),
+        "splat frame and gradients": gradient_work(scene, camera),
+        "planar frame": frame_work(scene, Planar(), camera),
+        "splat step": step_work(scene, SplatRecipe().stages(0)[0], view),
+        "planar step": step_work(scene, recipe.stages(0)[2], view),
+    }
+    theirs = gsplat_works(scene, camera) if importlib.util.find_spec("gsplat") else {}
+    partners = {
+        "splat frame": "gsplat frame",
+        "planar frame": "gsplat frame",
+        "splat frame and gradients": "gsplat frame and gradients",
+    }
+    started = time.perf_counter()
+    for work in works.values():
+        work()
+    torch.cuda.synchronize()
+    note = f"First use of all kernels took {time.perf_counter() - started:.1f} s, compilation included. "
+    note += "Ratios are medians of ratios taken round by round." if theirs else "gsplat is not installed."
+    seconds = interleaved_seconds({name: timed(work) for name, work in (works | theirs).items()}, REPEATS)
+    table = Table(
+        f"On a GPU: {count:,} primary Gaussians, SH 3, {WIDTH}x{HEIGHT}, one pane over half of the image",
+        ("what", "ms", "gsplat, ms", "gsplat : ours", "peak, MiB", "gsplat peak, MiB"),
+        note,
+    )
+    for name, work in works.items():
+        partner = partners.get(name) if theirs else None
+        table.add(name, milliseconds(seconds, name), *beside(seconds, name, partner), peak(work),
+                  peak(theirs[partner]) if partner else "")  # fmt: skip
+    return table
+
+
+def beside(seconds: Mapping[str, list[float]], name: str, partner: str | None) -> tuple[object, object]:
+    """The other's milliseconds and how many times ours they are; nothing where there is no other."""
+    if partner is None:
+        return "", ""
+    return milliseconds(seconds, partner), paired_ratio(seconds, partner, name)
+
+
+def milliseconds(seconds: Mapping[str, list[float]], name: str) -> float:
+    """Median milliseconds."""
+    return 1e3 * statistics.median(seconds[name])
+
+
+def timed(work: Work) -> Work:
+    """The work, until the GPU is done with it."""
+
+    def until_done() -> None:
+        work()
+        torch.cuda.synchronize()
+
+    return until_done
+
+
+def peak(work: Work) -> int:
+    """Most memory that torch held during the work, in MiB, what the scene takes included."""
+    torch.cuda.synchronize()
+    torch.cuda.reset_peak_memory_stats()
+    work()
+    torch.cuda.synchronize()
+    return int(torch.cuda.max_memory_allocated() / 2**20)
+
+
+def gradient_work(scene: Scene, camera: Camera) -> Work:
+    """One frame and the gradients of all raw Gaussian tensors."""
+
+    def work() -> None:
+        leaves = {name: tensor.detach().requires_grad_() for name, tensor in scene.primary.tensors().items()}
+        gaussians = scene.primary.with_tensors(leaves)
+        frame = Splat(depth=False)(Scene(gaussians, scene.extent), camera)
+        inputs = [leaf for name, leaf in leaves.items() if name != "log_intensity"]
+        torch.autograd.grad(frame.rgb.sum(), inputs, allow_unused=True)
+
+    return work
+
+
+def gsplat_works(scene: Scene, camera: Camera) -> dict[str, Work]:
+    """The same frame, and the same gradients, by gsplat; activations included, as in ours."""
+    rasterization = importlib.import_module("gsplat").rasterization
+    gaussians = scene.primary
+    names = ("means", "quats", "log_scales", "logit_opacities", "sh")
+    matrix = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], device="cuda")
+
+    def render(tensors: list[Tensor]) -> Tensor:
+        means, quats, log_scales, logit_opacities, sh = tensors
+        image: Tensor = rasterization(
+            means, quats, log_scales.exp(), logit_opacities.sigmoid(), sh, camera.cam_from_world[None], matrix[None],
+            camera.width, camera.height, sh_degree=gaussians.active_sh_degree, near_plane=0.03, packed=False,
+        )[0]  # fmt: skip
+        return image
+
+    def frame() -> None:
+        with torch.no_grad():
+            render([getattr(gaussians, name) for name in names])
+
+    def gradients() -> None:
+        leaves = [getattr(gaussians, name).detach().requires_grad_() for name in names]
+        torch.autograd.grad(render(leaves).sum(), leaves)
+
+    return {"gsplat frame": frame, "gsplat frame and gradients": gradients}
+
+
+def kernel_times(count: int) -> Table:
+    """Milliseconds of each operation, forward and backward."""
+    camera = bench_camera(WIDTH, HEIGHT)
+    scene = bench_scene(count, 0, 0.0, camera).to("cuda")
+    raw, batch = raw_of(scene.primary, trainable=True), batch_of(camera.to("cuda"))
+    projected = project(raw, batch, sh_degree=3, near=0.03)
+    splats = joined_splats(type(projected)(*(tensor.detach() for tensor in projected)))
+    bins = bin_tiles(splats, WIDTH, HEIGHT)
+    leaves: Any = [tensor.clone().requires_grad_() for tensor in (*splats[:3], projected.colors.detach())]
+    blended = composite(splats._replace(means2d=leaves[0], conics=leaves[1], opacities=leaves[2]), leaves[3], bins)
+    photo = torch.rand(HEIGHT, WIDTH, 3, device="cuda")
+    image = photo.clone().requires_grad_()
+    similarity = ssim(image, photo)
+    weights = [torch.rand_like(tensor) for tensor in projected[:5]]
+    works: dict[str, Work] = {
+        "project forward": lambda: project(raw, batch, sh_degree=3, near=0.03),
+        "project backward": backward(list(projected[:5]), weights, list(raw)),
+        "bin_tiles": lambda: bin_tiles(splats, WIDTH, HEIGHT),
+        "composite forward": lambda: composite(splats, leaves[3].detach(), bins),
+        "composite backward": backward([blended.image], [photo[None]], leaves),
+        "ssim forward": lambda: ssim(photo, photo),
+        "ssim backward": backward([similarity], [torch.ones_like(similarity)], [image]),
+    }
+    evaluations = visited_pixels(type(splats)(*(t.cpu() for t in splats)), bins_on_cpu(bins))
+    seconds = interleaved_seconds({name: timed(work) for name, work in works.items()}, REPEATS)
+    table = Table(
+        "Operations", ("operation", "ms", "G evaluations/s"),
+        f"{len(bins.pair_splats):,} (tile, splat) pairs, {evaluations:,} pixel-Gaussian evaluations.",
+    )  # fmt: skip
+    for name in works:
+        rate = evaluations / statistics.median(seconds[name]) / 1e9 if name.startswith("composite") else ""
+        table.add(name, milliseconds(seconds, name), rate)
+    return table
+
+
+def bins_on_cpu(bins: Any) -> Any:
+    """The same bins on the CPU."""
+    return type(bins)(*(field.cpu() if isinstance(field, Tensor) else field for field in bins))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

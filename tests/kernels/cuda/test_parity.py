@@ -1,0 +1,301 @@
+"""Every CUDA kernel against its PyTorch twin, forward and backward: on a GPU, or on tiny inputs in Numba's simulator.
+
+`test_simulator.py` runs this file once more with the simulator on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from glassplat.kernels import adam as adam_operation
+from glassplat.kernels import bin_tiles as bin_operation
+from glassplat.kernels import blend_panes as blend_operation
+from glassplat.kernels import composite as composite_operation
+from glassplat.kernels import pane_hits as hits_operation
+from glassplat.kernels import project as project_operation
+from glassplat.kernels import ssim as ssim_operation
+from glassplat.kernels.devices import SIMULATED, cuda_problem
+from glassplat.kernels.panes import Panes
+from glassplat.kernels.reference import adam as adam_twin
+from glassplat.kernels.reference import bin_tiles as bin_twin
+from glassplat.kernels.reference import blend_panes as blend_twin
+from glassplat.kernels.reference import composite as composite_twin
+from glassplat.kernels.reference import pane_hits as hits_twin
+from glassplat.kernels.reference import project as project_twin
+from glassplat.kernels.reference import ssim as ssim_twin
+from glassplat.kernels.splats import CameraBatch, Deviation, RawGaussians, Splats
+from tests.kernels.gaussians_and_cameras import draw, random_cameras, random_gaussians
+
+if not SIMULATED and (problem := cuda_problem()) is not None:
+    pytest.skip(f"no GPU to run the CUDA kernels on: {problem}", allow_module_level=True)
+
+pytestmark = [
+    # The simulator computes with NumPy's scalars, which warn where a GPU gives infinity, and in threads.
+    pytest.mark.filterwarnings("ignore::RuntimeWarning"),
+]
+
+DEVICE = torch.device("cpu" if SIMULATED else "cuda")
+WIDTH, HEIGHT = (20, 17) if SIMULATED else (203, 117)
+DTYPES = [torch.float64, torch.float32]
+TOLERANCE = {torch.float64: 1e-9, torch.float32: 2e-4}
+
+
+def many(few: int, number: int) -> int:
+    """A size for the simulator, and one for a GPU."""
+    return few if SIMULATED else number
+
+
+def on_device(value: Any) -> Any:
+    """Tensors, and records of tensors, on the device under test, as new leaves."""
+    if isinstance(value, Tensor):
+        return value.detach().to(DEVICE).requires_grad_(value.requires_grad)
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return type(value)(*map(on_device, value))
+    return value
+
+
+def close(found: Tensor, expected: Tensor, factor: float = 1.0) -> None:
+    """Agreement relative to the largest entry, because gradients of one tensor differ by orders of magnitude."""
+    assert found.shape == expected.shape
+    if expected.numel() == 0:
+        return
+    if not expected.is_floating_point():
+        assert torch.equal(found.cpu(), expected)
+        return
+    scale = max(float(expected.detach().abs().max()), 1e-12)
+    tolerance = factor * TOLERANCE[expected.dtype] * scale
+    torch.testing.assert_close(found.detach().cpu(), expected.detach(), rtol=0, atol=tolerance)
+
+
+def check_gradients(
+    found: Sequence[Tensor], expected: Sequence[Tensor], inputs: Sequence[Tensor], expected_inputs: Sequence[Tensor]
+) -> None:
+    """Gradients of random sums of the outputs agree."""
+    cotangents = [draw(*tensor.shape, seed=90 + i).to(tensor.dtype) for i, tensor in enumerate(expected)]
+    gradients = torch.autograd.grad(found, inputs, [c.to(DEVICE) for c in cotangents], allow_unused=True)
+    wanted = torch.autograd.grad(expected, expected_inputs, cotangents, allow_unused=True)
+    for gradient, want, leaf in zip(gradients, wanted, expected_inputs, strict=True):
+        zeros = torch.zeros_like(leaf)
+        close(zeros if gradient is None else gradient, zeros if want is None else want, 10)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(
+    ("count", "cameras", "degree"), [(many(9, 3000), 2, 3), (many(5, 700), 1, 1), (1, 1, 0), (0, 1, 3)]
+)
+def test_project(count: int, cameras: int, degree: int, dtype: torch.dtype) -> None:
+    gaussians = random_gaussians(count, dtype=dtype)
+    batch = random_cameras(cameras, clip=cameras > 1, dtype=dtype)
+    own, own_batch = on_device(gaussians), on_device(batch)
+    found = project_operation.project(own, own_batch, sh_degree=degree, near=0.1)
+    expected = project_twin.project(gaussians, batch, sh_degree=degree, near=0.1)
+    for name, value in expected._asdict().items():
+        close(getattr(found, name), value, 10)
+    leaves = [*gaussians, batch.cam_from_world]
+    check_gradients(found[:5], expected[:5], [*own, own_batch.cam_from_world], leaves)
+
+
+def test_project_without_colours_culls_what_is_not_finite() -> None:
+    gaussians = random_gaussians(6, coefficients=0)
+    poison = gaussians._replace(means=gaussians.means.detach().index_fill(0, torch.tensor([2]), torch.nan))
+    batch = random_cameras(1)
+    windows = torch.tensor([[10.0, 5.0, 30.0, 30.0]], dtype=torch.float64)
+    batch = CameraBatch(batch.cam_from_world, batch.intrinsics, batch.width, batch.height, None, windows)
+    found = project_operation.project(on_device(poison), on_device(batch), sh_degree=0, near=0.1)
+    expected = project_twin.project(poison, batch, sh_degree=0, near=0.1)
+    for name, value in expected._asdict().items():
+        close(getattr(found, name), value)
+
+
+SplatMaker = Callable[..., Splats]
+
+
+def listed(bins: Any) -> set[tuple[int, int]]:
+    """The (tile, splat) pairs of bins."""
+    sizes = bins.tile_offsets.diff().cpu()
+    tiles = torch.arange(len(sizes)).repeat_interleave(sizes)
+    return set(zip(tiles.tolist(), bins.pair_splats.cpu().tolist(), strict=True))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("masked", [False, True])
+def test_bin_tiles(random_splats: SplatMaker, masked: bool, dtype: torch.dtype) -> None:
+    splats = random_splats((2, many(12, 500)), (WIDTH, HEIGHT), dtype=dtype)
+    splats.depths[:, 3] = splats.depths[:, 5]
+    splats.radii[0, 1] = 0
+    rows, columns = bin_operation.tile_grid(WIDTH, HEIGHT)
+    mask = draw(2, rows, columns, seed=4) > 0 if masked else None
+    own_mask = None if mask is None else mask.to(DEVICE)
+    found = bin_operation.bin_tiles(on_device(splats), WIDTH, HEIGHT, own_mask)
+    expected = bin_twin.bin_tiles(splats, WIDTH, HEIGHT, mask)
+    assert listed(expected) <= listed(found)
+    assert len(listed(found) - listed(expected)) <= 0.02 * len(listed(expected)) + 1
+    assert found.active.tolist() == expected.active.tolist()
+    depths = splats.depths.flatten()[found.pair_splats.long().cpu()]
+    for begin, end in zip(found.tile_offsets.tolist(), found.tile_offsets.tolist()[1:], strict=False):
+        order = list(zip(depths[begin:end].tolist(), found.pair_splats[begin:end].tolist(), strict=True))
+        assert order == sorted(order)
+    owners = torch.arange(splats.depths.numel()).repeat_interleave(found.splat_offsets.diff().cpu())
+    assert found.pair_splats.cpu()[found.pair_slots.long().cpu()].tolist() == owners.tolist()
+    assert found.pair_slots.sort().values.tolist() == list(range(len(owners)))
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_bin_tiles_of_hardly_any_splats(random_splats: SplatMaker, count: int) -> None:
+    splats = random_splats((1, count), (WIDTH, HEIGHT))
+    found = bin_operation.bin_tiles(on_device(splats), WIDTH, HEIGHT)
+    assert listed(bin_twin.bin_tiles(splats, WIDTH, HEIGHT)) <= listed(found)
+    assert found.splat_offsets.shape == (count + 1,)
+
+
+def blended(
+    splats: Splats, channels: Tensor, marks: Tensor, deviation: Deviation | None, module: Any, binning: Any
+) -> list[Tensor]:
+    """Image, alpha, mask and deviation of two cameras with glass."""
+    primary = splats.depths.shape[1] - marks.shape[1]
+    mask = torch.ones(splats.depths.shape[0], *bin_operation.tile_grid(WIDTH, HEIGHT), dtype=torch.bool)
+    mask[-1, 0, 0] = False
+    bins = binning.bin_tiles(splats, WIDTH, HEIGHT, mask.to(channels.device))
+    return list(module.composite(splats, channels, bins, marks=marks, num_primary=primary, deviation=deviation))
+
+
+@pytest.mark.parametrize(
+    ("mean", "dtype"),
+    [(None, torch.float64), (True, torch.float64), (False, torch.float32)]
+    if SIMULATED
+    else [(mean, dtype) for mean in (None, False, True) for dtype in DTYPES],
+)
+def test_composite(random_splats: SplatMaker, mean: bool | None, dtype: torch.dtype) -> None:
+    count, glass = many(22, 300), many(6, 80)
+    opacities = (0.3, 0.999)
+    splats = random_splats((2, count), (WIDTH, HEIGHT), dtype=dtype, opacities=opacities, sigmas=(2.0, 9.0))
+    splats = Splats(*(tensor.requires_grad_(i < 3) for i, tensor in enumerate(splats)))
+    channels = draw(2, count, 4, seed=11).to(dtype).requires_grad_()
+    marks = draw(2, glass, seed=12).to(dtype).sigmoid().requires_grad_()
+    where = draw(2, HEIGHT, WIDTH, seed=13).to(dtype).clamp(min=0)
+    own_splats, own_channels, own_marks = on_device(splats), on_device(channels), on_device(marks)
+    request = None if mean is None else Deviation(3, where, mean)
+    own_request = None if mean is None else Deviation(3, where.to(DEVICE), mean)
+    found = blended(own_splats, own_channels, own_marks, own_request, composite_operation, bin_operation)
+    expected = blended(splats, channels, marks, request, composite_twin, bin_twin)
+    for value, want in zip(found, expected, strict=True):
+        close(value, want)
+    outputs = 3 if mean is None else 4
+    own = [*own_splats[:3], own_channels, own_marks]
+    check_gradients(found[:outputs], expected[:outputs], own, [*splats[:3], channels, marks])
+
+
+@pytest.mark.parametrize(("count", "channels"), [(0, 3), (1, 1), (many(18, 60), 12)])
+def test_composite_without_glass(random_splats: SplatMaker, count: int, channels: int) -> None:
+    splats = random_splats((1, count), (WIDTH, HEIGHT))
+    splats = Splats(*(tensor.requires_grad_(i < 3) for i, tensor in enumerate(splats)))
+    values = draw(1, count, channels, seed=3).requires_grad_()
+    own, own_values = on_device(splats), on_device(values)
+    found = composite_operation.composite(own, own_values, bin_operation.bin_tiles(own, WIDTH, HEIGHT))
+    expected = composite_twin.composite(splats, values, bin_twin.bin_tiles(splats, WIDTH, HEIGHT))
+    close(found.image, expected.image)
+    close(found.alpha, expected.alpha)
+    if count:
+        leaves, own_leaves = [*splats[:3], values], [*own[:3], own_values]
+        check_gradients([found.image, found.alpha], [expected.image, expected.alpha], own_leaves, leaves)
+
+
+def two_panes(dtype: torch.dtype) -> tuple[Panes, Tensor]:
+    """Two rectangles that overlap on screen, and intrinsics."""
+    centers = torch.tensor([[0.0, 0.1, 3.0], [0.6, 0.0, 2.5]])
+    normals = torch.nn.functional.normalize(torch.tensor([[0.1, 0.2, -1.0], [-0.8, 0.0, -0.6]]), dim=1)
+    first = torch.nn.functional.normalize(
+        torch.linalg.cross(normals, torch.tensor([[0.0, 1.0, 0.0]]).expand(2, 3)), dim=1
+    )
+    axes = torch.stack([first, torch.linalg.cross(normals, first)], dim=1)
+    half_sizes = torch.tensor([[0.6, 0.4], [0.8, 0.5]])
+    intrinsics = torch.tensor([0.9 * WIDTH, 0.8 * WIDTH, WIDTH / 2, HEIGHT / 2])
+    return Panes(*(tensor.to(dtype) for tensor in (centers, normals, axes, half_sizes))), intrinsics.to(dtype)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("masked", [False, True])
+def test_pane_hits(masked: bool, dtype: torch.dtype) -> None:
+    panes, intrinsics = two_panes(dtype)
+    mask = draw(HEIGHT, WIDTH, seed=5).to(dtype).clamp(min=0) if masked else None
+    own_mask = None if mask is None else mask.to(DEVICE)
+    found = hits_operation.pane_hits(on_device(panes), intrinsics.to(DEVICE), WIDTH, HEIGHT, own_mask)
+    expected = hits_twin.pane_hits(panes, intrinsics, WIDTH, HEIGHT, mask)
+    assert set(expected.pane.flatten().tolist()) == {-1, 0, 1}
+    for value, want in zip(found, expected, strict=True):
+        close(value, want)
+
+
+def test_no_pane_is_hit_where_there_is_none() -> None:
+    panes, intrinsics = two_panes(torch.float64)
+    none = Panes(*(tensor[:0].to(DEVICE) for tensor in panes))
+    found = hits_operation.pane_hits(none, intrinsics.to(DEVICE), WIDTH, HEIGHT)
+    assert (found.pane == -1).all()
+    assert found.windows.shape == (0, 4)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("switches", [(True, True, True), (False, True, False), (True, False, True)])
+def test_blend_panes(switches: tuple[bool, bool, bool], dtype: torch.dtype) -> None:
+    panes, intrinsics = two_panes(dtype)
+    pane = hits_twin.pane_hits(panes, intrinsics, WIDTH, HEIGHT).pane
+    mask = draw(HEIGHT, WIDTH, seed=1).to(dtype).clamp(min=0, max=1)
+    images = (torch.rand(HEIGHT, WIDTH, 3, dtype=dtype), mask, torch.rand(2, HEIGHT, WIDTH, 4, dtype=dtype))
+    leaves = [t.requires_grad_() for t in (*images, panes.normals, torch.tensor([0.04, 0.5], dtype=dtype))]
+    own = [on_device(leaf) for leaf in leaves]
+    names = dict(zip(("fresnel", "intensity", "linear"), switches, strict=True))
+    found = blend_operation.blend_panes(*own[:3], pane.to(DEVICE), *own[3:], intrinsics.to(DEVICE), **names)
+    expected = blend_twin.blend_panes(*leaves[:3], pane, *leaves[3:], intrinsics, **names)
+    for value, want in zip(found, expected, strict=True):
+        close(value, want, 5)
+    check_gradients(found, expected, own, leaves)
+
+
+@pytest.mark.parametrize(("quantised", "dtype"), [(False, torch.float64), (True, torch.float32)])
+def test_ssim(quantised: bool, dtype: torch.dtype) -> None:
+    image = torch.rand(HEIGHT, WIDTH, 3, dtype=dtype).requires_grad_()
+    target = torch.rand(HEIGHT, WIDTH, 3, dtype=dtype)
+    target = (target * 255).to(torch.uint8) if quantised else target
+    own = on_device(image)
+    found, expected = ssim_operation.ssim(own, target.to(DEVICE)), ssim_twin.ssim(image, target)
+    close(found, expected)
+    check_gradients([found], [expected], [own], [image])
+    close(ssim_operation.ssim_map(own, target.to(DEVICE)), ssim_twin.ssim_map(image, target))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("columns", [False, True])
+def test_adam(columns: bool, dtype: torch.dtype) -> None:
+    expected = [draw(many(50, 5000), 2, 3, seed=i).to(dtype) for i in range(2)]
+    expected += [torch.zeros_like(expected[0]), torch.zeros_like(expected[0])]
+    found = [tensor.clone().to(DEVICE) for tensor in expected]
+    lr = torch.linspace(0.1, 0.6, 6, dtype=dtype) if columns else 0.3
+    for step in (1, 2, 3):
+        adam_operation.adam(*found, lr=lr, step=step)
+        adam_twin.adam(*expected, lr=lr, step=step)
+    for value, want in zip(found, expected, strict=True):
+        close(value, want)
+
+
+def test_the_result_has_the_same_bits_every_time(random_splats: SplatMaker) -> None:
+    splats = on_device(random_splats((1, many(20, 2000)), (WIDTH, HEIGHT), dtype=torch.float32))
+    splats = Splats(*(tensor.requires_grad_(i < 3) for i, tensor in enumerate(splats)))
+    channels = draw(1, splats.depths.shape[1], 4, seed=2).float().to(DEVICE)
+    results = []
+    for _ in range(2):
+        image = composite_operation.composite(splats, channels, bin_operation.bin_tiles(splats, WIDTH, HEIGHT)).image
+        results.append((image, *torch.autograd.grad(image.square().sum(), splats[:3])))
+    for first, second in zip(*results, strict=True):
+        assert torch.equal(first, second)
+
+
+def test_raw_gaussians_are_left_as_they_were() -> None:
+    gaussians = RawGaussians(*(tensor.detach().to(DEVICE) for tensor in random_gaussians(4)))
+    before = [tensor.clone() for tensor in gaussians]
+    project_operation.project(gaussians, on_device(random_cameras(1)), sh_degree=3, near=0.1)
+    assert all(torch.equal(tensor, copy) for tensor, copy in zip(gaussians, before, strict=True))

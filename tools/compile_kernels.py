@@ -1,0 +1,120 @@
+"""Compiles every CUDA kernel without a GPU and says what each of them takes: python -m tools.compile_kernels.
+
+NVVM makes PTX for a compute capability, and nvJitLink, which is what Numba links with on a GPU, makes machine code of
+it and reports registers, spills and shared memory. Neither needs a driver.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import _lru_cache_wrapper
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+from unittest import mock
+
+import numpy as np
+
+CAPABILITIES = ((8, 0), (9, 0), (12, 0))
+SUPPORTED = ((7, 5), (8, 0), (8, 6), (8, 9), (9, 0), (10, 0), (12, 0))
+PACKAGE = "glassplat.kernels.cuda"
+
+
+class Resources(NamedTuple):
+    """What a thread or block of a kernel takes: registers, bytes spilled to memory and back, bytes shared."""
+
+    registers: int
+    spilled: int
+    shared: int
+
+
+def all_kernels(real: type = np.float32) -> list[Any]:
+    """Every kernel of the package, built for one floating-point type, in the order of their names."""
+    package = importlib.import_module(PACKAGE)
+    modules = [importlib.import_module(f"{PACKAGE}.{entry.name}") for entry in pkgutil.iter_modules(package.__path__)]
+    factories: set[Callable[..., Any]] = {
+        value
+        for module in modules
+        for value in vars(module).values()
+        if isinstance(value, _lru_cache_wrapper) and value.__module__ == module.__name__
+    }
+    return sorted((factory(real) for factory in factories), key=lambda kernel: str(kernel.name))
+
+
+@contextmanager
+def without_device(capability: tuple[int, int]) -> Iterator[None]:
+    """Lets Numba compile where there is no driver, and without the libraries that it only asks for their version."""
+    device = SimpleNamespace(compute_capability=capability)
+    with (
+        mock.patch("numba.cuda.dispatcher.get_current_device", return_value=device),
+        mock.patch("numba.cuda.cudadrv.nvrtc.get_supported_ccs", return_value=SUPPORTED),
+        mock.patch("numba.cuda.cuda_paths._get_nvrtc_path", return_value=None),
+    ):
+        yield
+
+
+def ptx_of(kernel: Any, capabilities: Sequence[tuple[int, int]] = CAPABILITIES) -> list[str]:
+    """PTX of a kernel for each compute capability."""
+    from numba import types
+    from numba.cuda import compiler
+
+    options = {"debug": None, "lineinfo": False, "fastmath": False, "opt": None, "abi_info": None, "forceinline": False}
+    with without_device(capabilities[0]):
+        # What `numba.cuda.compile` does, but typing and lowering, most of the time, happen once for all capabilities.
+        library, _ = compiler._compile_pyfunc_with_fixup(
+            kernel.function, types.void(*kernel.signature), device=False, cc=capabilities[0], abi="numba",
+            launch_bounds=kernel.bounds, lto=False, **options,
+        )  # fmt: skip
+        return ["".join(library.get_asm_strs(cc=capability)) for capability in capabilities]
+
+
+def resources_of(ptx: str, capability: tuple[int, int]) -> Resources:
+    """Links PTX into machine code and reads the linker's report."""
+    from cuda.bindings import nvjitlink
+
+    handle = nvjitlink.create(2, [f"-arch=sm_{capability[0]}{capability[1]}", "-verbose"])
+    try:
+        data = ptx.encode()
+        nvjitlink.add_data(handle, nvjitlink.InputType.PTX, data, len(data), "kernel")
+        nvjitlink.complete(handle)
+        report = bytearray(nvjitlink.get_info_log_size(handle))
+        nvjitlink.get_info_log(handle, report)
+    finally:
+        nvjitlink.destroy(handle)
+    return read_report(report.decode())
+
+
+def read_report(report: str) -> Resources:
+    """Registers, spills and shared memory from the linker's text."""
+
+    def largest(pattern: str) -> int:
+        return max((int(number) for number in re.findall(pattern, report)), default=0)
+
+    spilled = largest(r"(\d+) bytes spill stores") + largest(r"(\d+) bytes spill loads")
+    return Resources(largest(r"Used (\d+) registers"), spilled, largest(r"(\d+) bytes smem"))
+
+
+def table(kernels: Sequence[Any]) -> list[str]:
+    """A markdown table of the resources of kernels, one column for each compute capability."""
+    names = [f"sm_{major}{minor}" for major, minor in CAPABILITIES]
+    lines = ["| kernel | " + " | ".join(names) + " | shared bytes |", "| --- " * (len(names) + 2) + "|"]
+    for kernel in kernels:
+        found = [resources_of(ptx, cc) for ptx, cc in zip(ptx_of(kernel), CAPABILITIES, strict=True)]
+        cells = [f"{r.registers}" + (f" ({r.spilled} B spilled)" if r.spilled else "") for r in found]
+        lines.append(f"| {kernel.name} | " + " | ".join(cells) + f" | {found[-1].shared} |")
+    return lines
+
+
+def main() -> int:
+    """Prints the table of all kernels."""
+    for line in table(all_kernels()):
+        print(line)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
