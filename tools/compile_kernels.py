@@ -7,6 +7,7 @@ it and reports registers, spills and shared memory. Neither needs a driver.
 from __future__ import annotations
 
 import importlib
+import inspect
 import pkgutil
 import re
 import sys
@@ -40,7 +41,9 @@ def all_kernels(real: type = np.float32) -> list[Any]:
         value
         for module in modules
         for value in vars(module).values()
-        if isinstance(value, _lru_cache_wrapper) and value.__module__ == module.__name__
+        if isinstance(value, _lru_cache_wrapper)
+        and value.__module__ == module.__name__
+        and next(iter(inspect.signature(value).parameters)) == "real"
     }
     return sorted((factory(real) for factory in factories), key=lambda kernel: str(kernel.name))
 

@@ -1,18 +1,23 @@
 """How CUDA kernels are declared, compiled and launched: one place for the flags and for what torch and Numba share.
 
-Memory, sorting and scans belong to torch; a kernel gets views of its tensors and runs on its current stream.
+Memory, sorting and scans belong to torch; a kernel gets views of its tensors and runs on its current stream. Numba's
+own launch looks at each array for microseconds; here the arguments are written out as its calling convention wants.
 """
 
 from __future__ import annotations
 
+import ctypes
 import logging
+import math
 import re
 import time
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import torch
+from cuda.core import LaunchConfig, Stream, launch
 from numba import config, cuda, types
 from torch import Tensor
 
@@ -31,6 +36,7 @@ SCALARS = {
     "float": types.float32,
     "double": types.float64,
 }
+CTYPES = {"int16": "c_int16", "int32": "c_int32", "int64": "c_int64", "float32": "c_float", "float64": "c_double"}
 TOKEN = re.compile(r"([a-z]+)([1-4]?)")
 
 
@@ -51,6 +57,8 @@ class Kernel:
         self.function = function
         self.signature = signature
         self.bounds = bounds
+        self._expected = [Expected(type_) for type_ in signature]
+        self._loaded: dict[int, Any] = {}
         # The simulator knows no bounds.
         self.dispatcher = cuda.jit(function) if SIMULATED else cuda.jit(function, launch_bounds=bounds)
 
@@ -67,23 +75,70 @@ class Kernel:
         if len(arguments) != len(self.signature):
             raise TypeError(f"{self.name} takes {len(self.signature)} arguments, got {len(arguments)}")
         if SIMULATED:
-            self.dispatcher[blocks, threads](*map(_simulated, arguments, self.signature))
+            values_of = (e.simulated(argument) for e, argument in zip(self._expected, arguments, strict=True))
+            self.dispatcher[blocks, threads](*values_of)
             return
         device = next(argument.device for argument in arguments if isinstance(argument, Tensor))
-        # Numba keeps a current device of its own; torch's may have changed.
+        values: list[Any] = []
+        for argument, expected in zip(arguments, self._expected, strict=True):
+            expected.append(values, argument)
+        # Numba keeps a current device of its own, and the threads of a backward pass may have none.
         with cuda.gpus[device.index]:
-            self._announce_compilation()
-            handle = torch.cuda.current_stream(device).cuda_stream
-            stream = cuda.external_stream(handle) if handle else 0
-            self.dispatcher[blocks, threads, stream](*map(_on_device, arguments, self.signature))
+            stream = Stream.from_handle(torch.cuda.current_stream(device).cuda_stream)
+            launch(stream, LaunchConfig(grid=blocks, block=threads), self._machine_code(device.index), *values)
 
-    def _announce_compilation(self) -> None:
-        if self.dispatcher.overloads:
+    def _machine_code(self, device: int) -> Any:
+        """The kernel for the current device, compiled and loaded at first use."""
+        if device not in self._loaded:
+            log.info("compiling %s for this GPU (first use only) ...", self.name)
+            started = time.perf_counter()
+            compiled = self.dispatcher.compile(self.signature)
+            self._loaded[device] = compiled.library.get_cufunc().kernel
+            log.info("compiled %s in %.1f s", self.name, time.perf_counter() - started)
+        return self._loaded[device]
+
+
+@lru_cache(maxsize=4096)
+def _array_layout(shape: tuple[int, ...], size: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """What stands before and after an array's address, for elements of so many bytes."""
+    strides = tuple(math.prod(shape[axis + 1 :]) * size for axis in range(len(shape)))
+    # Two pointers that only host memory uses, the number of elements and their size; then shape and strides.
+    return (0, 0, math.prod(shape), size), (*shape, *strides)
+
+
+class Expected:
+    """What a kernel takes in one place, and how it is handed over.
+
+    Attributes:
+        type: the Numba type.
+    """
+
+    def __init__(self, type_: Any) -> None:
+        self.type = type_
+        self._is_array = isinstance(type_, types.Array)
+        self._ndim = type_.ndim if self._is_array else 0
+        element = str(type_.dtype if self._is_array else type_)
+        self._dtype = torch.bool if element == "bool" else getattr(torch, element)
+        self._number = bool if element == "bool" else getattr(ctypes, CTYPES[element])
+
+    def append(self, values: list[Any], argument: Any) -> None:
+        """Adds what stands for an argument in Numba's calling convention to the values of a launch."""
+        if not self._is_array:
+            values.append(self._number(argument))
             return
-        log.info("compiling %s for this GPU (first use only) ...", self.name)
-        started = time.perf_counter()
-        self.dispatcher.compile(self.signature)
-        log.info("compiled %s in %.1f s", self.name, time.perf_counter() - started)
+        if argument.dtype != self._dtype or argument.dim() != self._ndim or not argument.is_contiguous():
+            raise TypeError(f"got {argument.dtype} of shape {tuple(argument.shape)}, expected contiguous {self.type}")
+        before, after = _array_layout(argument.shape, argument.element_size())
+        values += (*before, argument.data_ptr(), *after)
+
+    def simulated(self, argument: Any) -> Any:
+        """What stands for an argument in the simulator."""
+        if not self._is_array:
+            return bool(argument) if self._number is bool else np.dtype(str(self.type)).type(argument)
+        array = argument.detach().numpy()
+        if argument.dtype != self._dtype or array.ndim != self.type.ndim or not array.flags.c_contiguous:
+            raise TypeError(f"got {array.dtype} of shape {array.shape}, expected contiguous {self.type}")
+        return array
 
 
 def kernel(
@@ -120,25 +175,3 @@ def _numba_type(token: str, real: type) -> Any:
     scalar = types.float32 if real is np.float32 else types.float64
     element = scalar if match[1] == "real" else SCALARS[match[1]]
     return types.Array(element, int(match[2]), "C") if match[2] else element
-
-
-def _on_device(argument: Any, expected: Any) -> Any:
-    if isinstance(argument, Tensor):
-        return cuda.as_cuda_array(argument.detach(), sync=False)
-    return _number(argument, expected)
-
-
-def _simulated(argument: Any, expected: Any) -> Any:
-    if isinstance(argument, Tensor):
-        array = argument.detach().numpy()
-        if str(array.dtype) != str(expected.dtype) or array.ndim != expected.ndim or not array.flags.c_contiguous:
-            raise TypeError(f"got {array.dtype} of shape {array.shape}, expected contiguous {expected}")
-        return array
-    return _number(argument, expected)
-
-
-def _number(argument: Any, expected: Any) -> Any:
-    """A number of exactly the expected type, so that no other signature is compiled."""
-    if expected == types.boolean:
-        return bool(argument)
-    return np.dtype(str(expected)).type(argument)
