@@ -50,7 +50,7 @@ class _GradientConflict(torch.autograd.Function):
         images = (tensor.detach().contiguous() for tensor in (transmission, reflection, hit))
         # A ring of zeros around the derivatives spares the backward pass all questions about the border.
         slopes = transmission.new_zeros(2, height + 2, 3 * (width + 2))
-        sums = torch.zeros(height, dtype=torch.float64)
+        sums = torch.zeros(height, dtype=torch.float64, device=hit.device)
         conflict_forward(REAL_OF[hit.dtype])(*(t.numpy() for t in images), slopes.numpy(), sums.numpy())
         ctx.save_for_backward(slopes)
         ctx.count = 3 * (height - 2) * (width - 2)
