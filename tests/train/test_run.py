@@ -37,6 +37,7 @@ def run(
 
 @pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_resumes_to_the_same_scene(tmp_path: Path, by: signal.Signals) -> None:
+    before = signal.getsignal(by)
     whole = run(tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "stopped", interrupt_at=5, by=by)
@@ -44,7 +45,7 @@ def test_an_interrupted_run_resumes_to_the_same_scene(tmp_path: Path, by: signal
     resumed = run(tmp_path / "stopped", resume=True)
     for name, tensor in whole.scene.parameters().items():
         assert torch.equal(tensor, resumed.scene.parameters()[name]), name
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(by) is before
 
 
 def test_the_log_has_every_tenth_step_once(tmp_path: Path) -> None:
