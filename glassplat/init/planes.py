@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -33,9 +33,9 @@ class PlaneFit:
     """How planes are found from masks.
 
     Attributes:
-        mirror_labels: panes that are mirrors; they start at a base reflectance near one.
+        mirror_labels: panes that are mirrors; they get a base reflectance near one, and keep it.
         glass_reflectance: base reflectance R0 that glass starts at.
-        mirror_reflectance: base reflectance that mirrors start at; one has no finite logit.
+        mirror_reflectance: base reflectance of mirrors; one has no finite logit.
         band: half width of the band along a mask's edge in which candidates lie, as a share of the
             image diagonal; the paper's 20 pixels at 960x720.
         inlier_distance: of RANSAC, as a share of the scene extent.
@@ -182,14 +182,21 @@ def _planes(panes: Sequence[_Pane], labels: Sequence[int], options: PlaneFit) ->
     def stacked(rows: list[Array]) -> Tensor:
         return torch.tensor(np.stack(rows), dtype=torch.float32)
 
-    reflectances = [
-        options.mirror_reflectance if label in options.mirror_labels else options.glass_reflectance for label in labels
-    ]
-    return Planes(
+    glass = options.glass_reflectance
+    planes = Planes(
         centers=stacked([pane.center for pane in panes]),
         raw_normals=stacked([pane.normal for pane in panes]),
-        logit_reflectances=torch.tensor([math.log(value / (1 - value)) for value in reflectances]),
+        logit_reflectances=torch.full((len(labels),), math.log(glass / (1 - glass))),
         tangents=stacked([pane.tangent for pane in panes]),
         half_sizes=stacked([pane.half_sizes for pane in panes]),
         labels=tuple(labels),
     )
+    return with_mirrors(planes, options.mirror_labels, options.mirror_reflectance)
+
+
+def with_mirrors(planes: Planes, labels: tuple[int, ...], reflectance: float) -> Planes:
+    """The planes with some of them, by label, made mirrors of a base reflectance that stays."""
+    kept = tuple(label for label in planes.labels if label in labels)
+    mirrors = torch.tensor([label in kept for label in planes.labels], device=planes.centers.device)
+    fixed = torch.full_like(planes.logit_reflectances, math.log(reflectance / (1 - reflectance)))
+    return replace(planes, logit_reflectances=torch.where(mirrors, fixed, planes.logit_reflectances), mirrors=kept)

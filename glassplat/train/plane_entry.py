@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import logging
-import math
 from dataclasses import dataclass, replace
 
-import torch
 from torch import Tensor
 
 from glassplat.data.dataset import Dataset
 from glassplat.densify.edit import append, apply_edit, keep
 from glassplat.init.glass import glass_gaussians
 from glassplat.init.material import mirror_labels, mirrored_coverage
-from glassplat.init.planes import PlaneFit, fit_planes
+from glassplat.init.planes import PlaneFit, fit_planes, with_mirrors
 from glassplat.init.points import gaussians_from_points
 from glassplat.init.virtual_scene import virtual_points
 from glassplat.scene.camera import Camera
@@ -51,14 +49,14 @@ class PlaneEntry:
         planes = fit_planes(means, annotations_of(dataset), extent=extent, options=self.fit)
         glass = glass_gaussians(planes, count=self.glass_count, seed=self.seed)
         scene = replace(state.scene, planes=planes, glass=glass)
-        mirrors = self.fit.mirror_labels
-        if self.detect_mirrors and not mirrors:
-            mirrors = mirror_labels(scene, dataset.train)
-            log.info("mirrors among the panes: %s", ", ".join(map(str, mirrors)) or "none")
-        state.scene = replace(scene, planes=with_mirrors(planes, mirrors, self.fit.mirror_reflectance))
+        if self.detect_mirrors and not self.fit.mirror_labels:
+            found = mirror_labels(scene, dataset.train)
+            log.info("mirrors among the panes: %s", ", ".join(map(str, found)) or "none")
+            planes = with_mirrors(planes, found, self.fit.mirror_reflectance)
+        state.scene = replace(scene, planes=planes)
         state.statistics.clear()
         for row, label in enumerate(planes.labels):
-            if label in mirrors:
+            if label in planes.mirrors:
                 turn_virtual_scene_round(state, dataset, planes.select([row]))
             elif self.seed_reflections:
                 seed_reflection(state, dataset, planes.select([row]))
@@ -67,14 +65,6 @@ class PlaneEntry:
 def annotations_of(dataset: Dataset) -> list[tuple[Camera, Tensor]]:
     """Cameras and pane labels [H, W] of the annotated training views."""
     return [(view.camera, view.pane_labels) for view in dataset.train if view.pane_labels is not None]
-
-
-def with_mirrors(planes: Planes, labels: tuple[int, ...], reflectance: float) -> Planes:
-    """The planes with some of them, by label, made mirrors of a base reflectance that stays."""
-    kept = tuple(label for label in planes.labels if label in labels)
-    mirrors = torch.tensor([label in kept for label in planes.labels], device=planes.centers.device)
-    fixed = torch.full_like(planes.logit_reflectances, math.log(reflectance / (1 - reflectance)))
-    return replace(planes, logit_reflectances=torch.where(mirrors, fixed, planes.logit_reflectances), mirrors=kept)
 
 
 def turn_virtual_scene_round(state: TrainState, dataset: Dataset, mirror: Planes) -> None:
@@ -98,12 +88,13 @@ def seed_reflection(state: TrainState, dataset: Dataset, pane: Planes) -> None:
     wrong and fade.
     """
     cameras = [view.camera for view in dataset.train]
-    if mirrored_coverage(state.scene, pane, cameras) >= LEAST_COVERAGE:
+    # The coverage is rendered over all views, so it comes last.
+    if not dataset.measured_points or mirrored_coverage(state.scene, pane, cameras) >= LEAST_COVERAGE:
         return
     points = dataset.points
     device = pane.centers.device
     virtual = virtual_points(points.positions.to(device), pane, cameras).cpu()
-    if not dataset.measured_points or not bool(virtual.any()):
+    if not bool(virtual.any()):
         return
     behind = replace(points, positions=points.positions[virtual], colors=points.colors[virtual])
     primary = state.scene.primary

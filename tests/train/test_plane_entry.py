@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import torch
 
+from glassplat.init.planes import with_mirrors
 from glassplat.scene.pose import mirror_matrices
 from glassplat.scene.scene import Scene
-from glassplat.train.plane_entry import seed_reflection, turn_virtual_scene_round, with_mirrors
+from glassplat.train.plane_entry import seed_reflection, turn_virtual_scene_round
 from glassplat.train.state import TrainState
 from tests.render.tiny_scene import in_single_precision, joined, pane, showcase
 from tests.train.tiny_capture import tiny_capture, true_scene
