@@ -8,38 +8,46 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import TRAINABLE, Planes
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Primary Gaussians, glass Gaussians and reflection planes.
+    """Primary Gaussians, glass Gaussians, reflection planes and the environment.
 
     Attributes:
         primary: the scene itself, in front of the panes and behind them.
         glass: Gaussians that mark where a pane reflects; they appear in the mask only.
         planes: the panes; empty for a scene without reflection.
         extent: radius of the capture in world units; learning rates and distances scale with it.
+        environment: what shiny surfaces mirror from far away; empty for most methods.
     """
 
     primary: Gaussians
     extent: float
     glass: Gaussians = field(default_factory=lambda: Gaussians.empty(channels=("logit_mark",)))
     planes: Planes = field(default_factory=Planes.empty)
+    environment: Environment = field(default_factory=Environment.empty)
 
     def gaussian_sets(self) -> dict[str, Gaussians]:
         """The sets of Gaussians by name."""
         return {"primary": self.primary, "glass": self.glass}
 
     def parameters(self) -> dict[str, Tensor]:
-        """Every trainable tensor by dotted name (`primary.means`, `planes.centers`, ...)."""
+        """Every trainable tensor by dotted name (`primary.means`, `planes.centers`, ...).
+
+        The environment (`environment.raw`) is among them where there is one.
+        """
         found = {f"{part}.{name}": t for part, g in self.gaussian_sets().items() for name, t in g.tensors().items()}
-        return found | {f"planes.{name}": getattr(self.planes, name) for name in TRAINABLE}
+        found |= {f"planes.{name}": getattr(self.planes, name) for name in TRAINABLE}
+        distant = {} if self.environment.is_empty else self.environment.tensors()
+        return found | {f"environment.{name}": tensor for name, tensor in distant.items()}
 
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> Scene:
         """The same scene with some tensors replaced by dotted name."""
-        parts: dict[str, dict[str, Tensor]] = {"primary": {}, "glass": {}, "planes": {}}
+        parts: dict[str, dict[str, Tensor]] = {"primary": {}, "glass": {}, "planes": {}, "environment": {}}
         for dotted, tensor in parameters.items():
             part, _, name = dotted.partition(".")
             if part not in parts:
@@ -50,6 +58,7 @@ class Scene:
             primary=self.primary.with_tensors(parts["primary"]),
             glass=self.glass.with_tensors(parts["glass"]),
             planes=self.planes.with_tensors(parts["planes"]),
+            environment=self.environment.with_tensors(parts["environment"]),
         )
 
     def with_gaussians(self, part: str, gaussians: Gaussians) -> Scene:
@@ -63,5 +72,9 @@ class Scene:
     def to(self, device: torch.device | str) -> Scene:
         """The same scene on another device."""
         return replace(
-            self, primary=self.primary.to(device), glass=self.glass.to(device), planes=self.planes.to(device)
+            self,
+            primary=self.primary.to(device),
+            glass=self.glass.to(device),
+            planes=self.planes.to(device),
+            environment=self.environment.to(device),
         )

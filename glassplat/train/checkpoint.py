@@ -16,6 +16,7 @@ from torch import Tensor
 from glassplat.data.errors import InputError
 from glassplat.densify.default import ScreenStatistics
 from glassplat.files.atomic import atomic_write
+from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import PER_GAUSSIAN, Gaussians
 from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
@@ -36,6 +37,8 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
     for part, gaussians in scene.gaussian_sets().items():
         tensors |= {f"scene/{part}/{name}": t for name, t in gaussians.tensors().items()}
     tensors |= {f"scene/planes/{name}": t for name, t in scene.planes.tensors().items()}
+    if not scene.environment.is_empty:
+        tensors |= {f"scene/environment/{name}": t for name, t in scene.environment.tensors().items()}
     for name, (first, second) in state.optimizer.moments.items():
         tensors |= {f"first/{name}": first, f"second/{name}": second}
     for part, statistics in state.statistics.items():
@@ -108,11 +111,17 @@ def restored_state(header: dict, tensors: dict[str, Tensor]) -> TrainState:
     planes = Planes(
         **under(tensors, "scene/planes/"), labels=tuple(header["labels"]), mirrors=tuple(header.get("mirrors", ()))
     )
+    distant = under(tensors, "scene/environment/")
     first, second = under(tensors, "first/"), under(tensors, "second/")
     statistics = under(tensors, "statistics/")
     parts = {name.partition("/")[0] for name in statistics}
     return TrainState(
-        scene=Scene(extent=header["extent"], planes=planes, **sets),
+        scene=Scene(
+            extent=header["extent"],
+            planes=planes,
+            environment=Environment(**distant) if distant else Environment.empty(),
+            **sets,
+        ),
         seed=header["seed"],
         step=header["step"],
         seconds=header["seconds"],
