@@ -38,6 +38,7 @@ def pane_hits(panes: Panes, intrinsics: Tensor, width: int, height: int, mask: T
 def ray_grid(intrinsics: Tensor, width: int, height: int) -> Tensor:
     """Rays [H, W, 3] through the pixel centres, (x, y, 1) in the camera frame."""
     fx, fy, cx, cy = intrinsics
-    x = (torch.arange(width, dtype=intrinsics.dtype) + 0.5 - cx) / fx
-    y = (torch.arange(height, dtype=intrinsics.dtype) + 0.5 - cy) / fy
-    return torch.stack([x.expand(height, width), y[:, None].expand(height, width), torch.ones(height, width)], dim=-1)
+    x = (torch.arange(width, dtype=intrinsics.dtype, device=intrinsics.device) + 0.5 - cx) / fx
+    y = (torch.arange(height, dtype=intrinsics.dtype, device=intrinsics.device) + 0.5 - cy) / fy
+    plane = x.expand(height, width)
+    return torch.stack([plane, y[:, None].expand(height, width), torch.ones_like(plane)], dim=-1)

@@ -82,13 +82,17 @@ def _ellipses(gaussians: RawGaussians, cameras: CameraBatch, tangents: Tensor, d
 
 def _axes(gaussians: RawGaussians) -> Tensor:
     """Principal axes as columns [N, 3, 3], each as long as its standard deviation."""
-    w, x, y, z = (gaussians.quats / gaussians.quats.square().sum(-1, keepdim=True).sqrt()).unbind(-1)
-    rotation = torch.stack([
+    return rotations(gaussians.quats) * torch.exp(gaussians.log_scales)[:, None, :]
+
+
+def rotations(quats: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4] `wxyz` of any length."""
+    w, x, y, z = (quats / quats.square().sum(-1, keepdim=True).sqrt()).unbind(-1)
+    return torch.stack([
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ], dim=-1).reshape(-1, 3, 3)  # fmt: skip
-    return rotation * torch.exp(gaussians.log_scales)[:, None, :]
 
 
 def _half_extents(ellipse: _Ellipses, opacities: Tensor) -> Tensor:

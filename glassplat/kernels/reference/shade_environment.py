@@ -1,0 +1,25 @@
+"""The definition of `shade_environment`: the equation, pixel by pixel."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from glassplat.kernels.reference.cube_lookup import cube_lookup
+from glassplat.kernels.reference.pane_hits import ray_grid
+from glassplat.kernels.shaded import NORMAL_MIN, Shaded
+
+
+def shade_environment(
+    base: Tensor, normals: Tensor, strength: Tensor, texels: Tensor, intrinsics: Tensor, world_from_cam: Tensor
+) -> Shaded:
+    """See `glassplat.kernels.shade_environment.shade_environment`."""
+    height, width = strength.shape
+    rays = ray_grid(intrinsics.detach(), width, height) @ world_from_cam.detach().T
+    bare = (normals.square().sum(-1, keepdim=True) <= NORMAL_MIN**2).detach()
+    # Where there is no normal, a harmless one stands in: a NaN masked afterwards would still reach the gradients.
+    safe = torch.where(bare, rays, normals)
+    # The lookup takes a direction of any length, so that neither the ray nor the normal needs to be of length 1.
+    mirrored = safe.square().sum(-1, keepdim=True) * rays - 2 * (rays * safe).sum(-1, keepdim=True) * safe
+    reflection = torch.where(bare, 0, torch.sigmoid(cube_lookup(texels, mirrored)))
+    return Shaded(torch.where(bare, base, base + strength[..., None] * (reflection - base)), reflection)

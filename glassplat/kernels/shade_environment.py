@@ -1,0 +1,52 @@
+"""Deferred shading of an image with what its surfaces mirror."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from glassplat.kernels.cube_lookup import check_cube
+from glassplat.kernels.reference import shade_environment as reference
+from glassplat.kernels.shaded import Shaded
+from glassplat.kernels.tensor_checks import check_tensors
+
+
+def shade_environment(
+    base: Tensor, normals: Tensor, strength: Tensor, texels: Tensor, intrinsics: Tensor, world_from_cam: Tensor
+) -> Shaded:
+    """Adds to every pixel what its surface mirrors of the environment (3DGS-DR, Eq. 3).
+
+        r = 2 (v . n) n - v,    n = N / |N|,    v from the surface to the camera
+        E = sigmoid(cube_lookup(texels, r))
+        C' = (1 - R) C + R E
+
+    Where N is shorter than `NORMAL_MIN`, as on an empty background, the image is the base, bit for bit, the reflection
+    is 0, and nothing but the base gets a gradient. Where the strength is 0 the image is the base, bit for bit, too, but
+    the strength has its gradient. A normal that is not finite gives NaN.
+
+    Differentiable in `base`, `normals`, `strength` and `texels`.
+
+    Args:
+        base: [H, W, 3] C, sRGB.
+        normals: [H, W, 3] N, world axes, of any length; the sign does not matter.
+        strength: [H, W] R.
+        texels: [6, S, S, 3] logits of the environment's sRGB colour, faces as in `cube_lookup`.
+        intrinsics: [4] fx, fy, cx, cy in pixels.
+        world_from_cam: [3, 3] rotation from camera to world axes; may be mirrored.
+
+    Raises:
+        ValueError: shapes disagree, or the environment has no texels.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
+    """
+    check_cube(texels)
+    height, width = strength.shape
+    check_tensors(
+        {
+            "base": (base, (height, width, 3)),
+            "normals": (normals, (height, width, 3)),
+            "strength": (strength, (height, width)),
+            "texels": (texels, (*texels.shape[:3], 3)),
+            "intrinsics": (intrinsics, (4,)),
+            "world_from_cam": (world_from_cam, (3, 3)),
+        }
+    )
+    return reference.shade_environment(base, normals, strength, texels, intrinsics, world_from_cam)
