@@ -14,6 +14,7 @@ from glassplat.data.dataset import Dataset, load_dataset
 from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
 from glassplat.kernels.devices import DeviceName, chosen_device
+from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.run import run_training
@@ -21,7 +22,9 @@ from glassplat.train.run_directory import RunDirectory, RunSettings
 from glassplat.train.splat_recipe import SplatRecipe
 
 AnyRecipe = (
-    Annotated[SplatRecipe, tyro.conf.subcommand("splat")] | Annotated[PlanarRecipe, tyro.conf.subcommand("planar")]
+    Annotated[SplatRecipe, tyro.conf.subcommand("splat")]
+    | Annotated[PlanarRecipe, tyro.conf.subcommand("planar")]
+    | Annotated[DeferredRecipe, tyro.conf.subcommand("deferred")]
 )
 
 

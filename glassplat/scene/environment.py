@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -21,9 +21,11 @@ class Environment:
 
     Attributes:
         raw: [6, S, S, 3] logits of sRGB colour; S = 0 for a scene without an environment.
+        region: centre and radius, world units, of the sphere that holds all that mirrors it; None for everywhere.
     """
 
     raw: Tensor
+    region: tuple[float, float, float, float] | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.raw.shape)
@@ -51,7 +53,7 @@ class Environment:
         unknown = set(tensors) - set(self.tensors())
         if unknown:
             raise ValueError(f"unknown tensors {sorted(unknown)}; an environment has {sorted(self.tensors())}")
-        return Environment(**(self.tensors() | dict(tensors)))
+        return replace(self, raw=tensors.get("raw", self.raw))
 
     def to(self, device: torch.device | str) -> Environment:
         """The same environment on another device."""

@@ -51,8 +51,11 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
         "extent": scene.extent,
         "labels": list(scene.planes.labels),
         "mirrors": list(scene.planes.mirrors),
+        "region": scene.environment.region,
         "active_sh_degree": {part: g.active_sh_degree for part, g in scene.gaussian_sets().items()},
         "updates": state.optimizer.updates,
+        "paused": state.optimizer.paused,
+        "records": state.records,
     }
     with atomic_write(path) as temporary:
         owned = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
@@ -112,6 +115,7 @@ def restored_state(header: dict, tensors: dict[str, Tensor]) -> TrainState:
         **under(tensors, "scene/planes/"), labels=tuple(header["labels"]), mirrors=tuple(header.get("mirrors", ()))
     )
     distant = under(tensors, "scene/environment/")
+    region = tuple(header["region"]) if header.get("region") else None
     first, second = under(tensors, "first/"), under(tensors, "second/")
     statistics = under(tensors, "statistics/")
     parts = {name.partition("/")[0] for name in statistics}
@@ -119,13 +123,18 @@ def restored_state(header: dict, tensors: dict[str, Tensor]) -> TrainState:
         scene=Scene(
             extent=header["extent"],
             planes=planes,
-            environment=Environment(**distant) if distant else Environment.empty(),
+            environment=Environment(**distant, region=region) if distant else Environment.empty(),
             **sets,
         ),
         seed=header["seed"],
         step=header["step"],
         seconds=header["seconds"],
-        optimizer=Optimizer({name: (first[name], second[name]) for name in first}, dict(header["updates"])),
+        records=dict(header.get("records", {})),
+        optimizer=Optimizer(
+            {name: (first[name], second[name]) for name in first},
+            updates=dict(header["updates"]),
+            paused=dict(header.get("paused", {})),
+        ),
         statistics={part: ScreenStatistics(**under(statistics, f"{part}/")) for part in sorted(parts)},
     )
 

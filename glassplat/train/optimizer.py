@@ -44,10 +44,12 @@ class Optimizer:
     Attributes:
         moments: first and second moment of each parameter.
         updates: how often each parameter was stepped, for the bias correction.
+        paused: for how many more steps a parameter is left as it is.
     """
 
     moments: Moments = field(default_factory=dict)
     updates: dict[str, int] = field(default_factory=dict)
+    paused: dict[str, int] = field(default_factory=dict)
 
     def step(
         self, parameters: Mapping[str, Tensor], gradients: Mapping[str, Tensor], rates: Mapping[str, float | Tensor]
@@ -55,11 +57,18 @@ class Optimizer:
         """Updates `parameters` in place for every name in `gradients`."""
         for name, gradient in gradients.items():
             parameter = parameters[name]
-            if parameter.numel() == 0:
+            if parameter.numel() == 0 or self._waits(name):
                 continue
             first, second = self.moments_of(name, parameter)
             self.updates[name] = self.updates.get(name, 0) + 1
             adam(parameter, gradient, first, second, lr=rates[name], step=self.updates[name])
+
+    def _waits(self, name: str) -> bool:
+        """Whether a parameter is paused; counts the step."""
+        left = self.paused.get(name, 0)
+        if left:
+            self.paused[name] = left - 1
+        return left > 0
 
     def moments_of(self, name: str, parameter: Tensor) -> tuple[Tensor, Tensor]:
         """The moments of a parameter, zero for one that is new."""

@@ -13,6 +13,7 @@ from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError
 from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
+from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Stage
@@ -39,7 +40,7 @@ class Recipe(Protocol):
         ...
 
 
-RECIPES: dict[str, type] = {recipe.method: recipe for recipe in (SplatRecipe, PlanarRecipe)}
+RECIPES: dict[str, type] = {recipe.method: recipe for recipe in (SplatRecipe, PlanarRecipe, DeferredRecipe)}
 
 
 def recipe_to_json(recipe: Any) -> str:

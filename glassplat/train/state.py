@@ -23,6 +23,7 @@ class TrainState:
         optimizer: Adam's moments.
         statistics: screen gradients collected for densification, by scene part.
         seconds: time spent training so far, over all sittings.
+        records: numbers that an action keeps from one turn to the next, by name.
     """
 
     scene: Scene
@@ -31,6 +32,7 @@ class TrainState:
     optimizer: Optimizer = field(default_factory=Optimizer)
     statistics: dict[str, ScreenStatistics] = field(default_factory=dict)
     seconds: float = 0.0
+    records: dict[str, float] = field(default_factory=dict)
 
     def generator(self, purpose: str) -> torch.Generator:
         """A random generator for one purpose at this step.
@@ -50,5 +52,5 @@ class TrainState:
             part: ScreenStatistics(**{name: tensor.to(device) for name, tensor in vars(known).items()})
             for part, known in self.statistics.items()
         }
-        optimizer = Optimizer(moments, self.optimizer.updates)
+        optimizer = replace(self.optimizer, moments=moments)
         return replace(self, scene=self.scene.to(device), optimizer=optimizer, statistics=statistics)

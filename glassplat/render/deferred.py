@@ -1,0 +1,151 @@
+"""`deferred`: glossy things under distant light (3D Gaussian Splatting with Deferred Reflection)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from glassplat.kernels.bin_tiles import bin_tiles
+from glassplat.kernels.composite import composite
+from glassplat.kernels.cube_lookup import cube_lookup
+from glassplat.kernels.facing_normals import facing_normals
+from glassplat.kernels.shade_environment import shade_environment
+from glassplat.render.frame import Frame, ScreenPass
+from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, mean_depth, over_background, project_gaussians
+from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Scene
+
+Shading = Literal["deferred", "forward"]
+
+
+class Surface(NamedTuple):
+    """What each Gaussian adds to the image besides its colour: normals [N, 3] facing the camera, strengths [N]."""
+
+    normals: Tensor
+    strengths: Tensor
+
+
+@dataclass(frozen=True)
+class Deferred:
+    """Blends colour, normal and reflection strength, then shades every pixel once (3DGS-DR, Section 3.1).
+
+        C, N, R = sum_i (c_i, n_i, r_i) alpha_i T_i                   (Eqs. 1 and 2)
+        C' = (1 - R) C + R E(2 (v . n) n - v),  n = N / |N|           (Eq. 3)
+
+    n_i is the shortest axis of a Gaussian, turned to the camera, v the direction to the camera, E the environment.
+    Colours are sRGB, as in the paper.
+
+    Layers: `base` C, `reflection` E, `normal` N in world axes, blended and not normalised [H, W, 3]; `strength` R,
+    `alpha`, `depth` [H, W]; `environment` [H, W, 3], what surrounds the scene behind each pixel, if asked for.
+
+    Attributes:
+        background: colour behind everything, sRGB.
+        shading: `forward` shades every Gaussian instead of every pixel, the paper's ablation; its `reflection` layer
+            is the blended light that the Gaussians reflect, divided by R.
+        environment: also render the layer `environment`.
+    """
+
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    shading: Shading = "deferred"
+    environment: bool = False
+
+    def __call__(self, scene: Scene, camera: Camera) -> Frame:
+        """Renders `scene` from `camera`, where the scene's tensors are.
+
+        Raises:
+            ValueError: the scene has no environment, or its Gaussians no reflection strength.
+        """
+        check_reflective(scene)
+        camera = camera.to(scene.primary.means.device)
+        surface = surface_of(scene.primary, camera)
+        rgb, layers, screen = (
+            self._shade_pixels(scene, camera, surface)
+            if self.shading == "deferred"
+            else self._shade_gaussians(scene, camera, surface)
+        )
+        if self.environment:
+            layers["environment"] = torch.sigmoid(cube_lookup(scene.environment.raw, view_directions(camera)))
+        return Frame(rgb, layers, (screen,))
+
+    def _shade_pixels(
+        self, scene: Scene, camera: Camera, surface: Surface
+    ) -> tuple[Tensor, dict[str, Tensor], ScreenPass]:
+        layers, screen = self._blend(scene, camera, surface)
+        shaded = shade_environment(
+            layers["base"],
+            layers["normal"],
+            layers["strength"],
+            scene.environment.raw,
+            camera.intrinsics,
+            camera.cam_from_world[:3, :3].T.contiguous(),
+        )
+        return shaded.rgb, layers | {"reflection": shaded.reflection}, screen
+
+    def _shade_gaussians(
+        self, scene: Scene, camera: Camera, surface: Surface
+    ) -> tuple[Tensor, dict[str, Tensor], ScreenPass]:
+        to_eye = torch.nn.functional.normalize(camera.center - scene.primary.means, dim=1)
+        cosines = (surface.normals * to_eye).sum(-1, keepdim=True)
+        reflected = torch.sigmoid(cube_lookup(scene.environment.raw, 2 * cosines * surface.normals - to_eye))
+        shares = surface.strengths[:, None]
+        layers, screen = self._blend(scene, camera, surface, (shares, shares * reflected))
+        lost, gained = layers.pop("extra").split([3, 3], dim=-1)
+        rgb = layers["base"] - lost + gained
+        return rgb, layers | {"reflection": gained / layers["strength"][..., None].clamp(min=1e-6)}, screen
+
+    def _blend(
+        self, scene: Scene, camera: Camera, surface: Surface, forward: tuple[Tensor, Tensor] | None = None
+    ) -> tuple[dict[str, Tensor], ScreenPass]:
+        """The blended layers; with `forward` (shares [N, 1], light [N, 3]) also `extra`, what replaces what."""
+        projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
+        splats = joined_splats(projected)
+        values = [projected.colors[0], surface.normals, surface.strengths[:, None], projected.depths[0, :, None]]
+        if forward is not None:
+            shares, light = forward
+            values += [shares * projected.colors[0], light]
+        channels = torch.cat(values, dim=-1)[None]
+        result = composite(splats, channels, bin_tiles(splats, camera.width, camera.height))
+        color, normal, strength, depth, extra = result.image[0].split([3, 3, 1, 1, channels.shape[2] - 8], dim=-1)
+        alpha = result.alpha[0]
+        layers = {
+            "base": over_background(color, alpha, self.background),
+            "normal": normal,
+            "strength": strength[..., 0],
+            "alpha": alpha,
+            "depth": mean_depth(depth[..., 0], alpha),
+        }
+        layers |= {"extra": extra} if forward is not None else {}
+        return layers, ScreenPass("primary", projected.means2d, projected.radii)
+
+
+def check_reflective(scene: Scene) -> None:
+    """Raises ValueError where a scene lacks what reflection needs."""
+    if scene.environment.is_empty:
+        raise ValueError("the scene has no environment; expected one trained with `deferred`")
+    if "logit_strength" not in scene.primary.channels:
+        raise ValueError(
+            f"the Gaussians have the channels {sorted(scene.primary.channels)}; expected logit_strength, as "
+            "`deferred` trains it"
+        )
+
+
+def surface_of(gaussians: Gaussians, camera: Camera) -> Surface:
+    """Normals and strengths of the Gaussians, as seen from a camera."""
+    normals = facing_normals(gaussians.quats, gaussians.log_scales, gaussians.means, camera.center)
+    return Surface(normals, torch.sigmoid(gaussians.channels["logit_strength"]))
+
+
+def view_directions(camera: Camera) -> Tensor:
+    """[H, W, 3] directions from the camera through the pixel centres, world axes, not unit."""
+    fx, fy, cx, cy = camera.intrinsics
+    rotation = camera.cam_from_world[:3, :3]
+    columns, rows = (
+        torch.arange(count, device=rotation.device, dtype=rotation.dtype) + 0.5
+        for count in (camera.width, camera.height)
+    )
+    y, x = torch.meshgrid((rows - cy) / fy, (columns - cx) / fx, indexing="ij")
+    return torch.stack([x, y, torch.ones_like(x)], dim=-1) @ rotation

@@ -1,0 +1,139 @@
+"""The recipe of `deferred`: 3D Gaussian Splatting with Deferred Reflection."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import torch
+
+from glassplat.data.dataset import Dataset
+from glassplat.densify.default import DefaultDensify
+from glassplat.densify.mcmc import McmcDensify
+from glassplat.densify.propagate import NormalPropagation
+from glassplat.init.region import reflective_region
+from glassplat.losses.reflectors import strength_outside
+from glassplat.losses.term import LossTerm
+from glassplat.render.deferred import Deferred, Shading
+from glassplat.render.splat import Splat
+from glassplat.scene.environment import Environment
+from glassplat.scene.scene import Scene
+from glassplat.train.optimizer import Rate
+from glassplat.train.propagation import GrowShAfterPropagation, Propagate, PropagationSchedule
+from glassplat.train.splat_recipe import GaussianRates, photometric_terms
+from glassplat.train.stage import Every, Stage
+from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
+
+
+@dataclass(frozen=True)
+class ReflectionRates:
+    """Learning rates of what reflects.
+
+    Attributes:
+        strength: logit of the reflection strength.
+        environment: raw texels of the environment.
+    """
+
+    strength: float = 6e-3
+    environment: float = 5e-2
+
+    def of(self) -> dict[str, Rate]:
+        """The rates by dotted parameter name."""
+        return {"primary.logit_strength": Rate(self.strength), "environment.raw": Rate(self.environment)}
+
+
+@dataclass(frozen=True)
+class DeferredRecipe:
+    """3DGS-DR: a strength and a normal for every Gaussian, one environment, and shading per pixel.
+
+    Attributes:
+        sh_degree: highest degree of the view-dependent colour, which grows once propagation has ended.
+        ssim_weight: lambda, share of D-SSIM in the photometric loss.
+        background: colour behind everything, sRGB.
+        shading: per pixel (`deferred`), or per Gaussian (`forward`, ablation).
+        bootstrap: share of the run without reflection (paper: a few thousand iterations).
+        texels: edge length of the environment's cube faces.
+        first_strength: reflection strength of every Gaussian at the start.
+        region: only what lies in this sphere may reflect: centre and radius, world units. None finds the place that
+            the cameras stand around, if there is one.
+        outside_weight: weight of the mean strength outside of the region in the objective.
+        propagation: how normals spread and colours are sabotaged.
+        schedule: when they do.
+        rates: learning rates of the Gaussians.
+        reflection_rates: learning rates of strength and environment.
+        rhythm: when opacities are reset and the SH degree grows.
+        strategy: what decides how many Gaussians there are and where; `densify` or `mcmc` holds its options.
+        densify: when and how Gaussians are added and pruned under `default`.
+        mcmc: when and how Gaussians are relocated and added under `mcmc`.
+    """
+
+    method: ClassVar[str] = "deferred"
+
+    sh_degree: int = 3
+    ssim_weight: float = 0.2
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    shading: Shading = "deferred"
+    bootstrap: float = 0.1
+    texels: int = 64
+    first_strength: float = 1e-3
+    region: tuple[float, float, float, float] | None = None
+    outside_weight: float = 0.4
+    propagation: NormalPropagation = field(default_factory=NormalPropagation)
+    schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
+    rates: GaussianRates = field(default_factory=GaussianRates)
+    reflection_rates: ReflectionRates = field(default_factory=ReflectionRates)
+    rhythm: Rhythm = field(default_factory=Rhythm)
+    strategy: Strategy = "default"
+    densify: DefaultDensify = field(default_factory=DefaultDensify)
+    mcmc: McmcDensify = field(default_factory=McmcDensify)
+
+    def initialise(self, dataset: Dataset) -> Scene:
+        """The first scene: one Gaussian per point that hardly reflects, and a random environment."""
+        primary = self._population().initial(dataset.points, self.sh_degree)
+        strengths = torch.full((len(primary),), math.log(self.first_strength / (1 - self.first_strength)))
+        primary = replace(primary, channels={"logit_strength": strengths})
+        environment = Environment.random(self.texels, generator=torch.Generator().manual_seed(0))
+        region = self.region or reflective_region([view.camera for view in dataset.train])
+        environment = replace(environment, region=region)
+        return Scene(primary, dataset.extent, environment=environment)
+
+    def renderer(self) -> Deferred:
+        """The renderer of the finished scene, with all its layers."""
+        return Deferred(self.background, self.shading)
+
+    def stages(self, seed: int) -> tuple[Stage, ...]:
+        """Bootstrap, then everything; what changes in between is up to `Propagate`."""
+        population = self._population()
+        photometric = photometric_terms(self.ssim_weight)
+        bootstrap = Stage(
+            name="1 bootstrap",
+            share=self.bootstrap,
+            renderer=Splat(self.background, depth=False),
+            losses=(*photometric, *population.terms),
+            rates=self.rates.of("primary"),
+            actions=population.edits,
+            motions=population.motions,
+        )
+        beat = Every(self.rhythm.beat, 0.0, self.schedule.stop, self.rhythm.least, skip_multiples_of=3)
+        reflection = Stage(
+            name="2 reflection",
+            share=1 - self.bootstrap,
+            renderer=Deferred(self.background, self.shading),
+            losses=(*photometric, LossTerm("outside", self.outside_weight, strength_outside), *population.terms),
+            rates=self.rates.of("primary") | self.reflection_rates.of(),
+            actions=(
+                *population.edits,
+                GrowShAfterPropagation(Every(self.rhythm.sh)),
+                *population.resets,
+                Propagate(beat, self.propagation, self.schedule),
+            ),
+            motions=population.motions,
+        )
+        return bootstrap, reflection
+
+    def _population(self) -> Population:
+        means_rate = self.rates.of("primary")["primary.means"]
+        return population_of(
+            self.strategy, default=self.densify, mcmc=self.mcmc, rhythm=self.rhythm, means_rate=means_rate
+        )

@@ -1,0 +1,100 @@
+"""When normals are propagated, when that ends, and what waits for the end (3DGS-DR, Section 3.3)."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from glassplat.data.dataset import Dataset
+from glassplat.densify.propagate import NormalPropagation
+from glassplat.train.actions import GrowSh
+from glassplat.train.stage import Clock, Every
+from glassplat.train.state import TrainState
+
+log = logging.getLogger("glassplat.train")
+
+ENDED, MOST, GREW = "propagation ended", "most reflective", "reflective grew"
+"""Names in `TrainState.records`: the step of the end, the largest number of reflective Gaussians, and its step."""
+GROWTH = 1.01
+"""Factor by which the number has to rise to count as growing."""
+
+
+@dataclass(frozen=True)
+class PropagationSchedule:
+    """When normals are propagated; at the beats of `Rhythm` that do not reset opacities.
+
+    Attributes:
+        end: `settled` ends it when the number of reflective Gaussians has stopped growing (the paper's criterion),
+            `fixed` at `stop`.
+        stop: share of the run after which nothing is propagated any more.
+        patience: share of the run without growth after which the number counts as settled.
+        pause: steps for which raised opacities are held.
+    """
+
+    end: Literal["settled", "fixed"] = "settled"
+    stop: float = 0.6
+    patience: float = 0.1
+    pause: int = 200
+
+
+@dataclass(frozen=True)
+class Propagate:
+    """Propagates normals and disturbs the colours of what does not reflect, until no more reflectors are found.
+
+    Attributes:
+        when: the beats at which it happens.
+        propagation: what it does.
+        schedule: when it ends.
+    """
+
+    when: Every
+    propagation: NormalPropagation
+    schedule: PropagationSchedule
+    name: str = "propagate normals"
+
+    def due(self, clock: Clock) -> bool:
+        """Whether to act after this step."""
+        return self.when.due(clock) or clock.progress == self.schedule.stop
+
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
+        """Edits `state`."""
+        if has_ended(state):
+            return
+        if self._settles(state, clock) or clock.progress >= self.schedule.stop:
+            state.records[ENDED] = clock.step
+            log.info("step %d: normal propagation has ended, %d reflective Gaussians", clock.step, self._count(state))
+            return
+        primary, moments = self.propagation.propagate(state.scene.primary, state.optimizer.moments)
+        primary, moments = self.propagation.disturb(primary, moments, state.generator(self.name))
+        state.scene, state.optimizer.moments = replace(state.scene, primary=primary), moments
+        if self.propagation.propagates:
+            state.optimizer.paused["primary.logit_opacities"] = self.schedule.pause
+
+    def _settles(self, state: TrainState, clock: Clock) -> bool:
+        """Whether the number of reflective Gaussians has not grown for long enough; keeps the records."""
+        count = self._count(state)
+        if count > GROWTH * state.records.get(MOST, 0):
+            state.records |= {MOST: count, GREW: clock.step}
+        waited = clock.step - state.records.get(GREW, clock.step)
+        return self.schedule.end == "settled" and waited >= self.schedule.patience * clock.iterations
+
+    def _count(self, state: TrainState) -> int:
+        return self.propagation.count_reflective(state.scene.primary)
+
+
+@dataclass(frozen=True)
+class GrowShAfterPropagation(GrowSh):
+    """Raises the SH degree, but not while normals are propagated: colours that turn with the view would explain
+    what reflects.
+    """
+
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
+        """Edits `state`."""
+        if has_ended(state):
+            super().apply(state, dataset, clock)
+
+
+def has_ended(state: TrainState) -> bool:
+    """Whether normal propagation is over."""
+    return ENDED in state.records
