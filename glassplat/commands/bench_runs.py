@@ -19,6 +19,7 @@ from glassplat.commands.train import Train
 from glassplat.data.dataset import load_dataset
 from glassplat.data.errors import InputError, first_names
 from glassplat.init.planes import PlaneFitError
+from glassplat.train.background import with_background
 from glassplat.train.run_directory import RunDirectory
 from glassplat.train.trainer import TrainingDivergedError
 
@@ -58,7 +59,12 @@ class PlannedRun:
             InputError: the run in it was made from other data, or with another recipe, length or seed.
         """
         directory = self.directory
-        if self.begun() and (directory.settings(), directory.recipe()) != (self.train.settings(), self.train.recipe):
+        if not self.begun():
+            return
+        recorded = directory.recipe()
+        # What the photographs decide is recorded, and not part of what was asked for.
+        wanted = with_background(self.train.recipe, recorded.background)
+        if (directory.settings(), recorded) != (self.train.settings(), wanted):
             raise InputError(
                 f"{directory.path} holds a run with {directory.settings()} or with another recipe; expected "
                 f"{self.train.settings()} and the recipe of this version. Choose another --output, or move the run away"

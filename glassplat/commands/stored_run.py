@@ -10,6 +10,7 @@ from glassplat.data.errors import InputError
 from glassplat.kernels.devices import DeviceName, chosen_device
 from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
+from glassplat.train.background import photo_background, settled
 from glassplat.train.run_directory import RunDirectory
 
 Split = Literal["train", "test", "all"]
@@ -27,7 +28,7 @@ class StoredRun(NamedTuple):
 
 
 def open_run(path: Path, device: DeviceName = "auto") -> StoredRun:
-    """Opens the run in a directory, with the capture it was trained on.
+    """Opens the run in a directory, with the capture it was trained on, over the same background.
 
     Args:
         path: the run's directory.
@@ -39,10 +40,16 @@ def open_run(path: Path, device: DeviceName = "auto") -> StoredRun:
         FileNotFoundError: the capture is no longer where it was.
     """
     directory = RunDirectory(path)
-    recipe, settings = directory.recipe(), directory.settings()
+    recorded, settings = directory.recipe(), directory.settings()
     scene, iterations = directory.latest_scene()
     scene = scene.to(chosen_device(device))
-    dataset = load_dataset(Path(settings.data), downscale=settings.downscale, mask_polarity=settings.mask_polarity)
+    dataset = load_dataset(
+        Path(settings.data),
+        downscale=settings.downscale,
+        background=photo_background(recorded),
+        mask_polarity=settings.mask_polarity,
+    )
+    recipe = settled(recorded, dataset)
     return StoredRun(directory, recipe, scene, recipe.renderer(), dataset, iterations)
 
 

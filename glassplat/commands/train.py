@@ -14,6 +14,7 @@ from glassplat.data.dataset import Dataset, load_dataset
 from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
 from glassplat.kernels.devices import DeviceName, chosen_device
+from glassplat.train.background import photo_background
 from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
 from glassplat.train.planar_recipe import PlanarRecipe
@@ -58,7 +59,10 @@ class Train:
         """Trains, with a progress bar."""
         if self.iterations < 1:
             raise InputError(f"--iterations is {self.iterations}; expected at least 1")
-        dataset = load_dataset(self.data, downscale=self.downscale, mask_polarity=self.mask_polarity)
+        background = photo_background(self.recipe)
+        dataset = load_dataset(
+            self.data, downscale=self.downscale, background=background, mask_polarity=self.mask_polarity
+        )
         describe(dataset, console)
         settings = self.settings()
         directory = RunDirectory(self.output)

@@ -48,6 +48,7 @@ class Dataset:
         warnings: what was assumed or left out, full sentences.
         split: how the test views were chosen.
         measured_points: False if `points` are random ones, which carry no geometry.
+        background: sRGB that is seen through transparent photographs; None where none is transparent.
     """
 
     root: Path
@@ -60,6 +61,7 @@ class Dataset:
     warnings: tuple[str, ...] = ()
     split: str = ""
     measured_points: bool = True
+    background: Rgb | None = None
 
 
 def load_dataset(
@@ -94,7 +96,7 @@ def load_dataset(
     warnings = (
         *capture.warnings,
         *masks.warnings,
-        *_view_warnings(prepared),
+        *_view_warnings(prepared, background),
         *point_warnings,
         *_far_off(train, extent),
     )
@@ -110,6 +112,7 @@ def load_dataset(
         warnings=warnings,
         split=split,
         measured_points=measured,
+        background=background if any(p.transparent for p in prepared) else None,
     )
 
 
@@ -204,7 +207,7 @@ def _points(capture: Capture, train: tuple[View, ...]) -> tuple[PointCloud, list
     return kept, [f"{int((~finite).sum())} points that are not finite are left out."]
 
 
-def _view_warnings(prepared: list[PreparedView]) -> list[str]:
+def _view_warnings(prepared: list[PreparedView], background: Rgb) -> list[str]:
     """What was assumed about photographs, once for all of them."""
     warnings = []
     rescaled = [p.view.name for p in prepared if p.rescaled]
@@ -215,5 +218,5 @@ def _view_warnings(prepared: list[PreparedView]) -> list[str]:
         )
     transparent = [p.view.name for p in prepared if p.transparent]
     if transparent:
-        warnings.append(f"{len(transparent)} photographs have transparency; they are laid over the background colour.")
+        warnings.append(f"{len(transparent)} photographs have transparency; they are laid over sRGB {background}.")
     return warnings

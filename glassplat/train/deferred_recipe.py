@@ -19,6 +19,7 @@ from glassplat.render.deferred import Deferred, Shading
 from glassplat.render.splat import Splat
 from glassplat.scene.environment import Environment
 from glassplat.scene.scene import Scene
+from glassplat.train.background import BLACK
 from glassplat.train.optimizer import Rate
 from glassplat.train.propagation import GrowShAfterPropagation, Propagate, PropagationSchedule
 from glassplat.train.splat_recipe import GaussianRates, photometric_terms
@@ -50,7 +51,7 @@ class DeferredRecipe:
     Attributes:
         sh_degree: highest degree of the view-dependent colour, which grows once propagation has ended.
         ssim_weight: lambda, share of D-SSIM in the photometric loss.
-        background: colour behind everything, sRGB.
+        background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         shading: per pixel (`deferred`), or per Gaussian (`forward`, ablation).
         bootstrap: share of the run without reflection (paper: a few thousand iterations).
         texels: edge length of the environment's cube faces.
@@ -72,7 +73,7 @@ class DeferredRecipe:
 
     sh_degree: int = 3
     ssim_weight: float = 0.2
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: tuple[float, float, float] | None = None
     shading: Shading = "deferred"
     bootstrap: float = 0.1
     texels: int = 64
@@ -100,7 +101,7 @@ class DeferredRecipe:
 
     def renderer(self) -> Deferred:
         """The renderer of the finished scene, with all its layers."""
-        return Deferred(self.background, self.shading)
+        return Deferred(self.background or BLACK, self.shading)
 
     def stages(self, seed: int) -> tuple[Stage, ...]:
         """Bootstrap, then everything; what changes in between is up to `Propagate`."""
@@ -109,7 +110,7 @@ class DeferredRecipe:
         bootstrap = Stage(
             name="1 bootstrap",
             share=self.bootstrap,
-            renderer=Splat(self.background, depth=False),
+            renderer=Splat(self.background or BLACK, depth=False),
             losses=(*photometric, *population.terms),
             rates=self.rates.of("primary"),
             actions=population.edits,
@@ -119,7 +120,7 @@ class DeferredRecipe:
         reflection = Stage(
             name="2 reflection",
             share=1 - self.bootstrap,
-            renderer=Deferred(self.background, self.shading),
+            renderer=Deferred(self.background or BLACK, self.shading),
             losses=(*photometric, LossTerm("outside", self.outside_weight, strength_outside), *population.terms),
             rates=self.rates.of("primary") | self.reflection_rates.of(),
             actions=(

@@ -16,6 +16,7 @@ from glassplat.render.planar import Blend, Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, GrowSh, PerturbOpacity
+from glassplat.train.background import BLACK
 from glassplat.train.optimizer import Rate
 from glassplat.train.plane_entry import PlaneEntry, annotations_of
 from glassplat.train.splat_recipe import GaussianRates, photometric_terms
@@ -91,7 +92,7 @@ class PlanarRecipe:
     Attributes:
         sh_degree: highest degree of the view-dependent colour.
         ssim_weight: lambda, share of D-SSIM in the photometric loss.
-        background: colour behind everything, sRGB.
+        background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         stage_shares: lengths of the three stages (paper: 3000, 3000 and 24,000 iterations).
         multi_stage: False skips stage 2 (ablation).
         fresnel: False makes the strength independent of the angle (ablation).
@@ -117,7 +118,7 @@ class PlanarRecipe:
 
     sh_degree: int = 3
     ssim_weight: float = 0.2
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: tuple[float, float, float] | None = None
     stage_shares: tuple[float, float, float] = (0.1, 0.1, 0.8)
     multi_stage: bool = True
     fresnel: bool = True
@@ -150,7 +151,7 @@ class PlanarRecipe:
 
     def renderer(self) -> Planar:
         """The renderer of the finished scene, with all its layers."""
-        return Planar(self.background, fresnel=self.fresnel, intensity=self.intensity, blend=self.blend)
+        return Planar(self.background or BLACK, fresnel=self.fresnel, intensity=self.intensity, blend=self.blend)
 
     def stages(self, seed: int) -> tuple[Stage, ...]:
         """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
@@ -160,7 +161,7 @@ class PlanarRecipe:
         initialisation = Stage(
             name="1 initialisation",
             share=first,
-            renderer=Splat(self.background, depth=False),
+            renderer=Splat(self.background or BLACK, depth=False),
             losses=(*photometric_terms(self.ssim_weight), *population.terms),
             rates=self.rates.of("primary"),
             actions=(*population.edits, GrowSh(Every(self.rhythm.sh))),
@@ -215,7 +216,7 @@ class PlanarRecipe:
 
     def _training_renderer(self, gradient: str) -> Planar:
         return Planar(
-            self.background,
+            self.background or BLACK,
             fresnel=self.fresnel,
             intensity=self.intensity,
             blend=self.blend,

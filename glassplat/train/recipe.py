@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError
+from glassplat.data.view import Rgb
 from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
 from glassplat.train.deferred_recipe import DeferredRecipe
@@ -25,6 +26,11 @@ class Recipe(Protocol):
     @property
     def method(self) -> str:
         """The method's name on the command line."""
+        ...
+
+    @property
+    def background(self) -> Rgb | None:
+        """Colour behind everything, sRGB; None leaves it to the photographs."""
         ...
 
     def initialise(self, dataset: Dataset) -> Scene:

@@ -13,6 +13,7 @@ from typing import Any, TextIO
 
 from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError
+from glassplat.train.background import settled
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.messages import Message, StepDone
 from glassplat.train.run_directory import RunDirectory, RunSettings
@@ -78,10 +79,14 @@ def run_training(
 ) -> TrainState:
     """Trains to the end or to the user's interrupt, and leaves a run directory from which both can go on.
 
+    A recipe that names no background gets the one that transparent photographs are laid over; it is recorded.
+
     Raises:
+        InputError: as `prepare` and `settled` do.
         KeyboardInterrupt: the user stopped the run; the checkpoint is written.
         TrainingDivergedError: a loss is not finite; the last checkpoint stays.
     """
+    recipe = settled(recipe, dataset)
     state = prepare(recipe, settings, directory, dataset, resume)
     every = max(settings.iterations // 10, 500)
     resumed_seconds, started = state.seconds, time.perf_counter()

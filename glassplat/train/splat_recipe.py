@@ -13,6 +13,7 @@ from glassplat.losses.term import LossTerm
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import GrowSh
+from glassplat.train.background import BLACK
 from glassplat.train.optimizer import Rate
 from glassplat.train.stage import Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
@@ -60,7 +61,7 @@ class SplatRecipe:
     Attributes:
         sh_degree: highest degree of the view-dependent colour.
         ssim_weight: lambda, share of D-SSIM in the photometric loss.
-        background: colour behind everything, sRGB.
+        background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         rates: learning rates.
         rhythm: when opacities are reset and the SH degree grows.
         strategy: what decides how many Gaussians there are and where; `densify` or `mcmc` holds its options.
@@ -72,7 +73,7 @@ class SplatRecipe:
 
     sh_degree: int = 3
     ssim_weight: float = 0.2
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: tuple[float, float, float] | None = None
     rates: GaussianRates = field(default_factory=GaussianRates)
     rhythm: Rhythm = field(default_factory=Rhythm)
     strategy: Strategy = "default"
@@ -85,7 +86,7 @@ class SplatRecipe:
 
     def renderer(self) -> Splat:
         """The renderer of the finished scene, with all its layers."""
-        return Splat(self.background)
+        return Splat(self.background or BLACK)
 
     def stages(self, seed: int) -> tuple[Stage, ...]:
         """One stage."""
@@ -94,7 +95,7 @@ class SplatRecipe:
             Stage(
                 name="splat",
                 share=1.0,
-                renderer=Splat(self.background, depth=False),
+                renderer=Splat(self.background or BLACK, depth=False),
                 losses=(*photometric_terms(self.ssim_weight), *population.terms),
                 rates=self.rates.of("primary"),
                 actions=(*population.edits, GrowSh(Every(self.rhythm.sh)), *population.resets),
