@@ -45,7 +45,5 @@ def test_transparent_photographs_go_over_white_by_default() -> None:
 
 
 def test_two_backgrounds_are_refused() -> None:
-    with pytest.raises(
-        InputError, match=r"laid over \(1\.0, .*, but the recipe renders over \(0\.0, "
-    ):
+    with pytest.raises(InputError, match=r"laid over \(1\.0, .*, but the recipe renders over \(0\.0, "):
         settled(SplatRecipe(background=BLACK), replace(tiny_capture(), background=WHITE))
