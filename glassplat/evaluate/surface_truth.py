@@ -6,8 +6,8 @@ r_0_normal.png     (n + 1) / 2 of the unit normals in world axes; alpha is the c
 r_0_strength.png   grey of 8 or 16 bits: the share of mirror-like reflection
 ```
 
-Shiny Blender has the normals, this project's own captures have both. The lens must be a pinhole: what lies beside a
-photograph is reduced with it, but not undistorted.
+Shiny Blender has the normals, this project's own captures have both; it could not be tried on Shiny Blender's own
+files. The lens must be a pinhole: what lies beside a photograph is reduced with it, but not undistorted.
 """
 
 from __future__ import annotations
