@@ -15,18 +15,18 @@ class Column:
     """One metric.
 
     Attributes:
-        name: in `results.json`, or of a plane in there.
+        name: in `results.json`.
         title: in the table.
         style: format specification of its values.
         is_ratio: compared by quotient, because absolute values differ between machines and scenes.
-        of_planes: the mean over the planes of the scene.
+        of_planes: the planes' metric of which it is the mean over the scene's planes; empty for one of the scene.
     """
 
     name: str
     title: str
     style: str
     is_ratio: bool = False
-    of_planes: bool = False
+    of_planes: str = ""
 
 
 COLUMNS = (
@@ -36,12 +36,17 @@ COLUMNS = (
     Column("pane_psnr", "pane psnr", ".2f"),
     Column("transmission_psnr", "transmission psnr", ".2f"),
     Column("reflection_psnr", "reflection psnr", ".2f"),
+    Column("normal_error_deg", "normal error, deg", ".2f"),
+    Column("reflective_normal_error_deg", "reflective normal error, deg", ".2f"),
+    Column("strength_error", "strength error", ".3f"),
+    Column("environment_psnr", "environment psnr", ".2f"),
+    Column("environment_lpips", "environment lpips", ".4f"),
     Column("num_gaussians", "Gaussians", ".0f", is_ratio=True),
     Column("train_seconds", "training, s", ".0f", is_ratio=True),
     Column("seconds_per_frame", "frame, s", ".4f", is_ratio=True),
-    Column("normal_error_deg", "normal error, deg", ".2f", of_planes=True),
-    Column("offset_error", "offset error", ".2%", of_planes=True),
-    Column("base_reflectance_error", "R0 error", ".3f", of_planes=True),
+    Column("pane_normal_error_deg", "pane normal error, deg", ".2f", of_planes="normal_error_deg"),
+    Column("offset_error", "offset error", ".2%", of_planes="offset_error"),
+    Column("base_reflectance_error", "R0 error", ".3f", of_planes="base_reflectance_error"),
 )
 
 
@@ -81,7 +86,7 @@ class Row(NamedTuple):
 
 def values_of(results: Mapping[str, Any]) -> dict[str, float | None]:
     """The columns' values in `results.json`."""
-    return {c.name: _mean_of_planes(results, c.name) if c.of_planes else results.get(c.name) for c in COLUMNS}
+    return {c.name: _mean_of_planes(results, c.of_planes) if c.of_planes else results.get(c.name) for c in COLUMNS}
 
 
 def means(measured: Sequence[Measured]) -> list[Row]:

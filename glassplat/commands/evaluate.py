@@ -12,7 +12,7 @@ from rich.table import Table
 
 from glassplat.commands.stored_run import StoredRun, open_run
 from glassplat.evaluate.evaluate import Evaluation, evaluate
-from glassplat.evaluate.report import Report
+from glassplat.evaluate.report import SURFACE_METRICS, Report
 from glassplat.kernels.devices import DeviceName
 from glassplat.render.planar import Planar
 from glassplat.train.checkpoint import recorded_seconds
@@ -25,6 +25,11 @@ SHOWN = (
     "pane_psnr",
     "transmission_psnr",
     "reflection_psnr",
+    "normal_error_deg",
+    "reflective_normal_error_deg",
+    "strength_error",
+    "environment_psnr",
+    "environment_lpips",
     "num_gaussians",
     "seconds_per_frame",
 )
@@ -81,6 +86,8 @@ def results_table(*results: dict) -> Table:
     """The main metrics of one or several runs, side by side."""
     table = Table("metric", *(r["method"] for r in results))
     for name in SHOWN:
+        if name in SURFACE_METRICS and all(r.get(name) is None for r in results):
+            continue
         table.add_row(name, *(shown(r.get(name)) for r in results))
     for result in results:
         for plane in result.get("planes") or []:

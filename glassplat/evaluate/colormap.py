@@ -1,4 +1,4 @@
-"""False colours for depth, errors and labels."""
+"""False colours for depth, errors, normals and labels."""
 
 from __future__ import annotations
 
@@ -65,6 +65,11 @@ def depth_colors(depth: Tensor, alpha: Tensor | None = None) -> Tensor:
     # The dark end is kept for what has no depth.
     brightness = 0.08 + 0.92 * ((inverse - low) / span).clamp(0, 1)
     return heat_colors(brightness) * shown[..., None]
+
+
+def normal_colors(normals: Tensor) -> Tensor:
+    """Colours [..., 3] in [0, 1] of normals [..., 3]: (n + 1) / 2, so that what has none is grey."""
+    return (0.5 * normals.nan_to_num(0.0) + 0.5).clamp(0, 1)
 
 
 def label_colors(labels: Tensor) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import resource
 import statistics
 import sys
@@ -19,22 +18,20 @@ from glassplat.data.dataset import Dataset, View
 from glassplat.data.errors import InputError
 from glassplat.evaluate.lpips import Lpips, load_lpips
 from glassplat.evaluate.metrics import psnr, quantized, reflection_gain, ssim
+from glassplat.evaluate.outcome import NO_WEIGHTS, SMALLEST_REGION, Outcome, plain
 from glassplat.evaluate.plane_errors import missing_panes, plane_table
+from glassplat.evaluate.surface_metrics import surface_metrics
+from glassplat.evaluate.surface_truth import TrueSurface, true_surface
 from glassplat.evaluate.truth import GroundTruth, TrueView, load_truth
 from glassplat.render.frame import Frame, Renderer
 from glassplat.scene.scene import Scene
 
-SMALLEST_REGION = 100
-"""Pixels that a view's region needs to count; a sliver of a pane says nothing."""
 MIRROR_STRENGTH = 0.999
 """From this true strength on, nothing is transmitted."""
 NO_TRUTH = "the data set has no ground truth"
 NO_VIEW_TRUTH = "the ground truth lacks this view"
-NO_WEIGHTS = "no LPIPS weights"
 TOO_FEW = f"fewer than {SMALLEST_REGION} pixels show a pane"
 
-Outcome = float | str
-"""A metric's value, or a sentence on why there is none."""
 Truths = tuple[GroundTruth | None, TrueView | None]
 """What is known of the data set, and of one view."""
 
@@ -60,12 +57,14 @@ class EvaluatedView:
         view: the photograph and its camera.
         frame: what was rendered, on the CPU.
         truth: the true layers, where they are known.
+        surface: the true surface, where it is known.
         metrics: as in `Evaluation.per_view`, without the reflection's, which needs all views.
     """
 
     view: View
     frame: Frame
     truth: TrueView | None
+    surface: TrueSurface | None
     metrics: Mapping[str, Any]
 
 
@@ -100,7 +99,11 @@ def evaluate(
     those that transmit (true strength below 0.999) against `gt/trans`, `reflection_psnr` against `gt/refl`
     after one gain for the whole scene. The pane is `gt/`'s where there is one, else the rendered mask above
     0.5; `pane_region` says which. A method without layers is scored with its image as its transmission:
-    that is what its user has. `peak_memory_mib` is that of the whole process so far.
+    that is what its user has.
+
+    `normal_error_deg` is the mean angle between the layer `normal` and the true normals over the pixels that show a
+    surface, `reflective_normal_error_deg` the same where it mirrors more than half, `strength_error` the mean
+    difference of the layer `strength` from the true one. `peak_memory_mib` is that of the whole process so far.
 
     Args:
         scene: what to render.
@@ -122,8 +125,10 @@ def evaluate(
     for view in dataset.test:
         frame, seconds = timed_render(renderer, scene, view)
         true_view = truth.view(view.name, view.camera.width, view.camera.height) if truth else None
-        measurements[view.name] = measured = _measure(frame, seconds, view.photo, truth=(truth, true_view), lpips=lpips)
-        listen(EvaluatedView(view, frame, true_view, plain(measured.metrics)))
+        surface = true_surface(view)
+        measured = _measure(frame, seconds, view.photo, truth=(truth, true_view), surface=surface, lpips=lpips)
+        measurements[view.name] = measured
+        listen(EvaluatedView(view, frame, true_view, surface, plain(measured.metrics)))
     gain = _add_reflection(measurements.values())
     per_view = {name: plain(m.metrics) | {"seconds": m.seconds} for name, m in measurements.items()}
     results = _description(scene, dataset)
@@ -157,16 +162,6 @@ def timed_render(renderer: Renderer, scene: Scene, view: View) -> tuple[Frame, f
     return frame, seconds
 
 
-def plain(outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
-    """JSON values: numbers as they are; None, and `<name>_reason`, where there is no finite number."""
-    result: dict[str, Any] = {}
-    for name, outcome in outcomes.items():
-        reason = outcome if isinstance(outcome, str) else "infinite: the images are equal"
-        is_number = not isinstance(outcome, str) and math.isfinite(outcome)
-        result |= {name: outcome} if is_number else {name: None, f"{name}_reason": reason}
-    return result
-
-
 def peak_memory_mib() -> float:
     """Largest resident size of this process so far, in MiB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -180,7 +175,9 @@ def _available_lpips(folder: Path | None) -> Lpips | str:
         return str(error)
 
 
-def _measure(frame: Frame, seconds: float, photo: Tensor, *, truth: Truths, lpips: Lpips | str) -> _Measurement:
+def _measure(
+    frame: Frame, seconds: float, photo: Tensor, *, truth: Truths, surface: TrueSurface | None, lpips: Lpips | str
+) -> _Measurement:
     """Every metric of one view except the reflection's, which needs all views."""
     pane = _pane(frame, *truth)
     metrics: dict[str, Outcome] = {
@@ -189,6 +186,7 @@ def _measure(frame: Frame, seconds: float, photo: Tensor, *, truth: Truths, lpip
         "lpips": NO_WEIGHTS if isinstance(lpips, str) else lpips(quantized(frame.rgb), quantized(photo)),
         "pane_psnr": pane if isinstance(pane, str) else _region_psnr(frame.rgb, photo, pane, TOO_FEW),
         "transmission_psnr": _transmission_psnr(frame, *truth),
+        **surface_metrics(frame, surface),
     }
     return _Measurement(metrics, seconds, _reflection_pixels(frame, *truth))
 

@@ -24,12 +24,21 @@ METRICS = {
     "transmission_psnr": ("PSNR, transmission", "{:.2f} dB"),
     "reflection_psnr": ("PSNR, reflection", "{:.2f} dB"),
 }
+SURFACE_METRICS = {
+    "normal_error_deg": ("normal error", "{:.2f}°"),
+    "reflective_normal_error_deg": ("normal error, reflective", "{:.2f}°"),
+    "strength_error": ("strength error", "{:.3f}"),
+    "environment_psnr": ("PSNR, environment", "{:.2f} dB"),
+    "environment_lpips": ("LPIPS, environment", "{:.4f}"),
+}
+"""Shown where they are known: only synthetic captures of objects have the truth they need."""
 FACTS = {
     "num_gaussians": ("Gaussians", "{:,}"),
     "train_seconds": ("training", "{:.0f} s"),
     "seconds_per_frame": ("per frame", "{:.3f} s"),
     "reflection_gain": ("reflection gain", "{:.2f}"),
 }
+SURFACE_FACTS = {"environment_gain": ("environment gain", "{:.2f}")}
 USES_FILE = "uses.png"
 SETTINGS = ("iterations", "seed", "resolution", "split", "lpips_backbone", "pane_region")
 PLANE_COLUMNS = {
@@ -64,7 +73,9 @@ class Report:
         """Draws one view; for `evaluate` to call."""
         view, frame = evaluated.view, evaluated.frame
         subtitle = _metrics_line(evaluated.metrics)
-        sheet = comparison_sheet(frame, view.photo, evaluated.truth, title=view.name, subtitle=subtitle)
+        sheet = comparison_sheet(
+            frame, view.photo, evaluated.truth, surface=evaluated.surface, title=view.name, subtitle=subtitle
+        )
         write_image(self._folder / self._sheets[view.name], sheet)
         if self._uses is not None:
             self._uses.add(evaluated)
@@ -126,8 +137,9 @@ def _settings_line(results: Mapping[str, Any]) -> str:
 
 def _cards(results: Mapping[str, Any]) -> str:
     cards = []
-    for name, (label, pattern) in (METRICS | FACTS).items():
-        if name in results:
+    known = {name for name in SURFACE_METRICS | SURFACE_FACTS if results.get(name) is not None}
+    for name, (label, pattern) in (METRICS | SURFACE_METRICS | FACTS | SURFACE_FACTS).items():
+        if name in known or (name in METRICS | FACTS and name in results):
             value, reason = _formatted(results[name], pattern), results.get(f"{name}_reason") or ""
             cards.append(f'<div title="{_escaped(reason)}"><b>{value}</b><span>{label}</span></div>')
     return f'<div class="cards">{"".join(cards)}</div>'
@@ -141,9 +153,8 @@ def _plane_table(planes: list[Mapping[str, Any]]) -> str:
 
 
 def _view_table(per_view: Mapping[str, Mapping[str, Any]], sheets: Mapping[str, str]) -> str:
-    shown = {
-        name: column for name, column in METRICS.items() if any(row.get(name) is not None for row in per_view.values())
-    }
+    columns = METRICS | SURFACE_METRICS
+    shown = {n: column for n, column in columns.items() if any(row.get(n) is not None for row in per_view.values())}
     rows = [
         [_link(name, sheets), *(_formatted(row.get(metric), pattern) for metric, (_, pattern) in shown.items())]
         for name, row in per_view.items()
@@ -169,7 +180,8 @@ def _figure(name: str, path: str, description: str) -> str:
 
 
 def _metrics_line(metrics: Mapping[str, Any]) -> str:
-    known = [(label, _formatted(metrics[n], p)) for n, (label, p) in METRICS.items() if metrics.get(n) is not None]
+    shown = (METRICS | SURFACE_METRICS).items()
+    known = [(label, _formatted(metrics[n], pattern)) for n, (label, pattern) in shown if metrics.get(n) is not None]
     return "    ".join(f"{label} {value}" for label, value in known)
 
 

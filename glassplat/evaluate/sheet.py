@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +11,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from glassplat.evaluate.colormap import depth_colors, heat_colors, label_colors
+from glassplat.evaluate.colormap import depth_colors, heat_colors, label_colors, normal_colors
 from glassplat.evaluate.metrics import quantized
+from glassplat.evaluate.surface_truth import NOTHING_KNOWN, TrueSurface
 from glassplat.evaluate.truth import TrueView
 from glassplat.render.frame import Frame
 
@@ -23,6 +25,9 @@ BACKGROUND, TEXT, QUIET_TEXT = (22, 24, 28), (236, 236, 236), (160, 166, 174)
 ERROR_SCALE = 0.2
 """The colour error that is drawn brightest; the same in every sheet, so that sheets can be compared."""
 SMALLEST_STRENGTH_SCALE = 0.05
+COLORED = ("transmission", "base", "reflection", "environment")
+COLUMNS = (*COLORED, "strength", "normal", "mask")
+"""Layers in the order in which they are shown."""
 
 
 @dataclass(frozen=True)
@@ -33,28 +38,40 @@ class Panel:
     image: Tensor
 
 
+Row = Sequence[Panel | None]
+"""Panels side by side; None leaves the place empty."""
+
+
 def comparison_sheet(
-    frame: Frame, photo: Tensor, truth: TrueView | None, *, title: str, subtitle: str = ""
+    frame: Frame,
+    photo: Tensor,
+    truth: TrueView | None,
+    *,
+    surface: TrueSurface | None = None,
+    title: str,
+    subtitle: str = "",
 ) -> NDArray[np.uint8]:
     """The sheet [H, W, 3] of one view.
 
-    First row: photograph, render, error, depth. Second row, where the method has them: transmission,
-    reflection, strength, mask. Third row, where they are known: the true ones, in the same columns.
+    First row: photograph, render, error, depth. Second row, where the method has them: transmission, base,
+    reflection, environment, strength, normals, mask. Third row, where they are known: the true ones, in the same
+    columns.
 
     Args:
         frame: what was rendered, on the CPU.
         photo: [H, W, 3] uint8.
         truth: the true layers.
+        surface: the true surface.
         title: set in large type; usually the view's name.
         subtitle: set in small type beside it; usually the metrics.
     """
-    rows = [_image_row(frame, photo), _layer_row(frame, truth), _truth_row(frame, truth)]
-    return composed([row for row in rows if row], title, subtitle)
+    rows: list[Row] = [_image_row(frame, photo), *_layer_rows(frame, truth, surface or NOTHING_KNOWN)]
+    return composed([row for row in rows if any(row)], title, subtitle)
 
 
-def composed(rows: list[list[Panel]], title: str, subtitle: str) -> NDArray[np.uint8]:
+def composed(rows: Sequence[Row], title: str, subtitle: str) -> NDArray[np.uint8]:
     """Panels of one size in rows, with captions and a title line."""
-    height, width = rows[0][0].image.shape[:2]
+    height, width = next(panel for row in rows for panel in row if panel).image.shape[:2]
     panel_size = _panel_size(width, height)
     columns = max(len(row) for row in rows)
     row_height = CAPTION_HEIGHT + panel_size[1] + GAP
@@ -66,6 +83,8 @@ def composed(rows: list[list[Panel]], title: str, subtitle: str) -> NDArray[np.u
     _draw_title(ImageDraw.Draw(canvas), title, subtitle, size[0])
     for row_index, row in enumerate(rows):
         for column, panel in enumerate(row):
+            if panel is None:
+                continue
             x = MARGIN + column * (panel_size[0] + GAP)
             y = MARGIN + TITLE_HEIGHT + row_index * row_height
             _draw_panel(canvas, panel, (x, y), panel_size)
@@ -84,38 +103,52 @@ def _image_row(frame: Frame, photo: Tensor) -> list[Panel]:
     return row
 
 
-def _layer_row(frame: Frame, truth: TrueView | None) -> list[Panel]:
+def _layer_rows(frame: Frame, truth: TrueView | None, surface: TrueSurface) -> tuple[Row, Row]:
+    """What was rendered, and what it should be below it."""
+    maps = [frame.layers.get("strength"), surface.strength, None if truth is None else truth.strength]
+    scale = _strength_scale([strength for strength in maps if strength is not None])
+    rendered, true = _rendered_panels(frame, scale), _true_panels(truth, surface, scale)
+    columns = [name for name in COLUMNS if name in rendered or name in true]
+    return [rendered.get(name) for name in columns], [true.get(name) for name in columns]
+
+
+def _rendered_panels(frame: Frame, scale: float) -> dict[str, Panel]:
+    """Panels of a frame's layers by name."""
     layers = frame.layers
-    row = [Panel("transmission", layers["transmission"])] if "transmission" in layers else []
-    if "reflection" in layers:
-        row.append(Panel("reflection", layers["reflection"]))
+    panels = {name: Panel(name, layers[name]) for name in COLORED if name in layers}
     if "strength" in layers:
-        scale = _strength_scale(frame, truth)
-        row.append(Panel(f"strength (white: {scale:.2f})", _grey(layers["strength"] / scale)))
+        panels["strength"] = _strength_panel("strength", layers["strength"], scale)
+    if "normal" in layers:
+        panels["normal"] = Panel("normals", normal_colors(layers["normal"]))
     if "mask" in layers:
-        row.append(Panel("mask", _grey(layers["mask"])))
-    return row
+        panels["mask"] = Panel("mask", _grey(layers["mask"]))
+    return panels
 
 
-def _truth_row(frame: Frame, truth: TrueView | None) -> list[Panel]:
-    if truth is None:
-        return []
-    scale = _strength_scale(frame, truth)
-    return [
-        Panel("true transmission", truth.transmission),
-        Panel("true reflection", truth.reflection),
-        Panel(f"true strength (white: {scale:.2f})", _grey(truth.strength / scale)),
-        Panel("true panes", label_colors(truth.labels)),
-    ]
+def _true_panels(truth: TrueView | None, surface: TrueSurface, scale: float) -> dict[str, Panel]:
+    """Panels of what is known to be true, by the name of the layer that should be like it."""
+    panels = {}
+    if surface.strength is not None:
+        panels["strength"] = _strength_panel("true strength", surface.strength, scale)
+    if surface.normals is not None:
+        panels["normal"] = Panel("true normals", normal_colors(surface.normals))
+    if truth is not None:
+        panels["transmission"] = Panel("true transmission", truth.transmission)
+        panels["reflection"] = Panel("true reflection", truth.reflection)
+        panels["strength"] = _strength_panel("true strength", truth.strength, scale)
+        panels["mask"] = Panel("true panes", label_colors(truth.labels))
+    return panels
 
 
-def _strength_scale(frame: Frame, truth: TrueView | None) -> float:
+def _strength_panel(caption: str, strength: Tensor, scale: float) -> Panel:
+    return Panel(f"{caption} (white: {scale:.2f})", _grey(strength / scale))
+
+
+def _strength_scale(maps: Sequence[Tensor]) -> float:
     """One scale for rendered and true strength, so that the two can be compared by eye."""
-    maps = [frame.layers["strength"]] if "strength" in frame.layers else []
-    maps += [truth.strength] if truth is not None else []
     # Glass at grazing angles reaches 1; the bulk of the pane is what should be seen.
     peaks = [float(np.percentile(strength.numpy(), 98)) for strength in maps]
-    return min(max(*peaks, SMALLEST_STRENGTH_SCALE), 1.0)
+    return min(max([*peaks, SMALLEST_STRENGTH_SCALE]), 1.0)
 
 
 def _grey(values: Tensor) -> Tensor:

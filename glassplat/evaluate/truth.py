@@ -88,7 +88,7 @@ class GroundTruth:
         return TrueView(
             transmission=torch.from_numpy(_resized_color(read_image(paths["transmission"]), size)),
             reflection=torch.from_numpy(_resized_color(read_image(paths["reflection"]), size)),
-            strength=torch.from_numpy(_resized_float(read_image_float(paths["strength"])[..., 0], size)),
+            strength=torch.from_numpy(resized_float(read_image_float(paths["strength"])[..., 0], size)),
             labels=torch.from_numpy(_resized_labels(read_image(paths["labels"])[..., 0], size)),
         )
 
@@ -130,7 +130,8 @@ def _resized_color(pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[
     return np.array(Image.fromarray(pixels[..., :3]).resize(size, Image.Resampling.BOX))
 
 
-def _resized_float(pixels: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+def resized_float(pixels: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """[H, W] averaged down to a size, which is width and height."""
     return np.array(Image.fromarray(pixels).resize(size, Image.Resampling.BOX))
 
 
@@ -138,6 +139,6 @@ def _resized_labels(labels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray
     """A label survives only where it covers the whole of the larger pixel."""
     result = np.zeros(size[::-1], dtype=np.uint8)
     for label in np.unique(labels[labels > 0]):
-        share = _resized_float((labels == label).astype(np.float32), size)
+        share = resized_float((labels == label).astype(np.float32), size)
         result[share > 1 - 1e-4] = label
     return result

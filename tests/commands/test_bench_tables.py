@@ -43,8 +43,9 @@ def test_plane_errors_are_means_over_the_planes() -> None:
         {"normal_error_deg": 0.2, "offset_error": 0.01, "base_reflectance_error": None},
         {"normal_error_deg": 0.4, "offset_error": 0.03, "base_reflectance_error": None},
     ]
-    values = values_of({"psnr": 30.0, "planes": planes})
-    assert values["normal_error_deg"] == pytest.approx(0.3)
+    values = values_of({"psnr": 30.0, "normal_error_deg": 7.0, "planes": planes})
+    assert values["pane_normal_error_deg"] == pytest.approx(0.3)
+    assert values["normal_error_deg"] == 7.0
     assert values["offset_error"] == pytest.approx(0.02)
     assert values["base_reflectance_error"] is None
     assert values["psnr"] == 30.0 and values["ssim"] is None

@@ -1,16 +1,24 @@
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
+from glassplat.data.dataset import load_dataset
 from glassplat.data.errors import InputError
-from glassplat.evaluate.evaluate import evaluate, plain
+from glassplat.evaluate.evaluate import EvaluatedView, evaluate
 from glassplat.evaluate.metrics import psnr
+from glassplat.evaluate.outcome import plain
 from glassplat.evaluate.plane_errors import plane_table
 from glassplat.evaluate.truth import load_truth
+from glassplat.render.frame import Frame
+from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
+from glassplat.scene.scene import Scene
+from tests.train.object_capture import RADIUS, write_object_capture
 
 REQUIRED_KEYS = {
     "resolution",
@@ -27,6 +35,9 @@ REQUIRED_KEYS = {
     "reflection_psnr",
     "planes",
     "peak_memory_mib",
+    "normal_error_deg",
+    "reflective_normal_error_deg",
+    "strength_error",
 }
 
 
@@ -148,6 +159,40 @@ def test_normal_error_is_the_angle_between_lines(case, angle: float) -> None:
 def test_the_first_frame_is_rendered_once_more_than_it_is_timed(case) -> None:
     evaluate(case.scene, case.renderer, case.dataset)
     assert case.renderer.calls == [40.0, 40.0, 41.0, 42.0]
+
+
+def ball_frame(scene: Scene, camera: Camera) -> Frame:
+    """A ball with normals turned by 90 degrees about z, and a strength 0.1 too high."""
+    rays = camera.ray_directions()
+    along = -(rays @ camera.center)
+    beyond = RADIUS**2 - (camera.center.square().sum() - along.square())
+    normals = (camera.center + (along - beyond.clamp(min=0).sqrt())[..., None] * rays) / RADIUS
+    turned = torch.stack([-normals[..., 1], normals[..., 0], normals[..., 2]], dim=-1)
+    strength = torch.where(normals[..., 2] > 0, 0.9, 0.1)
+    return Frame(torch.ones_like(normals), {"normal": 0.5 * turned, "strength": strength})
+
+
+def test_surfaces_are_compared_with_what_lies_beside_the_photographs(tmp_path: Path) -> None:
+    dataset = load_dataset(write_object_capture(tmp_path / "ball"))
+    seen: list[EvaluatedView] = []
+    evaluation = evaluate(Scene(Gaussians.empty(1), 1.0), ball_frame, dataset, listen=seen.append)
+    assert list(evaluation.per_view) == ["test/r_0.png", "test/r_1.png"]
+    for evaluated, row in zip(seen, evaluation.per_view.values(), strict=True):
+        assert evaluated.surface is not None and evaluated.surface.normals is not None
+        normals = evaluated.surface.normals[evaluated.surface.covered]
+        expected = torch.rad2deg(torch.acos(1 - normals[:, :2].square().sum(-1))).mean()
+        assert row["normal_error_deg"] == pytest.approx(float(expected), abs=0.5)
+        assert row["strength_error"] == pytest.approx(0.1, abs=0.02)
+    assert evaluation.results["reflective_normal_error_deg"] == pytest.approx(
+        sum(row["reflective_normal_error_deg"] for row in evaluation.per_view.values()) / 2
+    )
+    assert "normal_error_deg_reason" not in evaluation.results
+
+
+def test_without_true_surfaces_the_reason_is_said(case) -> None:
+    results = evaluate(case.scene, case.renderer, case.dataset).results
+    assert results["normal_error_deg_reason"] == "the method renders no normals"
+    assert results["strength_error_reason"] == "no true strength lies beside the photograph"
 
 
 def test_no_gradients_are_recorded(case) -> None:

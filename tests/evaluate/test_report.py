@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from glassplat.evaluate.colormap import depth_colors, heat_colors, label_colors
+from glassplat.evaluate.colormap import depth_colors, heat_colors, label_colors, normal_colors
 from glassplat.evaluate.evaluate import evaluate
 from glassplat.evaluate.report import Report, overview_page, sheet_names
-from glassplat.evaluate.sheet import CAPTION_HEIGHT, MARGIN, TITLE_HEIGHT, comparison_sheet
+from glassplat.evaluate.sheet import BACKGROUND, CAPTION_HEIGHT, MARGIN, TITLE_HEIGHT, comparison_sheet
+from glassplat.evaluate.surface_truth import TrueSurface
 from glassplat.files.images import read_image
 from glassplat.render.dereflect import dereflected_photo
 from glassplat.render.planar import Blend
@@ -98,6 +99,44 @@ def test_rows_follow_what_is_known(case) -> None:
     row = CAPTION_HEIGHT + 32 * 6 + 10
     assert heights[1] - heights[0] == row
     assert widths[1] - widths[0] == 48 * 6 + 10
+
+
+def panel_at(sheet: np.ndarray, row: int, column: int) -> np.ndarray:
+    """The pixels of one panel of a sheet of 48x32 images, which is drawn at six times that size."""
+    top = MARGIN + TITLE_HEIGHT + CAPTION_HEIGHT + row * (CAPTION_HEIGHT + 32 * 6 + 10)
+    left = MARGIN + column * (48 * 6 + 10)
+    return sheet[top : top + 32 * 6 : 6, left : left + 48 * 6 : 6]
+
+
+def test_true_normals_and_strength_stand_below_what_was_rendered(case) -> None:
+    size, view = (32, 48), case.dataset.test[0]
+    normal = torch.tensor([0.0, 0.0, 0.6]).expand(*size, 3)
+    layers = {"base": torch.full((*size, 3), 0.25), "strength": torch.full(size, 0.4), "normal": normal}
+    layers |= {"environment": torch.full((*size, 3), 0.75)}
+    surface = TrueSurface(torch.ones(size, dtype=torch.bool), normal / 0.6, torch.full(size, 0.8))
+    frame = replace(case.renderer.frames[40.0], layers=layers)
+    sheet = comparison_sheet(frame, view.photo, None, surface=surface, title="a")
+    second = [panel_at(sheet, 1, column)[0, 0].tolist() for column in range(4)]
+    third = [panel_at(sheet, 2, column)[0, 0].tolist() for column in range(4)]
+    assert second == [[64] * 3, [191] * 3, [128] * 3, [128, 128, 204]]
+    assert third == [list(BACKGROUND), list(BACKGROUND), [255] * 3, [128, 128, 255]]
+    without_layers = comparison_sheet(replace(frame, layers={}), view.photo, None, surface=surface, title="a")
+    assert panel_at(without_layers, 1, 1)[0, 0].tolist() == [128, 128, 255]
+
+
+def test_what_has_no_normal_is_grey() -> None:
+    normals = torch.tensor([[0.0, 0.0, 0.0], [float("nan"), 0.0, 1.0], [-2.0, 1.0, 0.0]])
+    assert normal_colors(normals).tolist() == [[0.5, 0.5, 0.5], [0.5, 0.5, 1.0], [0.0, 1.0, 0.5]]
+
+
+def test_surface_metrics_are_shown_where_they_are_known() -> None:
+    unknown = {"psnr": 30.0, "normal_error_deg": None, "normal_error_deg_reason": "the method renders no normals"}
+    known = {"psnr": 30.0, "normal_error_deg": 4.871, "environment_gain": 1.5}
+    assert "normal error" not in overview_page(unknown, {"a.jpg": unknown}, {})
+    page = overview_page(known, {"a.jpg": known}, {})
+    assert "<b>4.87°</b><span>normal error</span>" in page
+    assert "<b>1.50</b><span>environment gain</span>" in page
+    assert "<th>normal error</th>" in page and "<td>4.87°</td>" in page
 
 
 def test_large_photographs_give_sheets_of_a_bearable_size(case) -> None:

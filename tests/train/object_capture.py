@@ -12,8 +12,9 @@ from PIL import Image
 from glassplat.files.ply_table import write_table
 
 SIZE = 40
-RADIUS = 0.5
+RADIUS = 0.8
 DISTANCE = 4.0
+POINTS = 300
 OPENING_ANGLE_RAD = 0.7
 COLOR = (200, 40, 40)
 
@@ -67,8 +68,8 @@ def write_object_capture(root: Path) -> Path:
     """Four training and two test views of a red ball with a shiny upper half; returns the folder."""
     write_part(root, "train", np.linspace(0, 2 * math.pi, 4, endpoint=False))
     write_part(root, "test", np.array([0.4, 2.0]))
-    directions = np.random.default_rng(0).normal(size=(60, 3))
+    directions = np.random.default_rng(0).normal(size=(POINTS, 3))
     positions = 0.9 * RADIUS * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    rows = np.concatenate([positions, np.tile(COLOR, (60, 1))], axis=1).astype(np.float32)
+    rows = np.concatenate([positions, np.tile(COLOR, (POINTS, 1))], axis=1).astype(np.float32)
     write_table(root / "points3d.ply", ["x", "y", "z", "red", "green", "blue"], rows)
     return root

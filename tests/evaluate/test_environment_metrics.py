@@ -1,0 +1,87 @@
+import math
+
+import pytest
+import torch
+
+from glassplat.evaluate.environment_metrics import environment_lpips, environment_metrics, environment_psnr
+from glassplat.evaluate.metrics import psnr, quantized
+
+TRUTH = 0.1 + 0.6 * torch.rand(64, 128, 3, generator=torch.Generator().manual_seed(0))
+
+
+class MeanDifference:
+    """Stands for LPIPS."""
+
+    backbone = "alex"
+
+    def __call__(self, image: torch.Tensor, target: torch.Tensor) -> float:
+        assert image.dtype == target.dtype == torch.uint8
+        return float((image.double() - target.double()).abs().mean())
+
+
+def test_equal_maps_up_to_a_factor_have_no_error() -> None:
+    value, gain = environment_psnr(0.4 * TRUTH, TRUTH)
+    assert value == math.inf
+    assert gain == pytest.approx(2.5)
+
+
+def test_a_difference_that_keeps_the_energy_is_that_of_the_images() -> None:
+    stripes = torch.where(torch.arange(128)[:, None] % 2 == 0, 0.05, -0.05)
+    value, gain = environment_psnr(TRUTH + stripes, TRUTH)
+    assert gain == pytest.approx(1.0, abs=1e-6)
+    assert value == pytest.approx(psnr(TRUTH + stripes, TRUTH), abs=0.05)
+
+
+def test_rows_count_by_their_solid_angle() -> None:
+    grey = torch.full((64, 128, 3), 0.5)
+    stripe = torch.where(torch.arange(128)[:, None] % 2 == 0, 0.2, -0.2)
+    at_pole, at_equator = grey.clone(), grey.clone()
+    at_pole[0] += stripe
+    at_equator[32] += stripe
+    difference = environment_psnr(at_pole, grey)[0] - environment_psnr(at_equator, grey)[0]
+    ratio = math.cos(math.pi / 2 - math.pi / 128) / math.cos(math.pi / 128)
+    assert difference == pytest.approx(-10 * math.log10(ratio), abs=1e-3)
+
+
+def test_the_energy_too_is_that_of_the_sphere() -> None:
+    bright_pole, grey = torch.full((64, 128, 3), 0.5), torch.full((64, 128, 3), 0.5)
+    bright_pole[0] = 1.0
+    assert 0.999 < environment_psnr(bright_pole, grey)[1] < 1
+
+
+def test_a_larger_truth_is_averaged_down() -> None:
+    large = TRUTH.repeat_interleave(4, dim=0).repeat_interleave(4, dim=1)
+    assert environment_psnr(TRUTH, large)[0] == math.inf
+    assert environment_psnr(TRUTH, quantized(large))[0] > 50
+
+
+def test_black_maps() -> None:
+    value, gain = environment_psnr(torch.zeros(64, 128, 3), TRUTH)
+    assert gain == 1.0 and 0 < value < 20
+    assert environment_psnr(TRUTH, torch.zeros(64, 128, 3)) == (math.inf, 0.0)
+
+
+@pytest.mark.parametrize("shape", [(64, 64, 3), (128, 64, 3), (64, 128), (0, 0, 3), (64, 128, 4)])
+def test_what_is_no_panorama_is_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"true environment as a panorama \[H, 2H, 3\]"):
+        environment_psnr(TRUTH, torch.zeros(shape))
+
+
+def test_values_that_are_not_finite_are_refused() -> None:
+    with pytest.raises(ValueError, match="the learned environment holds values that are not finite"):
+        environment_psnr(TRUTH / 0, TRUTH)
+
+
+def test_lpips_sees_equalised_maps() -> None:
+    assert environment_lpips(0.4 * TRUTH, TRUTH, MeanDifference()) == 0  # type: ignore[arg-type]
+    assert environment_lpips(TRUTH.flip(0), TRUTH, MeanDifference()) > 1  # type: ignore[arg-type]
+    assert environment_lpips(TRUTH, TRUTH, "no LPIPS weights: put them somewhere") == "no LPIPS weights"
+
+
+def test_what_is_missing_is_the_reason() -> None:
+    names = {"environment_psnr", "environment_gain", "environment_lpips"}
+    found = environment_metrics(0.5 * TRUTH, TRUTH, "no weights")
+    assert set(found) == names
+    assert found["environment_gain"] == pytest.approx(2.0)
+    assert environment_metrics(None, TRUTH, "no weights") == dict.fromkeys(names, "the method learns no environment")
+    assert environment_metrics(TRUTH, None, "") == dict.fromkeys(names, "the data set has no true environment")
