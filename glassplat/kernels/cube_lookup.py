@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+from typing import Any
 
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from glassplat.kernels.cpu.cube_lookup import cube_lookup as lookup_on_cpu
+from glassplat.kernels.cpu.cube_lookup import cube_lookup_gradients
 from glassplat.kernels.reference import cube_lookup as reference
 from glassplat.kernels.tensor_checks import check_tensors
 
@@ -40,7 +46,11 @@ def cube_lookup(texels: Tensor, directions: Tensor) -> Tensor:
     """
     check_cube(texels)
     check_tensors({"texels": (texels, tuple(texels.shape)), "directions": (directions, (*directions.shape[:-1], 3))})
-    return reference.cube_lookup(texels, directions)
+    if texels.device.type != "cpu":
+        # As with `shade_environment`, these few gathers stay PyTorch's on a GPU.
+        return reference.cube_lookup(texels, directions)
+    found: Tensor = _CubeLookup.apply(texels, directions.reshape(-1, 3))
+    return found.reshape(*directions.shape[:-1], texels.shape[3])
 
 
 def check_cube(texels: Tensor) -> None:
@@ -48,3 +58,17 @@ def check_cube(texels: Tensor) -> None:
     shape = tuple(texels.shape)
     if len(shape) != 4 or shape[0] != 6 or shape[1] != shape[2] or shape[1] < 1:
         raise ValueError(f"texels has shape {shape}; expected (6, S, S, D), six square faces of at least one texel")
+
+
+class _CubeLookup(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, texels: Tensor, directions: Tensor) -> Tensor:
+        inputs = (texels.detach().contiguous(), directions.detach().contiguous())
+        ctx.save_for_backward(*inputs)
+        return lookup_on_cpu(*inputs)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_found: Tensor) -> tuple[Tensor, Tensor]:
+        texels, directions = ctx.saved_tensors
+        return cube_lookup_gradients(texels, directions, v_found.contiguous())

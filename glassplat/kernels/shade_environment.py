@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+from typing import Any
 
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from glassplat.kernels.cpu.shade_environment import shade_environment as shade_on_cpu
+from glassplat.kernels.cpu.shade_environment import shade_environment_gradients
 from glassplat.kernels.cube_lookup import check_cube
 from glassplat.kernels.reference import shade_environment as reference
 from glassplat.kernels.shaded import Shaded
@@ -49,4 +55,24 @@ def shade_environment(
             "world_from_cam": (world_from_cam, (3, 3)),
         }
     )
-    return reference.shade_environment(base, normals, strength, texels, intrinsics, world_from_cam)
+    inputs = (base, normals, strength, texels, intrinsics, world_from_cam)
+    if base.device.type != "cpu":
+        # On a GPU this is a small part of an image's work, so that there it stays PyTorch's.
+        return reference.shade_environment(*inputs)
+    return Shaded(*_ShadeEnvironment.apply(*inputs))
+
+
+class _ShadeEnvironment(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *tensors: Tensor) -> tuple[Tensor, Tensor]:
+        inputs = [tensor.detach().contiguous() for tensor in tensors]
+        rgb, reflection = shade_on_cpu(inputs)
+        ctx.save_for_backward(*inputs, reflection)
+        return rgb, reflection
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        *inputs, reflection = ctx.saved_tensors
+        cotangents = [gradient.contiguous() for gradient in gradients]
+        return (*shade_environment_gradients(inputs, reflection, cotangents), None, None)

@@ -1,0 +1,155 @@
+"""`shade_environment` against its twin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numba
+import pytest
+import torch
+from torch import Tensor
+
+from glassplat.kernels.cube_lookup import cube_lookup
+from glassplat.kernels.reference.shade_environment import shade_environment as twin
+from glassplat.kernels.shade_environment import shade_environment
+from glassplat.kernels.shaded import NORMAL_MIN, Shaded
+
+INPUTS = ("base", "normals", "strength", "texels")
+WIDTH, HEIGHT = 29, 23
+
+
+def shade_case(dtype: torch.dtype, height: int = HEIGHT, width: int = WIDTH, size: int = 6) -> dict[str, Tensor]:
+    """Random arguments; the left quarter has no normals, a tenth of the strengths is 0."""
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    normals = 2 * draw(height, width, 3) - 1
+    normals[:, : width // 4] = 0
+    strength = draw(height, width)
+    case = {
+        "base": draw(height, width, 3),
+        "normals": normals,
+        "strength": torch.where(strength < 0.1, 0, strength),
+        "texels": 4 * draw(6, size, size, 3) - 2,
+        "intrinsics": torch.tensor([20.0, 21.0, width / 2 + 0.3, height / 2 - 0.4], dtype=torch.float64),
+        "world_from_cam": torch.linalg.qr(draw(3, 3))[0],
+    }
+    return {name: tensor.to(dtype) for name, tensor in case.items()}
+
+
+def with_gradients(case: dict[str, Tensor], function: Callable[..., Shaded]) -> list[Tensor]:
+    inputs = {name: case[name].detach().requires_grad_() for name in INPUTS}
+    result = function(**(case | inputs))
+    generator = torch.Generator().manual_seed(3)
+    weights = [torch.randn(t.shape, generator=generator, dtype=torch.float64).to(t.dtype) for t in result]
+    total = sum((t * w).sum() for t, w in zip(result, weights, strict=True))
+    return [*(t.detach() for t in result), *torch.autograd.grad(total, list(inputs.values()))]
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-5), (torch.float64, 1e-11)])
+@pytest.mark.parametrize(("height", "width", "size"), [(23, 29, 6), (1, 1, 1), (0, 5, 2), (8, 9, 1)])
+def test_shading_matches_its_twin(dtype: torch.dtype, tolerance: float, height: int, width: int, size: int) -> None:
+    case = shade_case(dtype, height, width, size)
+    found, expected = (with_gradients(case, f) for f in (shade_environment, twin))
+    for tensor, other in zip(found, expected, strict=True):
+        scale = max(1.0, float(other.abs().max())) if other.numel() else 1.0
+        torch.testing.assert_close(tensor, other, rtol=tolerance, atol=tolerance * scale)
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_gradients_match_finite_differences(name: str) -> None:
+    case = shade_case(torch.float64, 4, 6, 3)
+    values = case[name]
+    if name == "normals":
+        values = torch.where(values == 0, 0.7, values)
+    assert torch.autograd.gradcheck(
+        lambda moved: tuple(shade_environment(**(case | {name: moved}))), values.requires_grad_(), eps=1e-7, atol=1e-5
+    )
+
+
+def test_the_equation_holds_as_the_paper_writes_it() -> None:
+    case = shade_case(torch.float64)
+    result = shade_environment(**case)
+    row, column = 11, 20
+    fx, fy, cx, cy = case["intrinsics"]
+    in_camera = torch.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, torch.ones_like(fx)])
+    v = -torch.nn.functional.normalize(case["world_from_cam"] @ in_camera, dim=0)
+    n = torch.nn.functional.normalize(case["normals"][row, column], dim=0)
+    mirrored = torch.sigmoid(cube_lookup(case["texels"], 2 * (v @ n) * n - v))
+    share = case["strength"][row, column]
+    torch.testing.assert_close(result.reflection[row, column], mirrored)
+    torch.testing.assert_close(result.rgb[row, column], (1 - share) * case["base"][row, column] + share * mirrored)
+
+
+def test_a_surface_that_faces_the_camera_mirrors_what_is_behind_it() -> None:
+    case = shade_case(torch.float64)
+    colors = torch.linspace(-3, 3, 18, dtype=torch.float64).reshape(6, 1, 1, 3)
+    case["texels"] = colors.expand(6, 5, 5, 3)
+    case["world_from_cam"] = torch.eye(3, dtype=torch.float64)
+    case["normals"] = torch.tensor([0.0, 0.0, -0.3], dtype=torch.float64).expand(HEIGHT, WIDTH, 3)
+    middle = shade_environment(**case).reflection[HEIGHT // 2, WIDTH // 2]
+    torch.testing.assert_close(middle, torch.sigmoid(colors[5, 0, 0]))
+
+
+def test_without_normal_or_strength_the_image_is_the_base_bit_for_bit() -> None:
+    case = shade_case(torch.float32)
+    case["normals"][3, 20] = torch.tensor([NORMAL_MIN / 2, 0, 0])
+    bare = case["normals"].norm(dim=-1) <= NORMAL_MIN
+    unlit = case["strength"] == 0
+    rgb, reflection, v_base, v_normals, v_strength, _ = with_gradients(case, shade_environment)
+    assert bool(bare.any()) and bool((unlit & ~bare).any())
+    assert torch.equal(rgb[bare | unlit], case["base"][bare | unlit])
+    assert float(reflection[bare].abs().max()) == 0 == float(v_normals[bare].abs().max())
+    assert float(v_strength[bare].abs().max()) == 0 < float(v_base[bare].abs().min())
+    assert float(v_strength[unlit & ~bare].abs().min()) > 0 < float(reflection[unlit & ~bare].min())
+
+
+def test_the_length_and_the_sign_of_a_normal_do_not_matter() -> None:
+    case = shade_case(torch.float64)
+    for factor in (-1.0, 1e-4):
+        for tensor, other in zip(
+            shade_environment(**case), shade_environment(**(case | {"normals": factor * case["normals"]})), strict=True
+        ):
+            torch.testing.assert_close(tensor, other)
+
+
+@pytest.mark.parametrize("poison", [float("nan"), float("inf")])
+def test_a_normal_that_is_not_finite_is_heard_of_and_others_are_spared(poison: float) -> None:
+    case = shade_case(torch.float32)
+    case["normals"][5, 15, 1] = poison
+    case["strength"][5, 15] = 0.5
+    for function in (shade_environment, twin):
+        rgb = function(**case).rgb
+        assert bool(rgb[5, 15].isnan().all()) and int(rgb.isnan().sum()) == 3
+
+
+def test_poisoned_texels_are_heard_of() -> None:
+    case = shade_case(torch.float32)
+    case["texels"][:] = float("nan")
+    lit = (case["normals"] != 0).any(-1)
+    for function in (shade_environment, twin):
+        reflection = function(**case).reflection
+        assert bool(reflection[lit].isnan().all()) and bool((reflection[~lit] == 0).all())
+
+
+def test_threads_do_not_change_a_bit() -> None:
+    case = shade_case(torch.float32)
+    many = with_gradients(case, shade_environment)
+    numba.set_num_threads(1)
+    one = with_gradients(case, shade_environment)
+    assert all(torch.equal(a, b) for a, b in zip(many, one, strict=True))
+
+
+def test_bad_input_is_named() -> None:
+    case = shade_case(torch.float32)
+    for name in ("base", "normals", "intrinsics", "world_from_cam"):
+        with pytest.raises(ValueError, match=f"{name} has shape"):
+            shade_environment(**(case | {name: torch.zeros(2, 2)}))
+    with pytest.raises(ValueError, match="six square faces"):
+        shade_environment(**(case | {"texels": torch.zeros(6, 0, 0, 3)}))
+    with pytest.raises(ValueError, match="texels has shape"):
+        shade_environment(**(case | {"texels": torch.zeros(6, 2, 2, 4)}))
+    with pytest.raises(TypeError, match=r"strength is torch\.float64"):
+        shade_environment(**(case | {"strength": case["strength"].double()}))
