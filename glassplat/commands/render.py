@@ -15,13 +15,15 @@ from glassplat.commands.output_folder import claim_folder, picture_paths
 from glassplat.commands.scene_edits import SceneEdits
 from glassplat.commands.stored_run import Split, chosen_views, open_run
 from glassplat.data.errors import InputError
-from glassplat.evaluate.colormap import depth_colors
+from glassplat.evaluate.colormap import depth_colors, normal_colors
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.files.images import write_image
 from glassplat.kernels.devices import DeviceName
 from glassplat.render.frame import Frame
 
-Layer = Literal["rgb", "transmission", "reflection", "strength", "mask", "depth", "alpha"]
+Layer = Literal[
+    "rgb", "transmission", "reflection", "strength", "mask", "depth", "alpha", "base", "normal", "environment"
+]
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class Render:
 
 
 def layer_image(frame: Frame, layer: str, method: str) -> Tensor:
-    """A layer of a frame as an image in [0, 1]; depth is colour-mapped, near bright.
+    """A layer of a frame as an image in [0, 1]; depth is colour-mapped, near bright, normals are (n + 1) / 2.
 
     Raises:
         InputError: the method has no such layer.
@@ -73,4 +75,6 @@ def layer_image(frame: Frame, layer: str, method: str) -> Tensor:
     if layer not in frame.layers:
         raise InputError(f"{method} renders no layer {layer!r}; it has {['rgb', *sorted(frame.layers)]}")
     image = frame.layers[layer]
+    if layer == "normal":
+        return normal_colors(image)
     return depth_colors(image, frame.layers["alpha"]) if layer == "depth" else image.clamp(0, 1)
