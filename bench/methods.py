@@ -1,4 +1,4 @@
-"""What the reflections cost: `planar` against `splat`, frame and training step, in one run."""
+"""What the reflections cost: `planar` and `deferred` against `splat`, frame and training step, in one run."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ from contextlib import contextmanager
 import numba
 import torch
 
-from bench.scene import bench_camera, bench_scene
+from bench.scene import bench_camera, bench_scene, glossy_scene
 from bench.timing import Work, interleaved_seconds, median_seconds, paired_ratio
 from glassplat.data.dataset import View
 from glassplat.files.markdown_table import Table
+from glassplat.render.deferred import Deferred
+from glassplat.render.frame import Renderer
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
+from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Stage
@@ -27,7 +30,7 @@ WIDTH, HEIGHT, COUNT = 480, 360, 100_000
 PANES = ((1, 0.5), (3, 0.5), (1, 1.0))
 
 
-def frame_work(scene: Scene, renderer: Splat | Planar, camera: Camera) -> Work:
+def frame_work(scene: Scene, renderer: Renderer, camera: Camera) -> Work:
     """Renders one frame without gradients."""
 
     def work() -> None:
@@ -89,6 +92,41 @@ def method_costs() -> Table:
             cells += [1e3 * statistics.median(seconds[name]) for name in ("splat", "planar")]
             cells.append(paired_ratio(seconds, "planar", "splat"))
         table.add(number, f"{share:.0%}", *cells)
+    return table
+
+
+def deferred_costs() -> Table:
+    """Frame and step of `deferred` and `splat` with the same Gaussians."""
+    table = Table(
+        "deferred against splat, SH 3, every Gaussian glossy",
+        (
+            "Gaussians",
+            "pixels",
+            "splat frame, ms",
+            "deferred frame, ms",
+            "frame ratio",
+            "splat step, ms",
+            "deferred step, ms",
+            "step ratio",
+        ),
+        "Ratios are medians of ratios taken round by round. Environment: 6 x 128 x 128 texels.",
+    )
+    splat_stage, deferred_stage = SplatRecipe().stages(0)[0], DeferredRecipe().stages(0)[1]
+    for count, width, height in ((COUNT, WIDTH, HEIGHT), (COUNT, 2 * WIDTH, 2 * HEIGHT)):
+        camera = bench_camera(width, height)
+        scene, view = glossy_scene(count), view_of(camera)
+        frames = interleaved_seconds(
+            {"splat": frame_work(scene, Splat(depth=False), camera), "deferred": frame_work(scene, Deferred(), camera)}
+        )
+        steps = interleaved_seconds(
+            {"splat": step_work(scene, splat_stage, view), "deferred": step_work(scene, deferred_stage, view)},
+            repeats=5,
+        )
+        cells: list[float] = []
+        for seconds in (frames, steps):
+            cells += [1e3 * statistics.median(seconds[name]) for name in ("splat", "deferred")]
+            cells.append(paired_ratio(seconds, "deferred", "splat"))
+        table.add(f"{count:,}", f"{width}x{height}", *cells)
     return table
 
 

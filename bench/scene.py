@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 
 from glassplat.scene.camera import Camera
+from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
@@ -89,3 +91,10 @@ def bench_scene(count: int, num_panes: int, share: float, camera: Camera) -> Sce
     if not num_panes:
         return Scene(room(count), extent=3.0)
     return Scene(room(count), extent=3.0, planes=planes, glass=glass_on(planes))
+
+
+def glossy_scene(count: int) -> Scene:
+    """The same room, all of it glossy, in a random environment."""
+    primary = room(count)
+    environment = Environment.random(128, generator=torch.Generator().manual_seed(2))
+    return Scene(replace(primary, channels={"logit_strength": torch.zeros(count)}), extent=3.0, environment=environment)
