@@ -55,13 +55,13 @@ class Propagate:
 
     def due(self, clock: Clock) -> bool:
         """Whether to act after this step."""
-        return self.when.due(clock) or clock.progress == self.schedule.stop
+        return self.when.due(clock) or clock.step == self._last(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
         """Edits `state`."""
         if has_ended(state):
             return
-        if self._settles(state, clock) or clock.progress >= self.schedule.stop:
+        if self._settles(state, clock) or clock.step >= self._last(clock):
             state.records[ENDED] = clock.step
             log.info("step %d: normal propagation has ended, %d reflective Gaussians", clock.step, self._count(state))
             return
@@ -70,6 +70,10 @@ class Propagate:
         state.scene, state.optimizer.moments = replace(state.scene, primary=primary), moments
         if self.propagation.propagates:
             state.optimizer.paused["primary.logit_opacities"] = self.schedule.pause
+
+    def _last(self, clock: Clock) -> int:
+        """The step at which it ends at the latest."""
+        return round(self.schedule.stop * clock.iterations)
 
     def _settles(self, state: TrainState, clock: Clock) -> bool:
         """Whether the number of reflective Gaussians has not grown for long enough; keeps the records."""

@@ -127,5 +127,16 @@ def test_propagation_ends_when_no_more_reflectors_are_found(end: str, counts: li
     assert state.records.get(ENDED) == ended
 
 
+@pytest.mark.parametrize("iterations", [20, 23, 7001])
+def test_propagation_ends_in_runs_of_any_length(iterations: int) -> None:
+    schedule = PropagationSchedule(end="fixed", stop=0.61)
+    state, action = fresh_state(), Propagate(Every(1 / 3, stop=0.61), NormalPropagation(), schedule)
+    for step in range(1, iterations + 1):
+        clock = Clock(step, iterations, 5)
+        if action.due(clock):
+            action.apply(state, tiny_capture(), clock)
+    assert state.records[ENDED] == pytest.approx(0.61 * iterations, abs=0.5)
+
+
 def test_the_recipe_survives_json() -> None:
     assert recipe_from_json(recipe_to_json(RECIPE)) == RECIPE
