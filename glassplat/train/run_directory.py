@@ -13,7 +13,9 @@ from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
 from glassplat.files.atomic import atomic_write
 from glassplat.files.cameras_json import write_cameras
+from glassplat.files.environment_image import write_equirect
 from glassplat.files.scene_folder import read_scene, write_scene
+from glassplat.render.environment import equirect_from_environment
 from glassplat.scene.scene import Scene
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
 
@@ -48,7 +50,7 @@ class RunDirectory:
     log.jsonl                          one line per logged step
     checkpoint.safetensors             to resume from
     cameras.json                       all cameras
-    point_cloud/iteration_N/           point_cloud.ply, glass.ply, scene.json
+    point_cloud/iteration_N/           point_cloud.ply, glass.ply, environment.safetensors, scene.json
     results.json  per_view.json        metrics
     sheets/  uses.png  index.html      pictures
     ```
@@ -93,6 +95,9 @@ class RunDirectory:
         """Writes the scene in the formats that others read; returns its folder."""
         folder = self.path / "point_cloud" / f"iteration_{step}"
         write_scene(folder, scene)
+        if not scene.environment.is_empty:
+            panorama = equirect_from_environment(scene.environment, 2 * scene.environment.size)
+            write_equirect(folder / "environment.png", panorama)
         return folder
 
     def latest_scene(self) -> tuple[Scene, int]:

@@ -72,10 +72,13 @@ from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.blend_panes import blend_panes
 from glassplat.kernels.composite import composite
 from glassplat.kernels.cpu.jit import Kernel
+from glassplat.kernels.cube_lookup import cube_lookup
+from glassplat.kernels.facing_normals import facing_normals
 from glassplat.kernels.gradient_conflict import gradient_conflict
 from glassplat.kernels.pane_hits import pane_hits
 from glassplat.kernels.panes import Panes
 from glassplat.kernels.project import project
+from glassplat.kernels.shade_environment import shade_environment
 from glassplat.kernels.splats import CameraBatch, Deviation, RawGaussians, Splats
 from glassplat.kernels.ssim import ssim
 
@@ -95,6 +98,11 @@ reflections = torch.ones(1, 16, 20, 4)
 blended = blend_panes(result.image[0], result.alpha[0], reflections, pane, normal, torch.ones(1), intrinsics)
 loss = ssim(blended.rgb, torch.zeros(16, 20, 3)) + result.deviation.sum()
 loss = loss + gradient_conflict(result.image[0], blended.reflection, result.alpha[0])
+texels = torch.zeros(6, 2, 2, 3, requires_grad=True)
+normals = facing_normals(raw.quats, raw.log_scales.detach(), means.detach(), torch.zeros(3))
+directions = normals[0].expand(16, 20, 3)
+shaded = shade_environment(blended.rgb, directions, result.alpha[0], texels, intrinsics, torch.eye(3))
+loss = loss + shaded.rgb.sum() + cube_lookup(texels, directions).sum()
 loss.backward()
 adam(means, raw.means.grad, torch.zeros(2, 3), torch.zeros(2, 3), lr=1e-3, step=1)
 

@@ -24,7 +24,7 @@ def cube_lookup(texels: Tensor, directions: Tensor) -> Tensor:
 def cube_lookup_gradients(texels: Tensor, directions: Tensor, cotangents: Tensor) -> tuple[Tensor, Tensor]:
     """Gradients of texels and directions."""
     v_directions = torch.empty_like(directions)
-    first_cells = torch.empty(directions.shape[0], dtype=torch.int32)
+    first_cells = torch.empty(directions.shape[0], 2, dtype=torch.int32)
     fractions = directions.new_empty(directions.shape[0], 2)
     inputs = (padded_faces(texels), directions, cotangents)
     outputs = (v_directions, first_cells, fractions)
@@ -83,7 +83,7 @@ def cube_lookup_backward(real: type) -> Kernel:
                 v_down += v * (lower[column, d] - upper[column, d] + along * (across_below - across_above))
             x, y, z = from_face(place, v_along * texels_per_u, v_down * texels_per_u)
             v_directions[i, 0], v_directions[i, 1], v_directions[i, 2] = x, y, z
-            first_cells[i] = (face * side + row) * side + column
+            first_cells[i, 0], first_cells[i, 1] = face * side + row, column
             fractions[i, 0], fractions[i, 1] = along, down
 
     return backward

@@ -1,13 +1,19 @@
-"""Deferred shading on the CPU, one pixel at a time."""
+"""Deferred shading on the CPU: runs of pixels of one row that have a normal.
+
+A run is kept in *planes* of one flat buffer, one plane per quantity, at offsets known to the compiler; that is what
+lets it turn the lookup and the sigmoid into vector instructions.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
 from numba import prange
+from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.kernels.cpu.cube_texels import NO_LOOKUP, padded_faces, texel_gradients
@@ -18,6 +24,17 @@ from glassplat.kernels.maths_blend import Scalar
 from glassplat.kernels.maths_cube import cube_maths
 from glassplat.kernels.shaded import NORMAL_MIN
 from glassplat.kernels.tensor_checks import REAL_OF
+
+RUN = 32
+"""Pixels of a run."""
+
+# Planes of a run: real numbers, and whole ones. What a run does not fill is left from another one and not read.
+NORMAL, RAY, PLACE, ALONG, DOWN, SEEN = (plane * RUN for plane in (0, 3, 6, 9, 10, 11))
+FORWARD_PLANES = 14
+V_RAW, BY_COLUMN, BY_ROW = (plane * RUN for plane in (14, 17, 18))
+BACKWARD_PLANES = 19
+COLUMN, AXIS, FACE, CELL_ROW, CELL, FIRST = (plane * RUN for plane in range(6))
+WHOLE_PLANES = 6
 
 
 def shade_environment(inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
@@ -35,27 +52,13 @@ def shade_environment_gradients(
     """Gradients of base, normals, strength and texels, given the reflection that the kernel found."""
     base, normals, strength, texels, *camera = inputs
     found = tuple(torch.empty_like(like) for like in (base, normals, strength))
-    first_cells = torch.empty(strength.shape, dtype=torch.int32)
+    first_cells = torch.empty(*strength.shape, 2, dtype=torch.int32)
     fractions, v_raw = base.new_empty(*strength.shape, 2), torch.empty_like(base)
     tensors = (*inputs[:3], padded_faces(texels), *camera, reflection, *cotangents, *found)
     lookups = (first_cells, fractions, v_raw)
     shade_environment_backward(REAL_OF[base.dtype])(*(tensor.numpy() for tensor in (*tensors, *lookups)))
-    v_texels = texel_gradients(first_cells.flatten(), fractions.flatten(0, 1), v_raw.flatten(0, 1), texels.shape[1])
-    return (*found, v_texels)
-
-
-def _ray(real: type) -> Scalar:
-    half, scaled_sum = real(0.5), vector_maths().scaled_sum
-    one = real(1.0)
-
-    @inlined
-    def ray(row, column, intrinsics, rotation):
-        """The ray of a pixel in world axes, of any length."""
-        x = (real(np.int32(column)) + half - intrinsics[2]) / intrinsics[0]
-        y = (real(np.int32(row)) + half - intrinsics[3]) / intrinsics[1]
-        return scaled_sum((x, y, one), rotation[:, 0], rotation[:, 1], rotation[:, 2])
-
-    return ray
+    first_cells, fractions, v_raw = (tensor.flatten(0, 1) for tensor in lookups)
+    return (*found, texel_gradients(first_cells, fractions, v_raw, texels.shape[1]))
 
 
 def _mirrored(real: type) -> tuple[Scalar, Scalar]:
@@ -76,51 +79,139 @@ def _mirrored(real: type) -> tuple[Scalar, Scalar]:
     return mirrored, mirrored_gradient
 
 
+def _place(real: type) -> Scalar:
+    maths, mirrored = cube_maths(real), _mirrored(real)[0]
+    on_face, cell = maths.on_face, maths.cell
+    one, half = real(1.0), real(0.5)
+
+    @inlined
+    def place(run, whole, row, side, intrinsics, rotation):
+        """Where on the cube the pixels of a run are mirrored to."""
+        inverse_f, start = one / intrinsics[0], half - intrinsics[2]
+        y = (real(np.int32(row)) + half - intrinsics[3]) / intrinsics[1]
+        across_x, across_y, across_z = rotation[0, 0], rotation[1, 0], rotation[2, 0]
+        from_x = y * rotation[0, 1] + rotation[0, 2]
+        from_y = y * rotation[1, 1] + rotation[1, 2]
+        from_z = y * rotation[2, 1] + rotation[2, 2]
+        size = side - np.int32(2)
+        for i in range(RUN):
+            x = (real(whole[COLUMN + i]) + start) * inverse_f
+            ray = x * across_x + from_x, x * across_y + from_y, x * across_z + from_z
+            normal = run[NORMAL + i], run[NORMAL + RUN + i], run[NORMAL + 2 * RUN + i]
+            to = mirrored(ray, normal)
+            axis, face, u, v, inverse = on_face(to[0], to[1], to[2])
+            left, along = cell(u, size)
+            top, down = cell(v, size)
+            run[RAY + i], run[RAY + RUN + i], run[RAY + 2 * RUN + i] = ray
+            run[PLACE + i], run[PLACE + RUN + i], run[PLACE + 2 * RUN + i] = u, v, inverse
+            run[ALONG + i], run[DOWN + i] = along, down
+            whole[AXIS + i], whole[FACE + i] = axis, face
+            cell_row = face * side + top
+            whole[CELL_ROW + i], whole[CELL + i] = cell_row, left
+            whole[FIRST + i] = (cell_row * side + left) * np.int32(3)
+
+    return place
+
+
 @cache
 def shade_environment_forward(real: type) -> Kernel:
     """Fills rgb and reflection."""
-    maths, ray_of, mirrored, dot = cube_maths(real), _ray(real), _mirrored(real)[0], vector_maths().dot
-    on_face, cell, logistic = maths.on_face, maths.cell, maths.logistic
+    logistic, place, dot = cube_maths(real).logistic, _place(real), vector_maths().dot
     shortest = real(NORMAL_MIN**2)
     zero, one = real(0.0), real(1.0)
+
+    @inlined
+    def look(run, whole, flat, below):
+        """The colour that each pixel of a run mirrors; `below` is the distance of the next row of cells."""
+        for d in range(3):
+            for i in range(RUN):
+                at, along, down = whole[FIRST + i] + d, run[ALONG + i], run[DOWN + i]
+                upper = flat[at] * (one - along) + flat[at + 3] * along
+                lower = flat[at + below] * (one - along) + flat[at + below + 3] * along
+                run[SEEN + d * RUN + i] = upper * (one - down) + lower * down
+        for i in range(3 * RUN):
+            run[SEEN + i] = logistic(run[SEEN + i])
 
     @kernel("shade_environment_forward", real)
     def forward(base, normals, strength, padded, intrinsics, rotation, rgb, reflection):
         height, width = strength.shape
-        size = padded.shape[1] - 2
+        side, flat = np.int32(padded.shape[1]), padded.reshape(padded.size)
         stride = even_stride(height)
         for task in prange(height):
             row = task * stride % height
+            run: NDArray[Any] = np.zeros(FORWARD_PLANES * RUN, real)
+            whole: NDArray[Any] = np.zeros(WHOLE_PLANES * RUN, np.int32)
+            count = 0
             for column in range(width):
                 normal = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
                 if dot(normal, normal) <= shortest:
                     for d in range(3):
                         rgb[row, column, d], reflection[row, column, d] = base[row, column, d], zero
+                else:
+                    whole[COLUMN + count] = column
+                    run[NORMAL + count], run[NORMAL + RUN + count], run[NORMAL + 2 * RUN + count] = normal
+                    count += 1
+                if count < RUN and column < width - 1:
                     continue
-                x, y, z = mirrored(ray_of(row, column, intrinsics, rotation), normal)
-                _, face, u, v, _ = on_face(x, y, z)
-                left, along = cell(u, size)
-                top, down = cell(v, size)
-                upper, lower = padded[face, top], padded[face, top + 1]
-                for d in range(3):
-                    above = upper[left, d] * (one - along) + upper[left + 1, d] * along
-                    below = lower[left, d] * (one - along) + lower[left + 1, d] * along
-                    seen = logistic(above * (one - down) + below * down)
-                    behind = base[row, column, d]
-                    reflection[row, column, d] = seen
-                    rgb[row, column, d] = behind + strength[row, column] * (seen - behind)
+                if count > 0:
+                    place(run, whole, row, side, intrinsics, rotation)
+                    look(run, whole, flat, 3 * side)
+                for i in range(count):
+                    at = whole[COLUMN + i]
+                    for d in range(3):
+                        seen, behind = run[SEEN + d * RUN + i], base[row, at, d]
+                        reflection[row, at, d] = seen
+                        rgb[row, at, d] = behind + strength[row, at] * (seen - behind)
+                count = 0
 
     return forward
+
+
+def _slopes(real: type) -> Scalar:
+    zero = real(0.0)
+
+    @inlined
+    def slopes(run, whole, flat, below):
+        """Gradients of each pixel's place among the cells, from those of what it looks up."""
+        for i in range(RUN):
+            run[BY_COLUMN + i], run[BY_ROW + i] = zero, zero
+        for d in range(3):
+            for i in range(RUN):
+                at, along, down, v = whole[FIRST + i] + d, run[ALONG + i], run[DOWN + i], run[V_RAW + d * RUN + i]
+                first, under = flat[at], flat[at + below]
+                across = flat[at + 3] - first
+                twist = flat[at + below + 3] - under - across
+                run[BY_COLUMN + i] += v * (across + down * twist)
+                run[BY_ROW + i] += v * (under - first + along * twist)
+
+    return slopes
+
+
+def _turn(real: type) -> Scalar:
+    from_face, mirrored_gradient = cube_maths(real).from_face, _mirrored(real)[1]
+    half = real(0.5)
+
+    @inlined
+    def turn(run, whole, side):
+        """Gradients of the normals, in place of the normals."""
+        cells_per_u = half * real(side - np.int32(2))
+        for i in range(RUN):
+            place = whole[AXIS + i], whole[FACE + i], run[PLACE + i], run[PLACE + RUN + i], run[PLACE + 2 * RUN + i]
+            g = from_face(place, run[BY_COLUMN + i] * cells_per_u, run[BY_ROW + i] * cells_per_u)
+            ray = run[RAY + i], run[RAY + RUN + i], run[RAY + 2 * RUN + i]
+            normal = run[NORMAL + i], run[NORMAL + RUN + i], run[NORMAL + 2 * RUN + i]
+            x, y, z = mirrored_gradient(ray, normal, g)
+            run[NORMAL + i], run[NORMAL + RUN + i], run[NORMAL + 2 * RUN + i] = x, y, z
+
+    return turn
 
 
 @cache
 def shade_environment_backward(real: type) -> Kernel:
     """Fills the gradients of base, normals, strength and of what was looked up, and which cells each pixel blends."""
-    maths, ray_of, dot = cube_maths(real), _ray(real), vector_maths().dot
-    mirrored, mirrored_gradient = _mirrored(real)
-    on_face, from_face, cell = maths.on_face, maths.from_face, maths.cell
+    place, slopes, turn, dot = _place(real), _slopes(real), _turn(real), vector_maths().dot
     shortest = real(NORMAL_MIN**2)
-    zero, one, half = real(0.0), real(1.0), real(0.5)
+    zero, one = real(0.0), real(1.0)
 
     @kernel("shade_environment_backward", real)
     def backward(
@@ -128,43 +219,44 @@ def shade_environment_backward(real: type) -> Kernel:
         v_base, v_normals, v_strength, first_cells, fractions, v_raw,
     ):  # fmt: skip
         height, width = strength.shape
-        side = padded.shape[1]
-        size = side - 2
-        texels_per_u = half * real(size)
+        side, flat = np.int32(padded.shape[1]), padded.reshape(padded.size)
         stride = even_stride(height)
         for task in prange(height):
             row = task * stride % height
+            run: NDArray[Any] = np.zeros(BACKWARD_PLANES * RUN, real)
+            whole: NDArray[Any] = np.zeros(WHOLE_PLANES * RUN, np.int32)
+            count = 0
             for column in range(width):
                 normal = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
-                v_strength[row, column] = zero
                 if dot(normal, normal) <= shortest:
-                    first_cells[row, column] = NO_LOOKUP
+                    v_strength[row, column], first_cells[row, column, 0] = zero, NO_LOOKUP
                     for d in range(3):
                         v_base[row, column, d], v_normals[row, column, d] = v_rgb[row, column, d], zero
+                else:
+                    share, v_share = strength[row, column], zero
+                    for d in range(3):
+                        seen, v = reflection[row, column, d], v_rgb[row, column, d]
+                        v_base[row, column, d] = v * (one - share)
+                        v_share += v * (seen - base[row, column, d])
+                        v = (v * share + v_reflection[row, column, d]) * seen * (one - seen)
+                        v_raw[row, column, d] = v
+                        run[V_RAW + d * RUN + count] = v
+                    v_strength[row, column] = v_share
+                    whole[COLUMN + count] = column
+                    run[NORMAL + count], run[NORMAL + RUN + count], run[NORMAL + 2 * RUN + count] = normal
+                    count += 1
+                if count < RUN and column < width - 1:
                     continue
-                ray = ray_of(row, column, intrinsics, rotation)
-                x, y, z = mirrored(ray, normal)
-                place = on_face(x, y, z)
-                face = place[1]
-                left, along = cell(place[2], size)
-                top, down = cell(place[3], size)
-                upper, lower = padded[face, top], padded[face, top + 1]
-                share = strength[row, column]
-                v_share, v_along, v_down = zero, zero, zero
-                for d in range(3):
-                    seen, v = reflection[row, column, d], v_rgb[row, column, d]
-                    v_base[row, column, d] = v * (one - share)
-                    v_share += v * (seen - base[row, column, d])
-                    v = (v * share + v_reflection[row, column, d]) * seen * (one - seen)
-                    v_raw[row, column, d] = v
-                    across_above = upper[left + 1, d] - upper[left, d]
-                    twist = lower[left + 1, d] - lower[left, d] - across_above
-                    v_along += v * (across_above + down * twist)
-                    v_down += v * (lower[left, d] - upper[left, d] + along * twist)
-                v_strength[row, column] = v_share
-                g = mirrored_gradient(ray, normal, from_face(place, v_along * texels_per_u, v_down * texels_per_u))
-                v_normals[row, column, 0], v_normals[row, column, 1], v_normals[row, column, 2] = g
-                first_cells[row, column] = (face * side + top) * side + left
-                fractions[row, column, 0], fractions[row, column, 1] = along, down
+                if count > 0:
+                    place(run, whole, row, side, intrinsics, rotation)
+                    slopes(run, whole, flat, 3 * side)
+                    turn(run, whole, side)
+                for i in range(count):
+                    at = whole[COLUMN + i]
+                    for d in range(3):
+                        v_normals[row, at, d] = run[NORMAL + d * RUN + i]
+                    first_cells[row, at, 0], first_cells[row, at, 1] = whole[CELL_ROW + i], whole[CELL + i]
+                    fractions[row, at, 0], fractions[row, at, 1] = run[ALONG + i], run[DOWN + i]
+                count = 0
 
     return backward

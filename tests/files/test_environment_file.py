@@ -1,0 +1,53 @@
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from glassplat.files.environment_file import read_environment, write_environment
+from glassplat.scene.environment import Environment
+
+
+def noise(size: int = 3) -> Environment:
+    return Environment.random(size, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize("region", [None, (0.1, -2.0, 1e-7, 3.3)])
+def test_an_environment_survives_bit_for_bit(tmp_path: Path, region: tuple[float, float, float, float] | None) -> None:
+    for raw in (noise().raw.requires_grad_(), noise(1).raw.double(), Environment.empty().raw):
+        write_environment(tmp_path / "environment.safetensors", Environment(raw, region))
+        read = read_environment(tmp_path / "environment.safetensors")
+        assert read.region == region
+        assert read.raw.dtype == raw.dtype and torch.equal(read.raw, raw)
+
+
+def test_a_file_that_is_cut_off_or_foreign_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "environment.safetensors"
+    with pytest.raises(FileNotFoundError, match="no environment at"):
+        read_environment(file)
+    write_environment(file, noise())
+    whole = file.read_bytes()
+    for contents in (whole[: len(whole) // 2], b"", b"not a safetensors file"):
+        file.write_bytes(contents)
+        with pytest.raises(ValueError, match="truncated or no environment"):
+            read_environment(file)
+    save_file({"raw": noise().raw}, file)
+    with pytest.raises(ValueError, match="has format None; expected 'glassplat-environment-1'"):
+        read_environment(file)
+
+
+@pytest.mark.parametrize(
+    ("raw", "region", "said"),
+    [
+        ((6, 2, 3, 3), "null", "raw has shape"),
+        ((6, 2, 2, 3), "[1, 2]", "its region is"),
+        ((6, 2, 2, 3), '"all"', "its region is"),
+    ],
+)
+def test_contents_that_make_no_environment_are_named(
+    tmp_path: Path, raw: tuple[int, ...], region: str, said: str
+) -> None:
+    header = f'{{"format": "glassplat-environment-1", "region": {region}}}'
+    save_file({"raw": torch.zeros(raw)}, tmp_path / "environment.safetensors", metadata={"glassplat": header})
+    with pytest.raises(ValueError, match=f"holds no environment: {said}"):
+        read_environment(tmp_path / "environment.safetensors")

@@ -1,0 +1,50 @@
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from glassplat.files.environment_image import read_equirect
+from glassplat.files.scene_folder import read_scene, write_scene
+from glassplat.render.environment import equirect_from_environment
+from glassplat.scene.environment import Environment
+from glassplat.scene.scene import Scene
+from glassplat.train.run_directory import RunDirectory
+from tests.render.tiny_scene import in_single_precision, showcase
+
+
+def lit(size: int = 3) -> Environment:
+    raw = Environment.random(size, generator=torch.Generator().manual_seed(0)).raw
+    return Environment(raw, (1.0, 2.0, 3.0, 0.25))
+
+
+@pytest.mark.parametrize("panes", [False, True])
+@pytest.mark.parametrize("environment", [Environment.empty(), lit()])
+def test_a_scene_survives_bit_for_bit(tmp_path: Path, panes: bool, environment: Environment) -> None:
+    whole = in_single_precision(showcase())
+    scene = replace(whole if panes else Scene(whole.primary, whole.extent), environment=environment)
+    write_scene(tmp_path, scene)
+    read = read_scene(tmp_path)
+    assert read.extent == scene.extent and read.environment.region == environment.region
+    assert read.primary.active_sh_degree == scene.primary.active_sh_degree
+    assert read.parameters().keys() == scene.parameters().keys()
+    for name, tensor in scene.parameters().items():
+        assert torch.equal(read.parameters()[name], tensor), name
+    assert (tmp_path / "environment.safetensors").is_file() != environment.is_empty
+
+
+def test_a_damaged_environment_is_named(tmp_path: Path) -> None:
+    write_scene(tmp_path, replace(in_single_precision(showcase()), environment=lit()))
+    (tmp_path / "environment.safetensors").write_bytes(b"cut")
+    with pytest.raises(ValueError, match=r"environment\.safetensors is truncated or no environment"):
+        read_scene(tmp_path)
+
+
+def test_an_exported_environment_can_be_looked_at(tmp_path: Path) -> None:
+    scene = replace(in_single_precision(showcase()), environment=lit(4))
+    folder = RunDirectory(tmp_path).export(scene, step=7)
+    shown = read_equirect(folder / "environment.png")
+    torch.testing.assert_close(shown, equirect_from_environment(scene.environment, 8), atol=0.5 / 255 + 1e-6, rtol=0)
+    assert torch.equal(RunDirectory(tmp_path).latest_scene()[0].environment.raw, scene.environment.raw)
+    bare = RunDirectory(tmp_path).export(replace(scene, environment=Environment.empty()), step=8)
+    assert not (bare / "environment.png").exists()
