@@ -8,16 +8,48 @@ which 3DGS-DR blends the reflection: there the two trade off exactly.
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from glassplat.data.errors import InputError
 from glassplat.evaluate.lpips import Lpips
 from glassplat.evaluate.metrics import quantized
 from glassplat.evaluate.outcome import NO_WEIGHTS, Outcome
+from glassplat.files.environment_image import read_equirect
+from glassplat.render.environment import equirect_from_environment
+from glassplat.scene.scene import Scene
 
 NO_ENVIRONMENT = "the method learns no environment"
 NO_TRUE_ENVIRONMENT = "the data set has no true environment"
+
+
+PANORAMA_HEIGHT = 64
+"""Rows at which environments are compared."""
+
+
+def learned_environment(scene: Scene) -> Tensor | None:
+    """The scene's environment as a panorama [H, 2H, 3]; None where it has none."""
+    if scene.environment.is_empty:
+        return None
+    with torch.no_grad():
+        return equirect_from_environment(scene.environment, PANORAMA_HEIGHT).cpu()
+
+
+def true_environment(capture: Path) -> Tensor | None:
+    """The panorama [h, 2h, 3] that a synthetic capture ships as `environment.exr` or `environment.png`, if any.
+
+    Raises:
+        InputError: the file is broken.
+    """
+    for path in (capture / f"environment{suffix}" for suffix in (".exr", ".png")):
+        if path.is_file():
+            try:
+                return read_equirect(path)
+            except ValueError as error:
+                raise InputError(str(error)) from error
+    return None
 
 
 def environment_metrics(learned: Tensor | None, truth: Tensor | None, lpips: Lpips | str) -> dict[str, Outcome]:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from glassplat.data.dataset import Dataset, View
 from glassplat.data.errors import InputError
+from glassplat.evaluate.environment_metrics import environment_metrics, learned_environment, true_environment
 from glassplat.evaluate.lpips import Lpips, load_lpips
 from glassplat.evaluate.metrics import psnr, quantized, reflection_gain, ssim
 from glassplat.evaluate.outcome import NO_WEIGHTS, SMALLEST_REGION, Outcome, plain
@@ -103,7 +104,8 @@ def evaluate(
 
     `normal_error_deg` is the mean angle between the layer `normal` and the true normals over the pixels that show a
     surface, `reflective_normal_error_deg` the same where it mirrors more than half, `strength_error` the mean
-    difference of the layer `strength` from the true one. `peak_memory_mib` is that of the whole process so far.
+    difference of the layer `strength` from the true one. `environment_psnr` compares the learned environment with the
+    capture's `environment.exr` or `.png`, after one gain. `peak_memory_mib` is that of the whole process so far.
 
     Args:
         scene: what to render.
@@ -135,6 +137,7 @@ def evaluate(
     results["seconds_per_frame"] = statistics.median(m.seconds for m in measurements.values())
     results["peak_memory_mib"] = peak_memory_mib()
     results |= plain(_means([m.metrics for m in measurements.values()]))
+    results |= plain(environment_metrics(learned_environment(scene), true_environment(dataset.root), lpips))
     results |= _footnotes(results, lpips, truth, gain)
     results["planes"] = plane_table(scene.planes, truth, dataset.extent)
     if len(scene.planes):

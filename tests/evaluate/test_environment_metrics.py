@@ -1,10 +1,23 @@
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
-from glassplat.evaluate.environment_metrics import environment_lpips, environment_metrics, environment_psnr
+from glassplat.data.errors import InputError
+from glassplat.evaluate.environment_metrics import (
+    environment_lpips,
+    environment_metrics,
+    environment_psnr,
+    learned_environment,
+    true_environment,
+)
 from glassplat.evaluate.metrics import psnr, quantized
+from glassplat.files.environment_image import write_equirect
+from glassplat.scene.environment import Environment
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Scene
 
 TRUTH = 0.1 + 0.6 * torch.rand(64, 128, 3, generator=torch.Generator().manual_seed(0))
 
@@ -85,3 +98,29 @@ def test_what_is_missing_is_the_reason() -> None:
     assert found["environment_gain"] == pytest.approx(2.0)
     assert environment_metrics(None, TRUTH, "no weights") == dict.fromkeys(names, "the method learns no environment")
     assert environment_metrics(TRUTH, None, "") == dict.fromkeys(names, "the data set has no true environment")
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".png"])
+def test_a_capture_may_ship_its_environment(tmp_path: Path, suffix: str) -> None:
+    assert true_environment(tmp_path) is None
+    panorama = torch.rand(8, 16, 3)
+    write_equirect(tmp_path / f"environment{suffix}", panorama)
+    found = true_environment(tmp_path)
+    assert found is not None
+    torch.testing.assert_close(found, panorama, atol=1 / 255, rtol=0)
+
+
+def test_a_broken_environment_is_named(tmp_path: Path) -> None:
+    (tmp_path / "environment.png").write_bytes(b"no image")
+    with pytest.raises(InputError, match=r"environment\.png"):
+        true_environment(tmp_path)
+
+
+def test_a_scene_that_knows_its_environment_matches_it() -> None:
+    scene = Scene(Gaussians.empty(1), extent=1.0)
+    assert learned_environment(scene) is None
+    environment = Environment.random(8, generator=torch.Generator().manual_seed(0))
+    learned = learned_environment(replace(scene, environment=environment))
+    assert learned is not None
+    metrics = environment_metrics(learned, learned, "no weights")
+    assert metrics["environment_gain"] == pytest.approx(1.0)
