@@ -8,6 +8,7 @@ along +x, +y is left of it by a quarter of the width, -y right of it, and -x at 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -91,6 +92,12 @@ def rotated(environment: Environment, rotation: Tensor) -> Environment:
     # A row d of directions times R is R^T d: where the rotated direction was before.
     before = texel_directions(environment.size) @ turn.cpu()
     return Environment(cube_lookup(environment.raw, before.to(environment.raw)), region)
+
+
+def resized(environment: Environment, size: int) -> Environment:
+    """The environment with another number of texels; raw values are interpolated between texel centres."""
+    _check_lit(environment)
+    return replace(environment, raw=cube_lookup(environment.raw, texel_directions(size).to(environment.raw)))
 
 
 def panorama_directions(height: int) -> Tensor:

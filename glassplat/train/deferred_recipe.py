@@ -21,7 +21,7 @@ from glassplat.scene.environment import Environment
 from glassplat.scene.scene import Scene
 from glassplat.train.background import BLACK
 from glassplat.train.optimizer import Rate
-from glassplat.train.propagation import GrowShAfterPropagation, Propagate, PropagationSchedule
+from glassplat.train.propagation import GrowShAfterPropagation, Propagate, PropagationSchedule, RefineEnvironment
 from glassplat.train.splat_recipe import GaussianRates, photometric_terms
 from glassplat.train.stage import Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
@@ -54,7 +54,9 @@ class DeferredRecipe:
         background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         shading: per pixel (`deferred`), or per Gaussian (`forward`, ablation).
         bootstrap: share of the run without reflection (paper: a few thousand iterations).
-        texels: edge length of the environment's cube faces.
+        texels: edge length of the environment's cube faces in the end.
+        first_texels: edge length at the start.
+        refinements: shares of the run at which the edge length doubles, until it is `texels`.
         first_strength: reflection strength of every Gaussian at the start.
         region: only what lies in this sphere may reflect: centre and radius, world units. None finds the place that
             the cameras stand around, if there is one.
@@ -77,6 +79,8 @@ class DeferredRecipe:
     shading: Shading = "deferred"
     bootstrap: float = 0.1
     texels: int = 64
+    first_texels: int = 16
+    refinements: tuple[float, ...] = (0.45, 0.65)
     first_strength: float = 1e-3
     region: tuple[float, float, float, float] | None = None
     outside_weight: float = 0.4
@@ -94,7 +98,9 @@ class DeferredRecipe:
         primary = self._population().initial(dataset.points, self.sh_degree)
         strengths = torch.full((len(primary),), math.log(self.first_strength / (1 - self.first_strength)))
         primary = replace(primary, channels={"logit_strength": strengths})
-        environment = Environment.random(self.texels, generator=torch.Generator().manual_seed(0))
+        environment = Environment.random(
+            min(self.first_texels, self.texels), generator=torch.Generator().manual_seed(0)
+        )
         region = self.region or reflective_region([view.camera for view in dataset.train])
         environment = replace(environment, region=region)
         return Scene(primary, dataset.extent, environment=environment)
@@ -128,6 +134,7 @@ class DeferredRecipe:
                 GrowShAfterPropagation(Every(self.rhythm.sh)),
                 *population.resets,
                 Propagate(beat, self.propagation, self.schedule),
+                RefineEnvironment(self.refinements, self.texels),
             ),
             motions=population.motions,
         )

@@ -6,8 +6,11 @@ import logging
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import torch
+
 from glassplat.data.dataset import Dataset
 from glassplat.densify.propagate import NormalPropagation
+from glassplat.render.environment import resized
 from glassplat.train.actions import GrowSh
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
@@ -97,6 +100,34 @@ class GrowShAfterPropagation(GrowSh):
         """Edits `state`."""
         if has_ended(state):
             super().apply(state, dataset, clock)
+
+
+@dataclass(frozen=True)
+class RefineEnvironment:
+    """Doubles the environment's texels at certain moments.
+
+    A normal has a gradient only as far as the texels that its reflection meets reach. Large texels at first let normals
+    find their way from farther off; small ones make the reflection sharp in the end.
+
+    Attributes:
+        moments: shares of the run.
+        largest: texels along a face that are enough.
+    """
+
+    moments: tuple[float, ...]
+    largest: int
+    name: str = "refine environment"
+
+    def due(self, clock: Clock) -> bool:
+        """Whether to act after this step."""
+        return clock.step in {round(moment * clock.iterations) for moment in self.moments}
+
+    @torch.no_grad()
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
+        """Edits `state`; the optimiser forgets the environment's moments, whose shape has changed."""
+        environment = state.scene.environment
+        finer = resized(environment, min(2 * environment.size, self.largest))
+        state.scene = replace(state.scene, environment=finer)
 
 
 def has_ended(state: TrainState) -> bool:

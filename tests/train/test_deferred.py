@@ -24,6 +24,8 @@ RECIPE = DeferredRecipe(
     sh_degree=1,
     bootstrap=0.2,
     texels=4,
+    first_texels=2,
+    refinements=(0.4, 0.6, 0.8),
     region=(0.0, 0.0, 3.5, 1.0),
     rhythm=Rhythm(beat=0.1, least=2, sh=0.1),
     schedule=PropagationSchedule(end="fixed", stop=0.7, pause=2),
@@ -125,6 +127,14 @@ def test_propagation_ends_when_no_more_reflectors_are_found(end: str, counts: li
         if action.due(clock):
             action.apply(state, tiny_capture(), clock)
     assert state.records.get(ENDED) == ended
+
+
+def test_the_environment_is_refined_up_to_its_size() -> None:
+    state, sizes = fresh_state(), {}
+    for message in train(RECIPE.stages(seed=0), tiny_capture(), state, iterations=20):
+        sizes[message.step] = state.scene.environment.size
+    assert [sizes[step] for step in (4, 7, 8, 12, 20)] == [2, 2, 4, 4, 4]
+    assert state.scene.environment.region == RECIPE.region
 
 
 @pytest.mark.parametrize("iterations", [20, 23, 7001])
