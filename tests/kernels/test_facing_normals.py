@@ -27,7 +27,7 @@ def with_gradient(function: Callable[..., Tensor], case: list[Tensor]) -> list[T
     quats = case[0].detach().requires_grad_()
     found = function(quats, *case[1:])
     weights = torch.randn(found.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    return [found.detach(), torch.autograd.grad((found * weights.to(found.dtype)).sum(), quats)[0]]
+    return [found.detach(), torch.autograd.grad((found * weights.to(found)).sum(), quats)[0]]
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-6), (torch.float64, 1e-13)])
@@ -40,7 +40,9 @@ def test_normals_match_their_twin(dtype: torch.dtype, tolerance: float, count: i
 
 def test_gradient_matches_finite_differences() -> None:
     quats, *others = gaussians(20, torch.float64)
-    assert torch.autograd.gradcheck(lambda q: facing_normals(q, *others), quats.requires_grad_(), eps=1e-7, atol=1e-6)
+    assert torch.autograd.gradcheck(
+        lambda q: facing_normals(q, *others), quats.requires_grad_(), eps=1e-7, atol=1e-6, fast_mode=True
+    )
 
 
 def test_normals_are_unit_shortest_axes_towards_the_eye() -> None:
@@ -69,6 +71,11 @@ def test_a_quaternion_without_direction_gives_no_normal_and_no_gradient(poison: 
         normals, gradient = with_gradient(function, case)
         assert normals[2].tolist() == [0.0, 0.0, 0.0] and gradient[2].tolist() == [0.0, 0.0, 0.0, 0.0]
         assert bool(normals.isfinite().all()) and bool(gradient.isfinite().all())
+
+
+def test_the_twin_makes_its_tensors_where_the_inputs_are() -> None:
+    case = [tensor.to("meta") for tensor in gaussians(5, torch.float32)]
+    assert {tensor.device.type for tensor in with_gradient(twin, case)} == {"meta"}
 
 
 def test_threads_do_not_change_a_bit() -> None:

@@ -19,7 +19,7 @@ WIDTH, HEIGHT = 29, 23
 
 
 def shade_case(dtype: torch.dtype, height: int = HEIGHT, width: int = WIDTH, size: int = 6) -> dict[str, Tensor]:
-    """Random arguments; the left quarter has no normals, a tenth of the strengths is 0."""
+    """Random arguments; the left quarter and a pixel have no normals, a tenth of the strengths is 0."""
     generator = torch.Generator().manual_seed(0)
 
     def draw(*shape: int) -> Tensor:
@@ -27,6 +27,7 @@ def shade_case(dtype: torch.dtype, height: int = HEIGHT, width: int = WIDTH, siz
 
     normals = 2 * draw(height, width, 3) - 1
     normals[:, : width // 4] = 0
+    normals[1:2, width // 2] = 0
     strength = draw(height, width)
     case = {
         "base": draw(height, width, 3),
@@ -43,13 +44,15 @@ def with_gradients(case: dict[str, Tensor], function: Callable[..., Shaded]) -> 
     inputs = {name: case[name].detach().requires_grad_() for name in INPUTS}
     result = function(**(case | inputs))
     generator = torch.Generator().manual_seed(3)
-    weights = [torch.randn(t.shape, generator=generator, dtype=torch.float64).to(t.dtype) for t in result]
+    weights = [torch.randn(t.shape, generator=generator, dtype=torch.float64).to(t) for t in result]
     total = sum((t * w).sum() for t, w in zip(result, weights, strict=True))
     return [*(t.detach() for t in result), *torch.autograd.grad(total, list(inputs.values()))]
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-5), (torch.float64, 1e-11)])
-@pytest.mark.parametrize(("height", "width", "size"), [(23, 29, 6), (1, 1, 1), (0, 5, 2), (8, 9, 1)])
+@pytest.mark.parametrize(
+    ("height", "width", "size"), [(23, 29, 6), (1, 1, 1), (0, 5, 2), (8, 9, 1), (3, 100, 5), (2, 128, 4)]
+)
 def test_shading_matches_its_twin(dtype: torch.dtype, tolerance: float, height: int, width: int, size: int) -> None:
     case = shade_case(dtype, height, width, size)
     found, expected = (with_gradients(case, f) for f in (shade_environment, twin))
@@ -65,7 +68,11 @@ def test_gradients_match_finite_differences(name: str) -> None:
     if name == "normals":
         values = torch.where(values == 0, 0.7, values)
     assert torch.autograd.gradcheck(
-        lambda moved: tuple(shade_environment(**(case | {name: moved}))), values.requires_grad_(), eps=1e-7, atol=1e-5
+        lambda moved: tuple(shade_environment(**(case | {name: moved}))),
+        values.requires_grad_(),
+        eps=1e-7,
+        atol=1e-5,
+        fast_mode=True,
     )
 
 
@@ -132,6 +139,11 @@ def test_poisoned_texels_are_heard_of() -> None:
     for function in (shade_environment, twin):
         reflection = function(**case).reflection
         assert bool(reflection[lit].isnan().all()) and bool((reflection[~lit] == 0).all())
+
+
+def test_the_twin_makes_its_tensors_where_the_inputs_are() -> None:
+    case = {name: tensor.to("meta") for name, tensor in shade_case(torch.float32).items()}
+    assert {tensor.device.type for tensor in with_gradients(case, twin)} == {"meta"}
 
 
 def test_threads_do_not_change_a_bit() -> None:
