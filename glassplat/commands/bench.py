@@ -1,10 +1,10 @@
-"""`glassplat bench`: methods over scenes, and what each part of `planar` is worth."""
+"""`glassplat bench`: methods over scenes, and what each part of a method is worth."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -28,12 +28,11 @@ from glassplat.commands.bench_tables import (
 from glassplat.commands.train import Train
 from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
-from glassplat.train.ablations import ABLATIONS, SWITCHES, Switch
-from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.ablations import ABLATIONS, Ablated, Ablation, Switch
 from glassplat.train.recipe import RECIPES
 from glassplat.train.run_directory import write_text
 
-Method = Literal["splat", "planar"]
+Method = Literal["splat", "planar", "deferred"]
 Strategy = Literal["default", "mcmc"]
 FULL = "full"
 SPREAD_NOTE = "Means over the seeds ± their standard deviation."
@@ -75,9 +74,10 @@ class BenchScenes:
             for method in unique(self.methods, "methods")
         }
         pairs = [
-            Pair(f"{planar} - {splat}", planar, splat)
+            Pair(f"{reflective} - {splat}", reflective, splat)
             for strategy in self.strategies
-            if (planar := variant_name("planar", strategy)) in recipes
+            for method in ("planar", "deferred")
+            if (reflective := variant_name(method, strategy)) in recipes
             and (splat := variant_name("splat", strategy)) in recipes
         ]
         runs = planned_runs(self, recipes)
@@ -87,12 +87,13 @@ class BenchScenes:
 
 @dataclass(frozen=True)
 class BenchAblation:
-    """Train `planar` with each of its parts switched off and write the differences to the full method.
+    """Train a method with each of its parts switched off and write the differences to the full method.
 
     Attributes:
         data: directories of the captures.
         output: where the tables and one directory per run go.
-        switches: which parts, one at a time; the first seven are the rows of the paper's Table IV.
+        method: which method.
+        switches: which of its parts, one at a time; all of them if none is named.
         seeds: one run for each.
         iterations: length of each run.
         downscale: shrink the photographs by this factor.
@@ -101,7 +102,8 @@ class BenchAblation:
 
     data: tuple[Path, ...]
     output: Path
-    switches: tuple[Switch, ...] = SWITCHES
+    method: Ablated = "planar"
+    switches: tuple[Switch, ...] = ()
     seeds: tuple[int, ...] = (0,)
     iterations: int = 7000
     downscale: float = 1.0
@@ -109,12 +111,24 @@ class BenchAblation:
 
     def run(self, console: Console) -> None:
         """Runs what is missing and writes `ablation.md` and `ablation.json`."""
-        full = PlanarRecipe()
-        switches = unique(self.switches, "switches")
-        recipes = {FULL: full} | {f"no-{switch}": ABLATIONS[switch].off(full) for switch in switches}
+        full = RECIPES[self.method]()
+        ablations = self.chosen()
+        recipes = {FULL: full} | {f"no-{switch}": ablation.off(full) for switch, ablation in ablations.items()}
         runs = planned_runs(self, recipes)
-        execute(runs, console, partial(write_ablation, self.output, switches))
+        execute(runs, console, partial(write_ablation, self.output, ablations))
         console.print(f"tables: {self.output / 'ablation.md'}, {self.output / 'ablation.json'}")
+
+    def chosen(self) -> dict[Switch, Ablation]:
+        """The parts to switch off.
+
+        Raises:
+            InputError: one is not a part of the method, or is named twice.
+        """
+        known = ABLATIONS[self.method]
+        foreign = [switch for switch in self.switches if switch not in known]
+        if foreign:
+            raise InputError(f"{self.method} has no parts {foreign}; expected --switches out of {list(known)}")
+        return {switch: known[switch] for switch in unique(self.switches or tuple(known), "switches")}
 
 
 AnyBench = (
@@ -124,7 +138,7 @@ AnyBench = (
 
 @dataclass(frozen=True)
 class Bench:
-    """Compare methods over scenes, or the parts of `planar` with each other.
+    """Compare methods over scenes, or the parts of a method with each other.
 
     Attributes:
         comparison: what to compare.
@@ -203,12 +217,12 @@ def write_scenes(output: Path, pairs: Sequence[Pair], finished: Sequence[Finishe
     write_json(output / "scenes.json", finished, reached, compared)
 
 
-def write_ablation(output: Path, switches: Sequence[Switch], finished: Sequence[FinishedRun]) -> None:
+def write_ablation(output: Path, ablations: Mapping[Switch, Ablation], finished: Sequence[FinishedRun]) -> None:
     """Writes what is finished."""
     measured = measured_runs(finished)
-    pairs = [Pair(ABLATIONS[switch].title, f"no-{switch}", FULL) for switch in switches]
+    pairs = [Pair(ablation.title, f"no-{switch}", FULL) for switch, ablation in ablations.items()]
     reached, compared = means(measured), differences(measured, pairs)
-    published = [ABLATIONS[s] for s in switches if ABLATIONS[s].paper_psnr is not None]
+    published = [ablation for ablation in ablations.values() if ablation.paper_psnr is not None]
     paper = "; ".join(f"{ablation.title} {ablation.paper_psnr:+.2f}" for ablation in published)
     note = f"Each part left out, minus the full method. {COMPARED_NOTE}"
     if paper:

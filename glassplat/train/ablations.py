@@ -1,11 +1,12 @@
-"""The parts of `planar` that can be switched off one at a time (TR-Gaussians, Table IV)."""
+"""The parts of methods that can be switched off one at a time (TR-Gaussians, Table IV; 3DGS-DR, Tables 1 and 5)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Any, Literal
 
+from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.planar_recipe import PlanarRecipe
 
 Switch = Literal[
@@ -20,7 +21,12 @@ Switch = Literal[
     "mirrors",
     "seeded-reflections",
     "linear-blend",
+    "propagation",
+    "sabotage",
+    "deferred-shading",
+    "coarse-to-fine",
 ]
+Ablated = Literal["planar", "deferred"]
 
 
 @dataclass(frozen=True)
@@ -30,12 +36,12 @@ class Ablation:
     Attributes:
         title: what the table calls the recipe without it.
         off: the recipe without it.
-        paper_psnr: what leaving it out changes in the paper, dB on two of its own scenes; None for what the paper
-            does not ablate.
+        paper_psnr: what leaving it out changes in the paper, dB on its own scenes; None for what the paper does not
+            ablate.
     """
 
     title: str
-    off: Callable[[PlanarRecipe], PlanarRecipe]
+    off: Callable[[Any], Any]
     paper_psnr: float | None = None
 
 
@@ -48,7 +54,15 @@ def _without_perturbation(recipe: PlanarRecipe) -> PlanarRecipe:
     return replace(recipe, perturbation=replace(recipe.perturbation, amplitude=0.0))
 
 
-ABLATIONS: dict[Switch, Ablation] = {
+def _without_propagation(recipe: DeferredRecipe) -> DeferredRecipe:
+    return replace(recipe, propagation=replace(recipe.propagation, propagates=False))
+
+
+def _without_sabotage(recipe: DeferredRecipe) -> DeferredRecipe:
+    return replace(recipe, propagation=replace(recipe.propagation, sabotage=0.0))
+
+
+PLANAR: dict[Switch, Ablation] = {
     "multi-stage": Ablation("w/o multi-stage optimization", lambda r: replace(r, multi_stage=False), -1.32),
     "depth-and-conflict": Ablation("w/o L_d and L_c", _without("depth", "conflict"), -0.50),
     "depth": Ablation("w/o L_d", _without("depth"), -0.30),
@@ -61,6 +75,14 @@ ABLATIONS: dict[Switch, Ablation] = {
     "seeded-reflections": Ablation("w/o seeded reflections", lambda r: replace(r, seed_reflections=False)),
     "linear-blend": Ablation("blended in sRGB", lambda r: replace(r, blend="srgb")),
 }
-"""Every switch; the first seven are the rows of Table IV, the others are parts that the paper does not ablate."""
+"""The first seven are the rows of TR-Gaussians' Table IV, the others are parts that the paper does not ablate."""
 
-SWITCHES: tuple[Switch, ...] = get_args(Switch)
+DEFERRED: dict[Switch, Ablation] = {
+    "propagation": Ablation("w/o normal propagation", _without_propagation, -5.81),
+    "sabotage": Ablation("w/o colour sabotage", _without_sabotage, -3.66),
+    "deferred-shading": Ablation("forward shading", lambda r: replace(r, shading="forward"), -6.02),
+    "coarse-to-fine": Ablation("w/o coarse-to-fine environment", lambda r: replace(r, first_texels=r.texels)),
+}
+"""The rows of 3DGS-DR's Table 5 and its forward variant (Table 1, `ball`), and what the paper does not have."""
+
+ABLATIONS: dict[Ablated, dict[Switch, Ablation]] = {"planar": PLANAR, "deferred": DEFERRED}

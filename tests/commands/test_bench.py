@@ -6,7 +6,7 @@ import json
 import signal
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
@@ -16,10 +16,11 @@ from glassplat.commands.bench_runs import FinishedRun, PlannedRun, RunClock, in_
 from glassplat.commands.train import Train, TrainingProgress
 from glassplat.data.errors import InputError
 from glassplat.init.planes import PlaneFitError
-from glassplat.train.ablations import ABLATIONS, SWITCHES
+from glassplat.train.ablations import ABLATIONS, Ablated, Switch
 from glassplat.train.checkpoint import load_checkpoint
 from glassplat.train.messages import Message, StepDone
 from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.recipe import RECIPES
 from glassplat.train.splat_recipe import SplatRecipe
 from tests.train.tiny_capture import write_tiny_capture
 
@@ -141,14 +142,28 @@ def test_the_ablation_tables_differences_to_the_full_method(capture: Path) -> No
     assert written(output) == before
 
 
-def test_every_switch_changes_the_recipe_and_no_two_alike() -> None:
+@pytest.mark.parametrize("method", sorted(ABLATIONS))
+def test_every_switch_changes_the_recipe_and_no_two_alike(method: Ablated) -> None:
+    full, ablations = RECIPES[method](), ABLATIONS[method]
+    recipes = [full, *(ablation.off(full) for ablation in ablations.values())]
+    assert len({repr(recipe) for recipe in recipes}) == len(ablations) + 1
+
+
+def test_switches_leave_the_rest_as_it_is() -> None:
     full = PlanarRecipe()
-    recipes = [full, *(ABLATIONS[switch].off(full) for switch in SWITCHES)]
-    assert len({repr(recipe) for recipe in recipes}) == len(SWITCHES) + 1
-    assert set(ABLATIONS) == set(SWITCHES)
-    off = ABLATIONS["depth-and-conflict"].off(full).weights
+    off = ABLATIONS["planar"]["depth-and-conflict"].off(full).weights
     assert (off.depth, off.conflict, off.mask) == (0.0, 0.0, full.weights.mask)
-    assert ABLATIONS["perturbation"].off(full).perturbation.amplitude == 0
+    assert ABLATIONS["planar"]["perturbation"].off(full).perturbation.amplitude == 0
+
+
+def test_every_switch_belongs_to_a_method() -> None:
+    assert set(get_args(Switch)) == {switch for ablations in ABLATIONS.values() for switch in ablations}
+
+
+def test_a_switch_of_another_method_is_refused(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["bench", "ablation", "--data", str(capture), "--output", str(capture.parent / "ablation")]
+    assert main([*arguments, "--method", "deferred", "--switches", "fresnel"]) == 2
+    assert "deferred has no parts ['fresnel']" in " ".join(capsys.readouterr().err.split())
 
 
 @dataclass(frozen=True)
