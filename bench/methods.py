@@ -116,7 +116,10 @@ def deferred_costs() -> Table:
         camera = bench_camera(width, height)
         scene, view = glossy_scene(count), view_of(camera)
         frames = interleaved_seconds(
-            {"splat": frame_work(scene, Splat(depth=False), camera), "deferred": frame_work(scene, Deferred(), camera)}
+            {
+                "splat": frame_work(scene, Splat(depth=False), camera),
+                "deferred": frame_work(scene, Deferred(depth=False), camera),
+            }
         )
         steps = interleaved_seconds(
             {"splat": step_work(scene, splat_stage, view), "deferred": step_work(scene, deferred_stage, view)},

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -19,6 +19,7 @@ from glassplat.evaluate.colormap import depth_colors, normal_colors
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.files.images import write_image
 from glassplat.kernels.devices import DeviceName
+from glassplat.render.deferred import Deferred
 from glassplat.render.frame import Frame
 
 Layer = Literal[
@@ -50,6 +51,9 @@ class Render:
         """Renders."""
         stored = open_run(self.run_directory, self.device)
         scene = self.edits.applied(stored.scene)
+        renderer = stored.renderer
+        if "environment" in self.layers and isinstance(renderer, Deferred):
+            renderer = replace(renderer, environment=True)
         views = chosen_views(stored.dataset, self.split)
         paths = picture_paths([view.name for view in views])
         if claim_folder(self.output, "render", self.run_directory):
@@ -57,7 +61,7 @@ class Render:
                 f"adding to {self.output}, which `glassplat render` wrote earlier; images of one name are replaced"
             )
         for view in track(views, "rendering", console=console):
-            frame, _ = timed_render(stored.renderer, scene, view)
+            frame, _ = timed_render(renderer, scene, view)
             for layer in self.layers:
                 image = layer_image(frame, layer, stored.recipe.method)
                 write_image(self.output / layer / paths[view.name], image)

@@ -46,11 +46,13 @@ class Deferred:
         background: colour behind everything, sRGB.
         shading: `forward` shades every Gaussian instead of every pixel, the paper's ablation; its `reflection` layer
             is the blended light that the Gaussians reflect, divided by R.
+        depth: also render the depth layer.
         environment: also render the layer `environment`.
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     shading: Shading = "deferred"
+    depth: bool = True
     environment: bool = False
 
     def __call__(self, scene: Scene, camera: Camera) -> Frame:
@@ -90,35 +92,32 @@ class Deferred:
     ) -> tuple[Tensor, dict[str, Tensor], ScreenPass]:
         to_eye = torch.nn.functional.normalize(camera.center - scene.primary.means, dim=1)
         cosines = (surface.normals * to_eye).sum(-1, keepdim=True)
-        reflected = torch.sigmoid(cube_lookup(scene.environment.raw, 2 * cosines * surface.normals - to_eye))
-        shares = surface.strengths[:, None]
-        layers, screen = self._blend(scene, camera, surface, (shares, shares * reflected))
-        lost, gained = layers.pop("extra").split([3, 3], dim=-1)
-        rgb = layers["base"] - lost + gained
+        mirrored = torch.sigmoid(cube_lookup(scene.environment.raw, 2 * cosines * surface.normals - to_eye))
+        layers, screen = self._blend(scene, camera, surface, mirrored)
+        gained = layers.pop("gained")
+        rgb = layers["base"] - layers.pop("lost") + gained
         return rgb, layers | {"reflection": gained / layers["strength"][..., None].clamp(min=1e-6)}, screen
 
     def _blend(
-        self, scene: Scene, camera: Camera, surface: Surface, forward: tuple[Tensor, Tensor] | None = None
+        self, scene: Scene, camera: Camera, surface: Surface, mirrored: Tensor | None = None
     ) -> tuple[dict[str, Tensor], ScreenPass]:
-        """The blended layers; with `forward` (shares [N, 1], light [N, 3]) also `extra`, what replaces what."""
+        """The blended layers; given what every Gaussian mirrors [N, 3], also `lost` and `gained`: what gives way to it."""
         projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
         splats = joined_splats(projected)
-        values = [projected.colors[0], surface.normals, surface.strengths[:, None], projected.depths[0, :, None]]
-        if forward is not None:
-            shares, light = forward
-            values += [shares * projected.colors[0], light]
-        channels = torch.cat(values, dim=-1)[None]
+        colors, shares = projected.colors[0], surface.strengths[:, None]
+        values = {"base": colors, "normal": surface.normals, "strength": shares}
+        if self.depth:
+            values["depth"] = projected.depths[0, :, None]
+        if mirrored is not None:
+            values |= {"lost": shares * colors, "gained": shares * mirrored}
+        channels = torch.cat(list(values.values()), dim=-1)[None]
         result = composite(splats, channels, bin_tiles(splats, camera.width, camera.height))
-        color, normal, strength, depth, extra = result.image[0].split([3, 3, 1, 1, channels.shape[2] - 8], dim=-1)
-        alpha = result.alpha[0]
-        layers = {
-            "base": over_background(color, alpha, self.background),
-            "normal": normal,
-            "strength": strength[..., 0],
-            "alpha": alpha,
-            "depth": mean_depth(depth[..., 0], alpha),
-        }
-        layers |= {"extra": extra} if forward is not None else {}
+        images = result.image[0].split([value.shape[1] for value in values.values()], dim=-1)
+        layers, alpha = dict(zip(values, images, strict=True)), result.alpha[0]
+        layers |= {"base": over_background(layers["base"], alpha, self.background), "alpha": alpha}
+        layers["strength"] = layers["strength"][..., 0]
+        if self.depth:
+            layers["depth"] = mean_depth(layers["depth"][..., 0], alpha)
         return layers, ScreenPass("primary", projected.means2d, projected.radii)
 
 

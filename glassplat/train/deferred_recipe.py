@@ -126,7 +126,7 @@ class DeferredRecipe:
         reflection = Stage(
             name="2 reflection",
             share=1 - self.bootstrap,
-            renderer=Deferred(self.background or BLACK, self.shading),
+            renderer=Deferred(self.background or BLACK, self.shading, depth=False),
             losses=(*photometric, LossTerm("outside", self.outside_weight, strength_outside), *population.terms),
             rates=self.rates.of("primary") | self.reflection_rates.of(),
             actions=(
