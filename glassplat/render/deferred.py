@@ -101,7 +101,7 @@ class Deferred:
     def _blend(
         self, scene: Scene, camera: Camera, surface: Surface, mirrored: Tensor | None = None
     ) -> tuple[dict[str, Tensor], ScreenPass]:
-        """The blended layers; given what every Gaussian mirrors [N, 3], also `lost` and `gained`: what gives way to it."""
+        """The blended layers; given what each Gaussian mirrors [N, 3], also `lost` and `gained`."""
         projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
         splats = joined_splats(projected)
         colors, shares = projected.colors[0], surface.strengths[:, None]
