@@ -13,6 +13,7 @@ from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
 from glassplat.densify.propagate import NormalPropagation
 from glassplat.init.region import reflective_region
+from glassplat.losses.geometry import normal_consistency
 from glassplat.losses.reflectors import strength_outside
 from glassplat.losses.term import LossTerm
 from glassplat.render.deferred import Deferred, Shading
@@ -36,7 +37,7 @@ class ReflectionRates:
         environment: raw texels of the environment.
     """
 
-    strength: float = 6e-3
+    strength: float = 2e-2
     environment: float = 5e-2
 
     def of(self) -> dict[str, Rate]:
@@ -61,6 +62,7 @@ class DeferredRecipe:
         region: only what lies in this sphere may reflect: centre and radius, world units. None finds the place that
             the cameras stand around, if there is one.
         outside_weight: weight of the mean strength outside of the region in the objective.
+        consistency_weight: weight of the difference between normals and the slope of the depths, while normals spread.
         propagation: how normals spread and colours are sabotaged.
         schedule: when they do.
         rates: learning rates of the Gaussians.
@@ -84,6 +86,7 @@ class DeferredRecipe:
     first_strength: float = 1e-3
     region: tuple[float, float, float, float] | None = None
     outside_weight: float = 0.4
+    consistency_weight: float = 0.05
     propagation: NormalPropagation = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
     rates: GaussianRates = field(default_factory=GaussianRates)
@@ -125,9 +128,17 @@ class DeferredRecipe:
         beat = Every(self.rhythm.beat, 0.0, self.schedule.stop, self.rhythm.least, skip_multiples_of=3)
         reflection = Stage(
             name="2 reflection",
-            share=1 - self.bootstrap,
-            renderer=Deferred(self.background or BLACK, self.shading, depth=False),
-            losses=(*photometric, LossTerm("outside", self.outside_weight, strength_outside), *population.terms),
+            share=self.schedule.stop - self.bootstrap,
+            renderer=Deferred(self.background or BLACK, self.shading, depth=self.consistency_weight != 0),
+            losses=(
+                *photometric,
+                LossTerm("outside", self.outside_weight, strength_outside),
+                *(
+                    (LossTerm("consistency", self.consistency_weight, normal_consistency),)
+                    * (self.consistency_weight != 0)
+                ),
+                *population.terms,
+            ),
             rates=self.rates.of("primary") | self.reflection_rates.of(),
             actions=(
                 *population.edits,
@@ -138,7 +149,14 @@ class DeferredRecipe:
             ),
             motions=population.motions,
         )
-        return bootstrap, reflection
+        refinement = replace(
+            reflection,
+            name="3 refinement",
+            share=1 - self.schedule.stop,
+            renderer=Deferred(self.background or BLACK, self.shading, depth=False),
+            losses=tuple(term for term in reflection.losses if term.name != "consistency"),
+        )
+        return bootstrap, reflection, refinement
 
     def _population(self) -> Population:
         means_rate = self.rates.of("primary")["primary.means"]

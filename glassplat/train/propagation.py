@@ -36,9 +36,9 @@ class PropagationSchedule:
     """
 
     end: Literal["settled", "fixed"] = "settled"
-    stop: float = 0.6
+    stop: float = 0.75
     patience: float = 0.1
-    pause: int = 200
+    pause: int = 100
 
 
 @dataclass(frozen=True)
