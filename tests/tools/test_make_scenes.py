@@ -1,0 +1,124 @@
+"""Reflective scenes: cameras, shapes and surroundings as documented, and the small scene in the tree obeys optics."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from glassplat.data.dataset import load_dataset
+from tools.make_demo_scene import linear_from_srgb
+from tools.make_scenes import BALL_RADIUS, Arguments, camera_positions, main, world_from_opengl
+from tools.scene_environment import directions, make_environment
+from tools.scene_surfaces import Triangles, disc, ground_texture, torus, torus_depth
+
+BALL = Path(__file__).parent.parent / "data_files" / "ball"
+TEST_FRAMES = json.loads((BALL / "transforms_test.json").read_text())["frames"]
+TRAIN, TEST, SIZE = 24, 6, 96
+
+
+def unit_pixels(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.array(image) / 255.0
+
+
+def environment_along(direction: np.ndarray) -> np.ndarray:
+    """Nearest pixel of the ball's surroundings, linear radiance [..., 3], by the documented convention."""
+    panorama = linear_from_srgb(unit_pixels(BALL / "environment.png"))
+    height, width = panorama.shape[:2]
+    column = (0.5 - np.arctan2(direction[..., 1], direction[..., 0]) / (2 * np.pi)) * width
+    row = np.arccos(np.clip(direction[..., 2], -1, 1)) / np.pi * height
+    return panorama[np.clip(row.astype(int), 0, height - 1), column.astype(int) % width]
+
+
+def ball_points(frame: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rays [S, S, 3] through the pixel centres, unit normals where they meet the ball, and whether they do clearly."""
+    pose = np.array(frame["transform_matrix"])
+    focal = 0.5 * SIZE / np.tan(json.loads((BALL / "transforms_test.json").read_text())["camera_angle_x"] / 2)
+    x, y = np.meshgrid((np.arange(SIZE) + 0.5 - SIZE / 2) / focal, -(np.arange(SIZE) + 0.5 - SIZE / 2) / focal)
+    rays = np.stack([x, y, -np.ones_like(x)], axis=-1) @ pose[:3, :3].T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    origin = pose[:3, 3]
+    along = rays @ origin
+    root = along**2 - origin @ origin + BALL_RADIUS**2
+    distance = -along - np.sqrt(np.maximum(root, 0))
+    normals = (origin + distance[..., None] * rays) / BALL_RADIUS
+    return rays, normals, (root > 0) & (-(normals * rays).sum(axis=-1) > 0.4)
+
+
+def test_cameras_look_at_the_object_from_above() -> None:
+    for position in camera_positions(50, 0.3):
+        pose = world_from_opengl(position)
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
+        ahead = position - 4 * pose[:3, 2]
+        np.testing.assert_allclose(ahead, [0, 0, -0.15], atol=1e-12)
+        assert pose[2, 1] > 0 and pose[2, 0] == pytest.approx(0)
+
+
+@pytest.mark.parametrize("triangles", [disc(1.2, -0.5), torus(0.6, 0.25, 40.0, rings=24, segments=16)])
+def test_faces_turn_the_way_their_normals_point(triangles: Triangles) -> None:
+    first, second, third = (triangles.positions[triangles.faces[:, corner]] for corner in range(3))
+    turned = np.cross(second - first, third - first)
+    normals = triangles.normals[triangles.faces].mean(axis=1)
+    assert ((turned * normals).sum(axis=-1) > 0).all()
+    np.testing.assert_allclose(np.linalg.norm(triangles.normals, axis=-1), 1)
+
+
+def test_a_torus_stands_on_its_lowest_point() -> None:
+    lowest = torus(0.6, 0.25, 40.0).positions[:, 2].min()
+    assert lowest == pytest.approx(-torus_depth(0.6, 0.25, 40.0), abs=1e-3)
+
+
+def test_a_panorama_is_seen_from_inside() -> None:
+    direction = directions(64)
+    np.testing.assert_allclose(direction[:, 63:65].mean(axis=1)[32], [1, 0, 0], atol=0.05)
+    np.testing.assert_allclose(direction[32, 32], [0, 1, 0], atol=0.05)
+    np.testing.assert_allclose(direction[0, :, 2], 1, atol=0.01)
+
+
+def test_surroundings_and_textures_hardly_leave_what_eight_bits_hold() -> None:
+    environment = make_environment(64)
+    assert environment.shape == (64, 128, 3)
+    assert environment.min() >= 0 and environment.max() <= 1.2 + 1e-6
+    assert (environment > 1).mean() < 0.1
+    ground = ground_texture(1.2, 64)
+    assert ground.min() > 0 and ground.max() < 1
+
+
+def test_no_scene_is_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "torus").mkdir()
+    with pytest.raises(FileExistsError, match=r"torus exist; expected new folders"):
+        main(Arguments(output=tmp_path))
+
+
+def test_the_small_ball_is_small_and_read_like_shiny_blender() -> None:
+    assert sum(path.stat().st_size for path in BALL.rglob("*") if path.is_file()) < 3_000_000
+    dataset = load_dataset(BALL)
+    assert (len(dataset.train), len(dataset.test)) == (TRAIN, TEST)
+    assert not dataset.measured_points and not dataset.pane_labels
+    assert dataset.test[0].photo.shape == (SIZE, SIZE, 3)
+
+
+@pytest.mark.parametrize("frame", TEST_FRAMES, ids=lambda frame: frame["file_path"])
+def test_the_small_ball_has_the_normals_of_a_sphere(frame: dict) -> None:
+    _, normals, hit = ball_points(frame)
+    stored = 2 * unit_pixels(BALL / f"{frame['file_path']}_normal.png")[..., :3] - 1
+    error = np.linalg.norm(stored - normals, axis=-1)[hit]
+    assert error.max() < np.radians(1.0)
+
+
+@pytest.mark.parametrize("frame", TEST_FRAMES, ids=lambda frame: frame["file_path"])
+def test_the_small_ball_mirrors_its_surroundings(frame: dict) -> None:
+    rays, normals, hit = ball_points(frame)
+    assert (unit_pixels(BALL / f"{frame['file_path']}_strength.png")[hit] == 1).all()
+    mirrored = rays - 2 * (rays * normals).sum(axis=-1, keepdims=True) * normals
+    # Below the horizon the ball shows the ground, which is near.
+    sky = hit & (mirrored[..., 2] > 0.05)
+    shown = linear_from_srgb(unit_pixels(BALL / f"{frame['file_path']}.png")[..., :3])
+    difference = np.abs(shown - environment_along(mirrored))[sky]
+    assert sky.sum() > 100
+    assert np.median(difference) < 0.01

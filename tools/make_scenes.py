@@ -1,0 +1,297 @@
+"""Makes small scenes of reflective objects under a known environment, with Mitsuba 3.
+
+    pip install -e '.[scenes]'
+    python -m tools.make_scenes --output runs/reflective --scenes ball torus control
+
+docs/scenes.md describes the scenes and their files.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from PIL import Image
+
+from tools.make_demo_scene import srgb_from_linear
+from tools.scene_environment import make_environment
+from tools.scene_surfaces import Triangles, ball_texture, disc, ground_texture, torus, torus_depth
+
+SceneName = Literal["ball", "torus", "control"]
+Variant = Literal["llvm_ad_rgb", "cuda_ad_rgb"]
+Array = NDArray[np.floating]
+
+CAMERA_DISTANCE = 4.0
+"""World units from `LOOKED_AT` to every camera."""
+CAMERA_ANGLE_X_RAD = 0.6911
+"""Opening angle of the NeRF-synthetic cameras."""
+LOOKED_AT = np.array([0.0, 0.0, -0.15])
+ELEVATIONS_DEG = (8.0, 75.0)
+"""Lowest and highest camera above the horizontal through `LOOKED_AT`."""
+GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))
+TEST_AZIMUTH_RAD = 1.0
+"""Turns the spiral of the test cameras against that of the training cameras."""
+
+BALL_RADIUS = 0.7
+TORUS_MAJOR, TORUS_MINOR = 0.58, 0.25
+TORUS_TILT_DEG = 40.0
+TORUS_COLOR = (0.34, 0.02, 0.04)
+TORUS_REFRACTION = 2.5
+"""Refractive index of the coating: it reflects 18 % head-on, far more than lacquer does."""
+GROUND_RADIUS = 1.2
+TEXTURE_SIZE = 1024
+BOUNCES = 6
+SUBPIXELS = 8
+"""Rays per pixel and axis that measure normals, coverage and strength."""
+MITSUBA_FROM_OPENGL = np.diag([-1.0, 1.0, -1.0, 1.0])
+WORLD_FROM_MITSUBA_SKY = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""Mitsuba's environments have +y up, +z in the middle and +x a quarter from the left."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Path-traces scenes of reflective objects, with true normals, strength and environment."""
+
+    output: Path
+    """Folder that gets one folder per scene; those must not exist yet."""
+    scenes: tuple[SceneName, ...] = ("ball", "torus", "control")
+    """Which scenes to make."""
+    size: int = 256
+    """Width and height of the images, pixels."""
+    train: int = 80
+    """Training views."""
+    test: int = 16
+    """Test views."""
+    samples: int = 256
+    """Light paths per pixel."""
+    environment_height: int = 512
+    """Height of the equirectangular environment, pixels."""
+    variant: Variant = "llvm_ad_rgb"
+    """Mitsuba's backend: CPU or NVIDIA GPU."""
+
+
+@dataclass(frozen=True)
+class Studio:
+    """One scene in Mitsuba and the shape in it that counts as reflective, if any."""
+
+    mitsuba: Any
+    scene: Any
+    mirror: Any | None
+    size: int
+
+
+def camera_positions(count: int, azimuth_rad: float) -> Array:
+    """Points [count, 3] on a spiral that climbs the hemisphere around `LOOKED_AT`, evenly over its area."""
+    lowest, highest = np.sin(np.radians(ELEVATIONS_DEG))
+    up = lowest + (highest - lowest) * (np.arange(count) + 0.5) / count
+    azimuth = azimuth_rad + GOLDEN_ANGLE_RAD * np.arange(count)
+    across = np.sqrt(1 - up**2)
+    directions = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), up], axis=1)
+    return LOOKED_AT + CAMERA_DISTANCE * directions
+
+
+def world_from_opengl(position: Array) -> Array:
+    """Pose [4, 4] of a camera at `position` [3] that looks at `LOOKED_AT`: +x right, +y up, -z forward."""
+    backward = (position - LOOKED_AT) / np.linalg.norm(position - LOOKED_AT)
+    right = np.cross([0.0, 0.0, 1.0], backward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(backward, right), backward, position], axis=1)
+    return pose
+
+
+def textured(mitsuba: Any, reflectance: Array) -> dict[str, Any]:
+    """A matte material that shows a picture of linear reflectances [H, W, 3]."""
+    bitmap = mitsuba.Bitmap(np.ascontiguousarray(reflectance, dtype=np.float32))
+    return {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": bitmap, "raw": True}}
+
+
+def mesh(mitsuba: Any, triangles: Triangles, material: Mapping[str, Any]) -> Any:
+    """A Mitsuba mesh of one material."""
+    properties = mitsuba.Properties()
+    properties["mesh_bsdf"] = mitsuba.load_dict(dict(material))
+    shape = mitsuba.Mesh(
+        "mesh",
+        vertex_count=len(triangles.positions),
+        face_count=len(triangles.faces),
+        has_vertex_normals=True,
+        has_vertex_texcoords=True,
+        props=properties,
+    )
+    parameters = mitsuba.traverse(shape)
+    parameters["vertex_positions"] = triangles.positions.astype(np.float32).ravel()
+    parameters["vertex_normals"] = triangles.normals.astype(np.float32).ravel()
+    parameters["vertex_texcoords"] = triangles.coordinates.astype(np.float32).ravel()
+    parameters["faces"] = triangles.faces.astype(np.uint32).ravel()
+    parameters.update()
+    return shape
+
+
+def make_body(mitsuba: Any, name: SceneName) -> tuple[Any, float]:
+    """The object of a scene, about the origin, and the height of the ground that it stands on."""
+    if name == "torus":
+        coated = {
+            "type": "plastic",
+            "int_ior": TORUS_REFRACTION,
+            "diffuse_reflectance": {"type": "rgb", "value": list(TORUS_COLOR)},
+        }
+        body = mesh(mitsuba, torus(TORUS_MAJOR, TORUS_MINOR, TORUS_TILT_DEG), coated)
+        return body, -torus_depth(TORUS_MAJOR, TORUS_MINOR, TORUS_TILT_DEG)
+    perfect_mirror = {"type": "conductor", "material": "none"}
+    material = perfect_mirror if name == "ball" else textured(mitsuba, ball_texture(TEXTURE_SIZE))
+    return mitsuba.load_dict({"type": "sphere", "radius": BALL_RADIUS, "bsdf": material}), -BALL_RADIUS
+
+
+def make_studio(mitsuba: Any, name: SceneName, environment: Array, size: int) -> Studio:
+    """Object, ground and environment; what the camera sees of the environment is transparent."""
+    body, ground_z = make_body(mitsuba, name)
+    ground = mesh(
+        mitsuba, disc(GROUND_RADIUS, ground_z), textured(mitsuba, ground_texture(GROUND_RADIUS, TEXTURE_SIZE))
+    )
+    sky = {
+        "type": "envmap",
+        "bitmap": mitsuba.Bitmap(np.ascontiguousarray(environment)),
+        "to_world": mitsuba.ScalarTransform4f(WORLD_FROM_MITSUBA_SKY),
+    }
+    tracer = {"type": "path", "max_depth": BOUNCES, "hide_emitters": True}
+    scene = mitsuba.load_dict({"type": "scene", "integrator": tracer, "body": body, "ground": ground, "sky": sky})
+    # A scene may merge or copy shapes while it is built, so the object is found again by its place.
+    mirror = None if name == "control" else scene.shapes()[0]
+    return Studio(mitsuba, scene, mirror, size)
+
+
+def make_sensor(studio: Studio, pose: Array, samples: int) -> Any:
+    """A pinhole camera at `pose`, camera-to-world in OpenGL axes, whose pixels average over their square."""
+    film = {
+        "type": "hdrfilm",
+        "width": studio.size,
+        "height": studio.size,
+        "pixel_format": "rgba",
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+    }
+    return studio.mitsuba.load_dict(
+        {
+            "type": "perspective",
+            "fov": math.degrees(CAMERA_ANGLE_X_RAD),
+            "fov_axis": "x",
+            "near_clip": 0.01,
+            "far_clip": 100.0,
+            "to_world": studio.mitsuba.ScalarTransform4f(pose @ MITSUBA_FROM_OPENGL),
+            "film": film,
+            "sampler": {"type": "multijitter", "sample_count": samples},
+        }
+    )
+
+
+def photograph(studio: Studio, pose: Array, samples: int, seed: int) -> NDArray[np.uint8]:
+    """One view [S, S, 4]: sRGB, and in the last channel coverage, by which the colours are not multiplied."""
+    sensor = make_sensor(studio, pose, samples)
+    linear = np.array(studio.mitsuba.render(studio.scene, sensor=sensor, spp=samples, seed=seed), dtype=np.float64)
+    alpha = np.clip(linear[..., 3:], 0, 1)
+    straight = linear[..., :3] / np.maximum(alpha, 1e-6)
+    return as_bytes(np.concatenate([srgb_from_linear(np.clip(straight, 0, 1)), alpha], axis=-1))
+
+
+def visible_surfaces(studio: Studio, pose: Array) -> tuple[Array, Array]:
+    """What one camera sees, from rays through a regular grid in every pixel.
+
+    Returns:
+        Unit world normal averaged over what is covered, and coverage, [S, S, 4]; and the share [S, S] of the pixel
+        that shows the reflective object.
+    """
+    fine = studio.size * SUBPIXELS
+    half = math.tan(CAMERA_ANGLE_X_RAD / 2)
+    line = half * (2 * (np.arange(fine) + 0.5) / fine - 1)
+    x, y = np.meshgrid(line, -line)
+    in_camera = np.stack([x.ravel(), y.ravel(), -np.ones(fine * fine)])
+    in_world = pose[:3, :3] @ in_camera / np.linalg.norm(in_camera, axis=0)
+    mitsuba = studio.mitsuba
+    rays = mitsuba.Ray3f(mitsuba.Point3f(pose[:3, 3]), mitsuba.Vector3f(in_world.astype(np.float32)))
+    hits = studio.scene.ray_intersect(rays)
+    seen = np.array(hits.is_valid(), dtype=np.float64)
+    normals = np.array(hits.sh_frame.n, dtype=np.float64).T * seen[:, None]
+    is_mirror = np.zeros(fine * fine) if studio.mirror is None else np.array(hits.shape == studio.mirror) * seen
+    sums = pixel_means(np.column_stack([normals, seen, is_mirror]), studio.size)
+    lengths = np.linalg.norm(sums[..., :3], axis=-1, keepdims=True)
+    return np.concatenate([sums[..., :3] / np.maximum(lengths, 1e-9), sums[..., 3:4]], axis=-1), sums[..., 4]
+
+
+def pixel_means(values: Array, size: int) -> Array:
+    """Means [size, size, D] over the subpixels of every pixel, from rows of subpixels [size^2 SUBPIXELS^2, D]."""
+    return values.reshape(size, SUBPIXELS, size, SUBPIXELS, -1).mean(axis=(1, 3))
+
+
+def as_bytes(unit: Array) -> NDArray[np.uint8]:
+    """Eight bits of values in [0, 1]."""
+    return np.round(np.clip(unit, 0, 1) * 255).astype(np.uint8)
+
+
+def write_truth(studio: Studio, pose: Array, stem: Path) -> None:
+    """Writes `<stem>_normal.png` and `<stem>_strength.png` of one view."""
+    normals, strength = visible_surfaces(studio, pose)
+    encoded = np.concatenate([(normals[..., :3] + 1) / 2, normals[..., 3:]], axis=-1)
+    encoded[normals[..., 3] == 0] = 0
+    Image.fromarray(as_bytes(encoded)).save(f"{stem}_normal.png", optimize=True)
+    Image.fromarray(as_bytes(strength)).save(f"{stem}_strength.png", optimize=True)
+
+
+def write_views(studio: Studio, folder: Path, part: Literal["train", "test"], arguments: Arguments) -> None:
+    """Renders one part of the split and writes its `transforms_<part>.json` when all of it is there."""
+    count, azimuth_rad = (arguments.train, 0.0) if part == "train" else (arguments.test, TEST_AZIMUTH_RAD)
+    (folder / part).mkdir()
+    frames = []
+    started = time.monotonic()
+    for number, position in enumerate(camera_positions(count, azimuth_rad)):
+        pose = world_from_opengl(position)
+        stem = folder / part / f"r_{number}"
+        seed = number if part == "train" else arguments.train + number
+        pixels = photograph(studio, pose, arguments.samples, seed)
+        Image.fromarray(pixels).save(f"{stem}.png", optimize=True)
+        if part == "test":
+            write_truth(studio, pose, stem)
+        frames.append({"file_path": f"./{part}/r_{number}", "transform_matrix": pose.tolist()})
+        print(f"\r{folder.name} {part} {number + 1}/{count}, {time.monotonic() - started:.0f} s", end="", flush=True)
+    print()
+    settings = {"camera_angle_x": CAMERA_ANGLE_X_RAD, "frames": frames}
+    (folder / f"transforms_{part}.json").write_text(json.dumps(settings, indent=1) + "\n")
+
+
+def write_environment(mitsuba: Any, environment: Array, folder: Path) -> None:
+    """Writes `environment.exr`, linear radiance in half floats, and `environment.png`, sRGB cut at 1."""
+    bitmap = mitsuba.Bitmap(np.ascontiguousarray(environment, dtype=np.float32))
+    bitmap.convert(component_format=mitsuba.Struct.Type.Float16).write(str(folder / "environment.exr"))
+    Image.fromarray(as_bytes(srgb_from_linear(np.clip(environment, 0, 1)))).save(
+        folder / "environment.png", optimize=True
+    )
+
+
+def main(arguments: Arguments) -> None:
+    """Makes every scene that was asked for, after checking that none would be overwritten."""
+    folders: dict[SceneName, Path] = {name: arguments.output / name for name in arguments.scenes}
+    existing = [str(folder) for folder in folders.values() if folder.exists()]
+    if existing:
+        raise FileExistsError(f"{', '.join(existing)} exist; expected new folders, so remove them first")
+    # Imported here because the backend has to be chosen before the rest of Mitsuba can be used.
+    import mitsuba
+
+    mitsuba.set_variant(arguments.variant)
+    environment = make_environment(arguments.environment_height)
+    for name, folder in folders.items():
+        folder.mkdir(parents=True)
+        write_environment(mitsuba, environment, folder)
+        studio = make_studio(mitsuba, name, environment, arguments.size)
+        write_views(studio, folder, "test", arguments)
+        write_views(studio, folder, "train", arguments)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments, description=__doc__))

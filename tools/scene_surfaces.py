@@ -1,0 +1,129 @@
+"""Shapes and textures of the reflective scenes, made in numpy: triangles with normals, pictures of solid patterns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
+
+WAVES = 48
+CHECKER_SIZE = 0.2
+"""Side of a square of the ground, world units."""
+INK = np.array([[0.08, 0.22, 0.45], [0.62, 0.25, 0.10], [0.80, 0.70, 0.42], [0.12, 0.36, 0.20], [0.72, 0.72, 0.70]])
+"""Linear reflectances [5, 3] that textures choose from."""
+
+
+@dataclass(frozen=True)
+class Triangles:
+    """A mesh with smooth normals.
+
+    Attributes:
+        positions: [V, 3], world units.
+        normals: [V, 3], unit, outwards.
+        coordinates: [V, 2] in [0, 1], where textures are looked up.
+        faces: [F, 3] indices, anticlockwise seen from outside.
+    """
+
+    positions: Array
+    normals: Array
+    coordinates: Array
+    faces: NDArray[np.int64]
+
+
+def disc(radius: float, z: float, segments: int = 256) -> Triangles:
+    """A horizontal disc about the z axis that faces up; its texture spans the square around it."""
+    angle = 2 * np.pi * np.arange(segments) / segments
+    rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    flat = np.concatenate([np.zeros((1, 2)), rim])
+    positions = np.concatenate([radius * flat, np.full((segments + 1, 1), z)], axis=1)
+    normals = np.broadcast_to([0.0, 0.0, 1.0], positions.shape)
+    around = np.arange(segments)
+    faces = np.stack([np.zeros(segments, dtype=np.int64), 1 + around, 1 + (around + 1) % segments], axis=1)
+    return Triangles(positions, normals, (flat + 1) / 2, faces)
+
+
+def torus(major: float, minor: float, tilt_deg: float, rings: int = 320, segments: int = 160) -> Triangles:
+    """A torus about the origin whose axis leans from +z by `tilt_deg`, towards -y.
+
+    Args:
+        major: radius of the circle that the tube follows, world units.
+        minor: radius of the tube.
+        tilt_deg: angle between the axis of the torus and +z.
+        rings: vertices around the axis.
+        segments: vertices around the tube.
+    """
+    around, tube = np.meshgrid(
+        2 * np.pi * np.arange(rings) / rings, 2 * np.pi * np.arange(segments) / segments, indexing="ij"
+    )
+    normals = np.stack([np.cos(tube) * np.cos(around), np.cos(tube) * np.sin(around), np.sin(tube)], axis=-1)
+    centers = major * np.stack([np.cos(around), np.sin(around), np.zeros_like(around)], axis=-1)
+    cosine, sine = np.cos(np.radians(tilt_deg)), np.sin(np.radians(tilt_deg))
+    lean = np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
+    coordinates = np.stack([around, tube], axis=-1) / (2 * np.pi)
+    ring, segment = np.meshgrid(np.arange(rings), np.arange(segments), indexing="ij")
+    next_ring, next_segment = (ring + 1) % rings, (segment + 1) % segments
+    here, along = ring * segments + segment, next_ring * segments + segment
+    across, opposite = ring * segments + next_segment, next_ring * segments + next_segment
+    faces = np.concatenate([np.stack([here, along, opposite], -1), np.stack([here, opposite, across], -1)], axis=0)
+    return Triangles(
+        positions=(centers + minor * normals).reshape(-1, 3) @ lean.T,
+        normals=normals.reshape(-1, 3) @ lean.T,
+        coordinates=coordinates.reshape(-1, 2),
+        faces=faces.reshape(-1, 3),
+    )
+
+
+def torus_depth(major: float, minor: float, tilt_deg: float) -> float:
+    """How far the lowest point of `torus` lies below the origin, world units."""
+    return major * float(np.sin(np.radians(tilt_deg))) + minor
+
+
+def solid_noise(points: Array, frequency: float, seed: int) -> Array:
+    """A smooth random pattern in space: [...] in about [0, 1] at points [..., 3].
+
+    A solid pattern has neither seams nor poles, whatever surface it is cut by.
+
+    Args:
+        points: world units.
+        frequency: typical waves per world unit.
+        seed: chooses the pattern.
+    """
+    generator = np.random.default_rng(seed)
+    vectors = generator.normal(scale=2 * np.pi * frequency / np.sqrt(3), size=(WAVES, 3))
+    phases = generator.uniform(0, 2 * np.pi, WAVES)
+    total = np.zeros(points.shape[:-1])
+    for vector, phase in zip(vectors, phases, strict=True):
+        total += np.cos(points @ vector + phase)
+    return 0.5 + total / np.sqrt(8 * WAVES)
+
+
+def ground_texture(radius: float, size: int) -> NDArray[np.float32]:
+    """Linear reflectance [size, size, 3] of the disc: a checkerboard, each half of it with its own pattern."""
+    line = radius * (2 * (np.arange(size) + 0.5) / size - 1)
+    x, y = np.meshgrid(line, line)
+    points = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    light = (np.floor(x / CHECKER_SIZE) + np.floor(y / CHECKER_SIZE)) % 2 == 0
+    patches = _patches(points, frequency=1.2, seed=1)
+    grain = 0.8 + 0.4 * solid_noise(points, frequency=9.0, seed=2)[..., None]
+    shade = np.where(light[..., None], 0.35 + 0.65 * patches, 0.12 + 0.3 * patches[..., ::-1])
+    return np.clip(shade * grain, 0.02, 0.9).astype(np.float32)
+
+
+def ball_texture(size: int) -> NDArray[np.float32]:
+    """Linear reflectance [size, 2 size, 3] of a matte ball: coloured patches with a fine grain."""
+    azimuth = 2 * np.pi * (np.arange(2 * size) + 0.5) / (2 * size)
+    polar = (np.pi * (np.arange(size) + 0.5) / size)[:, None]
+    points = np.stack(
+        [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar) + 0 * azimuth], -1
+    )
+    grain = 0.7 + 0.6 * solid_noise(points, frequency=7.0, seed=4)[..., None]
+    return np.clip(_patches(points, frequency=0.9, seed=3) * grain, 0.02, 0.9).astype(np.float32)
+
+
+def _patches(points: Array, *, frequency: float, seed: int) -> Array:
+    """Areas of the colours of `INK` [..., 3] with crisp borders, at points [..., 3]."""
+    level = solid_noise(points, frequency, seed)
+    return INK[np.clip((level * len(INK)).astype(int), 0, len(INK) - 1)]
