@@ -91,7 +91,7 @@ class DeferredRecipe:
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
     rates: GaussianRates = field(default_factory=GaussianRates)
     reflection_rates: ReflectionRates = field(default_factory=ReflectionRates)
-    rhythm: Rhythm = field(default_factory=Rhythm)
+    rhythm: Rhythm = field(default_factory=lambda: Rhythm(least=150))
     strategy: Strategy = "default"
     densify: DefaultDensify = field(default_factory=DefaultDensify)
     mcmc: McmcDensify = field(default_factory=McmcDensify)
