@@ -10,11 +10,11 @@ from glassplat.render.frame import Frame
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
 
-REACH = 2
-"""Pixels over which depths are averaged and differentiated, to either side."""
+CELL = 4
+"""Pixels along the side of the cells over which depths and normals are averaged before they are compared."""
 LEAST_COVERAGE = 0.5
-STEEPEST = 0.1
-"""Largest change of depth across a window, as a share of the depth, that is a slope and not an edge."""
+STEEPEST = 0.15
+"""Largest change of depth between neighbouring cells, as a share of the depth, that is a slope and not an edge."""
 
 
 def depth_deviation_loss(frame: Frame, view: View, scene: Scene) -> Tensor:
@@ -29,42 +29,45 @@ def depth_deviation_loss(frame: Frame, view: View, scene: Scene) -> Tensor:
 def normal_consistency(frame: Frame, view: View, scene: Scene) -> Tensor:
     """How far the blended normals are from those of the surface that the depths describe (after 2DGS, Eq. 14).
 
-    The image mean of alpha (1 - n . n_d): n is the layer `normal`, made unit, n_d the normal of the depth map after a
-    blur. Only n has a gradient, so that the depths pull the normals and not the other way round. Pixels on an edge of
-    the depth map, or with less than half coverage, do not count.
+    The mean of 1 - n . n_d over cells of `CELL` x `CELL` pixels: n is the mean layer `normal`, made unit, n_d the
+    normal of the mean depths. Only n has a gradient, so that the depths pull the normals and not the other way round.
+    Cells on an edge of the depth map, or not covered, count as 0.
     """
     from_depth, trusted = depth_normals(frame.layers["depth"].detach(), frame.layers["alpha"].detach(), view.camera)
-    blended = torch.nn.functional.normalize(frame.layers["normal"], dim=-1)
-    return (trusted * frame.layers["alpha"].detach() * (1 - (blended * from_depth).sum(-1))).mean()
+    blended = torch.nn.functional.normalize(_cell_means(frame.layers["normal"]), dim=-1)
+    return (trusted * (1 - (blended * from_depth).sum(-1))).mean()
 
 
 def depth_normals(depth: Tensor, alpha: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Normals [H, W, 3] of a depth map, world axes, facing the camera; and [H, W] 1 where they mean something, else 0.
+    """Normals [H / CELL, W / CELL, 3] of a depth map, world axes, facing the camera; and 1 where they mean something.
 
     Args:
         depth: [H, W] along the optical axis.
         alpha: [H, W] coverage.
         camera: whose pixels they are.
     """
-    camera = camera.to(depth.device)
     covered = (alpha > LEAST_COVERAGE).to(depth.dtype)
-    blurred = _blurred(depth * covered) / _blurred(covered).clamp(min=1e-6)
-    columns = torch.arange(camera.width, device=depth.device, dtype=depth.dtype) + 0.5
-    rows = torch.arange(camera.height, device=depth.device, dtype=depth.dtype) + 0.5
+    share = _cell_means(covered[..., None])[..., 0]
+    mean_depth = _cell_means((depth * covered)[..., None])[..., 0] / share.clamp(min=1e-6)
+    rows, columns = ((torch.arange(n, dtype=depth.dtype, device=depth.device) + 0.5) * CELL for n in mean_depth.shape)
     y, x = torch.meshgrid((rows - camera.cy) / camera.fy, (columns - camera.cx) / camera.fx, indexing="ij")
-    points = blurred[..., None] * torch.stack([x, y, torch.ones_like(x)], dim=-1)
+    points = mean_depth[..., None] * torch.stack([x, y, torch.ones_like(x)], dim=-1)
     along, down = torch.zeros_like(points), torch.zeros_like(points)
-    along[:, REACH:-REACH] = points[:, 2 * REACH :] - points[:, : -2 * REACH]
-    down[REACH:-REACH] = points[2 * REACH :] - points[: -2 * REACH]
+    along[:, 1:-1] = points[:, 2:] - points[:, :-2]
+    down[1:-1] = points[2:] - points[:-2]
     # In a frame with x to the right, y down and z forward, down x along points to the camera.
     normals = torch.nn.functional.normalize(torch.linalg.cross(down, along), dim=-1)
-    window = torch.nn.functional.max_pool2d
-    low, high = -window(-blurred[None], 2 * REACH + 1, 1, REACH)[0], window(blurred[None], 2 * REACH + 1, 1, REACH)[0]
-    whole = -window(-covered[None], 2 * REACH + 1, 1, REACH)[0]
-    trusted = whole * (high - low < STEEPEST * blurred) * (normals.abs().sum(-1) > 0)
-    return normals @ camera.cam_from_world[:3, :3].to(depth.dtype), trusted.to(depth.dtype)
+    steepness = _most_nearby(mean_depth) + _most_nearby(-mean_depth)
+    whole = (_most_nearby(1 - share) == 0) & (steepness < STEEPEST * mean_depth) & (normals.abs().sum(-1) > 0)
+    rotation = camera.cam_from_world[:3, :3].to(depth)
+    return normals @ rotation, whole.to(depth.dtype)
 
 
-def _blurred(image: Tensor) -> Tensor:
-    """Means over windows of 2 REACH + 1 pixels."""
-    return torch.nn.functional.avg_pool2d(image[None], 2 * REACH + 1, 1, REACH, count_include_pad=False)[0]
+def _cell_means(image: Tensor) -> Tensor:
+    """Means [H / CELL, W / CELL, D] over the whole cells of an image [H, W, D]."""
+    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), CELL).permute(1, 2, 0)
+
+
+def _most_nearby(image: Tensor) -> Tensor:
+    """[h, w] largest value among each cell and its eight neighbours."""
+    return torch.nn.functional.max_pool2d(image[None], 3, 1, 1)[0]
