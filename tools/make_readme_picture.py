@@ -1,4 +1,4 @@
-"""The README's picture: one test view of a finished `planar` run, taken apart.
+"""The README's picture: one test view of a finished `planar` or `deferred` run, taken apart.
 
 python tools/make_readme_picture.py RUN --view 0016.jpg --output docs/images/showcase.png
 """
@@ -9,10 +9,18 @@ import argparse
 from pathlib import Path
 
 from glassplat.commands.stored_run import open_run
+from glassplat.evaluate.colormap import normal_colors
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.evaluate.metrics import quantized
 from glassplat.evaluate.sheet import TITLE_HEIGHT, Panel, composed
 from glassplat.files.images import write_image
+
+PARTS = {
+    "transmission": "behind the glass",
+    "base": "its own colour",
+    "reflection": "what it reflects",
+    "normal": "normals",
+}
 
 
 def main() -> None:
@@ -27,12 +35,10 @@ def main() -> None:
     if view is None:
         raise SystemExit(f"no test view {arguments.view!r}; there are {[v.name for v in stored.dataset.test]}")
     frame, _ = timed_render(stored.renderer, stored.scene, view)
-    panels = [
-        Panel("photograph", view.photo),
-        Panel("render", quantized(frame.rgb)),
-        Panel("behind the glass", quantized(frame.layers["transmission"])),
-        Panel("reflected by it", quantized(frame.layers["reflection"])),
-    ]
+    panels = [Panel("photograph", view.photo), Panel("render", quantized(frame.rgb))]
+    for layer in (layer for layer in PARTS if layer in frame.layers):
+        image = normal_colors(frame.layers[layer]) if layer == "normal" else frame.layers[layer]
+        panels.append(Panel(PARTS[layer], quantized(image)))
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     write_image(arguments.output, composed([panels], "", "")[TITLE_HEIGHT:])
 
