@@ -81,9 +81,9 @@ class Propagate:
     def _settles(self, state: TrainState, clock: Clock) -> bool:
         """Whether the number of reflective Gaussians has not grown for long enough; keeps the records."""
         count = self._count(state)
-        if count > GROWTH * state.records.get(MOST, 0):
+        if GREW not in state.records or count > GROWTH * state.records[MOST]:
             state.records |= {MOST: count, GREW: clock.step}
-        waited = clock.step - state.records.get(GREW, clock.step)
+        waited = clock.step - state.records[GREW]
         return self.schedule.end == "settled" and waited >= self.schedule.patience * clock.iterations
 
     def _count(self, state: TrainState) -> int:

@@ -113,10 +113,11 @@ def with_reflective(state: TrainState, count: int) -> None:
         ("settled", [1, 2, 4, 8, 16], None),
         ("settled", [1, 4, 4, 4, 4], 40),
         ("settled", [4, 3, 2, 4, 8], 30),
+        ("settled", [0, 0, 0, 0, 0], 30),
         ("fixed", [4, 4, 4, 4, 4], None),
         ("fixed", [1, 2, 4, 8, 16, 17], 60),
     ],
-    ids=["grows", "stays", "falls", "fixed goes on", "fixed stops"],
+    ids=["grows", "stays", "falls", "nothing reflects", "fixed goes on", "fixed stops"],
 )
 def test_propagation_ends_when_no_more_reflectors_are_found(end: str, counts: list[int], ended: int | None) -> None:
     schedule = PropagationSchedule(end=end, stop=0.6, patience=0.2)  # type: ignore[arg-type]
