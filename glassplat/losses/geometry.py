@@ -10,8 +10,8 @@ from glassplat.render.frame import Frame
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
 
-CELL = 4
-"""Pixels along the side of the cells over which depths and normals are averaged before they are compared."""
+CELLS_ACROSS = 32
+"""Cells along the longer side of an image; depths and normals are averaged over cells before they are compared."""
 LEAST_COVERAGE = 0.5
 STEEPEST = 0.15
 """Largest change of depth between neighbouring cells, as a share of the depth, that is a slope and not an edge."""
@@ -29,27 +29,33 @@ def depth_deviation_loss(frame: Frame, view: View, scene: Scene) -> Tensor:
 def normal_consistency(frame: Frame, view: View, scene: Scene) -> Tensor:
     """How far the blended normals are from those of the surface that the depths describe (after 2DGS, Eq. 14).
 
-    The mean of 1 - n . n_d over cells of `CELL` x `CELL` pixels: n is the mean layer `normal`, made unit, n_d the
-    normal of the mean depths. Only n has a gradient, so that the depths pull the normals and not the other way round.
+    The mean of 1 - n . n_d over the cells of a coarse grid: n is the mean layer `normal`, made unit, n_d the normal of
+    the mean depths. Only n has a gradient, so that the depths pull the normals and not the other way round.
     Cells on an edge of the depth map, or not covered, count as 0.
     """
     from_depth, trusted = depth_normals(frame.layers["depth"].detach(), frame.layers["alpha"].detach(), view.camera)
-    blended = torch.nn.functional.normalize(_cell_means(frame.layers["normal"]), dim=-1)
+    blended = torch.nn.functional.normalize(_cell_means(frame.layers["normal"], cell_side(view.camera)), dim=-1)
     return (trusted * (1 - (blended * from_depth).sum(-1))).mean()
 
 
+def cell_side(camera: Camera) -> int:
+    """Pixels along the side of a cell."""
+    return max(1, round(max(camera.width, camera.height) / CELLS_ACROSS))
+
+
 def depth_normals(depth: Tensor, alpha: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Normals [H / CELL, W / CELL, 3] of a depth map, world axes, facing the camera; and 1 where they mean something.
+    """Normals [h, w, 3] of a depth map's cells, world axes, facing the camera; and [h, w] 1 where they count, else 0.
 
     Args:
         depth: [H, W] along the optical axis.
         alpha: [H, W] coverage.
         camera: whose pixels they are.
     """
+    side = cell_side(camera)
     covered = (alpha > LEAST_COVERAGE).to(depth.dtype)
-    share = _cell_means(covered[..., None])[..., 0]
-    mean_depth = _cell_means((depth * covered)[..., None])[..., 0] / share.clamp(min=1e-6)
-    rows, columns = ((torch.arange(n, dtype=depth.dtype, device=depth.device) + 0.5) * CELL for n in mean_depth.shape)
+    share = _cell_means(covered[..., None], side)[..., 0]
+    mean_depth = _cell_means((depth * covered)[..., None], side)[..., 0] / share.clamp(min=1e-6)
+    rows, columns = ((torch.arange(n, dtype=depth.dtype, device=depth.device) + 0.5) * side for n in mean_depth.shape)
     y, x = torch.meshgrid((rows - camera.cy) / camera.fy, (columns - camera.cx) / camera.fx, indexing="ij")
     points = mean_depth[..., None] * torch.stack([x, y, torch.ones_like(x)], dim=-1)
     along, down = torch.zeros_like(points), torch.zeros_like(points)
@@ -63,9 +69,9 @@ def depth_normals(depth: Tensor, alpha: Tensor, camera: Camera) -> tuple[Tensor,
     return normals @ rotation, whole.to(depth.dtype)
 
 
-def _cell_means(image: Tensor) -> Tensor:
-    """Means [H / CELL, W / CELL, D] over the whole cells of an image [H, W, D]."""
-    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), CELL).permute(1, 2, 0)
+def _cell_means(image: Tensor, side: int) -> Tensor:
+    """Means [h, w, D] over the whole cells of an image [H, W, D]."""
+    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), side).permute(1, 2, 0)
 
 
 def _most_nearby(image: Tensor) -> Tensor:
