@@ -30,12 +30,13 @@ def normal_consistency(frame: Frame, view: View, scene: Scene) -> Tensor:
     """How far the blended normals are from those of the surface that the depths describe (after 2DGS, Eq. 14).
 
     The mean of 1 - n . n_d over the cells of a coarse grid: n is the mean layer `normal`, made unit, n_d the normal of
-    the mean depths. Only n has a gradient, so that the depths pull the normals and not the other way round.
+    the mean depths. Both have a gradient: where depths are right they turn the normals, and where reflections have
+    found the normals, these smooth the surface.
     Cells on an edge of the depth map, or not covered, count as 0.
     """
-    from_depth, trusted = depth_normals(frame.layers["depth"].detach(), frame.layers["alpha"].detach(), view.camera)
+    from_depth, trusted = depth_normals(frame.layers["depth"], frame.layers["alpha"].detach(), view.camera)
     blended = torch.nn.functional.normalize(_cell_means(frame.layers["normal"], cell_side(view.camera)), dim=-1)
-    return (trusted * (1 - (blended * from_depth).sum(-1))).mean()
+    return (trusted.detach() * (1 - (blended * from_depth).sum(-1))).mean()
 
 
 def cell_side(camera: Camera) -> int:
