@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from glassplat.cli import main
+from glassplat.commands.scene_edits import SceneEdits
 from glassplat.commands.stored_run import open_run
+from glassplat.data.errors import InputError
 from glassplat.files.environment_image import read_equirect, write_equirect
+from glassplat.files.images import read_image
 from glassplat.render.environment import equirect_from_environment
+from glassplat.scene.environment import Environment
 from glassplat.train.checkpoint import load_checkpoint
 from tests.train.object_capture import write_object_capture
 
@@ -55,3 +60,21 @@ def test_the_stored_scene_is_the_trained_one(run: Path) -> None:
     panorama = read_equirect(run / "point_cloud" / "iteration_8" / "environment.png")
     expected = equirect_from_environment(trained.environment, panorama.shape[0])
     torch.testing.assert_close(panorama, expected, atol=0.01, rtol=0)
+
+
+def test_surroundings_can_be_exchanged(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    panorama = run.parent / "red.png"
+    write_equirect(panorama, torch.tensor([1.0, 0.0, 0.0]).expand(8, 16, 3))
+    options = ["--layers", "environment", "--surroundings", str(panorama), "--output", str(run.parent / "red")]
+    assert main(["render", str(run), *options]) == 0
+    image = read_image(next((run.parent / "red" / "environment").rglob("*.png")))
+    assert image[..., 0].min() > 250 and image[..., 1:].max() < 5
+    options[3] = str(run.parent / "no.png")
+    assert main(["render", str(run), *options]) == 2
+    assert "no panorama at" in " ".join(capsys.readouterr().err.split())
+
+
+def test_what_mirrors_nothing_has_no_surroundings_to_exchange(run: Path) -> None:
+    scene = replace(open_run(run, "cpu").scene, environment=Environment.empty())
+    with pytest.raises(InputError, match="nothing in the run mirrors its surroundings"):
+        SceneEdits(surroundings=run.parent / "red.png").applied(scene)
