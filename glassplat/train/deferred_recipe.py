@@ -79,7 +79,7 @@ class DeferredRecipe:
     ssim_weight: float = 0.2
     background: tuple[float, float, float] | None = None
     shading: Shading = "deferred"
-    bootstrap: float = 0.1
+    bootstrap: float = 0.043
     texels: int = 64
     first_texels: int = 16
     refinements: tuple[float, ...] = (0.45, 0.65)
@@ -91,7 +91,7 @@ class DeferredRecipe:
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
     rates: GaussianRates = field(default_factory=GaussianRates)
     reflection_rates: ReflectionRates = field(default_factory=ReflectionRates)
-    rhythm: Rhythm = field(default_factory=lambda: Rhythm(least=150))
+    rhythm: Rhythm = field(default_factory=lambda: Rhythm(beat=0.0214, least=150))
     strategy: Strategy = "default"
     densify: DefaultDensify = field(default_factory=DefaultDensify)
     mcmc: McmcDensify = field(default_factory=McmcDensify)
