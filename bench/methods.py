@@ -60,6 +60,22 @@ def view_of(camera: Camera) -> View:
     )
 
 
+def against_splat(method: str, scene: Scene, renderer: Renderer, stage: Stage, view: View) -> list[float]:
+    """Milliseconds of a `splat` frame and the method's, their ratio, and the same of a training step."""
+    splat_stage, camera = SplatRecipe().stages(0)[0], view.camera
+    frames = interleaved_seconds(
+        {"splat": frame_work(scene, Splat(depth=False), camera), method: frame_work(scene, renderer, camera)}
+    )
+    steps = interleaved_seconds(
+        {"splat": step_work(scene, splat_stage, view), method: step_work(scene, stage, view)}, repeats=5
+    )
+    cells: list[float] = []
+    for seconds in (frames, steps):
+        cells += [1e3 * statistics.median(seconds[name]) for name in ("splat", method)]
+        cells.append(paired_ratio(seconds, method, "splat"))
+    return cells
+
+
 def method_costs() -> Table:
     """Frame and step of both methods with the same primary Gaussians."""
     camera = bench_camera(WIDTH, HEIGHT)
@@ -78,19 +94,10 @@ def method_costs() -> Table:
         ),
         "Ratios are medians of ratios taken round by round. The planar step is one of stage 3 on an annotated view.",
     )
-    splat_stage, planar_stage = SplatRecipe().stages(0)[0], PlanarRecipe().stages(0)[2]
+    planar_stage = PlanarRecipe().stages(0)[2]
     for number, share in PANES:
         scene = bench_scene(COUNT, number, share, camera)
-        frames = interleaved_seconds(
-            {"splat": frame_work(scene, Splat(depth=False), camera), "planar": frame_work(scene, Planar(), camera)}
-        )
-        steps = interleaved_seconds(
-            {"splat": step_work(scene, splat_stage, view), "planar": step_work(scene, planar_stage, view)}, repeats=5
-        )
-        cells: list[float] = []
-        for seconds in (frames, steps):
-            cells += [1e3 * statistics.median(seconds[name]) for name in ("splat", "planar")]
-            cells.append(paired_ratio(seconds, "planar", "splat"))
+        cells = against_splat("planar", scene, Planar(), planar_stage, view)
         table.add(number, f"{share:.0%}", *cells)
     return table
 
@@ -111,24 +118,11 @@ def deferred_costs() -> Table:
         ),
         "Ratios are medians of ratios taken round by round. Environment: 6 x 128 x 128 texels.",
     )
-    splat_stage, deferred_stage = SplatRecipe().stages(0)[0], DeferredRecipe().stages(0)[1]
+    deferred_stage = DeferredRecipe().stages(0)[1]
     for count, width, height in ((COUNT, WIDTH, HEIGHT), (COUNT, 2 * WIDTH, 2 * HEIGHT)):
         camera = bench_camera(width, height)
         scene, view = glossy_scene(count), view_of(camera)
-        frames = interleaved_seconds(
-            {
-                "splat": frame_work(scene, Splat(depth=False), camera),
-                "deferred": frame_work(scene, Deferred(depth=False), camera),
-            }
-        )
-        steps = interleaved_seconds(
-            {"splat": step_work(scene, splat_stage, view), "deferred": step_work(scene, deferred_stage, view)},
-            repeats=5,
-        )
-        cells: list[float] = []
-        for seconds in (frames, steps):
-            cells += [1e3 * statistics.median(seconds[name]) for name in ("splat", "deferred")]
-            cells.append(paired_ratio(seconds, "deferred", "splat"))
+        cells = against_splat("deferred", scene, Deferred(depth=False), deferred_stage, view)
         table.add(f"{count:,}", f"{width}x{height}", *cells)
     return table
 

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from glassplat.data.dataset import View
+from glassplat.kernels.reference.pane_hits import ray_grid
 from glassplat.render.frame import Frame
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
@@ -56,9 +57,8 @@ def depth_normals(depth: Tensor, alpha: Tensor, camera: Camera) -> tuple[Tensor,
     covered = (alpha > LEAST_COVERAGE).to(depth.dtype)
     share = _cell_means(covered[..., None], side)[..., 0]
     mean_depth = _cell_means((depth * covered)[..., None], side)[..., 0] / share.clamp(min=1e-6)
-    rows, columns = ((torch.arange(n, dtype=depth.dtype, device=depth.device) + 0.5) * side for n in mean_depth.shape)
-    y, x = torch.meshgrid((rows - camera.cy) / camera.fy, (columns - camera.cx) / camera.fx, indexing="ij")
-    points = mean_depth[..., None] * torch.stack([x, y, torch.ones_like(x)], dim=-1)
+    height, width = mean_depth.shape
+    points = mean_depth[..., None] * ray_grid(camera.intrinsics.to(depth) / side, width, height)
     along, down = torch.zeros_like(points), torch.zeros_like(points)
     along[:, 1:-1] = points[:, 2:] - points[:, :-2]
     down[1:-1] = points[2:] - points[:-2]

@@ -12,6 +12,7 @@ from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
 from glassplat.kernels.cube_lookup import cube_lookup
 from glassplat.kernels.facing_normals import facing_normals
+from glassplat.kernels.reference.pane_hits import ray_grid
 from glassplat.kernels.shade_environment import shade_environment
 from glassplat.render.frame import Frame, ScreenPass
 from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, mean_depth, over_background, project_gaussians
@@ -140,11 +141,5 @@ def surface_of(gaussians: Gaussians, camera: Camera) -> Surface:
 
 def view_directions(camera: Camera) -> Tensor:
     """[H, W, 3] directions from the camera through the pixel centres, world axes, not unit."""
-    fx, fy, cx, cy = camera.intrinsics
     rotation = camera.cam_from_world[:3, :3]
-    columns, rows = (
-        torch.arange(count, device=rotation.device, dtype=rotation.dtype) + 0.5
-        for count in (camera.width, camera.height)
-    )
-    y, x = torch.meshgrid((rows - cy) / fy, (columns - cx) / fx, indexing="ij")
-    return torch.stack([x, y, torch.ones_like(x)], dim=-1) @ rotation
+    return ray_grid(camera.intrinsics.to(rotation), camera.width, camera.height) @ rotation
