@@ -126,19 +126,15 @@ class DeferredRecipe:
             motions=population.motions,
         )
         beat = Every(self.rhythm.beat, 0.0, self.schedule.stop, self.rhythm.least, skip_multiples_of=3)
+        guidance = (
+            LossTerm("outside", self.outside_weight, strength_outside),
+            LossTerm("consistency", self.consistency_weight, normal_consistency),
+        )
         reflection = Stage(
             name="2 reflection",
             share=self.schedule.stop - self.bootstrap,
             renderer=Deferred(self.background or BLACK, self.shading, depth=self.consistency_weight != 0),
-            losses=(
-                *photometric,
-                LossTerm("outside", self.outside_weight, strength_outside),
-                *(
-                    (LossTerm("consistency", self.consistency_weight, normal_consistency),)
-                    * (self.consistency_weight != 0)
-                ),
-                *population.terms,
-            ),
+            losses=(*photometric, *(term for term in guidance if term.weight != 0), *population.terms),
             rates=self.rates.of("primary") | self.reflection_rates.of(),
             actions=(
                 *population.edits,
