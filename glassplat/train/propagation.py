@@ -19,8 +19,9 @@ log = logging.getLogger("glassplat.train")
 
 ENDED, MOST, GREW = "propagation ended", "most reflective", "reflective grew"
 """Names in `TrainState.records`: the step of the end, the largest number of reflective Gaussians, and its step."""
-GROWTH = 1.01
-"""Factor by which the number has to rise to count as growing."""
+GROWTH = 0.01
+"""Share of all Gaussians by which the number has to rise to count as growing; a share of the number itself would let
+the few that noise makes reflective in a matte scene go on for ever."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,8 @@ class Propagate:
     def _settles(self, state: TrainState, clock: Clock) -> bool:
         """Whether the number of reflective Gaussians has not grown for long enough; keeps the records."""
         count = self._count(state)
-        if GREW not in state.records or count > GROWTH * state.records[MOST]:
+        least = GROWTH * len(state.scene.primary)
+        if GREW not in state.records or count > state.records[MOST] + least:
             state.records |= {MOST: count, GREW: clock.step}
         waited = clock.step - state.records[GREW]
         return self.schedule.end == "settled" and waited >= self.schedule.patience * clock.iterations

@@ -130,6 +130,19 @@ def test_propagation_ends_when_no_more_reflectors_are_found(end: str, counts: li
     assert state.records.get(ENDED) == ended
 
 
+def test_a_few_reflectors_among_many_gaussians_do_not_keep_propagation_going() -> None:
+    schedule = PropagationSchedule(stop=0.6, patience=0.2)
+    state, action = fresh_state(), Propagate(Every(0.1, stop=0.6), NormalPropagation(), schedule)
+    primary = state.scene.primary
+    repeats = -(-1000 // len(primary))
+    many = {name: torch.cat([tensor] * repeats) for name, tensor in primary.tensors().items()}
+    state.scene = replace(state.scene, primary=primary.with_tensors(many))
+    for turn, count in enumerate([1, 4, 8], start=1):
+        with_reflective(state, count)
+        action.apply(state, tiny_capture(), Clock(10 * turn, 100, 5))
+    assert state.records.get(ENDED) == 30
+
+
 def test_the_environment_is_refined_up_to_its_size() -> None:
     state, sizes = fresh_state(), {}
     for message in train(RECIPE.stages(seed=0), tiny_capture(), state, iterations=20):
