@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from glassplat.densify.edit import Edit, Moments, apply_edit, clone, forget, keep, split
+from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import Gaussians
 
 
@@ -188,5 +189,5 @@ def reset_opacity(
 
     What the photographs need grows back; what does not is pruned.
     """
-    lowered = gaussians.logit_opacities.clamp(max=math.log(ceiling / (1 - ceiling)))
+    lowered = gaussians.logit_opacities.clamp(max=logit(ceiling))
     return gaussians.with_tensors({"logit_opacities": lowered}), forget(moments, ("primary.logit_opacities",))

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from glassplat.densify.edit import Moments, forget
+from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import SH_ZERO, Gaussians
 
 
@@ -42,9 +43,9 @@ class NormalPropagation:
         """Raised opacities and strengths, and reflective Gaussians grown; what changed forgets its moments."""
         if not self.propagates:
             return gaussians, dict(moments)
-        opacities = gaussians.logit_opacities.clamp(min=_logit(self.least_opacity))
-        strengths = gaussians.channels["logit_strength"].clamp(min=_logit(self.least_strength))
-        grows = strengths >= _logit(self.reflective)
+        opacities = gaussians.logit_opacities.clamp(min=logit(self.least_opacity))
+        strengths = gaussians.channels["logit_strength"].clamp(min=logit(self.least_strength))
+        grows = strengths >= logit(self.reflective)
         shortest = torch.nn.functional.one_hot(gaussians.log_scales.argmin(dim=1), 3).bool()
         log_scales = gaussians.log_scales + math.log(self.growth) * (grows[:, None] & ~shortest)
         changed = {"logit_opacities": opacities, "logit_strength": strengths, "log_scales": log_scales}
@@ -58,15 +59,11 @@ class NormalPropagation:
         if self.sabotage == 0:
             return gaussians, dict(moments)
         unit = torch.rand(gaussians.sh[:, 0].shape, generator=generator, device=gaussians.sh.device)
-        dull = gaussians.channels["logit_strength"] <= _logit(self.sabotaged)
+        dull = gaussians.channels["logit_strength"] <= logit(self.sabotaged)
         sh = gaussians.sh.clone()
         sh[:, 0] += torch.where(dull[:, None], self.sabotage * (2 * unit - 1) / SH_ZERO, 0)
         return gaussians.with_tensors({"sh": sh}), forget(moments, ["primary.sh"], dull)
 
     def count_reflective(self, gaussians: Gaussians) -> int:
         """How many Gaussians reflect, by the measure of the paper's criterion for the end (strength above 0.1)."""
-        return int((gaussians.channels["logit_strength"] > _logit(0.1)).sum())
-
-
-def _logit(value: float) -> float:
-    return math.log(value / (1 - value))
+        return int((gaussians.channels["logit_strength"] > logit(0.1)).sum())

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
+from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
 
@@ -43,9 +44,9 @@ def glass_gaussians(
         means=means,
         quats=quats,
         log_scales=log_scales,
-        logit_opacities=torch.full((number,), math.log(opacity / (1 - opacity))),
+        logit_opacities=torch.full((number,), logit(opacity)),
         sh=torch.zeros(number, 0, 3),
-        channels={"logit_mark": torch.full((number,), math.log(mark / (1 - mark)))},
+        channels={"logit_mark": torch.full((number,), logit(mark))},
     ).to(planes.centers.device)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -11,6 +9,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from glassplat.data.capture import PointCloud
+from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import SH_ZERO, Gaussians
 
 NEIGHBOURS = 3
@@ -55,7 +54,7 @@ def gaussians_from_points(
         means=means,
         quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
         log_scales=torch.log(spread * _spacing(means)).float()[:, None].repeat(1, 3),
-        logit_opacities=torch.full((count,), math.log(opacity / (1 - opacity))),
+        logit_opacities=torch.full((count,), logit(opacity)),
         sh=sh,
         channels={"log_intensity": torch.zeros(count)},
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -18,6 +17,7 @@ from glassplat.losses.reflectors import strength_outside
 from glassplat.losses.term import LossTerm
 from glassplat.render.deferred import Deferred, Shading
 from glassplat.render.splat import Splat
+from glassplat.scene.activations import logit
 from glassplat.scene.environment import Environment
 from glassplat.scene.scene import Scene
 from glassplat.train.background import BLACK
@@ -99,7 +99,7 @@ class DeferredRecipe:
     def initialise(self, dataset: Dataset) -> Scene:
         """The first scene: one Gaussian per point that hardly reflects, and a random environment."""
         primary = self._population().initial(dataset.points, self.sh_degree)
-        strengths = torch.full((len(primary),), math.log(self.first_strength / (1 - self.first_strength)))
+        strengths = torch.full((len(primary),), logit(self.first_strength))
         primary = replace(primary, channels={"logit_strength": strengths})
         environment = Environment.random(
             min(self.first_texels, self.texels), generator=torch.Generator().manual_seed(0)
