@@ -16,7 +16,7 @@ from glassplat.files.markdown_table import Table
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
 from glassplat.kernels.pane_hits import pane_hits
-from glassplat.render.deferred import Deferred
+from glassplat.render.deferred import INVISIBLE, Deferred
 from glassplat.render.frame import Renderer
 from glassplat.render.planar import Planar, half_spaces_of, panes_in_camera
 from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, project_gaussians
@@ -156,7 +156,7 @@ def deferred_costs() -> Table:
     for count, width, height in ((COUNT, WIDTH, HEIGHT), (COUNT, 2 * WIDTH, 2 * HEIGHT)):
         camera = bench_camera(width, height)
         scene, view = glossy_scene(count), view_of(camera)
-        cells = against_splat("deferred", scene, Deferred(depth=False), deferred_stage, view)
+        cells = against_splat("deferred", scene, Deferred(depth=False, least_strength=INVISIBLE), deferred_stage, view)
         table.add(f"{count:,}", f"{width}x{height}", *cells)
     return table
 

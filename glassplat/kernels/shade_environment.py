@@ -17,7 +17,14 @@ from glassplat.kernels.tensor_checks import check_tensors
 
 
 def shade_environment(
-    base: Tensor, normals: Tensor, strength: Tensor, texels: Tensor, intrinsics: Tensor, world_from_cam: Tensor
+    base: Tensor,
+    normals: Tensor,
+    strength: Tensor,
+    texels: Tensor,
+    intrinsics: Tensor,
+    world_from_cam: Tensor,
+    *,
+    least_strength: float = 0.0,
 ) -> Shaded:
     """Adds to every pixel what its surface mirrors of the environment (3DGS-DR, Eq. 3).
 
@@ -25,9 +32,9 @@ def shade_environment(
         E = sigmoid(cube_lookup(texels, r))
         C' = (1 - R) C + R E
 
-    Where N is shorter than `NORMAL_MIN`, as on an empty background, the image is the base, bit for bit, the reflection
-    is 0, and nothing but the base gets a gradient. Where the strength is 0 the image is the base, bit for bit, too, but
-    the strength has its gradient. A normal that is not finite gives NaN.
+    Where N is shorter than `NORMAL_MIN`, as on an empty background, or |R| is below `least_strength`, the image is the
+    base, bit for bit, the reflection is 0, and nothing but the base gets a gradient. Where else the strength is 0 the
+    image is the base, bit for bit, too, but the strength has its gradient. A normal that is not finite gives NaN.
 
     Differentiable in `base`, `normals`, `strength` and `texels`.
 
@@ -38,6 +45,7 @@ def shade_environment(
         texels: [6, S, S, 3] logits of the environment's sRGB colour, faces as in `cube_lookup`.
         intrinsics: [4] fx, fy, cx, cy in pixels.
         world_from_cam: [3, 3] rotation from camera to world axes; may be mirrored.
+        least_strength: pixels that reflect less are left as they are, which saves their lookup.
 
     Raises:
         ValueError: shapes disagree, or the environment has no texels.
@@ -58,15 +66,16 @@ def shade_environment(
     inputs = (base, normals, strength, texels, intrinsics, world_from_cam)
     if base.device.type != "cpu":
         # On a GPU this is a small part of an image's work, so that there it stays PyTorch's.
-        return reference.shade_environment(*inputs)
-    return Shaded(*_ShadeEnvironment.apply(*inputs))
+        return reference.shade_environment(*inputs, least_strength=least_strength)
+    return Shaded(*_ShadeEnvironment.apply(least_strength, *inputs))
 
 
 class _ShadeEnvironment(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *tensors: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, least_strength: float, *tensors: Tensor) -> tuple[Tensor, Tensor]:
         inputs = [tensor.detach().contiguous() for tensor in tensors]
-        rgb, reflection = shade_on_cpu(inputs)
+        rgb, reflection = shade_on_cpu(inputs, least_strength)
+        ctx.least_strength = least_strength
         ctx.save_for_backward(*inputs, reflection)
         return rgb, reflection
 
@@ -75,4 +84,5 @@ class _ShadeEnvironment(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         *inputs, reflection = ctx.saved_tensors
         cotangents = [gradient.contiguous() for gradient in gradients]
-        return (*shade_environment_gradients(inputs, reflection, cotangents), None, None)
+        found = shade_environment_gradients(inputs, ctx.least_strength, reflection, cotangents)
+        return (None, *found, None, None)

@@ -21,6 +21,8 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
 Shading = Literal["deferred", "forward"]
+INVISIBLE = 1 / 512
+"""A pixel that reflects less changes by at most half a step of eight bits, from black to white."""
 
 
 class Surface(NamedTuple):
@@ -49,12 +51,15 @@ class Deferred:
             is the blended light that the Gaussians reflect, divided by R.
         depth: also render the depth layer.
         environment: also render the layer `environment`.
+        least_strength: pixels that reflect less are not shaded, and their `reflection` is 0. Not for training, where a
+            strength learns from what it would reflect.
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     shading: Shading = "deferred"
     depth: bool = True
     environment: bool = False
+    least_strength: float = 0.0
 
     def __call__(self, scene: Scene, camera: Camera) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are.
@@ -85,6 +90,7 @@ class Deferred:
             scene.environment.raw,
             camera.intrinsics,
             camera.cam_from_world[:3, :3].T.contiguous(),
+            least_strength=self.least_strength,
         )
         return shaded.rgb, layers | {"reflection": shaded.reflection}, screen
 

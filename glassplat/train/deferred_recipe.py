@@ -15,7 +15,7 @@ from glassplat.init.region import reflective_region
 from glassplat.losses.geometry import normal_consistency
 from glassplat.losses.reflectors import strength_outside
 from glassplat.losses.term import LossTerm
-from glassplat.render.deferred import Deferred, Shading
+from glassplat.render.deferred import INVISIBLE, Deferred, Shading
 from glassplat.render.splat import Splat
 from glassplat.scene.activations import logit
 from glassplat.scene.environment import Environment
@@ -110,7 +110,7 @@ class DeferredRecipe:
 
     def renderer(self) -> Deferred:
         """The renderer of the finished scene, with all its layers."""
-        return Deferred(self.background or BLACK, self.shading)
+        return Deferred(self.background or BLACK, self.shading, least_strength=INVISIBLE)
 
     def stages(self, seed: int) -> tuple[Stage, ...]:
         """Bootstrap, then everything; what changes in between is up to `Propagate`."""

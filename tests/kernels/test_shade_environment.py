@@ -40,9 +40,11 @@ def shade_case(dtype: torch.dtype, height: int = HEIGHT, width: int = WIDTH, siz
     return {name: tensor.to(dtype) for name, tensor in case.items()}
 
 
-def with_gradients(case: dict[str, Tensor], function: Callable[..., Shaded]) -> list[Tensor]:
+def with_gradients(
+    case: dict[str, Tensor], function: Callable[..., Shaded], least_strength: float = 0.0
+) -> list[Tensor]:
     inputs = {name: case[name].detach().requires_grad_() for name in INPUTS}
-    result = function(**(case | inputs))
+    result = function(**(case | inputs), least_strength=least_strength)
     generator = torch.Generator().manual_seed(3)
     weights = [torch.randn(t.shape, generator=generator, dtype=torch.float64).to(t) for t in result]
     total = sum((t * w).sum() for t, w in zip(result, weights, strict=True))
@@ -53,9 +55,12 @@ def with_gradients(case: dict[str, Tensor], function: Callable[..., Shaded]) -> 
 @pytest.mark.parametrize(
     ("height", "width", "size"), [(23, 29, 6), (1, 1, 1), (0, 5, 2), (8, 9, 1), (3, 100, 5), (2, 128, 4)]
 )
-def test_shading_matches_its_twin(dtype: torch.dtype, tolerance: float, height: int, width: int, size: int) -> None:
+@pytest.mark.parametrize("least_strength", [0.0, 0.5])
+def test_shading_matches_its_twin(
+    dtype: torch.dtype, tolerance: float, height: int, width: int, size: int, least_strength: float
+) -> None:
     case = shade_case(dtype, height, width, size)
-    found, expected = (with_gradients(case, f) for f in (shade_environment, twin))
+    found, expected = (with_gradients(case, f, least_strength) for f in (shade_environment, twin))
     for tensor, other in zip(found, expected, strict=True):
         scale = max(1.0, float(other.abs().max())) if other.numel() else 1.0
         torch.testing.assert_close(tensor, other, rtol=tolerance, atol=tolerance * scale)
@@ -111,6 +116,18 @@ def test_without_normal_or_strength_the_image_is_the_base_bit_for_bit() -> None:
     assert float(reflection[bare].abs().max()) == 0 == float(v_normals[bare].abs().max())
     assert float(v_strength[bare].abs().max()) == 0 < float(v_base[bare].abs().min())
     assert float(v_strength[unlit & ~bare].abs().min()) > 0 < float(reflection[unlit & ~bare].min())
+
+
+def test_pixels_that_reflect_too_little_are_the_base_and_the_others_stay_as_they_were() -> None:
+    case = shade_case(torch.float32)
+    dull = case["strength"] < 0.5
+    assert bool(dull.any()) and not bool(dull.all())
+    every, some = (with_gradients(case, shade_environment, least) for least in (0.0, 0.5))
+    for tensor, other in zip(some[:-1], every[:-1], strict=True):
+        assert torch.equal(tensor[~dull], other[~dull])
+    rgb, reflection, _, v_normals, v_strength, _ = some
+    assert torch.equal(rgb[dull], case["base"][dull])
+    assert all(float(tensor[dull].abs().max()) == 0 for tensor in (reflection, v_normals, v_strength))
 
 
 def test_the_length_and_the_sign_of_a_normal_do_not_matter() -> None:

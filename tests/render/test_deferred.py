@@ -92,6 +92,19 @@ def test_the_image_is_composed_of_its_layers() -> None:
     assert float(share.max()) > 0.2
 
 
+def test_pixels_that_hardly_reflect_cost_no_visible_difference() -> None:
+    scene, camera = glossy(), camera_at(0.1, 0.0, 0.0)
+    every = Deferred()(scene, camera)
+    least = 0.5 * float(every.layers["strength"].max())
+    some = Deferred(least_strength=least)(scene, camera)
+    dull = every.layers["strength"] < least
+    assert torch.equal(some.rgb[~dull], every.rgb[~dull])
+    assert float(some.layers["reflection"][dull].abs().max()) == 0
+    change, most = (some.rgb - every.rgb).abs(), (every.layers["reflection"] - every.layers["base"]).abs()
+    assert float(change.max()) > 0
+    assert bool((change <= least * most + 1e-12).all())
+
+
 @BOTH
 def test_an_empty_pixel_shows_the_background(shading: Shading) -> None:
     scene = glossy(count=1)

@@ -1,4 +1,4 @@
-"""Deferred shading on the CPU: runs of pixels of one row that have a normal.
+"""Deferred shading on the CPU: runs of pixels of one row that have a normal and reflect.
 
 A run is kept in *planes* of one flat buffer, one plane per quantity, at offsets known to the compiler; that is what
 lets it turn the lookup and the sigmoid into vector instructions.
@@ -37,26 +37,28 @@ COLUMN, AXIS, FACE, CELL_ROW, CELL, FIRST = (plane * RUN for plane in range(6))
 WHOLE_PLANES = 6
 
 
-def shade_environment(inputs: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+def shade_environment(inputs: Sequence[Tensor], least_strength: float) -> tuple[Tensor, Tensor]:
     """The fields of `Shaded`; inputs in the order of the kernel."""
     base, normals, strength, texels, *camera = inputs
+    real = REAL_OF[base.dtype]
     rgb, reflection = torch.empty_like(base), torch.empty_like(base)
     tensors = (base, normals, strength, padded_faces(texels), *camera, rgb, reflection)
-    shade_environment_forward(REAL_OF[base.dtype])(*(tensor.numpy() for tensor in tensors))
+    shade_environment_forward(real)(real(least_strength), *(tensor.numpy() for tensor in tensors))
     return rgb, reflection
 
 
 def shade_environment_gradients(
-    inputs: Sequence[Tensor], reflection: Tensor, cotangents: Sequence[Tensor]
+    inputs: Sequence[Tensor], least_strength: float, reflection: Tensor, cotangents: Sequence[Tensor]
 ) -> tuple[Tensor, ...]:
     """Gradients of base, normals, strength and texels, given the reflection that the kernel found."""
     base, normals, strength, texels, *camera = inputs
+    real = REAL_OF[base.dtype]
     found = tuple(torch.empty_like(like) for like in (base, normals, strength))
     first_cells = torch.empty(*strength.shape, 2, dtype=torch.int32)
     fractions, v_raw = base.new_empty(*strength.shape, 2), torch.empty_like(base)
     tensors = (*inputs[:3], padded_faces(texels), *camera, reflection, *cotangents, *found)
     lookups = (first_cells, fractions, v_raw)
-    shade_environment_backward(REAL_OF[base.dtype])(*(tensor.numpy() for tensor in (*tensors, *lookups)))
+    shade_environment_backward(real)(real(least_strength), *(tensor.numpy() for tensor in (*tensors, *lookups)))
     first_cells, fractions, v_raw = (tensor.flatten(0, 1) for tensor in lookups)
     return (*found, texel_gradients(first_cells, fractions, v_raw, texels.shape[1]))
 
@@ -133,7 +135,7 @@ def shade_environment_forward(real: type) -> Kernel:
             run[SEEN + i] = logistic(run[SEEN + i])
 
     @kernel("shade_environment_forward", real)
-    def forward(base, normals, strength, padded, intrinsics, rotation, rgb, reflection):
+    def forward(least_strength, base, normals, strength, padded, intrinsics, rotation, rgb, reflection):
         height, width = strength.shape
         side, flat = np.int32(padded.shape[1]), padded.reshape(padded.size)
         stride = even_stride(height)
@@ -144,7 +146,7 @@ def shade_environment_forward(real: type) -> Kernel:
             count = 0
             for column in range(width):
                 normal = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
-                if dot(normal, normal) <= shortest:
+                if dot(normal, normal) <= shortest or abs(strength[row, column]) < least_strength:
                     for d in range(3):
                         rgb[row, column, d], reflection[row, column, d] = base[row, column, d], zero
                 else:
@@ -215,7 +217,7 @@ def shade_environment_backward(real: type) -> Kernel:
 
     @kernel("shade_environment_backward", real)
     def backward(
-        base, normals, strength, padded, intrinsics, rotation, reflection, v_rgb, v_reflection,
+        least_strength, base, normals, strength, padded, intrinsics, rotation, reflection, v_rgb, v_reflection,
         v_base, v_normals, v_strength, first_cells, fractions, v_raw,
     ):  # fmt: skip
         height, width = strength.shape
@@ -228,7 +230,7 @@ def shade_environment_backward(real: type) -> Kernel:
             count = 0
             for column in range(width):
                 normal = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
-                if dot(normal, normal) <= shortest:
+                if dot(normal, normal) <= shortest or abs(strength[row, column]) < least_strength:
                     v_strength[row, column], first_cells[row, column, 0] = zero, NO_LOOKUP
                     for d in range(3):
                         v_base[row, column, d], v_normals[row, column, d] = v_rgb[row, column, d], zero

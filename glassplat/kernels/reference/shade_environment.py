@@ -11,12 +11,19 @@ from glassplat.kernels.shaded import NORMAL_MIN, Shaded
 
 
 def shade_environment(
-    base: Tensor, normals: Tensor, strength: Tensor, texels: Tensor, intrinsics: Tensor, world_from_cam: Tensor
+    base: Tensor,
+    normals: Tensor,
+    strength: Tensor,
+    texels: Tensor,
+    intrinsics: Tensor,
+    world_from_cam: Tensor,
+    *,
+    least_strength: float = 0.0,
 ) -> Shaded:
     """See `glassplat.kernels.shade_environment.shade_environment`."""
     height, width = strength.shape
     rays = ray_grid(intrinsics.detach(), width, height) @ world_from_cam.detach().T
-    bare = (normals.square().sum(-1, keepdim=True) <= NORMAL_MIN**2).detach()
+    bare = (normals.square().sum(-1, keepdim=True) <= NORMAL_MIN**2) | (strength.abs() < least_strength)[..., None]
     # Where there is no normal, a harmless one stands in: a NaN masked afterwards would still reach the gradients.
     safe = torch.where(bare, rays, normals)
     # The lookup takes a direction of any length, so that neither the ray nor the normal needs to be of length 1.
