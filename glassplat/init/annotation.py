@@ -17,6 +17,9 @@ Mask = NDArray[np.bool_]
 
 THINNEST_PART = 0.005  # Half width below which a part of a mask is taken for an artefact, in image diagonals.
 
+EDGE_SMOOTHING = 0.005
+"""Standard deviation with which a mask is smoothed before its edge has a direction, in image diagonals."""
+
 
 @dataclass(frozen=True)
 class PaneView:
@@ -29,6 +32,7 @@ class PaneView:
         distance: [H, W] pixels from a pixel's centre to the edge of the mask, positive inside. Where
             the mask leaves the image there is no edge, because the pane goes on.
         edge: [E, 2] points (x, y) half-way between a pixel on the pane and a neighbour off it.
+        outward: [E, 2] unit vectors across the edge, off the pane.
     """
 
     cam_from_world: Array
@@ -36,6 +40,7 @@ class PaneView:
     mask: Mask
     distance: Array
     edge: Array
+    outward: Array
 
     @property
     def center(self) -> Array:
@@ -52,6 +57,19 @@ class PaneView:
         fx, fy, cx, cy = self.intrinsics
         in_camera = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], axis=1)
         return in_camera @ self.cam_from_world[:3, :3]
+
+    def sight_limits(self, pixels: Array, outward: Array) -> Array:
+        """[P, 3] unit normals of the planes through the camera and lines in the image.
+
+        Args:
+            pixels: [P, 2] a point of each line.
+            outward: [P, 2] unit vectors across the lines, to the side that the normals point to.
+        """
+        fx, fy, cx, cy = self.intrinsics
+        a, b = outward[:, 0] * fx, outward[:, 1] * fy
+        c = -(a * (pixels[:, 0] - cx) / fx + b * (pixels[:, 1] - cy) / fy)
+        in_camera = np.stack([a, b, c], axis=1)
+        return in_camera / np.linalg.norm(in_camera, axis=1, keepdims=True) @ self.cam_from_world[:3, :3]
 
     def project(self, points: Array) -> tuple[Array, Mask]:
         """Pixel positions [..., 2] of world points [..., 3], and whether the image holds them."""
@@ -102,12 +120,14 @@ def pane_view(camera: Camera, labels: Tensor, label: int) -> PaneView:
             "resize both the same way"
         )
     mask = _without_slivers(labels.cpu().numpy() == label)
+    edge = _edge_points(mask)
     return PaneView(
         cam_from_world=_array(camera.cam_from_world),
         intrinsics=np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
         mask=mask,
         distance=_signed_distance(mask),
-        edge=_edge_points(mask),
+        edge=edge,
+        outward=_outward(mask, edge),
     )
 
 
@@ -145,6 +165,16 @@ def _edge_points(mask: Mask) -> Array:
     row, column = np.nonzero(mask[1:] != mask[:-1])
     level = np.stack([column + 0.5, row + 1.0], axis=1)
     return np.concatenate([upright, level])
+
+
+def _outward(mask: Mask, edge: Array) -> Array:
+    """[E, 2] unit vectors down the slope of the smoothed mask at its edge points."""
+    smooth = ndimage.gaussian_filter(mask.astype(np.float64), EDGE_SMOOTHING * np.hypot(*mask.shape), mode="nearest")
+    slopes = [
+        ndimage.map_coordinates(-np.gradient(smooth, axis=axis), edge[:, ::-1].T - 0.5, order=1) for axis in (1, 0)
+    ]
+    outward = np.stack(slopes, axis=1)
+    return outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), np.finfo(np.float64).tiny)
 
 
 def pane_views(annotations: Sequence[tuple[Camera, Tensor]], label: int, *, most: int = 12) -> list[PaneView]:

@@ -1,159 +1,92 @@
-"""The search for a pane's plane: hypotheses from points, judged and refined by the masks."""
+"""The search for a pane's plane: hypotheses from points and masks, judged and refined by the masks."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
-from glassplat.init.annotation import PaneView
-from glassplat.init.consistency import edge_cost, edge_distances, geman_mcclure, mask_agreement
-from glassplat.init.ransac import PlaneEquations, random_planes, support
+from glassplat.init.consistency import mask_agreement
+from glassplat.init.plane_moves import planes_nearby, planes_through_masks
+from glassplat.init.plane_objective import COARSE, FINE, MIDDLE, USUAL_FRAME, Objective
+from glassplat.init.plane_refinement import refined
+from glassplat.init.ransac import FramedPlanes, joined, random_planes
 
 Array = NDArray[np.float64]
 
-COARSE, MIDDLE, FINE = 0.01, 0.004, 0.002
-"""Distances, in image diagonals, at which the loss of two mask edges that do not meet is one half."""
-POINTS_WEIGHT = 0.1
-"""Weight of the inliers against the mask edges: they decide only what the edges leave open."""
-SUPPORT_WEIGHT = 0.1
-"""Weight of a hypothesis' inliers against the agreement of the masks: it decides where parallax is too small to."""
-NEARBY_TILT, NEARBY_SHIFT, NEARBY_COUNT = 0.03, 0.01, 500
-"""Spread (radians, scene extents) and number of the planes that are tried around the best hypothesis."""
+AGREEMENT_WEIGHT = 0.1
+"""Weight of the agreement of the masks against that of their edges, which know of frames."""
+BEAM, CHILDREN = 12, 30
+"""Number of hypotheses that are followed, and of the planes tried around each of them in each round."""
+ROUNDS = ((0.3, 0.1, 2 * COARSE), (0.1, 0.03, COARSE))
+"""Spread of these (radians, distances of the cameras from the pane) and tolerance of the edges, for each round."""
+SHAKE = (0.03, 0.01, MIDDLE)
+"""The same for the last round, between two refinements."""
+FRAME_SPREAD = 0.5
+"""Standard deviation of the logarithm of the height of frames in each round."""
+COARSE_EDGES = 200
+"""Edge points, in all views together, while hypotheses are many."""
+PIXELS = 600
+"""Pixels whose rays are followed to compare masks, in all views together."""
 
 
-@dataclass(frozen=True)
-class Search:
-    """Size of a plane search.
+def best_plane(objective: Objective, *, hypotheses: int, refine: int, rng: np.random.Generator) -> FramedPlanes:
+    """The one plane on which the masks of all views coincide best.
 
-    Attributes:
-        extent: radius of the capture in world units.
-        distance: inlier distance in world units.
-        hypotheses: number of planes drawn through triplets of points.
-        refined: number of the best of them that are refined.
-    """
-
-    extent: float
-    distance: float
-    hypotheses: int = 1000
-    refined: int = 4
-
-
-def best_plane(
-    points: Array, weights: Array, views: Sequence[PaneView], search: Search, rng: np.random.Generator
-) -> PlaneEquations:
-    """The plane on which the masks of all views coincide best.
-
-    RANSAC draws hypotheses; the agreement of the masks ranks those with the most inliers; the
-    leading ones are refined. At fine tolerance the loss has many local minima where posts or plants
-    hide parts of the pane, so planes all around the best one are tried as well.
+    Hypotheses pass through triplets of points, as in RANSAC, and through pixels of the masks, because a pane may have
+    no points on its frame. The agreement of the masks ranks them. The best ones are followed by random search, refined,
+    shaken and refined again, as the loss has many local minima where posts or plants hide parts of the pane.
 
     Args:
-        points: [N, 3] candidates, at least three.
-        weights: [N] positive weights.
-        views: annotated views of the pane, at least two.
-        search: how far to go.
-        rng: source of randomness.
-
-    Raises:
-        ValueError: the candidates span no plane.
-    """
-    drawn = random_planes(points, weights, search.hypotheses, rng)
-    if len(drawn) == 0:
-        raise ValueError(f"its {len(points)} candidate points lie on one line")
-    supports = support(drawn, points, weights, distance=search.distance)
-    supported = np.argsort(-supports, kind="stable")[: max(search.hypotheses // 4, search.refined)]
-    scores = mask_agreement(drawn.select(supported), views) + SUPPORT_WEIGHT * supports[supported]
-    leading = drawn.select(supported[np.argsort(-scores, kind="stable")[: search.refined]])
-    start = _best_refined(leading, points, views, search, tolerances=(COARSE, MIDDLE))
-
-    anchor = _inliers(start, points, search.distance).mean(axis=0)
-    finest = 1 / min(view.diagonal for view in views)  # A mask drawn in pixels says no more than that.
-    shift = NEARBY_SHIFT * search.extent
-    around = planes_nearby(start, anchor, NEARBY_COUNT, tilt=NEARBY_TILT, shift=shift, rng=rng)
-    costs = edge_cost(around, views, tolerance=max(MIDDLE, finest))
-    leading = around.select(np.argsort(costs, kind="stable")[: search.refined])
-    return _best_refined(leading, points, views, search, tolerances=(max(MIDDLE, finest), max(FINE, finest)))
-
-
-def _best_refined(
-    planes: PlaneEquations, points: Array, views: Sequence[PaneView], search: Search, *, tolerances: Sequence[float]
-) -> PlaneEquations:
-    """The one plane, of all given ones after refinement, on which the mask edges coincide best."""
-    refined = []
-    for number in range(len(planes)):
-        plane = planes.select(np.array([number]))
-        refined.append(refined_plane(plane, views, _inliers(plane, points, search.distance), search, tolerances))
-    candidates = PlaneEquations(
-        np.concatenate([plane.normals for plane in refined]), np.concatenate([plane.offsets for plane in refined])
-    )
-    best = np.argmin(edge_cost(candidates, views, tolerance=tolerances[-1]))
-    return candidates.select(np.array([best]))
-
-
-def _inliers(plane: PlaneEquations, points: Array, distance: float) -> Array:
-    """[M, 3] the points within `distance` of one plane; the nearest three where there are fewer."""
-    away = np.abs(plane.distances(points)[0])
-    return points[away <= max(distance, np.partition(away, 2)[2])]
-
-
-def refined_plane(
-    plane: PlaneEquations, views: Sequence[PaneView], inliers: Array, search: Search, tolerances: Sequence[float]
-) -> PlaneEquations:
-    """The plane near `plane` on which the mask edges of all views coincide best.
-
-    Tilt and offset minimise the distances between edges under the Geman-McClure loss, at ever finer
-    tolerance. That loss ignores what is far off, and it must: where something stands before the
-    pane, the mask's edge is not the pane's and matches no other view.
-
-    Args:
-        plane: one plane to start from.
-        views: annotated views of the pane.
-        inliers: [N, 3] points on the plane, at least one.
-        search: scale of the scene.
-        tolerances: distances at which the loss is one half, in image diagonals.
-    """
-    anchor = inliers.mean(axis=0)
-
-    def residuals(parameters: Array, tolerance: float) -> Array:
-        moved = _moved(plane, anchor, parameters[None] * [1, 1, search.extent])
-        edges = edge_distances(moved, views, edges_per_view=100)[0].ravel() / tolerance
-        points = moved.distances(inliers)[0] / search.distance
-        return np.concatenate([edges, np.sqrt(POINTS_WEIGHT * len(edges) / len(points)) * points])
-
-    parameters = np.zeros(3)
-    for tolerance in tolerances:
-        parameters = least_squares(
-            residuals, parameters, args=(tolerance,), loss=geman_mcclure, x_scale=0.01, max_nfev=30
-        ).x
-    return _moved(plane, anchor, parameters[None] * [1, 1, search.extent])
-
-
-def planes_nearby(
-    plane: PlaneEquations, anchor: Array, count: int, *, tilt: float, shift: float, rng: np.random.Generator
-) -> PlaneEquations:
-    """One plane and `count` random ones around it.
-
-    Args:
-        plane: one plane.
-        anchor: [3] point about which the tilts turn.
-        count: number of further planes.
-        tilt: standard deviation of the two tilts, radians.
-        shift: standard deviation of the shift along the normal, world units.
+        objective: views of the pane, at least two, and candidate points, of which there may be none.
+        hypotheses: number of planes drawn through triplets of points, and again through the masks.
+        refine: number of planes that are refined at last.
         rng: source of randomness.
     """
-    steps = rng.standard_normal((count, 3)) * [tilt, tilt, shift]
-    return _moved(plane, anchor, np.vstack([np.zeros(3), steps]))
+    beam = _hypotheses(objective, hypotheses, rng)
+    for tilt, shift, tolerance in ROUNDS:
+        beam = _followed(beam, objective, (tilt, shift), tolerance, rng)
+    beam = refined(beam, objective, (COARSE, MIDDLE))
+    tilt, shift, tolerance = SHAKE
+    shaken = _followed(beam, objective, (tilt, shift), tolerance, rng)
+    best_first = np.argsort(_cost(beam, objective, (COARSE, MIDDLE)), kind="stable")
+    leading = joined([beam.select(best_first[:refine]), shaken.select(np.arange(min(refine, len(shaken))))])
+    finished = refined(leading, objective, (MIDDLE, FINE))
+    return finished.select(np.array([np.argmin(_cost(finished, objective, (COARSE, MIDDLE, FINE)))]))
 
 
-def _moved(plane: PlaneEquations, anchor: Array, steps: Array) -> PlaneEquations:
-    """One plane after each of [H, 3] small moves: two tilts about the point nearest to `anchor`, and a shift."""
-    normal = plane.normals[0]
-    tangents = np.linalg.svd(normal[None])[2][1:]
-    foot = anchor - plane.distances(anchor[None])[0] * normal
-    normals = normal + steps[:, :2] @ tangents
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return PlaneEquations(normals, normals @ foot + steps[:, 2])
+def _hypotheses(objective: Objective, count: int, rng: np.random.Generator) -> FramedPlanes:
+    """The planes, of those drawn through points and masks, on which the masks agree best."""
+    drawn = [planes_through_masks(objective.views, count, rng)]
+    if len(objective.points) >= 3:
+        through = random_planes(objective.points, objective.weights, count, rng)
+        drawn.append(through.select(np.argsort(-objective.support(through), kind="stable")[: count // 4]))
+    usual = USUAL_FRAME * objective.extent
+    planes = joined([FramedPlanes(part, np.full(len(part), usual)) for part in drawn])
+    scores = _agreement(planes, objective) + AGREEMENT_WEIGHT * objective.support(planes.planes)
+    return planes.select(np.argsort(-scores, kind="stable")[:BEAM])
+
+
+def _followed(
+    beam: FramedPlanes, objective: Objective, spread: tuple[float, float], tolerance: float, rng: np.random.Generator
+) -> FramedPlanes:
+    """The best plane around each of the beam's, best first."""
+    tilt, shift = spread
+    shifts = shift * objective.reach(beam.planes)
+    around = planes_nearby(beam.planes, objective.anchors(beam.planes), CHILDREN, tilt=tilt, shift=shifts, rng=rng)
+    factors = np.exp(FRAME_SPREAD * rng.standard_normal((len(beam), 1 + CHILDREN)))
+    factors[:, 0] = 1
+    family = FramedPlanes(around, (beam.frames[:, None] * factors).ravel())
+    costs = objective.terms(family, tolerance, edges=COARSE_EDGES).cost.reshape(factors.shape)
+    best = np.arange(len(beam)) * (1 + CHILDREN) + costs.argmin(axis=1)
+    return family.select(best[np.argsort(costs.min(axis=1), kind="stable")])
+
+
+def _cost(planes: FramedPlanes, objective: Objective, tolerances: tuple[float, ...]) -> Array:
+    """[H] what tells against planes, their masks included, at several tolerances."""
+    costs = [objective.terms(planes, tolerance).cost for tolerance in tolerances]
+    mean: Array = np.mean(costs, axis=0) - AGREEMENT_WEIGHT * _agreement(planes, objective)
+    return mean
+
+
+def _agreement(planes: FramedPlanes, objective: Objective) -> Array:
+    return mask_agreement(planes.planes, objective.views, pixels_per_view=PIXELS // len(objective.views))

@@ -15,13 +15,20 @@ from torch import Tensor
 from glassplat.init.annotation import PaneView, pane_views, plane_candidates
 from glassplat.init.consistency import mask_agreement
 from glassplat.init.footprint import pane_rectangle
-from glassplat.init.plane_search import Search, best_plane
-from glassplat.init.ransac import PlaneEquations
+from glassplat.init.plane_objective import MIDDLE, Objective
+from glassplat.init.plane_refinement import doubt
+from glassplat.init.plane_search import best_plane
+from glassplat.init.ransac import FramedPlanes, PlaneEquations
 from glassplat.scene.camera import Camera
 from glassplat.scene.plane import Planes
 
 Array = NDArray[np.float64]
 log = logging.getLogger("glassplat.init")
+
+LEAST_APART = 0.01
+"""Distance between annotated cameras below which nothing is tried, in scene extents."""
+MOST_DOUBT = 5.0
+"""Degrees by which a plane may be turned without its masks telling before it is refused."""
 
 
 class PlaneFitError(ValueError):
@@ -39,8 +46,8 @@ class PlaneFit:
         band: half width of the band along a mask's edge in which candidates lie, as a share of the
             image diagonal; the paper's 20 pixels at 960x720.
         inlier_distance: of RANSAC, as a share of the scene extent.
-        hypotheses: number of planes drawn by RANSAC.
-        refined: number of them, the best by agreement of the masks, that are refined.
+        hypotheses: number of planes drawn by RANSAC, and again through the masks.
+        refined: number of the best of them that are refined at last.
         most_views: number of annotated views that are used; a few that were taken far apart tell enough.
         least_agreement: intersection over union of the masks on the plane below which a fit is refused.
         margin: factor on the rectangle's sides, which must not cut into the pane.
@@ -83,7 +90,8 @@ def fit_planes(
     As in the paper, candidates are points that project near a mask's edge, RANSAC draws planes
     through them, and rotating calipers bound the rectangle. Beyond the paper, the masks themselves
     choose among the planes and place the best one exactly: on the pane's own plane, and on no other,
-    the masks of all views coincide (`consistency`). RANSAC alone often prefers a wall or the floor.
+    the masks of all views coincide (`consistency`), and their edges do (`edges`). RANSAC alone often prefers a
+    wall or the floor. No points are needed: further planes are drawn through the masks.
 
     Args:
         centers: [N, 3] centres of the primary Gaussians, or SfM points.
@@ -96,8 +104,8 @@ def fit_planes(
         Planes whose normals point to the side that most annotated cameras are on.
 
     Raises:
-        PlaneFitError: no mask names a pane, or a pane has too few views or candidates, or its masks
-            agree on no plane.
+        PlaneFitError: no mask names a pane, or a pane has too few views or views from one place, or its
+            masks agree on no plane or on many.
     """
     options = options or PlaneFit()
     labels = sorted({int(label) for _, image in annotations for label in image.unique()} - {0})
@@ -132,25 +140,53 @@ def _fit_pane(
         )
     if len(views) == 2:
         log.warning("pane %d is annotated in two views only; its plane may be off by degrees, a third helps", label)
+    _check_places(label, views, extent)
+    _check_outline(label, views)
     chosen = plane_candidates(points, views, band=options.band)
-    if chosen.sum() < 3:
-        raise PlaneFitError(
-            f"pane {label}: {int(chosen.sum())} of {len(points)} points lie along its edge in the {len(views)} "
-            "annotated views; expected at least three. Annotate more views in which the frame of the pane is visible "
-            "and sharp, and check that the masks end at the frame and belong to these images"
-        )
-    search = Search(extent, options.inlier_distance * extent, options.hypotheses, options.refined)
+    objective = Objective(views, points[chosen], weights[chosen], extent, options.inlier_distance * extent)
     rng = np.random.default_rng((options.seed, label))
     try:
-        plane = best_plane(points[chosen], weights[chosen], views, search, rng)
-        _check_agreement(plane, views, options.least_agreement)
+        found = best_plane(objective, hypotheses=options.hypotheses, refine=options.refined, rng=rng)
+        _check_agreement(found.planes, views, options.least_agreement)
+        _check_certainty(found, objective)
         log.info("pane %d: plane found from %d views and %d candidate points", label, len(views), chosen.sum())
-        return _pane(plane, views, options.margin)
+        return _pane(found.planes, views, options.margin)
     except ValueError as error:
         raise PlaneFitError(
             f"pane {label}, annotated in {len(views)} views: {error}. Check that label {label} means the same flat "
-            "pane in every mask, and annotate more views that show all of it with nothing standing before it"
+            "pane in every mask, and annotate more views, from places well apart, that show its outline inside of the "
+            "image with nothing standing before it"
         ) from error
+
+
+def _check_places(label: int, views: Sequence[PaneView], extent: float) -> None:
+    eyes = np.stack([view.center for view in views])
+    apart = float(np.linalg.norm(eyes - eyes[0], axis=1).max())
+    if apart < LEAST_APART * extent:
+        raise PlaneFitError(
+            f"pane {label}: its {len(views)} annotated views were taken from places at most {apart:.3g} apart in a "
+            f"capture of radius {extent:.3g}, and its plane shows only between places: annotate views "
+            "of it from farther apart"
+        )
+
+
+def _check_outline(label: int, views: Sequence[PaneView]) -> None:
+    showing = sum(len(view.edge) > 0 for view in views)
+    if showing < 2:
+        raise PlaneFitError(
+            f"pane {label}: its outline lies inside of the image in {showing} of {len(views)} annotated views, "
+            "expected at least two: annotate views that show where it ends, from places well apart"
+        )
+
+
+def _check_certainty(found: FramedPlanes, objective: Objective) -> None:
+    degrees = float(np.degrees(doubt(found, objective, MIDDLE)[0]))
+    if degrees <= MOST_DOUBT:
+        return
+    raise ValueError(
+        f"the plane could turn by {min(degrees, 90):.0f} degrees before its masks tell; too little of its outline lies "
+        f"inside of the images, and {len(objective.points)} points lie along it"
+    )
 
 
 def _check_agreement(plane: PlaneEquations, views: Sequence[PaneView], least: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +33,40 @@ class PlaneEquations:
     def select(self, index: NDArray[np.int64]) -> PlaneEquations:
         """The planes at `index`."""
         return PlaneEquations(self.normals[index], self.offsets[index])
+
+
+@dataclass(frozen=True)
+class FramedPlanes:
+    """Planes with the heights of the frames around them.
+
+    Attributes:
+        planes: H planes.
+        frames: [H] how far the frame stands out from the glass, world units.
+    """
+
+    planes: PlaneEquations
+    frames: Array
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def select(self, index: NDArray[np.int64]) -> FramedPlanes:
+        """Those at `index`."""
+        return FramedPlanes(self.planes.select(index), self.frames[index])
+
+
+def joined(parts: Sequence[FramedPlanes]) -> FramedPlanes:
+    """All planes of several sets."""
+    normals = np.concatenate([part.planes.normals for part in parts])
+    offsets = np.concatenate([part.planes.offsets for part in parts])
+    return FramedPlanes(PlaneEquations(normals, offsets), np.concatenate([part.frames for part in parts]))
+
+
+def in_plane_axes(planes: PlaneEquations) -> tuple[Array, Array]:
+    """Two directions [H, 3] each that are perpendicular to the normals and to one another; unit vectors."""
+    first = np.cross(planes.normals, np.eye(3)[np.argmin(np.abs(planes.normals), axis=1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return first, np.cross(planes.normals, first)
 
 
 def random_planes(points: Array, weights: Array, count: int, rng: np.random.Generator) -> PlaneEquations:

@@ -1,0 +1,63 @@
+"""Mask edges on planes: what a frame hides, and what a rectangle's sides do."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from glassplat.init.annotation import PaneView, pane_views
+from glassplat.init.edges import edge_matches
+from glassplat.init.plane_objective import Objective
+from glassplat.init.plane_refinement import doubt, refined
+from glassplat.init.ransac import FramedPlanes, PlaneEquations
+from tests.init.pane_scene import FRONT, framed_scene_of, scene_of
+
+TRUTH = PlaneEquations(FRONT.normal[None], np.array([FRONT.normal @ FRONT.center]))
+BEYOND = ((2.6, 0.0, 0.3), (-1.9, 0.4, 0.6), (0.2, 0.2, -1.2))
+HEIGHT = 0.12
+PIXEL = 1 / np.hypot(220, 300)
+
+
+def test_edges_meet_on_the_true_plane() -> None:
+    views = pane_views(scene_of([FRONT]), 1)
+    matches = edge_matches(TRUTH, views, edges_per_view=100)
+    assert matches.compared.sum() > 300
+    assert np.abs(matches.distances[matches.compared]).max() < 1.5 * PIXEL
+    assert np.median(np.abs(matches.turns)) < 0.1
+
+
+def test_a_frame_explains_edges_that_do_not_meet() -> None:
+    views = pane_views(framed_scene_of(FRONT, HEIGHT, BEYOND), 1)
+    matches = edge_matches(TRUTH, views, edges_per_view=100)
+    hidden = np.abs(matches.shifts) * HEIGHT > 4 * PIXEL
+    assert hidden.sum() > 100
+    assert np.median(np.abs(matches.distances[hidden])) > 4 * PIXEL
+    explained = matches.distances - HEIGHT * matches.shifts
+    assert np.median(np.abs(explained[hidden])) < PIXEL
+
+
+def test_refinement_measures_the_frame() -> None:
+    views = pane_views(framed_scene_of(FRONT, HEIGHT, BEYOND), 1)
+    objective = Objective(views, np.zeros((0, 3)), np.zeros(0), 3.0, 0.03)
+    start = FramedPlanes(PlaneEquations(TRUTH.normals, TRUTH.offsets + 0.01), np.array([0.06]))
+    found = refined(start, objective, (0.01, 0.004))
+    assert found.frames[0] == pytest.approx(HEIGHT, rel=0.15)
+    assert found.planes.offsets[0] == pytest.approx(TRUTH.offsets[0], abs=0.01)
+    assert found.planes.normals[0] @ TRUTH.normals[0] > np.cos(np.radians(0.5))
+
+
+def upper(view: PaneView) -> np.ndarray:
+    """[E] bool: the edge points on the upper side of the mask."""
+    steep: np.ndarray = view.outward[:, 1] < -0.9
+    return steep
+
+
+def test_doubt_is_small_where_all_sides_are_seen_and_large_where_one_is() -> None:
+    views = pane_views(scene_of([FRONT]), 1)
+    planes = FramedPlanes(TRUTH, np.zeros(1))
+    nothing = (np.zeros((0, 3)), np.zeros(0), 3.0, 0.03)
+    assert doubt(planes, Objective(views, *nothing), 0.004)[0] < np.radians(1)
+    level = [
+        replace(view, edge=view.edge[sides], outward=view.outward[sides]) for view in views for sides in [upper(view)]
+    ]
+    assert doubt(planes, Objective(level, *nothing), 0.004)[0] > np.radians(10)
