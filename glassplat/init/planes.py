@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -19,6 +18,7 @@ from glassplat.init.plane_objective import MIDDLE, Objective
 from glassplat.init.plane_refinement import doubt
 from glassplat.init.plane_search import best_plane
 from glassplat.init.ransac import FramedPlanes, PlaneEquations
+from glassplat.scene.activations import logit
 from glassplat.scene.camera import Camera
 from glassplat.scene.plane import Planes
 
@@ -222,7 +222,7 @@ def _planes(panes: Sequence[_Pane], labels: Sequence[int], options: PlaneFit) ->
     planes = Planes(
         centers=stacked([pane.center for pane in panes]),
         raw_normals=stacked([pane.normal for pane in panes]),
-        logit_reflectances=torch.full((len(labels),), math.log(glass / (1 - glass))),
+        logit_reflectances=torch.full((len(labels),), logit(glass)),
         tangents=stacked([pane.tangent for pane in panes]),
         half_sizes=stacked([pane.half_sizes for pane in panes]),
         labels=tuple(labels),
@@ -234,5 +234,5 @@ def with_mirrors(planes: Planes, labels: tuple[int, ...], reflectance: float) ->
     """The planes with some of them, by label, made mirrors of a base reflectance that stays."""
     kept = tuple(label for label in planes.labels if label in labels)
     mirrors = torch.tensor([label in kept for label in planes.labels], device=planes.centers.device)
-    fixed = torch.full_like(planes.logit_reflectances, math.log(reflectance / (1 - reflectance)))
+    fixed = torch.full_like(planes.logit_reflectances, logit(reflectance))
     return replace(planes, logit_reflectances=torch.where(mirrors, fixed, planes.logit_reflectances), mirrors=kept)
