@@ -27,8 +27,8 @@ from glassplat.files.markdown_table import Table
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
 from glassplat.kernels.devices import cuda_problem
+from glassplat.kernels.photometric import photometric
 from glassplat.kernels.project import project
-from glassplat.kernels.ssim import ssim
 from glassplat.render.planar import Planar
 from glassplat.render.rasterize import joined_splats
 from glassplat.render.splat import Splat
@@ -178,18 +178,19 @@ def kernel_times(count: int) -> Table:
     bins = bin_tiles(splats, WIDTH, HEIGHT)
     leaves: Any = [tensor.clone().requires_grad_() for tensor in (*splats[:3], projected.colors.detach())]
     blended = composite(splats._replace(means2d=leaves[0], conics=leaves[1], opacities=leaves[2]), leaves[3], bins)
-    photo = torch.rand(HEIGHT, WIDTH, 3, device="cuda")
-    image = photo.clone().requires_grad_()
-    similarity = ssim(image, photo)
+    picture = torch.rand(HEIGHT, WIDTH, 3, device="cuda")
+    photo = (torch.rand(HEIGHT, WIDTH, 3, device="cuda") * 255).to(torch.uint8)
+    image = picture.clone().requires_grad_()
+    means = list(photometric(image, photo))
     weights = [torch.rand_like(tensor) for tensor in projected[:5]]
     works: dict[str, Work] = {
         "project forward": lambda: project(raw, batch, sh_degree=3, near=0.03),
         "project backward": backward(list(projected[:5]), weights, list(raw)),
         "bin_tiles": lambda: bin_tiles(splats, WIDTH, HEIGHT),
         "composite forward": lambda: composite(splats, leaves[3].detach(), bins),
-        "composite backward": backward([blended.image], [photo[None]], leaves),
-        "ssim forward": lambda: ssim(photo, photo),
-        "ssim backward": backward([similarity], [torch.ones_like(similarity)], [image]),
+        "composite backward": backward([blended.image], [picture[None]], leaves),
+        "photometric forward": lambda: photometric(picture, photo),
+        "photometric backward": backward(means, [torch.ones_like(means[0])] * 2, [image]),
     }
     evaluations = visited_pixels(type(splats)(*(t.cpu() for t in splats)), bins_on_cpu(bins))
     seconds = interleaved_seconds({name: timed(work) for name, work in works.items()}, REPEATS)

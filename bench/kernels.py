@@ -15,12 +15,12 @@ from glassplat.files.markdown_table import Table
 from glassplat.kernels import bin_tiles as bin_tiles_module
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
+from glassplat.kernels.photometric import photometric
 from glassplat.kernels.project import project
 from glassplat.kernels.reference import composite as composite_twin
+from glassplat.kernels.reference import photometric as photometric_twin
 from glassplat.kernels.reference import project as project_twin
-from glassplat.kernels.reference import ssim as ssim_twin
 from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians, Splats, TileBins
-from glassplat.kernels.ssim import ssim
 from glassplat.render.rasterize import joined_splats
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
@@ -71,18 +71,20 @@ def kernel_times() -> Table:
     )
     colors = flat.colors.clone().requires_grad_()
     blended = composite(leaves, colors, bins)
-    photo = torch.rand(HEIGHT, WIDTH, 3)
-    image = photo.clone().requires_grad_()
-    similarity = ssim(image, photo)
+    picture = torch.rand(HEIGHT, WIDTH, 3)
+    photo = (torch.rand(HEIGHT, WIDTH, 3) * 255).to(torch.uint8)
+    image = picture.clone().requires_grad_()
+    means = list(photometric(image, photo))
     weights = [torch.rand_like(t) for t in projected[:5]]
     works: dict[str, Work] = {
         "project forward": lambda: project(raw_of(gaussians), batch, sh_degree=3, near=0.03),
         "project backward": backward(list(projected[:5]), weights, list(raw)),
         "bin_tiles": lambda: bin_tiles(splats, WIDTH, HEIGHT),
         "composite forward": lambda: composite(splats, flat.colors, bins),
-        "composite backward": backward([blended.image], [photo[None]], [*leaves[:3], colors]),
-        "ssim forward": lambda: ssim(photo, photo),
-        "ssim backward": backward([similarity], [torch.tensor(1.0)], [image]),
+        "composite backward": backward([blended.image], [picture[None]], [*leaves[:3], colors]),
+        "photometric forward": lambda: photometric(picture, photo),
+        "photometric forward, for a gradient": lambda: photometric(image, photo),
+        "photometric backward": backward(means, [torch.tensor(1.0)] * 2, [image]),
     }
     evaluations = visited_pixels(splats, bins)
     peak = peak_multiply_adds(2)
@@ -129,7 +131,7 @@ def twin_ratios() -> Table:
     flat = project(raw, batch, sh_degree=3, near=0.03)
     splats = joined_splats(flat)
     bins = bin_tiles(splats, 64, 48)
-    photo = torch.rand(HEIGHT, WIDTH, 3)
+    picture, photo = torch.rand(HEIGHT, WIDTH, 3), torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8)
     large = raw_of(room(COUNT))
     full = batch_of(bench_camera(WIDTH, HEIGHT))
     pairs: dict[str, tuple[Work, Work]] = {
@@ -141,7 +143,10 @@ def twin_ratios() -> Table:
             lambda: composite(splats, flat.colors, bins),
             lambda: composite_twin.composite(splats, flat.colors, bins),
         ),
-        f"ssim, {WIDTH}x{HEIGHT}": (lambda: ssim(photo, photo), lambda: ssim_twin.ssim(photo, photo)),
+        f"photometric, {WIDTH}x{HEIGHT}": (
+            lambda: photometric(picture, photo),
+            lambda: photometric_twin.photometric(picture, photo),
+        ),
     }
     table = Table(
         "Kernels against their PyTorch twins, forward", ("operation", "kernel, ms", "twin, ms", "twin : kernel")

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from glassplat.kernels.ssim import ssim as mean_ssim
+from glassplat.kernels.photometric import photometric
 
 
 def quantized(image: Tensor) -> Tensor:
@@ -58,9 +58,7 @@ def ssim(image: Tensor, target: Tensor) -> float:
         ValueError: shapes disagree.
     """
     _check_shapes(image, target)
-    pixels = [quantized(picture).to(torch.float32) / 255 for picture in (image, target)]
-    with torch.no_grad():
-        return float(mean_ssim(*pixels))
+    return float(photometric(quantized(image).to(torch.float32) / 255, quantized(target)).ssim)
 
 
 def reflection_gain(images: list[Tensor], targets: list[Tensor]) -> float:

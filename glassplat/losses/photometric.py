@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from torch import Tensor
 
 from glassplat.data.dataset import View
-from glassplat.kernels.ssim import ssim
+from glassplat.kernels.photometric import photometric
 from glassplat.render.frame import Frame
 from glassplat.scene.scene import Scene
 
 
-def l1(frame: Frame, view: View, scene: Scene) -> Tensor:
-    """Mean absolute colour difference."""
-    return (frame.rgb - view.photo.to(frame.rgb.device).to(frame.rgb.dtype) / 255).abs().mean()
+@dataclass(frozen=True)
+class PhotometricLoss:
+    """(1 - lambda) L1 + lambda D-SSIM: both from one traversal, with the photograph as bytes.
 
+    Attributes:
+        ssim_weight: lambda, in [0, 1]; D-SSIM is 1 - SSIM, window 11, sigma 1.5.
+    """
 
-def dssim(frame: Frame, view: View, scene: Scene) -> Tensor:
-    """1 - SSIM, window 11, sigma 1.5."""
-    return 1 - ssim(frame.rgb, view.photo.to(frame.rgb.device))
+    ssim_weight: float
+
+    def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor:
+        """The loss of a view; scalar."""
+        found = photometric(frame.rgb, view.photo.to(frame.rgb.device))
+        return (1 - self.ssim_weight) * found.l1 + self.ssim_weight * (1 - found.ssim)

@@ -23,7 +23,7 @@ from glassplat.scene.scene import Scene
 from glassplat.train.background import BLACK
 from glassplat.train.optimizer import Rate
 from glassplat.train.propagation import GrowShAfterPropagation, Propagate, PropagationSchedule, RefineEnvironment
-from glassplat.train.splat_recipe import GaussianRates, photometric_terms
+from glassplat.train.splat_recipe import GaussianRates, photometric_term
 from glassplat.train.stage import Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
 
@@ -115,12 +115,12 @@ class DeferredRecipe:
     def stages(self, seed: int) -> tuple[Stage, ...]:
         """Bootstrap, then everything; what changes in between is up to `Propagate`."""
         population = self._population()
-        photometric = photometric_terms(self.ssim_weight)
+        photometric = photometric_term(self.ssim_weight)
         bootstrap = Stage(
             name="1 bootstrap",
             share=self.bootstrap,
             renderer=Splat(self.background or BLACK, depth=False),
-            losses=(*photometric, *population.terms),
+            losses=(photometric, *population.terms),
             rates=self.rates.of("primary"),
             actions=population.edits,
             motions=population.motions,
@@ -134,7 +134,7 @@ class DeferredRecipe:
             name="2 reflection",
             share=self.schedule.stop - self.bootstrap,
             renderer=Deferred(self.background or BLACK, self.shading, depth=self.consistency_weight != 0),
-            losses=(*photometric, *(term for term in guidance if term.weight != 0), *population.terms),
+            losses=(photometric, *(term for term in guidance if term.weight != 0), *population.terms),
             rates=self.rates.of("primary") | self.reflection_rates.of(),
             actions=(
                 *population.edits,

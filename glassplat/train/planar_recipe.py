@@ -19,7 +19,7 @@ from glassplat.train.actions import Densify, GrowSh, PerturbOpacity
 from glassplat.train.background import BLACK
 from glassplat.train.optimizer import Rate
 from glassplat.train.plane_entry import PlaneEntry, annotations_of
-from glassplat.train.splat_recipe import GaussianRates, photometric_terms
+from glassplat.train.splat_recipe import GaussianRates, photometric_term
 from glassplat.train.stage import Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
 
@@ -162,7 +162,7 @@ class PlanarRecipe:
             name="1 initialisation",
             share=first,
             renderer=Splat(self.background or BLACK, depth=False),
-            losses=(*photometric_terms(self.ssim_weight), *population.terms),
+            losses=(photometric_term(self.ssim_weight), *population.terms),
             rates=self.rates.of("primary"),
             actions=(*population.edits, GrowSh(Every(self.rhythm.sh))),
             motions=population.motions,
@@ -178,7 +178,7 @@ class PlanarRecipe:
             name="2 plane adjustment",
             share=share,
             renderer=self._training_renderer("planes"),
-            losses=(*photometric_terms(self.ssim_weight), *self.weights.terms(), *population.terms),
+            losses=(photometric_term(self.ssim_weight), *self.weights.terms(), *population.terms),
             rates=self.rates.of("primary") | self.rates.of("glass") | self.plane_rates.of(1.0),
             actions=(*population.edits, GrowSh(Every(self.rhythm.sh)), Densify(self.densify, part="glass")),
             motions=population.motions,
@@ -193,7 +193,7 @@ class PlanarRecipe:
             name="3 joint optimisation",
             share=share,
             renderer=self._training_renderer("all"),
-            losses=(*photometric_terms(self.ssim_weight), *self.weights.terms(), *population.terms),
+            losses=(photometric_term(self.ssim_weight), *self.weights.terms(), *population.terms),
             rates=self.rates.of("primary")
             | self.rates.of("glass")
             | self.plane_rates.of(self.plane_rates.joint_factor)

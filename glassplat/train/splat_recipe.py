@@ -8,7 +8,7 @@ from typing import ClassVar
 from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
-from glassplat.losses.photometric import dssim, l1
+from glassplat.losses.photometric import PhotometricLoss
 from glassplat.losses.term import LossTerm
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
@@ -49,9 +49,9 @@ class GaussianRates:
         }
 
 
-def photometric_terms(ssim_weight: float) -> tuple[LossTerm, ...]:
+def photometric_term(ssim_weight: float) -> LossTerm:
     """(1 - lambda) L1 + lambda D-SSIM (TR-Gaussians, Eq. 18)."""
-    return LossTerm("l1", 1 - ssim_weight, l1), LossTerm("dssim", ssim_weight, dssim)
+    return LossTerm("photometric", 1.0, PhotometricLoss(ssim_weight))
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class SplatRecipe:
                 name="splat",
                 share=1.0,
                 renderer=Splat(self.background or BLACK, depth=False),
-                losses=(*photometric_terms(self.ssim_weight), *population.terms),
+                losses=(photometric_term(self.ssim_weight), *population.terms),
                 rates=self.rates.of("primary"),
                 actions=(*population.edits, GrowSh(Every(self.rhythm.sh)), *population.resets),
                 motions=population.motions,

@@ -80,7 +80,7 @@ from glassplat.kernels.panes import Panes
 from glassplat.kernels.project import project
 from glassplat.kernels.shade_environment import shade_environment
 from glassplat.kernels.splats import CameraBatch, Deviation, RawGaussians, Splats
-from glassplat.kernels.ssim import ssim
+from glassplat.kernels.photometric import photometric
 
 means = torch.tensor([[0.0, 0.0, 2.0], [0.1, 0.0, 3.0]])
 raw = RawGaussians(means, torch.randn(2, 4), torch.full((2, 3), -2.0), torch.zeros(2), torch.zeros(2, 1, 3))
@@ -96,7 +96,7 @@ panes = Panes(2 * normal, normal, torch.eye(3)[None, :2].contiguous(), torch.one
 pane = pane_hits(panes, intrinsics, 20, 16).pane
 reflections = torch.ones(1, 16, 20, 4)
 blended = blend_panes(result.image[0], result.alpha[0], reflections, pane, normal, torch.ones(1), intrinsics)
-loss = ssim(blended.rgb, torch.zeros(16, 20, 3)) + result.deviation.sum()
+loss = photometric(blended.rgb, torch.zeros(16, 20, 3, dtype=torch.uint8)).ssim + result.deviation.sum()
 loss = loss + gradient_conflict(result.image[0], blended.reflection, result.alpha[0])
 texels = torch.zeros(6, 2, 2, 3, requires_grad=True)
 normals = facing_normals(raw.quats, raw.log_scales.detach(), means.detach(), torch.zeros(3))

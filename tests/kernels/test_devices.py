@@ -84,7 +84,9 @@ def test_tensors_on_a_gpu_without_its_kernels_are_refused(monkeypatch: pytest.Mo
 
 
 @pytest.mark.skipif(importlib.util.find_spec("numba_cuda") is None, reason="numba-cuda is not installed")
-@pytest.mark.parametrize("name", ["adam", "bin_tiles", "blend_panes", "composite", "pane_hits", "project", "ssim"])
+@pytest.mark.parametrize(
+    "name", ["adam", "bin_tiles", "blend_panes", "composite", "pane_hits", "photometric", "project"]
+)
 def test_every_operation_has_the_same_functions_on_both_devices(name: str) -> None:
     cpu, cuda = (kernels_for(name, torch.device(kind)) for kind in ("cpu", "cuda"))
     own = {key for key, value in vars(cpu).items() if getattr(value, "__module__", "") == cpu.__name__}

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from glassplat.densify.mcmc import McmcDensify
+from glassplat.losses.photometric import PhotometricLoss
 from glassplat.train.actions import Densify, Relocate, ResetOpacity, cap_of
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.messages import ActionDone, Message, StepDone
@@ -93,8 +94,9 @@ def test_the_strategy_decides_what_happens_to_the_primary_gaussians(recipe: Any)
 
 def test_the_planar_objective_is_that_of_equation_20() -> None:
     *_, joint = RECIPES[1].stages(seed=0)
+    assert joint.losses[0].function == PhotometricLoss(ssim_weight=0.2)
     assert {term.name: term.weight for term in joint.losses} == pytest.approx(
-        {"l1": 0.8, "dssim": 0.2, "depth": 0.005, "conflict": 0.2, "mask": 0.5, "opacity": 0.01, "scale": 0.01}
+        {"photometric": 1.0, "depth": 0.005, "conflict": 0.2, "mask": 0.5, "opacity": 0.01, "scale": 0.01}
     )
 
 
@@ -135,7 +137,7 @@ def test_relocation_keeps_its_share_of_the_run() -> None:
 def test_weights_and_noise_of_zero_are_left_out() -> None:
     bare = McmcDensify(noise_rate=0.0, opacity_weight=0.0, scale_weight=0.0)
     (stage,) = SplatRecipe(strategy="mcmc", mcmc=bare).stages(seed=0)
-    assert not stage.motions and {term.name for term in stage.losses} == {"l1", "dssim"}
+    assert not stage.motions and {term.name for term in stage.losses} == {"photometric"}
 
 
 @BOTH

@@ -10,7 +10,7 @@ import torch
 
 from glassplat.data.errors import InputError
 from glassplat.init.points import gaussians_from_points
-from glassplat.losses.photometric import l1
+from glassplat.losses.photometric import PhotometricLoss
 from glassplat.losses.term import LossTerm
 from glassplat.scene.scene import Scene
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
@@ -64,8 +64,8 @@ def test_planar_goes_through_its_stages() -> None:
     assert [(m.step, m.stage[0]) for m in messages if isinstance(m, StageEntered)] == [(0, "1"), (4, "2"), (10, "3")]
     assert any(isinstance(m, ActionDone) for m in messages)
     terms = [set(m.losses) for m in messages if isinstance(m, StepDone)]
-    assert terms[0] == {"l1", "dssim"}
-    assert {"l1", "dssim", "depth", "conflict"} <= terms[-1]
+    assert terms[0] == {"photometric"}
+    assert {"photometric", "depth", "conflict"} <= terms[-1]
     assert any("mask" in names for names in terms)
 
 
@@ -104,7 +104,10 @@ def test_a_loss_that_is_not_finite_stops_training_and_is_named() -> None:
         name="broken",
         share=1.0,
         renderer=SplatRecipe().renderer(),
-        losses=(LossTerm("l1", 1.0, l1), LossTerm("poison", 1.0, lambda f, v, s: f.rgb.sum() * float("nan"))),
+        losses=(
+            LossTerm("photometric", 1.0, PhotometricLoss(0.2)),
+            LossTerm("poison", 1.0, lambda f, v, s: f.rgb.sum() * float("nan")),
+        ),
         rates=SplatRecipe().rates.of("primary"),
     )
     state = fresh_state()

@@ -30,13 +30,21 @@ config.CUDA_LOW_OCCUPANCY_WARNINGS = 0
 
 SCALARS = {
     "bool": types.boolean,
+    "byte": types.uint8,
     "short": types.int16,
     "int": types.int32,
     "long": types.int64,
     "float": types.float32,
     "double": types.float64,
 }
-CTYPES = {"int16": "c_int16", "int32": "c_int32", "int64": "c_int64", "float32": "c_float", "float64": "c_double"}
+CTYPES = {
+    "uint8": "c_uint8",
+    "int16": "c_int16",
+    "int32": "c_int32",
+    "int64": "c_int64",
+    "float32": "c_float",
+    "float64": "c_double",
+}
 TOKEN = re.compile(r"([a-z]+)([1-4]?)")
 
 
@@ -149,8 +157,8 @@ def kernel(
     Args:
         name: the operation and direction, such as `composite_forward`.
         real: `np.float32` or `np.float64`.
-        arguments: the type of each argument: `bool`, `short`, `int`, `long`, `float`, `double` or `real`, with a digit
-            for a C-contiguous array of so many dimensions: `"real2 int1 real"`.
+        arguments: the type of each argument: `bool`, `byte`, `short`, `int`, `long`, `float`, `double` or `real`, with
+            a digit for a C-contiguous array of so many dimensions: `"real2 int1 real"`.
         bounds: threads of a block, and how many blocks a multiprocessor should hold at once.
     """
     full_name = f"{name}_{np.dtype(real).name}"

@@ -17,8 +17,8 @@ from glassplat.kernels import bin_tiles as bin_operation
 from glassplat.kernels import blend_panes as blend_operation
 from glassplat.kernels import composite as composite_operation
 from glassplat.kernels import pane_hits as hits_operation
+from glassplat.kernels import photometric as photometric_operation
 from glassplat.kernels import project as project_operation
-from glassplat.kernels import ssim as ssim_operation
 from glassplat.kernels.devices import SIMULATED, cuda_problem
 from glassplat.kernels.panes import Panes
 from glassplat.kernels.reference import adam as adam_twin
@@ -26,8 +26,8 @@ from glassplat.kernels.reference import bin_tiles as bin_twin
 from glassplat.kernels.reference import blend_panes as blend_twin
 from glassplat.kernels.reference import composite as composite_twin
 from glassplat.kernels.reference import pane_hits as hits_twin
+from glassplat.kernels.reference import photometric as photometric_twin
 from glassplat.kernels.reference import project as project_twin
-from glassplat.kernels.reference import ssim as ssim_twin
 from glassplat.kernels.splats import CameraBatch, Deviation, RawGaussians, Splats
 from tests.kernels.gaussians_and_cameras import draw, random_cameras, random_gaussians
 
@@ -256,16 +256,18 @@ def test_blend_panes(switches: tuple[bool, bool, bool], dtype: torch.dtype) -> N
     check_gradients(found, expected, own, leaves)
 
 
-@pytest.mark.parametrize(("quantised", "dtype"), [(False, torch.float64), (True, torch.float32)])
-def test_ssim(quantised: bool, dtype: torch.dtype) -> None:
-    image = torch.rand(HEIGHT, WIDTH, 3, dtype=dtype).requires_grad_()
-    target = torch.rand(HEIGHT, WIDTH, 3, dtype=dtype)
-    target = (target * 255).to(torch.uint8) if quantised else target
+@pytest.mark.parametrize(("dtype", "differentiated"), [(torch.float64, True), (torch.float32, False)])
+def test_photometric(dtype: torch.dtype, differentiated: bool) -> None:
+    size = (many(9, HEIGHT), many(18, WIDTH), 3)
+    image, target = torch.rand(size, dtype=dtype), (torch.rand(size) * 255).to(torch.uint8)
+    image.requires_grad_(differentiated)
     own = on_device(image)
-    found, expected = ssim_operation.ssim(own, target.to(DEVICE)), ssim_twin.ssim(image, target)
-    close(found, expected)
-    check_gradients([found], [expected], [own], [image])
-    close(ssim_operation.ssim_map(own, target.to(DEVICE)), ssim_twin.ssim_map(image, target))
+    found = photometric_operation.photometric(own, target.to(DEVICE))
+    expected = photometric_twin.photometric(image, target)
+    for value, want in zip(found, expected, strict=True):
+        close(value, want)
+    if differentiated:
+        check_gradients(found, expected, [own], [image])
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

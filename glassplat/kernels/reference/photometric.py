@@ -1,23 +1,20 @@
-"""The definition of `ssim`: five blurs with a full two-dimensional window."""
+"""The definition of `photometric`: five blurs with a full two-dimensional window."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-
-def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """See `glassplat.kernels.ssim.ssim`."""
-    return _similarity(image, target).mean()
+from glassplat.kernels.photometric import Photometric
 
 
-def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """See `glassplat.kernels.ssim.ssim_map`."""
-    return _similarity(image, target).mean(dim=-1)
+def photometric(image: Tensor, target: Tensor) -> Photometric:
+    """See `glassplat.kernels.photometric.photometric`."""
+    photo = target.to(image.dtype) / 255
+    return Photometric((image - photo).abs().mean(), _similarity(image, photo).mean())
 
 
 def _similarity(image: Tensor, target: Tensor) -> Tensor:
-    target = target.to(image.dtype) / 255 if target.dtype == torch.uint8 else target
     x, y = image.permute(2, 0, 1)[:, None], target.permute(2, 0, 1)[:, None]
     offsets = torch.arange(-5, 6, dtype=image.dtype)
     profile = torch.exp(-0.5 * (offsets / 1.5) ** 2)
@@ -33,4 +30,4 @@ def _similarity(image: Tensor, target: Tensor) -> Tensor:
     c1, c2 = 0.01**2, 0.03**2
     luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
     structure = (2 * covariance + c2) / (variance_x + variance_y + c2)
-    return (luminance * structure)[:, 0].permute(1, 2, 0)
+    return luminance * structure
