@@ -8,9 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from glassplat.kernels.cpu.cube_lookup import cube_lookup as lookup_on_cpu
-from glassplat.kernels.cpu.cube_lookup import cube_lookup_gradients
-from glassplat.kernels.reference import cube_lookup as reference
+from glassplat.kernels.devices import kernels_for
 from glassplat.kernels.tensor_checks import check_tensors
 
 
@@ -46,9 +44,6 @@ def cube_lookup(texels: Tensor, directions: Tensor) -> Tensor:
     """
     check_cube(texels)
     check_tensors({"texels": (texels, tuple(texels.shape)), "directions": (directions, (*directions.shape[:-1], 3))})
-    if texels.device.type != "cpu":
-        # As with `shade_environment`, these few gathers stay PyTorch's on a GPU.
-        return reference.cube_lookup(texels, directions)
     found: Tensor = _CubeLookup.apply(texels, directions.reshape(-1, 3))
     return found.reshape(*directions.shape[:-1], texels.shape[3])
 
@@ -65,10 +60,13 @@ class _CubeLookup(torch.autograd.Function):
     def forward(ctx: Any, texels: Tensor, directions: Tensor) -> Tensor:
         inputs = (texels.detach().contiguous(), directions.detach().contiguous())
         ctx.save_for_backward(*inputs)
-        return lookup_on_cpu(*inputs)
+        found: Tensor = kernels_for("cube_lookup", texels.device).cube_lookup(*inputs)
+        return found
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_found: Tensor) -> tuple[Tensor, Tensor]:
         texels, directions = ctx.saved_tensors
-        return cube_lookup_gradients(texels, directions, v_found.contiguous())
+        kernels = kernels_for("cube_lookup", texels.device)
+        gradients: tuple[Tensor, Tensor] = kernels.cube_lookup_gradients(texels, directions, v_found.contiguous())
+        return gradients

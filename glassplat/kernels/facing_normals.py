@@ -8,9 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from glassplat.kernels.cpu.facing_normals import facing_normals as normals_on_cpu
-from glassplat.kernels.cpu.facing_normals import facing_normals_gradient
-from glassplat.kernels.reference import facing_normals as reference
+from glassplat.kernels.devices import kernels_for
 from glassplat.kernels.tensor_checks import check_tensors
 
 
@@ -43,9 +41,6 @@ def facing_normals(quats: Tensor, log_scales: Tensor, means: Tensor, eye: Tensor
             "eye": (eye, (3,)),
         }
     )
-    if quats.device.type != "cpu":
-        # On a GPU a few operations per Gaussian are no bottleneck, so that there they stay PyTorch's.
-        return reference.facing_normals(quats, log_scales, means, eye)
     normals: Tensor = _FacingNormals.apply(quats, log_scales, means, eye)
     return normals
 
@@ -54,7 +49,7 @@ class _FacingNormals(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *tensors: Tensor) -> Tensor:
         quats, log_scales, means, eye = (tensor.detach().contiguous() for tensor in tensors)
-        normals = normals_on_cpu(quats, log_scales, means, eye)
+        normals: Tensor = kernels_for("facing_normals", quats.device).facing_normals(quats, log_scales, means, eye)
         ctx.save_for_backward(quats, log_scales, normals)
         return normals
 
@@ -62,4 +57,5 @@ class _FacingNormals(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, v_normals: Tensor) -> tuple[Tensor, None, None, None]:
         quats, log_scales, normals = ctx.saved_tensors
-        return facing_normals_gradient(quats, log_scales, normals, v_normals.contiguous()), None, None, None
+        gradient = kernels_for("facing_normals", quats.device).facing_normals_gradient
+        return gradient(quats, log_scales, normals, v_normals.contiguous()), None, None, None

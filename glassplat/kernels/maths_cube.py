@@ -1,4 +1,4 @@
-"""Scalar maths of a cube map: which face a direction meets, where on it, and which texels meet at an edge.
+"""Scalar maths of a cube map: which face a direction meets, where on it, which texels meet at an edge, and mirroring.
 
 Every function is pure and typed by its factory, so that one source compiles for the CPU and for CUDA. Face 2 a + s is
 the one of axis a, on the negative side for s = 1; its columns run along axis a + 1 and its rows along a + 2 (mod 3).
@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.maths import vector_maths
 from glassplat.kernels.maths_blend import Scalar, blend_maths
 
 
@@ -94,6 +95,35 @@ def _logistic(real: type) -> Scalar:
         return value if x == x else x
 
     return logistic
+
+
+class MirrorMaths(NamedTuple):
+    """Scalar functions of a mirrored ray for one floating-point type.
+
+    Attributes:
+        mirrored: a ray mirrored by a normal of any length, times the square of that length.
+        gradient: gradient of the normal from that of the mirrored ray.
+    """
+
+    mirrored: Scalar
+    gradient: Scalar
+
+
+def mirror_maths(real: type) -> MirrorMaths:
+    """Builds the functions for `real`, np.float32 or np.float64."""
+    dot, blend, two = vector_maths().dot, vector_maths().blend, real(2.0)
+
+    @inlined
+    def mirrored(ray, normal):  # type: ignore[no-untyped-def]
+        return blend(dot(normal, normal), ray, -two * dot(ray, normal), normal)
+
+    @inlined
+    def gradient(ray, normal, g):  # type: ignore[no-untyped-def]
+        by_square = blend(two * dot(ray, g), normal, -two * dot(normal, g), ray)
+        across = -two * dot(ray, normal)
+        return by_square[0] + across * g[0], by_square[1] + across * g[1], by_square[2] + across * g[2]
+
+    return MirrorMaths(mirrored, gradient)
 
 
 class EdgeMaths(NamedTuple):

@@ -8,10 +8,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from glassplat.kernels.cpu.shade_environment import shade_environment as shade_on_cpu
-from glassplat.kernels.cpu.shade_environment import shade_environment_gradients
 from glassplat.kernels.cube_lookup import check_cube
-from glassplat.kernels.reference import shade_environment as reference
+from glassplat.kernels.devices import kernels_for
 from glassplat.kernels.shaded import Shaded
 from glassplat.kernels.tensor_checks import check_tensors
 
@@ -64,9 +62,6 @@ def shade_environment(
         }
     )
     inputs = (base, normals, strength, texels, intrinsics, world_from_cam)
-    if base.device.type != "cpu":
-        # On a GPU this is a small part of an image's work, so that there it stays PyTorch's.
-        return reference.shade_environment(*inputs, least_strength=least_strength)
     return Shaded(*_ShadeEnvironment.apply(least_strength, *inputs))
 
 
@@ -74,7 +69,8 @@ class _ShadeEnvironment(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, least_strength: float, *tensors: Tensor) -> tuple[Tensor, Tensor]:
         inputs = [tensor.detach().contiguous() for tensor in tensors]
-        rgb, reflection = shade_on_cpu(inputs, least_strength)
+        kernels = kernels_for("shade_environment", inputs[0].device)
+        rgb, reflection = kernels.shade_environment(inputs, least_strength)
         ctx.least_strength = least_strength
         ctx.save_for_backward(*inputs, reflection)
         return rgb, reflection
@@ -84,5 +80,6 @@ class _ShadeEnvironment(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         *inputs, reflection = ctx.saved_tensors
         cotangents = [gradient.contiguous() for gradient in gradients]
-        found = shade_environment_gradients(inputs, ctx.least_strength, reflection, cotangents)
+        kernels = kernels_for("shade_environment", reflection.device)
+        found = kernels.shade_environment_gradients(inputs, ctx.least_strength, reflection, cotangents)
         return (None, *found, None, None)

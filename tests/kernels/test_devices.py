@@ -85,7 +85,19 @@ def test_tensors_on_a_gpu_without_its_kernels_are_refused(monkeypatch: pytest.Mo
 
 @pytest.mark.skipif(importlib.util.find_spec("numba_cuda") is None, reason="numba-cuda is not installed")
 @pytest.mark.parametrize(
-    "name", ["adam", "bin_tiles", "blend_panes", "composite", "pane_hits", "photometric", "project"]
+    "name",
+    [
+        "adam",
+        "bin_tiles",
+        "blend_panes",
+        "composite",
+        "cube_lookup",
+        "facing_normals",
+        "pane_hits",
+        "photometric",
+        "project",
+        "shade_environment",
+    ],
 )
 def test_every_operation_has_the_same_functions_on_both_devices(name: str) -> None:
     cpu, cuda = (kernels_for(name, torch.device(kind)) for kind in ("cpu", "cuda"))

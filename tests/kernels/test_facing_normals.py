@@ -73,11 +73,6 @@ def test_a_quaternion_without_direction_gives_no_normal_and_no_gradient(poison: 
         assert bool(normals.isfinite().all()) and bool(gradient.isfinite().all())
 
 
-def test_the_twin_makes_its_tensors_where_the_inputs_are() -> None:
-    case = [tensor.to("meta") for tensor in gaussians(5, torch.float32)]
-    assert {tensor.device.type for tensor in with_gradient(twin, case)} == {"meta"}
-
-
 def test_threads_do_not_change_a_bit() -> None:
     case = gaussians(1000, torch.float32)
     many = with_gradient(facing_normals, case)

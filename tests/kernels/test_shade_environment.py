@@ -158,11 +158,6 @@ def test_poisoned_texels_are_heard_of() -> None:
         assert bool(reflection[lit].isnan().all()) and bool((reflection[~lit] == 0).all())
 
 
-def test_the_twin_makes_its_tensors_where_the_inputs_are() -> None:
-    case = {name: tensor.to("meta") for name, tensor in shade_case(torch.float32).items()}
-    assert {tensor.device.type for tensor in with_gradients(case, twin)} == {"meta"}
-
-
 def test_threads_do_not_change_a_bit() -> None:
     case = shade_case(torch.float32)
     many = with_gradients(case, shade_environment)

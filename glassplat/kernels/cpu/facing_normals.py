@@ -10,7 +10,6 @@ from torch import Tensor
 
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
 from glassplat.kernels.maths import shape_maths, vector_maths
-from glassplat.kernels.maths_blend import Scalar
 from glassplat.kernels.tensor_checks import REAL_OF
 
 
@@ -30,21 +29,18 @@ def facing_normals_gradient(quats: Tensor, log_scales: Tensor, normals: Tensor, 
     return v_quats
 
 
-def _shortest_axis(real: type) -> Scalar:
-    @inlined
-    def shortest_axis(x, y, z):
-        """Position of the smallest of three values, the first among equals."""
-        if y < x:
-            return 2 if z < y else 1
-        return 2 if z < x else 0
-
-    return shortest_axis
+@inlined
+def shortest_axis(x, y, z):
+    """Position of the smallest of three values, the first among equals."""
+    if y < x:
+        return 2 if z < y else 1
+    return 2 if z < x else 0
 
 
 @cache
 def facing_normals_forward(real: type) -> Kernel:
     """Fills the normals."""
-    maths, dot, shortest_axis = shape_maths(real), vector_maths().dot, _shortest_axis(real)
+    maths, dot = shape_maths(real), vector_maths().dot
     unit_quat, rotation, is_finite = maths.unit_quat, maths.rotation, maths.is_finite
     zero, one = real(0.0), real(1.0)
 
@@ -68,7 +64,7 @@ def facing_normals_forward(real: type) -> Kernel:
 @cache
 def facing_normals_backward(real: type) -> Kernel:
     """Fills the gradients of the quaternions."""
-    maths, dot, shortest_axis = shape_maths(real), vector_maths().dot, _shortest_axis(real)
+    maths, dot = shape_maths(real), vector_maths().dot
     unit_quat, rotation, unit_quat_gradient = maths.unit_quat, maths.rotation, maths.unit_quat_gradient
     zero, one = real(0.0), real(1.0)
 

@@ -21,7 +21,7 @@ from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
 from glassplat.kernels.cpu.schedule import even_stride
 from glassplat.kernels.maths import vector_maths
 from glassplat.kernels.maths_blend import Scalar
-from glassplat.kernels.maths_cube import cube_maths
+from glassplat.kernels.maths_cube import cube_maths, mirror_maths
 from glassplat.kernels.shaded import NORMAL_MIN
 from glassplat.kernels.tensor_checks import REAL_OF
 
@@ -63,26 +63,8 @@ def shade_environment_gradients(
     return (*found, texel_gradients(first_cells, fractions, v_raw, texels.shape[1]))
 
 
-def _mirrored(real: type) -> tuple[Scalar, Scalar]:
-    dot, blend, two = vector_maths().dot, vector_maths().blend, real(2.0)
-
-    @inlined
-    def mirrored(ray, normal):
-        """The ray mirrored by a normal of any length, times the square of that length."""
-        return blend(dot(normal, normal), ray, -two * dot(ray, normal), normal)
-
-    @inlined
-    def mirrored_gradient(ray, normal, g):
-        """Gradient of the normal."""
-        by_square = blend(two * dot(ray, g), normal, -two * dot(normal, g), ray)
-        across = -two * dot(ray, normal)
-        return by_square[0] + across * g[0], by_square[1] + across * g[1], by_square[2] + across * g[2]
-
-    return mirrored, mirrored_gradient
-
-
 def _place(real: type) -> Scalar:
-    maths, mirrored = cube_maths(real), _mirrored(real)[0]
+    maths, mirrored = cube_maths(real), mirror_maths(real).mirrored
     on_face, cell = maths.on_face, maths.cell
     one, half = real(1.0), real(0.5)
 
@@ -190,7 +172,7 @@ def _slopes(real: type) -> Scalar:
 
 
 def _turn(real: type) -> Scalar:
-    from_face, mirrored_gradient = cube_maths(real).from_face, _mirrored(real)[1]
+    from_face, mirrored_gradient = cube_maths(real).from_face, mirror_maths(real).gradient
     half = real(0.5)
 
     @inlined

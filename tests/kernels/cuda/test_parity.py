@@ -16,18 +16,24 @@ from glassplat.kernels import adam as adam_operation
 from glassplat.kernels import bin_tiles as bin_operation
 from glassplat.kernels import blend_panes as blend_operation
 from glassplat.kernels import composite as composite_operation
+from glassplat.kernels import cube_lookup as lookup_operation
+from glassplat.kernels import facing_normals as normals_operation
 from glassplat.kernels import pane_hits as hits_operation
 from glassplat.kernels import photometric as photometric_operation
 from glassplat.kernels import project as project_operation
+from glassplat.kernels import shade_environment as shade_operation
 from glassplat.kernels.devices import SIMULATED, cuda_problem
 from glassplat.kernels.panes import Panes
 from glassplat.kernels.reference import adam as adam_twin
 from glassplat.kernels.reference import bin_tiles as bin_twin
 from glassplat.kernels.reference import blend_panes as blend_twin
 from glassplat.kernels.reference import composite as composite_twin
+from glassplat.kernels.reference import cube_lookup as lookup_twin
+from glassplat.kernels.reference import facing_normals as normals_twin
 from glassplat.kernels.reference import pane_hits as hits_twin
 from glassplat.kernels.reference import photometric as photometric_twin
 from glassplat.kernels.reference import project as project_twin
+from glassplat.kernels.reference import shade_environment as shade_twin
 from glassplat.kernels.splats import CameraBatch, Deviation, RawGaussians, Splats
 from tests.kernels.gaussians_and_cameras import draw, random_cameras, random_gaussians
 
@@ -268,6 +274,68 @@ def test_photometric(dtype: torch.dtype, differentiated: bool) -> None:
         close(value, want)
     if differentiated:
         check_gradients(found, expected, [own], [image])
+
+
+def directions_of(count: int) -> Tensor:
+    """Random directions, then those of all edges, corners and faces of a cube, and a little beside each."""
+    whole = torch.cartesian_prod(*3 * [torch.tensor([-1.0, 0.0, 1.0])])
+    whole = whole[whole.abs().sum(1) > 0]
+    return torch.cat([draw(count, 3, seed=6).float(), whole + 0.01 * draw(len(whole), 3, seed=7).float()])
+
+
+@pytest.mark.parametrize(
+    ("size", "depth", "count", "dtype"), [(1, 2, 5, torch.float64), (many(2, 16), 3, many(20, 9000), torch.float32)]
+)
+def test_cube_lookup(size: int, depth: int, count: int, dtype: torch.dtype) -> None:
+    texels = draw(6, size, size, depth, seed=5).to(dtype).requires_grad_()
+    directions = directions_of(count).to(dtype).requires_grad_()
+    leaves, own = [texels, directions], [on_device(texels), on_device(directions)]
+    found, expected = lookup_operation.cube_lookup(*own), lookup_twin.cube_lookup(*leaves)
+    close(found, expected)
+    check_gradients([found], [expected], own, leaves)
+
+
+def test_cube_lookup_of_many_directions_of_one_texel_and_of_none() -> None:
+    near = torch.tensor([0.1, 1.0, 0.2], dtype=torch.float64) + 0.02 * draw(70, 3, seed=1)
+    for size, directions in ((2, near), (1, near[:0])):
+        texels = draw(6, size, size, 1, seed=5).requires_grad_()
+        leaves = [texels, directions.detach().requires_grad_()]
+        own = [on_device(leaf) for leaf in leaves]
+        found, expected = lookup_operation.cube_lookup(*own), lookup_twin.cube_lookup(*leaves)
+        close(found, expected)
+        check_gradients([found], [expected], own, leaves)
+
+
+@pytest.mark.parametrize("dtype", DTYPES[: many(1, 2)])
+def test_shade_environment(dtype: torch.dtype) -> None:
+    height, width, size = many(7, HEIGHT), many(8, WIDTH), many(2, 16)
+    normals = draw(height, width, 3, seed=2)
+    normals[:, : width // 4], normals[1, width // 2] = 0, torch.tensor([1e-7, 0.0, 0.0])
+    base, strength = draw(height, width, 3, seed=1).sigmoid(), draw(height, width, seed=3).clamp(min=0, max=1)
+    texels, rotation = draw(6, size, size, 3, seed=4), torch.linalg.qr(draw(3, 3, seed=5))[0].to(dtype)
+    intrinsics = torch.tensor([0.9 * width, 0.8 * width, width / 2 + 0.3, height / 2 - 0.4], dtype=dtype)
+    leaves = [tensor.to(dtype).detach().requires_grad_() for tensor in (base, normals, strength, texels)]
+    own = [on_device(leaf) for leaf in leaves]
+    found = shade_operation.shade_environment(*own, intrinsics.to(DEVICE), rotation.to(DEVICE), least_strength=0.2)
+    expected = shade_twin.shade_environment(*leaves, intrinsics, rotation, least_strength=0.2)
+    for value, want in zip(found, expected, strict=True):
+        close(value, want)
+    check_gradients(found, expected, own, leaves)
+
+
+@pytest.mark.parametrize("count", [0, 1, many(40, 4000)])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_facing_normals(count: int, dtype: torch.dtype) -> None:
+    quats, log_scales, means = (draw(count, k, seed=k).to(dtype) for k in (4, 3, 2))
+    means = torch.cat([means, means[:, :1]], dim=1)
+    log_scales[: count // 3], quats[count // 2 : count // 2 + 2] = -1, 0
+    eye = torch.tensor([0.2, 0.1, -0.3], dtype=dtype)
+    quats.requires_grad_()
+    own = on_device(quats)
+    found = normals_operation.facing_normals(own, *(tensor.to(DEVICE) for tensor in (log_scales, means, eye)))
+    expected = normals_twin.facing_normals(quats, log_scales, means, eye)
+    close(found, expected)
+    check_gradients([found], [expected], [own], [quats])
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
