@@ -153,13 +153,15 @@ def _spread_slopes(real: type) -> Scalar:
     blur, zero = ssim_maths(real).blur, real(0.0)
 
     @inlined
-    def spread_slopes(scratch, inside, first, last, row):
-        """Blurs the row of slopes into row `row` of the planes; there are none outside of columns first .. last - 1."""
+    def spread_slopes(scratch, inside, left, rest, row):
+        """Blurs the row of slopes into row `row` of the planes; beyond the image, `rest` columns on, there are none."""
         for plane in range(3):
             at, to = SLOPES + (plane & 3) * STRIDE, PULLS + (plane & 3) * PLANE + (row & 31) * STRIDE
             if inside:
-                for j in range(WIDE if first > 0 or last < WIDE else 0):
-                    scratch[at + j] = scratch[at + j] if first <= j < last else zero
+                for j in range(MARGIN if left == 0 else 0):
+                    scratch[at + j] = zero
+                for j in range(min(rest + MARGIN, WIDE) & 511, WIDE):
+                    scratch[at + j] = zero
                 for j in range(COLUMNS):
                     scratch[to + j] = blur(scratch, at + j, CHANNELS)
             else:
@@ -241,7 +243,7 @@ def _forward(real: type) -> Kernel:
                     if top <= y < bottom:
                         ssim += similarity(scratch, right - left)
                     if reach > 0:
-                        spread_slopes(scratch, inside, MARGIN - left, MARGIN + width - left, 2 * RADIUS + i)
+                        spread_slopes(scratch, inside, left, width - left, 2 * RADIUS + i)
                 scroll(scratch, BLURRED, 4, WIDE)
                 if reach == 0:
                     continue
