@@ -7,23 +7,20 @@ own launch looks at each array for microseconds; here the arguments are written 
 from __future__ import annotations
 
 import ctypes
-import logging
 import math
 import re
-import time
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import torch
-from cuda.core import LaunchConfig, Stream, launch
+from cuda.core import LaunchConfig, ObjectCode, Stream, launch
 from numba import config, cuda, types
 from torch import Tensor
 
+from glassplat.kernels.cuda.cache import ImageCache
 from glassplat.kernels.devices import SIMULATED
-
-log = logging.getLogger("glassplat.kernels")
 
 # Small launches are part of every frame (few cameras, few panes), and Numba warns of each of them.
 config.CUDA_LOW_OCCUPANCY_WARNINGS = 0
@@ -49,7 +46,7 @@ TOKEN = re.compile(r"([a-z]+)([1-4]?)")
 
 
 class Kernel:
-    """A CUDA kernel, compiled at its first launch for each compute capability.
+    """A CUDA kernel, read from the disk or compiled at its first launch on each GPU.
 
     Attributes:
         name: the operation and direction, such as `composite_forward_float32`.
@@ -67,8 +64,8 @@ class Kernel:
         self.bounds = bounds
         self._expected = [Expected(type_) for type_ in signature]
         self._loaded: dict[int, Any] = {}
-        # The simulator knows no bounds.
-        self.dispatcher = cuda.jit(function) if SIMULATED else cuda.jit(function, launch_bounds=bounds)
+        self._images = ImageCache(function, name, signature, bounds)
+        self._simulated = cuda.jit(function) if SIMULATED else None
 
     def __call__(self, blocks: int, threads: int, *arguments: Any) -> None:
         """Launches on torch's current stream of the device of the first tensor; does nothing for no blocks.
@@ -82,9 +79,9 @@ class Kernel:
             return
         if len(arguments) != len(self.signature):
             raise TypeError(f"{self.name} takes {len(self.signature)} arguments, got {len(arguments)}")
-        if SIMULATED:
+        if self._simulated is not None:
             values_of = (e.simulated(argument) for e, argument in zip(self._expected, arguments, strict=True))
-            self.dispatcher[blocks, threads](*values_of)
+            self._simulated[blocks, threads](*values_of)
             return
         device = next(argument.device for argument in arguments if isinstance(argument, Tensor))
         values: list[Any] = []
@@ -93,17 +90,14 @@ class Kernel:
         # Numba keeps a current device of its own, and the threads of a backward pass may have none.
         with cuda.gpus[device.index]:
             stream = Stream.from_handle(torch.cuda.current_stream(device).cuda_stream)
-            launch(stream, LaunchConfig(grid=blocks, block=threads), self._machine_code(device.index), *values)
+            launch(stream, LaunchConfig(grid=blocks, block=threads), self._on_device(device), *values)
 
-    def _machine_code(self, device: int) -> Any:
-        """The kernel for the current device, compiled and loaded at first use."""
-        if device not in self._loaded:
-            log.info("compiling %s for this GPU (first use only) ...", self.name)
-            started = time.perf_counter()
-            compiled = self.dispatcher.compile(self.signature)
-            self._loaded[device] = compiled.library.get_cufunc().kernel
-            log.info("compiled %s in %.1f s", self.name, time.perf_counter() - started)
-        return self._loaded[device]
+    def _on_device(self, device: torch.device) -> Any:
+        """The kernel on a GPU, which has to be the current one, loaded at first use."""
+        if device.index not in self._loaded:
+            code = self._images.machine_code(torch.cuda.get_device_capability(device))
+            self._loaded[device.index] = ObjectCode.from_cubin(code.cubin, name=self.name).get_kernel(code.entry)
+        return self._loaded[device.index]
 
 
 @lru_cache(maxsize=4096)

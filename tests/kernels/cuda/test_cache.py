@@ -1,0 +1,204 @@
+"""Machine code comes from the disk: another process compiles nothing, and a damaged or foreign file does no harm."""
+
+from __future__ import annotations
+
+import logging
+import runpy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("numba_cuda", reason="numba-cuda is not installed; `make setup` installs it")
+
+from numba import config
+
+from glassplat.kernels.cuda import cache, launch
+from glassplat.kernels.cuda.cache import ImageCache
+from glassplat.kernels.devices import SIMULATED
+from tests.kernels.test_cache import printed_by
+from tools.compile_kernels import without_device
+
+if SIMULATED:
+    pytest.skip("the simulator has no compiler", allow_module_level=True)
+
+CAPABILITY = (9, 0)
+SMALL_KERNEL = """
+import hashlib
+import logging
+import sys
+
+import numpy as np
+
+from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.cuda.launch import kernel
+from tools.compile_kernels import without_device
+
+
+def scale_in_place(real):
+    factor = real(2)
+
+    @inlined
+    def scaled(x):
+        return factor * x
+
+    @kernel("scale", real, "real1")
+    def scale(values):
+        for i in range(values.size):
+            values[i] = scaled(values[i])
+
+    return scale
+
+
+logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
+with without_device((9, 0)):
+    code = scale_in_place(np.float32)._images.machine_code((9, 0))
+print(code.entry, hashlib.sha256(code.cubin).hexdigest())
+"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where this test's machine code is kept."""
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    return tmp_path
+
+
+def images(factor: float = 2.0, *, arguments: str = "real1", bounds: tuple[int, int] | None = None) -> ImageCache:
+    """The machine code of a small kernel."""
+    constant = np.float32(factor)
+
+    def scale(values: Any) -> None:
+        values[0] *= constant
+
+    return launch.kernel("scale", np.float32, arguments, bounds=bounds)(scale)._images
+
+
+def made(cached: ImageCache, log: pytest.LogCaptureFixture) -> tuple[Any, int]:
+    """The machine code, and how many times the compiler ran for it."""
+    log.clear()
+    with log.at_level(logging.INFO, logger="glassplat.kernels"), without_device(CAPABILITY):
+        code = cached.machine_code(CAPABILITY)
+    return code, sum(message.startswith("compiling scale_float32 for this GPU") for message in log.messages)
+
+
+def test_a_kernel_is_announced_then_cached_for_other_processes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    script = tmp_path / "small_kernel.py"
+    script.write_text(SMALL_KERNEL)
+    with caplog.at_level(logging.INFO, logger="glassplat.kernels"):
+        runpy.run_path(str(script))
+    assert len(caplog.messages) == 2
+    assert caplog.messages[0] == "compiling scale_float32 for this GPU (first use only, then cached on disk) ..."
+    assert caplog.messages[1].startswith("compiled scale_float32 in")
+    first = capsys.readouterr().out.splitlines()
+    root = str(Path(launch.__file__).parents[3])
+    assert printed_by(script, NUMBA_CACHE_DIR=str(tmp_path), PYTHONPATH=root) == first
+
+
+def test_the_key_tells_apart_whatever_changes_the_machine_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = images().key(CAPABILITY)
+    assert images().key(CAPABILITY) == plain
+    others = [
+        images(3.0).key(CAPABILITY),
+        images(arguments="real2").key(CAPABILITY),
+        images(bounds=(256, 2)).key(CAPABILITY),
+        images().key((8, 0)),
+    ]
+    monkeypatch.setattr(cache, "compiler_versions", lambda: "numba-cuda of another version")
+    others.append(images().key(CAPABILITY))
+    assert len({plain, *others}) == 6
+
+
+def test_each_compute_capability_has_its_file(folder: Path) -> None:
+    codes = []
+    for capability in ((8, 0), (9, 0)):
+        with without_device(capability):
+            codes.append(images().machine_code(capability))
+    assert codes[0].cubin != codes[1].cubin
+    assert sorted(path.name for path in folder.rglob("*.cubin")) == [
+        "scale_float32.sm_80.cubin",
+        "scale_float32.sm_90.cubin",
+    ]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: b"",
+        lambda data: data[:-100],
+        lambda data: data[:200] + bytes([data[200] ^ 1]) + data[201:],
+        lambda data: b"something else altogether",
+        lambda data: data.replace(cache.MAGIC, b"glassplat cubin 0\n"),
+    ],
+    ids=["empty", "cut short", "one bit", "foreign", "other format"],
+)
+def test_a_damaged_or_foreign_file_is_replaced(
+    damage: Callable[[bytes], bytes], folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    made(images(), caplog)
+    (file,) = folder.rglob("*.cubin")
+    file.write_bytes(damage(file.read_bytes()))
+    code, compiled = made(images(), caplog)
+    assert compiled == 1
+    assert made(images(), caplog) == (code, 0)
+
+
+def test_a_file_made_from_other_code_is_replaced(caplog: pytest.LogCaptureFixture) -> None:
+    first, _ = made(images(2.0), caplog)
+    second, compiled = made(images(3.0), caplog)
+    assert compiled == 1
+    assert second.cubin != first.cubin
+
+
+def test_an_interrupted_write_leaves_the_old_file(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    made(images(2.0), caplog)
+    (file,) = folder.rglob("*.cubin")
+    before = file.read_bytes()
+
+    def fails(*arguments: object) -> None:
+        raise OSError("disk is full")
+
+    monkeypatch.setattr("os.replace", fails)
+    code, _ = made(images(3.0), caplog)
+    assert code.cubin[:4] == b"\x7fELF"
+    assert "cannot keep scale_float32 for the next time: disk is full" in caplog.messages
+    assert list(file.parent.iterdir()) == [file]
+    assert file.read_bytes() == before
+
+
+class Loader:
+    """Stands in for the driver, and notes what it is given."""
+
+    def __init__(self) -> None:
+        self.loaded: list[tuple[bytes, str]] = []
+
+    def from_cubin(self, cubin: bytes, *, name: str) -> Loader:
+        self.cubin = cubin
+        return self
+
+    def get_kernel(self, entry: str) -> str:
+        self.loaded.append((self.cubin, entry))
+        return f"kernel {len(self.loaded)}"
+
+
+def test_the_loader_gets_what_the_disk_has(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    loader = Loader()
+    monkeypatch.setattr(launch, "ObjectCode", loader)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: CAPABILITY)
+    kept, _ = made(images(), caplog)
+    caplog.clear()
+    scale = launch.Kernel(images()._function, "scale_float32", images()._signature, None)
+    first, second = torch.device("cuda", 0), torch.device("cuda", 1)
+    with caplog.at_level(logging.INFO, logger="glassplat.kernels"):
+        assert scale._on_device(first) == "kernel 1"
+        assert scale._on_device(second) == "kernel 2"
+        assert scale._on_device(first) == "kernel 1"
+    assert loader.loaded == [(kept.cubin, kept.entry)] * 2
+    assert caplog.messages == []
