@@ -43,7 +43,7 @@ def all_kernels(real: type = np.float32) -> list[Any]:
         for value in vars(module).values()
         if isinstance(value, _lru_cache_wrapper)
         and value.__module__ == module.__name__
-        and next(iter(inspect.signature(value).parameters)) == "real"
+        and next(iter(inspect.signature(value).parameters), None) == "real"
     }
     return sorted((factory(real) for factory in factories), key=lambda kernel: str(kernel.name))
 

@@ -80,18 +80,20 @@ def composite(
         if not 0 <= deviation.channel < channels.shape[2]:
             raise ValueError(f"deviation.channel is {deviation.channel}, but there are {channels.shape[2]} channels")
     check_tensors(expected)
-    return Composite(*_Composite.apply(*splats, channels, marks, bins, num_primary, deviation))
+    needs_gradients = torch.is_grad_enabled() and any(t.requires_grad for t in (*splats[:3], channels, marks))
+    return Composite(*_Composite.apply(*splats, channels, marks, bins, num_primary, deviation, needs_gradients))
 
 
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        *tensors, bins, num_primary, deviation = arguments
+        *tensors, bins, num_primary, deviation, needs_gradients = arguments
         *fields, channels, marks = (tensor.detach().contiguous() for tensor in tensors)
         splats = Splats(*fields)
         *outputs, saved = kernels_for("composite", channels.device).composite(
-            splats, channels, bins, marks=marks, num_primary=num_primary, deviation=deviation
-        )
+            splats, channels, bins,
+            marks=marks, num_primary=num_primary, deviation=deviation, needs_gradients=needs_gradients,
+        )  # fmt: skip
         ctx.save_for_backward(*splats, channels, marks)
         ctx.bins, ctx.num_primary, ctx.deviation, ctx.saved = bins, num_primary, deviation, saved
         return tuple(outputs)
@@ -105,4 +107,4 @@ class _Composite(torch.autograd.Function):
             Splats(*fields), channels, ctx.bins, ctx.saved, v_outputs,
             marks=marks, num_primary=ctx.num_primary, deviation=ctx.deviation,
         )  # fmt: skip
-        return v_means, v_conics, v_opacities, None, None, v_channels, v_marks, None, None, None
+        return v_means, v_conics, v_opacities, None, None, v_channels, v_marks, None, None, None, None

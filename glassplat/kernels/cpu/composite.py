@@ -39,9 +39,13 @@ class Saved(NamedTuple):
 
 
 def composite(
-    splats: Splats, channels: Tensor, bins: TileBins, *, marks: Tensor, num_primary: int, deviation: Deviation | None
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Saved]:
-    """Image [C, H, W, D], alpha, mask and deviation [C, H, W], and what `composite_gradients` starts from."""
+    splats: Splats, channels: Tensor, bins: TileBins,
+    *, marks: Tensor, num_primary: int, deviation: Deviation | None, needs_gradients: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Saved]:  # fmt: skip
+    """Image [C, H, W, D], alpha, mask and deviation [C, H, W], and what `composite_gradients` starts from.
+
+    That is little here, and kept whether gradients are needed or not.
+    """
     real = tile.real_of(splats)
     cameras, count, num_channels = channels.shape
     shape = (bins.num_cameras, bins.height, bins.width)

@@ -14,10 +14,10 @@ import torch
 from numba import cuda
 from torch import Tensor
 
-from glassplat.kernels.cuda.composite_backward import composite_backward
-from glassplat.kernels.cuda.launch import Kernel, kernel
+from glassplat.kernels.cuda.composite_backward import PULLS, THREADS, WARPS, composite_backward, composite_pulls
+from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
 from glassplat.kernels.cuda.pair_gradients import new_pair_rows, sum_pair_rows
-from glassplat.kernels.cuda.tile import GEOMETRY, MEMBER, MEMBERSHIP, PIXELS, tile_steps
+from glassplat.kernels.cuda.tile import BUCKET, GEOMETRY, MEMBER, MEMBERSHIP, PIXELS, tile_steps
 from glassplat.kernels.maths_blend import TRANSMITTANCE_MIN, blend_maths
 from glassplat.kernels.splats import LEAST_ALPHA, TILE, Deviation, Splats, TileBins
 from glassplat.kernels.tensor_checks import REAL_OF
@@ -29,45 +29,61 @@ class Saved(NamedTuple):
     final [A, 2, 256]: both transmittances of each pixel of the active tiles.
     last [A, 2, 256] int32: the last pair, counted from the tile's first, that each pixel blended, -1 for none.
     looked_at [A] int32: how many pairs of each tile any pixel blended, those in between included.
+    bucket_tiles [B] int32: the active tile that each bucket belongs to, -1 for buckets that none has.
+    kept [B, D + 1, 256], with glass [B, D + 3, 256]: of each pixel that had not stopped, its transmittance before the
+        first pair of a bucket, what its channels had gathered, its second transmittance, and what its mask had.
+    kept_spread [B, 256]: what the deviation had gathered there, where it was asked for.
     center, lean [C, H, W]: of the channel whose deviation was asked for, as on the CPU.
-    alpha [C, H, W]: the coverage.
+    outputs: image, alpha, mask and deviation.
+
+    B is 0 where no gradients are needed.
     """
 
     final: Tensor
     last: Tensor
     looked_at: Tensor
+    bucket_tiles: Tensor
+    kept: Tensor
+    kept_spread: Tensor
     center: Tensor
     lean: Tensor
-    alpha: Tensor
+    outputs: tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def composite(
-    splats: Splats, channels: Tensor, bins: TileBins, *, marks: Tensor, num_primary: int, deviation: Deviation | None
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Saved]:
+    splats: Splats, channels: Tensor, bins: TileBins,
+    *, marks: Tensor, num_primary: int, deviation: Deviation | None, needs_gradients: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Saved]:  # fmt: skip
     """As `glassplat.kernels.cpu.composite.composite`."""
     real, (_, count, num_channels) = REAL_OF[channels.dtype], channels.shape
     shape, tiles = (bins.num_cameras, bins.height, bins.width), len(bins.active)
     image, alpha, mask = (channels.new_zeros(s) for s in ((*shape, num_channels), shape, shape))
     deviated, center, lean = (channels.new_zeros(shape if deviation else (0, 0, 0)) for _ in range(3))
+    buckets = len(bins.pair_splats) // BUCKET + tiles if needs_gradients else 0
+    planes = num_channels + (1 if num_primary == count else 3)
     saved = Saved(
         channels.new_empty(tiles, 2, PIXELS),
         torch.empty(tiles, 2, PIXELS, dtype=torch.int32, device=channels.device),
         torch.empty(tiles, dtype=torch.int32, device=channels.device),
+        torch.full((buckets,), -1, dtype=torch.int32, device=channels.device),
+        channels.new_empty(buckets, planes, PIXELS),
+        channels.new_empty(buckets if deviation else 0, PIXELS),
         center,
         lean,
-        alpha,
+        # Without their history: it holds this record, and would keep itself alive.
+        (image.detach(), alpha.detach(), mask.detach(), deviated.detach()),
     )
     lists = (bins.pair_splats, bins.tile_offsets, bins.active)
     geometry = flat_geometry(splats)
     values = channels.view(-1, num_channels)
     composite_forward(real, num_channels)(
-        tiles, PIXELS, *geometry, values, marks, count, num_primary, *lists, *saved[:3], image, alpha, mask
+        tiles, PIXELS, *geometry, values, marks, count, num_primary, *lists, *saved[:5], image, alpha, mask
     )
     if deviation:
         where = deviation.where.detach().contiguous()
         composite_deviation(real)(
             tiles, PIXELS, *geometry, values, count, num_primary, deviation.channel, where, *lists, *saved[1:3],
-            image, alpha, center, lean, deviated,
+            saved.kept_spread, image, alpha, center, lean, deviated,
         )  # fmt: skip
     return image, alpha, mask, deviated, saved
 
@@ -77,18 +93,25 @@ def composite_gradients(
     *, marks: Tensor, num_primary: int, deviation: Deviation | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """As `glassplat.kernels.cpu.composite.composite_gradients`."""
-    real, (_, count, num_channels) = REAL_OF[channels.dtype], channels.shape
+    real, (_, count, num_channels), tiles = REAL_OF[channels.dtype], channels.shape, len(bins.active)
     v_image, v_alpha, v_mask, v_deviation = v_outputs
-    channel = -1
+    image, _, mask, deviated = saved.outputs
+    channel, v_spread = -1, v_deviation
     if deviation:
-        channel, v_deviation = deviation.channel, v_deviation * deviation.where
+        channel, v_spread = deviation.channel, v_deviation * deviation.where
         if deviation.through_mean:
-            v_image, v_alpha = through_mean(v_image, v_alpha, v_deviation, saved, channel)
+            v_image, v_alpha = through_mean(v_image, v_alpha, v_spread, saved, channel)
+    pulls = channels.new_empty(tiles, num_channels + PULLS, PIXELS)
+    composite_pulls(real, num_channels)(
+        tiles, PIXELS, channel, bins.active, saved.final, saved.center, image, mask, deviated,
+        *(v.contiguous() for v in (v_image, v_alpha, v_mask, v_deviation, v_spread)), pulls,
+    )  # fmt: skip
     rows = new_pair_rows(bins, channels)
     composite_backward(real, num_channels)(
-        len(bins.active), PIXELS, *flat_geometry(splats), channels.view(-1, num_channels), marks, count, num_primary,
-        channel, bins.pair_splats, bins.tile_offsets, bins.active, *saved[:4],
-        *(v.contiguous() for v in (v_image, v_alpha, v_mask, v_deviation)), rows,
+        blocks_for(len(saved.bucket_tiles), WARPS), THREADS, *flat_geometry(splats), channels.view(-1, num_channels),
+        marks, count, num_primary, channel, bins.width, bins.height, bins.pair_splats, bins.tile_offsets, bins.active,
+        saved.last.view(-1), saved.looked_at, saved.bucket_tiles, saved.kept.view(-1), saved.kept_spread.view(-1),
+        pulls.view(-1), rows,
     )  # fmt: skip
     v_means, v_conics, v_opacities, v_values = sum_pair_rows(rows, bins, splats)
     v_marks = torch.zeros_like(marks)
@@ -102,8 +125,9 @@ def through_mean(
     v_image: Tensor, v_alpha: Tensor, v_deviation: Tensor, saved: Saved, channel: int
 ) -> tuple[Tensor, Tensor]:
     """Adds what the deviation's gradient does through the mean, which is the channel's sum over the coverage."""
-    covered = saved.alpha > LEAST_ALPHA
-    v_sum = torch.where(covered, -v_deviation * saved.lean / torch.where(covered, saved.alpha, 1), 0)
+    alpha = saved.outputs[1]
+    covered = alpha > LEAST_ALPHA
+    v_sum = torch.where(covered, -v_deviation * saved.lean / torch.where(covered, alpha, 1), 0)
     v_image = v_image.clone()
     v_image[..., channel] += v_sum
     return v_image, v_alpha - v_sum * saved.center
@@ -124,11 +148,11 @@ def composite_forward(real: type, num_channels: int = 4) -> Kernel:
     @kernel(
         f"composite_forward_{num_channels}",
         real,
-        "real2 real2 real1 real2 real2 int int int1 long1 int1 real3 int3 int1 real4 real3 real3",
+        "real2 real2 real1 real2 real2 int int int1 long1 int1 real3 int3 int1 int1 real3 real4 real3 real3",
     )
     def forward(
         means, conics, opacities, channels, marks, splats_per_camera, num_primary, pair_splats, tile_offsets, active,
-        final, last, looked_at, image, alpha, mask,
+        final, last, looked_at, bucket_tiles, kept, image, alpha, mask,
     ):  # fmt: skip
         geometry = cuda.shared.array((GEOMETRY, PIXELS), real)
         membership = cuda.shared.array((MEMBERSHIP, PIXELS), np.int32)
@@ -145,10 +169,13 @@ def composite_forward(real: type, num_channels: int = 4) -> Kernel:
         if pixel == 0:
             most[0] = 0
         start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
+        keeps, keeps_glass = bucket_tiles.size > 0, num_primary < splats_per_camera
         for first in range(start, stop, PIXELS):
             if not cuda.syncthreads_or(1 if running else 0):
                 break
             if first + pixel < stop:
+                if keeps and pixel % BUCKET == 0:
+                    bucket_tiles[start // BUCKET + n + (first + pixel - start) // BUCKET] = n
                 load(
                     geometry, membership, pixel, pair_splats[first + pixel], means, conics, opacities, x0, y0, num_rows
                 )
@@ -156,6 +183,13 @@ def composite_forward(real: type, num_channels: int = 4) -> Kernel:
             for i in range(min(PIXELS, stop - first)):
                 if not running:
                     break
+                if keeps and i % BUCKET == 0:
+                    bucket = start // BUCKET + n + (first + i - start) // BUCKET
+                    kept[bucket, 0, pixel] = t
+                    for d in range(num_channels):
+                        kept[bucket, 1 + d, pixel] = sums[d]
+                    if keeps_glass:
+                        kept[bucket, num_channels + 1, pixel], kept[bucket, num_channels + 2, pixel] = t_glass, shown
                 a = clipped_alpha(coverage(geometry, membership, i, column, row))
                 if not a > zero:
                     continue
@@ -204,11 +238,11 @@ def composite_deviation(real: type) -> Kernel:
     @kernel(
         "composite_deviation",
         real,
-        "real2 real2 real1 real2 int int int real3 int1 long1 int1 int3 int1 real4 real3 real3 real3 real3",
+        "real2 real2 real1 real2 int int int real3 int1 long1 int1 int3 int1 real2 real4 real3 real3 real3 real3",
     )
     def deviate(
         means, conics, opacities, channels, splats_per_camera, num_primary, channel, where,
-        pair_splats, tile_offsets, active, last, looked_at, image, alpha, center, lean, deviation,
+        pair_splats, tile_offsets, active, last, looked_at, kept_spread, image, alpha, center, lean, deviation,
     ):  # fmt: skip
         geometry = cuda.shared.array((GEOMETRY, PIXELS), real)
         membership = cuda.shared.array((MEMBERSHIP, PIXELS), np.int32)
@@ -235,6 +269,8 @@ def composite_deviation(real: type) -> Kernel:
                 )
             cuda.syncthreads()
             for i in range(min(PIXELS, stop - first)):
+                if kept_spread.shape[0] > 0 and i % BUCKET == 0:
+                    kept_spread[start // BUCKET + n + (first + i - start) // BUCKET, pixel] = spread
                 s = membership[MEMBER, i]
                 if first + i - start > last_order or s - camera * splats_per_camera >= num_primary:
                     continue

@@ -13,6 +13,13 @@ from glassplat.kernels.splats import TILE
 
 PIXELS = TILE * TILE
 
+BUCKET = 32
+"""Consecutive pairs of a tile that a warp takes in the backward pass, one for each lane.
+
+Bucket `k` of the n-th active tile, whose pairs begin at `start`, has the number `start // BUCKET + n + k`, which no
+other bucket has.
+"""
+
 # Rows of a splat's geometry in shared memory; the mean is relative to the tile's corner.
 MEAN_X, MEAN_Y, FORM_XX, FORM_XY, FORM_YY, OPACITY, GEOMETRY = 0, 1, 2, 3, 4, 5, 6
 FIRST, LAST, MEMBER, MEMBERSHIP = 0, 1, 2, 3

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -22,7 +23,7 @@ from glassplat.kernels import pane_hits as hits_operation
 from glassplat.kernels import photometric as photometric_operation
 from glassplat.kernels import project as project_operation
 from glassplat.kernels import shade_environment as shade_operation
-from glassplat.kernels.devices import SIMULATED, cuda_problem
+from glassplat.kernels.devices import SIMULATED, cuda_problem, kernels_for
 from glassplat.kernels.panes import Panes
 from glassplat.kernels.reference import adam as adam_twin
 from glassplat.kernels.reference import bin_tiles as bin_twin
@@ -159,36 +160,33 @@ def test_bin_tiles_of_hardly_any_splats(random_splats: SplatMaker, count: int) -
     assert found.splat_offsets.shape == (count + 1,)
 
 
+Size = tuple[int, int]
+
+
 def blended(
-    splats: Splats, channels: Tensor, marks: Tensor, deviation: Deviation | None, module: Any, binning: Any
+    splats: Splats, channels: Tensor, marks: Tensor, deviation: Deviation | None, modules: Any, size: Size
 ) -> list[Tensor]:
-    """Image, alpha, mask and deviation of two cameras with glass."""
+    """Image, alpha, mask and deviation of all cameras with glass; the last camera's first tile is left out."""
+    binning, blending = modules
     primary = splats.depths.shape[1] - marks.shape[1]
-    mask = torch.ones(splats.depths.shape[0], *bin_operation.tile_grid(WIDTH, HEIGHT), dtype=torch.bool)
+    mask = torch.ones(splats.depths.shape[0], *bin_operation.tile_grid(*size), dtype=torch.bool)
     mask[-1, 0, 0] = False
-    bins = binning.bin_tiles(splats, WIDTH, HEIGHT, mask.to(channels.device))
-    return list(module.composite(splats, channels, bins, marks=marks, num_primary=primary, deviation=deviation))
+    bins = binning.bin_tiles(splats, *size, mask.to(channels.device))
+    return list(blending.composite(splats, channels, bins, marks=marks, num_primary=primary, deviation=deviation))
 
 
-@pytest.mark.parametrize(
-    ("mean", "dtype"),
-    [(None, torch.float64), (True, torch.float64), (False, torch.float32)]
-    if SIMULATED
-    else [(mean, dtype) for mean in (None, False, True) for dtype in DTYPES],
-)
-def test_composite(random_splats: SplatMaker, mean: bool | None, dtype: torch.dtype) -> None:
-    count, glass = many(22, 300), many(6, 80)
-    opacities = (0.3, 0.999)
-    splats = random_splats((2, count), (WIDTH, HEIGHT), dtype=dtype, opacities=opacities, sigmas=(2.0, 9.0))
+def check_composite(splats: Splats, glass: int, mean: bool | None, size: Size) -> None:
+    """All outputs and gradients agree, the last `glass` splats being glass, with a deviation unless `mean` is None."""
+    (cameras, count), dtype = splats.depths.shape, splats.depths.dtype
     splats = Splats(*(tensor.requires_grad_(i < 3) for i, tensor in enumerate(splats)))
-    channels = draw(2, count, 4, seed=11).to(dtype).requires_grad_()
-    marks = draw(2, glass, seed=12).to(dtype).sigmoid().requires_grad_()
-    where = draw(2, HEIGHT, WIDTH, seed=13).to(dtype).clamp(min=0)
+    channels = draw(cameras, count, 4, seed=11).to(dtype).requires_grad_()
+    marks = draw(cameras, glass, seed=12).to(dtype).sigmoid().requires_grad_()
+    where = draw(cameras, *reversed(size), seed=13).to(dtype).clamp(min=0)
     own_splats, own_channels, own_marks = on_device(splats), on_device(channels), on_device(marks)
     request = None if mean is None else Deviation(3, where, mean)
     own_request = None if mean is None else Deviation(3, where.to(DEVICE), mean)
-    found = blended(own_splats, own_channels, own_marks, own_request, composite_operation, bin_operation)
-    expected = blended(splats, channels, marks, request, composite_twin, bin_twin)
+    found = blended(own_splats, own_channels, own_marks, own_request, (bin_operation, composite_operation), size)
+    expected = blended(splats, channels, marks, request, (bin_twin, composite_twin), size)
     for value, want in zip(found, expected, strict=True):
         close(value, want)
     outputs = 3 if mean is None else 4
@@ -196,14 +194,40 @@ def test_composite(random_splats: SplatMaker, mean: bool | None, dtype: torch.dt
     check_gradients(found[:outputs], expected[:outputs], own, [*splats[:3], channels, marks])
 
 
+@pytest.mark.parametrize(
+    ("mean", "dtype", "size"),
+    [
+        (None, torch.float64, (WIDTH, HEIGHT)),
+        # In the simulator every row of a tile takes a second.
+        (True, torch.float64, (19, 5)),
+        (False, torch.float32, (18, 4)),
+    ]
+    if SIMULATED
+    else [(mean, dtype, (WIDTH, HEIGHT)) for mean in (None, False, True) for dtype in DTYPES],
+)
+def test_composite(random_splats: SplatMaker, mean: bool | None, dtype: torch.dtype, size: Size) -> None:
+    shape = (2, many(22, 300))
+    splats = random_splats(shape, size, dtype=dtype, opacities=(0.3, 0.999), sigmas=(2.0, 9.0))
+    check_composite(splats, many(6, 80), mean, size)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_composite_of_many_splats_of_one_tile(random_splats: SplatMaker, dtype: torch.dtype) -> None:
+    size, shape = (7, 3), (2, many(100, 1000))
+    splats = random_splats(shape, size, dtype=dtype, opacities=(0.01, many(40, 10) / 100), sigmas=(2.0, 9.0))
+    assert bin_twin.bin_tiles(splats, *size).tile_offsets[1] > 64
+    check_composite(splats, many(25, 200), True, size)
+
+
 @pytest.mark.parametrize(("count", "channels"), [(0, 3), (1, 1), (many(18, 60), 12)])
 def test_composite_without_glass(random_splats: SplatMaker, count: int, channels: int) -> None:
-    splats = random_splats((1, count), (WIDTH, HEIGHT))
+    size = WIDTH, many(6, HEIGHT)
+    splats = random_splats((1, count), size)
     splats = Splats(*(tensor.requires_grad_(i < 3) for i, tensor in enumerate(splats)))
     values = draw(1, count, channels, seed=3).requires_grad_()
     own, own_values = on_device(splats), on_device(values)
-    found = composite_operation.composite(own, own_values, bin_operation.bin_tiles(own, WIDTH, HEIGHT))
-    expected = composite_twin.composite(splats, values, bin_twin.bin_tiles(splats, WIDTH, HEIGHT))
+    found = composite_operation.composite(own, own_values, bin_operation.bin_tiles(own, *size))
+    expected = composite_twin.composite(splats, values, bin_twin.bin_tiles(splats, *size))
     close(found.image, expected.image)
     close(found.alpha, expected.alpha)
     if count:
@@ -353,12 +377,13 @@ def test_adam(columns: bool, dtype: torch.dtype) -> None:
 
 
 def test_the_result_has_the_same_bits_every_time(random_splats: SplatMaker) -> None:
-    splats = on_device(random_splats((1, many(20, 2000)), (WIDTH, HEIGHT), dtype=torch.float32))
+    size = WIDTH, many(3, HEIGHT)
+    splats = on_device(random_splats((1, many(40, 2000)), size, dtype=torch.float32))
     splats = Splats(*(tensor.requires_grad_(i < 3) for i, tensor in enumerate(splats)))
     channels = draw(1, splats.depths.shape[1], 4, seed=2).float().to(DEVICE)
     results = []
     for _ in range(2):
-        image = composite_operation.composite(splats, channels, bin_operation.bin_tiles(splats, WIDTH, HEIGHT)).image
+        image = composite_operation.composite(splats, channels, bin_operation.bin_tiles(splats, *size)).image
         results.append((image, *torch.autograd.grad(image.square().sum(), splats[:3])))
     for first, second in zip(*results, strict=True):
         assert torch.equal(first, second)
@@ -369,3 +394,31 @@ def test_raw_gaussians_are_left_as_they_were() -> None:
     before = [tensor.clone() for tensor in gaussians]
     project_operation.project(gaussians, on_device(random_cameras(1)), sh_degree=3, near=0.1)
     assert all(torch.equal(tensor, copy) for tensor, copy in zip(gaussians, before, strict=True))
+
+
+def test_what_gradients_need_is_stored_only_for_them_and_freed_with_the_image(
+    random_splats: SplatMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    splats = on_device(random_splats((1, 3), (4, 2)))
+    colors = draw(1, 3, 3, seed=1).to(DEVICE)
+    bins = bin_operation.bin_tiles(splats, 4, 2)
+    module = kernels_for("composite", DEVICE)
+    composite, stored = module.composite, []
+
+    def noting(*arguments: Any, **options: Any) -> Any:
+        result = composite(*arguments, **options)
+        stored.append(weakref.ref(result[-1].kept))
+        sizes.append(result[-1].kept.numel())
+        return result
+
+    sizes: list[int] = []
+    monkeypatch.setattr(module, "composite", noting)
+    composite_operation.composite(splats, colors, bins)
+    with torch.no_grad():
+        composite_operation.composite(splats, colors.requires_grad_(), bins)
+    kept = composite_operation.composite(splats, colors, bins)
+    assert sizes[:2] == [0, 0]
+    assert sizes[2] > 0
+    assert stored[2]() is not None
+    del kept
+    assert stored[2]() is None
