@@ -1,7 +1,8 @@
-"""Binning on the GPU: two passes over the splats, one to count and one to write their tiles; torch scans and sorts.
+"""Binning on the GPU: one pass over the splats to count their tiles, one over the pairs; torch scans and sorts.
 
 Splats are sorted by depth first. Their pairs are written in that order, so that one stable sort of the pairs by tile,
-an integer of 16 bits for all but very large images, leaves each tile's splats nearest first.
+an integer of 16 bits for all but very large images, leaves each tile's splats nearest first. Each pair has a thread,
+which searches the sums of the counts for its splat: no thread waits for one that covers the whole image.
 """
 
 from __future__ import annotations
@@ -32,9 +33,8 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
     shapes = (splats.means2d.view(count, 2), splats.conics.view(count, 3), splats.opacities.view(count))
     radii = splats.radii.view(count, 2)
     mask = radii.new_zeros(0, 0, 0, dtype=torch.bool) if active_tiles is None else active_tiles
-    blocks = blocks_for(count, THREADS)
     counts = torch.empty(count, dtype=torch.int32, device=device)
-    count_tiles(real)(blocks, THREADS, *shapes, radii, mask, per_camera, width, height, counts)
+    count_tiles(real)(blocks_for(count, THREADS), THREADS, *shapes, radii, mask, per_camera, width, height, counts)
     splat_offsets = torch.zeros(count + 1, dtype=torch.int64, device=device)
     torch.cumsum(counts, 0, out=splat_offsets[1:])
     num_pairs = int(splat_offsets[-1])
@@ -43,8 +43,8 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
     tiles = torch.empty(num_pairs, dtype=torch.int16 if narrow else torch.int32, device=device)
     members, slots = torch.empty(2, num_pairs, dtype=torch.int32, device=device)
     emit_tiles(real, np.int16 if narrow else np.int32)(
-        blocks, THREADS, *shapes, radii, mask, per_camera, width, height, num_tiles,
-        splat_offsets, _starts_by_depth(splats.depths, counts), tiles, members, slots,
+        blocks_for(num_pairs, THREADS), THREADS, *shapes, radii, mask, per_camera, width, height, num_tiles,
+        *_sequence(splats.depths, counts), splat_offsets, tiles, members, slots,
     )  # fmt: skip
     by_tile, order = torch.sort(tiles, stable=True)
     edges = torch.arange(num_tiles + 1, dtype=tiles.dtype, device=device)
@@ -58,15 +58,13 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
     return TileBins(members[order], tile_offsets, pair_slots, splat_offsets, active, width, height, num_cameras)
 
 
-def _starts_by_depth(depths: Tensor, counts: Tensor) -> Tensor:
-    """Where each splat's pairs begin [S] when the splats of each camera are in the order of their depths."""
+def _sequence(depths: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+    """The splats [S] in the order of their depths, camera by camera, and how many pairs those before each have."""
     num_cameras, per_camera = depths.shape
     first = torch.arange(num_cameras, device=depths.device)[:, None] * per_camera
     order = (torch.argsort(depths, dim=1, stable=True) + first).flatten()
     in_order = counts[order].long()
-    starts = torch.empty_like(in_order)
-    starts[order] = in_order.cumsum(0) - in_order
-    return starts
+    return order, in_order.cumsum(0) - in_order
 
 
 def _spans(real: type) -> tuple[Scalar, Scalar]:
@@ -127,41 +125,62 @@ def count_tiles(real: type) -> Kernel:
     return count
 
 
+def _search() -> Scalar:
+    @inlined
+    def search(values, x):
+        """The last of ascending values that is at most x; the first is."""
+        low, high = 0, values.size
+        while high - low > 1:
+            middle = (low + high) // 2
+            if values[middle] <= x:
+                low = middle
+            else:
+                high = middle
+        return low
+
+    return search
+
+
 @cache
 def emit_tiles(real: type, key: type = np.int16) -> Kernel:
-    """Writes the tile, the splat and the slot of every pair, from each splat's start on."""
+    """Writes the tile, the splat and the slot of every pair."""
     rows_of, columns_of = _spans(real)
+    search = _search()
     keys = "short1" if key is np.int16 else "int1"
 
     @kernel(
         f"emit_tiles_{np.dtype(key).name}",
         real,
-        f"real2 real2 real1 real2 bool3 int int int int long1 long1 {keys} int1 int1",
+        f"real2 real2 real1 real2 bool3 int int int int long1 long1 long1 {keys} int1 int1",
     )
     def emit(
         means2d, conics, opacities, radii, active_tiles, per_camera, width, height, num_tiles,
-        splat_offsets, starts, tiles, members, slots,
+        order, starts, splat_offsets, tiles, members, slots,
     ):  # fmt: skip
-        s = cuda.grid(1)
-        if s >= starts.size:
+        pair = cuda.grid(1)
+        if pair >= tiles.size:
             return
-        slot, end = splat_offsets[s], splat_offsets[s + 1]
-        if slot == end:
-            return
-        masked, camera, at = active_tiles.size > 0, s // per_camera, starts[s] - slot
+        place = search(starts, pair)
+        s, left_over = order[place], pair - starts[place]
+        members[pair], slots[pair] = s, splat_offsets[s] + left_over
+        masked, camera = active_tiles.size > 0, s // per_camera
         grid_rows, grid_columns = (height + TILE - 1) // TILE, (width + TILE - 1) // TILE
         rows = rows_of(means2d, conics, opacities, radii, s, height)
         for row in range(rows[0] // TILE, rows[1] // TILE + 1):
             left, right = columns_of(means2d, conics, s, row, rows, width)
-            for column in range(left, right + 1):
-                if slot < end and (not masked or active_tiles[camera, row, column]):
-                    tiles[at + slot] = key((camera * grid_rows + row) * grid_columns + column)
-                    members[at + slot], slots[at + slot] = s, slot
-                    slot += 1
+            if masked:
+                for column in range(left, right + 1):
+                    if active_tiles[camera, row, column]:
+                        if left_over == 0:
+                            tiles[pair] = key((camera * grid_rows + row) * grid_columns + column)
+                            return
+                        left_over -= 1
+            elif left_over <= right - left:
+                tiles[pair] = key((camera * grid_rows + row) * grid_columns + left + left_over)
+                return
+            else:
+                left_over -= right - left + 1
         # Should the two passes ever round differently, what is left over goes behind the last tile, where none looks.
-        while slot < end:
-            tiles[at + slot] = key(num_tiles)
-            members[at + slot], slots[at + slot] = s, slot
-            slot += 1
+        tiles[pair] = key(num_tiles)
 
     return emit

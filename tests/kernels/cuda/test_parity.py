@@ -9,6 +9,7 @@ import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -158,6 +159,37 @@ def test_bin_tiles_of_hardly_any_splats(random_splats: SplatMaker, count: int) -
     found = bin_operation.bin_tiles(on_device(splats), WIDTH, HEIGHT)
     assert listed(bin_twin.bin_tiles(splats, WIDTH, HEIGHT)) <= listed(found)
     assert found.splat_offsets.shape == (count + 1,)
+
+
+def test_splats_of_very_different_sizes_are_listed_in_their_tiles(random_splats: SplatMaker) -> None:
+    size = 70, 50
+    splats = random_splats((2, many(9, 900)), size, sigmas=(0.3, 9.0))
+    splats.conics[1, 4] = torch.tensor([1e-6, 0.0, 1e-6])
+    splats.radii[1, 4] = 1000
+    found, expected = bin_operation.bin_tiles(on_device(splats), *size), bin_twin.bin_tiles(splats, *size)
+    assert found.splat_offsets.diff()[splats.depths.shape[1] + 4] == 20
+    assert listed(expected) <= listed(found)
+    assert len(listed(found) - listed(expected)) <= 0.02 * len(listed(expected)) + 1
+
+
+def test_pairs_that_were_counted_but_not_found_end_behind_the_last_tile(
+    random_splats: SplatMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    splats = on_device(random_splats((1, 6), (WIDTH, HEIGHT)))
+    expected = bin_operation.bin_tiles(splats, WIDTH, HEIGHT)
+    module = kernels_for("bin_tiles", DEVICE)
+    count = module.count_tiles(np.float64)
+
+    def one_more(*arguments: Any) -> None:
+        count(*arguments)
+        arguments[-1].add_(1)
+
+    monkeypatch.setattr(module, "count_tiles", lambda real: one_more)
+    found = bin_operation.bin_tiles(splats, WIDTH, HEIGHT)
+    assert torch.equal(found.tile_offsets, expected.tile_offsets)
+    assert torch.equal(found.pair_splats[: len(expected.pair_splats)], expected.pair_splats)
+    assert found.pair_splats[len(expected.pair_splats) :].sort().values.tolist() == list(range(6))
+    assert found.pair_slots.sort().values.tolist() == list(range(len(expected.pair_splats) + 6))
 
 
 Size = tuple[int, int]
