@@ -1,0 +1,80 @@
+"""The benchmark of the GPU: what can be known of it without one."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.gpu_roofline import Counts, Peaks, backward_demand, forward_demand
+from bench.gpu_training import beside_the_cpu
+from glassplat.kernels.devices import SIMULATED
+
+ROOT = Path(__file__).parents[2]
+WITHOUT_NUMBA_CUDA = """
+import sys
+sys.modules["numba_cuda"] = None
+sys.argv = ["bench.gpu"]
+from bench.gpu import main
+sys.exit(main())
+"""
+
+
+def test_without_a_gpu_and_without_numba_cuda_it_says_so_in_one_line() -> None:
+    environment = os.environ | {"CUDA_VISIBLE_DEVICES": "", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", WITHOUT_NUMBA_CUDA]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert len(done.stderr.splitlines()) == 1
+    assert done.stderr.startswith("no GPU to measure: ")
+
+
+def test_the_bound_is_the_scarcer_of_arithmetic_and_memory() -> None:
+    counts = Counts(pairs=1000, evaluations=100_000, buckets=40, pixels=5000, channels=3)
+    forward, backward = forward_demand(counts), backward_demand(counts)
+    assert forward.multiply_adds == 1_800_000
+    assert forward.bytes == 1000 * 40 + 40 * 256 * 16 + 5000 * 36
+    assert backward.multiply_adds == 2 * forward.multiply_adds
+    assert backward.bytes == forward.bytes + 1000 * 36
+    assert forward.seconds_at(Peaks(multiply_adds=1e6, bytes=1e12)) == 1.8
+    assert forward.seconds_at(Peaks(multiply_adds=1e12, bytes=forward.bytes / 3)) == pytest.approx(3.0)
+
+
+RESULTS = {"method": "planar", "iterations": 7000, "seed": 0, "downscale": 1.0, "psnr": 30.25, "lpips": "no weights"}
+
+
+def test_the_quality_stands_beside_that_of_the_same_run_on_the_cpu() -> None:
+    recorded = RESULTS | {"psnr": 30.3, "train_seconds": 900.0}
+    text = beside_the_cpu(RESULTS, recorded, 70.0, Path("captures/showcase")).markdown()
+    assert "planar on showcase, 7,000 iterations" in text
+    assert "| training, s | 70 | 900 |  |" in text
+    assert "| psnr | 30.250 | 30.300 | -0.050 |" in text
+    assert "lpips" not in text
+
+
+def test_without_the_cpus_run_it_names_the_command() -> None:
+    text = beside_the_cpu(RESULTS, {}, 70.0, Path("captures/showcase")).markdown()
+    assert "`glassplat train planar --data captures/showcase --output runs/cpu --iterations 7000 --device cpu`" in text
+    assert "| psnr | 30.250 |  |  |" in text
+
+
+def test_another_run_is_not_compared() -> None:
+    with pytest.raises(ValueError, match=r"the run on the CPU is .*'iterations': 300"):
+        beside_the_cpu(RESULTS, RESULTS | {"iterations": 300}, 70.0, Path("showcase"))
+
+
+@pytest.mark.skipif(SIMULATED, reason="the simulator has no compiler")
+@pytest.mark.filterwarnings("ignore::numba.core.errors.NumbaPerformanceWarning")
+def test_the_peak_is_measured_with_multiply_adds() -> None:
+    pytest.importorskip("numba_cuda", reason="numba-cuda is not installed; `make setup` installs it")
+    from bench.gpu_peaks import CHAINS, multiply_adds
+    from tools.compile_kernels import ptx_of
+
+    (text,) = ptx_of(multiply_adds(np.float32), [(9, 0)])
+    assert text.count("fma.rn.f32") >= CHAINS
+    assert "mul.f32" not in text
