@@ -206,13 +206,14 @@ def gsplat_works(scene: Scene, view: View) -> dict[str, Work]:
     kept = fresh()
     image = render(kept)
     ones = torch.ones_like(image)
-    parameters, photo = fresh(), torch.rand(camera.height, camera.width, 3, device="cuda")
+    parameters = fresh()
+    photo = (torch.rand(camera.height, camera.width, 3, device="cuda") * 255).to(torch.uint8)
     optimizer = torch.optim.Adam(parameters, lr=1e-6, fused=True)
 
     def step() -> None:
         optimizer.zero_grad()
-        rendered = render(parameters)[0]
-        loss = 0.8 * (rendered - photo).abs().mean() + 0.2 * (1 - ssim(rendered, photo))
+        l1, ssim = photometric(render(parameters)[0], photo)
+        loss = 0.8 * l1 + 0.2 * (1 - ssim)
         loss.backward()
         optimizer.step()
 

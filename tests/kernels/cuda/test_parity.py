@@ -231,8 +231,8 @@ def check_composite(splats: Splats, glass: int, mean: bool | None, size: Size) -
     [
         (None, torch.float64, (WIDTH, HEIGHT)),
         # In the simulator every row of a tile takes a second.
-        (True, torch.float64, (19, 5)),
-        (False, torch.float32, (18, 4)),
+        (True, torch.float64, (19, 2)),
+        (False, torch.float32, (18, 2)),
     ]
     if SIMULATED
     else [(mean, dtype, (WIDTH, HEIGHT)) for mean in (None, False, True) for dtype in DTYPES],
@@ -253,7 +253,7 @@ def test_composite_of_many_splats_of_one_tile(random_splats: SplatMaker, dtype: 
 
 @pytest.mark.parametrize(("count", "channels"), [(0, 3), (1, 1), (many(18, 60), 12)])
 def test_composite_without_glass(random_splats: SplatMaker, count: int, channels: int) -> None:
-    size = WIDTH, many(6, HEIGHT)
+    size = WIDTH, many(3, HEIGHT)
     splats = random_splats((1, count), size)
     splats = Splats(*(tensor.requires_grad_(i < 3) for i, tensor in enumerate(splats)))
     values = draw(1, count, channels, seed=3).requires_grad_()
