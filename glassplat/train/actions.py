@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 
 from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify, reset_opacity
-from glassplat.densify.edit import forget
+from glassplat.densify.edit import Moments, apply_edit, forget
 from glassplat.densify.mcmc import McmcDensify
+from glassplat.densify.order import in_morton_order
 from glassplat.densify.perturb import perturb_opacities
+from glassplat.scene.gaussians import Gaussians
 from glassplat.train.optimizer import Rate
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
@@ -73,7 +75,7 @@ class Densify:
         if statistics is None or len(gaussians) == 0:
             return
         threshold = self.densifier.gradient_threshold * threshold_factor(dataset)
-        edited, state.optimizer.moments = replace(self.densifier, gradient_threshold=threshold).densify(
+        edited, moments = replace(self.densifier, gradient_threshold=threshold).densify(
             gaussians,
             state.optimizer.moments,
             statistics,
@@ -82,7 +84,14 @@ class Densify:
             part=self.part,
             prune_large=self.part == "primary" and clock.progress > self.densifier.prune_large_start,
         )
-        state.scene = state.scene.with_gaussians(self.part, edited)
+        put_in_order(state, edited, moments, self.part)
+
+
+def put_in_order(state: TrainState, gaussians: Gaussians, moments: Moments, part: str = "primary") -> None:
+    """Replaces a part of the scene and its moments, sorted so that neighbours in space are neighbours in memory."""
+    order = in_morton_order(gaussians.means)
+    ordered, state.optimizer.moments = apply_edit(gaussians, moments, order, part=part)
+    state.scene = state.scene.with_gaussians(part, ordered)
 
 
 def cap_of(densifier: McmcDensify, dataset: Dataset) -> int:
@@ -106,13 +115,13 @@ class Relocate:
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
         """Edits `state`."""
-        edited, state.optimizer.moments = self.densifier.densify(
+        edited, moments = self.densifier.densify(
             state.scene.primary,
             state.optimizer.moments,
             cap=cap_of(self.densifier, dataset),
             generator=state.generator(self.name),
         )
-        state.scene = replace(state.scene, primary=edited)
+        put_in_order(state, edited, moments)
         # Nothing here reads the screen gradients, but what was gathered no longer fits the rows.
         state.statistics.pop("primary", None)
 
