@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -39,6 +40,9 @@ from glassplat.kernels.reference import shade_environment as shade_twin
 from glassplat.kernels.splats import CameraBatch, Deviation, RawGaussians, Splats
 from tests.kernels.gaussians_and_cameras import draw, random_cameras, random_gaussians
 
+if SIMULATED and hasattr(os, "sched_setaffinity"):
+    # The simulator has a Python thread for each of CUDA's; on several cores they fight over the interpreter.
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 if not SIMULATED and (problem := cuda_problem()) is not None:
     pytest.skip(f"no GPU to run the CUDA kernels on: {problem}", allow_module_level=True)
 
