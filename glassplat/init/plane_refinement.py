@@ -44,8 +44,7 @@ def _minimised(planes: FramedPlanes, objective: Objective, tolerance: float) -> 
     """All planes after damped steps; those that have arrived are left where they are."""
     count = len(planes)
     damping, active = np.full(count, FIRST_DAMPING), np.arange(count)
-    anchors, ones = objective.anchors(planes.planes), np.ones(count)
-    scales = np.stack([ones, ones, objective.reach(planes.planes), objective.extent * ones], axis=1)
+    anchors, scales = objective.anchors(planes.planes), _scales(planes, objective)
     for _ in range(ITERATIONS):
         moving = planes.select(active)
         cost, hessian, gradient = _quadratic(moving, objective, tolerance, anchors[active], scales[active])
@@ -60,6 +59,12 @@ def _minimised(planes: FramedPlanes, objective: Objective, tolerance: float) -> 
         if not len(active):
             break
     return planes
+
+
+def _scales(planes: FramedPlanes, objective: Objective) -> Array:
+    """[H, 4] what a step of one means for each plane: a radian twice, a distance of the cameras, a scene extent."""
+    ones = np.ones(len(planes))
+    return np.stack([ones, ones, objective.reach(planes.planes), objective.extent * ones], axis=1)
 
 
 def _quadratic(
@@ -98,9 +103,8 @@ def doubt(planes: FramedPlanes, objective: Objective, tolerance: float) -> Array
 
     The plane is free to shift and the frame to grow meanwhile. The Gauss-Newton matrix at the plane tells.
     """
-    ones = np.ones(len(planes))
-    scales = np.stack([ones, ones, objective.reach(planes.planes), objective.extent * ones], axis=1)
-    hessian = _quadratic(planes, objective, tolerance, objective.anchors(planes.planes), scales)[1]
+    anchors, scales = objective.anchors(planes.planes), _scales(planes, objective)
+    hessian = _quadratic(planes, objective, tolerance, anchors, scales)[1]
     turns = np.linalg.inv(hessian + SMALLEST_CURVATURE * np.eye(4))[:, :2, :2]
     widest: Array = np.sqrt(NOTICEABLE * np.linalg.eigvalsh(turns)[:, -1])
     return widest
