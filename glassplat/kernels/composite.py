@@ -13,6 +13,9 @@ from glassplat.kernels.devices import kernels_for
 from glassplat.kernels.splats import MOST_CHANNELS, Deviation, Splats, TileBins
 from glassplat.kernels.tensor_checks import check_tensors
 
+PROBE = 7
+"""Which argument of the operation the probe is."""
+
 
 class Composite(NamedTuple):
     """Blended images.
@@ -30,6 +33,7 @@ class Composite(NamedTuple):
 def composite(
     splats: Splats, channels: Tensor, bins: TileBins,
     *, marks: Tensor | None = None, num_primary: int | None = None, deviation: Deviation | None = None,
+    probe: Tensor | None = None,
 ) -> Composite:  # fmt: skip
     """Blends depth-sorted splats over each pixel (3DGS; TR-Gaussians, Eqs. 2, 4, 7 and 13).
 
@@ -54,6 +58,9 @@ def composite(
         marks: [C, G - num_primary] what a glass splat adds to the mask, in [0, 1]; needed where there is glass.
         num_primary: how many splats are primary; all of them by default.
         deviation: the channel z whose deviation to compute, and where; the mean is a constant unless it says so.
+        probe: [C, G, 2], any values; they change nothing. Its gradient is how strongly single pixels pull at the
+            centres: |v_x| and |v_y|, summed over the pixels, of which the gradient of `means2d` is the sum
+            with signs (AbsGS, arXiv 2404.10484, Eq. 8). Pixels that pull against each other show here only.
 
     Raises:
         TypeError: tensors are not all float32 or all float64.
@@ -79,15 +86,18 @@ def composite(
         expected["deviation.where"] = (deviation.where, (cameras, bins.height, bins.width))
         if not 0 <= deviation.channel < channels.shape[2]:
             raise ValueError(f"deviation.channel is {deviation.channel}, but there are {channels.shape[2]} channels")
+    if probe is not None:
+        expected["probe"] = (probe, (cameras, count, 2))
     check_tensors(expected)
-    needs_gradients = torch.is_grad_enabled() and any(t.requires_grad for t in (*splats[:3], channels, marks))
-    return Composite(*_Composite.apply(*splats, channels, marks, bins, num_primary, deviation, needs_gradients))
+    needing = [tensor for tensor in (*splats[:3], channels, marks, probe) if tensor is not None]
+    needs_gradients = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in needing)
+    return Composite(*_Composite.apply(*splats, channels, marks, probe, bins, num_primary, deviation, needs_gradients))
 
 
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        *tensors, bins, num_primary, deviation, needs_gradients = arguments
+        *tensors, _, bins, num_primary, deviation, needs_gradients = arguments
         *fields, channels, marks = (tensor.detach().contiguous() for tensor in tensors)
         splats = Splats(*fields)
         *outputs, saved = kernels_for("composite", channels.device).composite(
@@ -103,8 +113,8 @@ class _Composite(torch.autograd.Function):
     def backward(ctx: Any, *v_outputs: Tensor) -> tuple[Tensor | None, ...]:
         *fields, channels, marks = ctx.saved_tensors
         kernels = kernels_for("composite", channels.device)
-        v_means, v_conics, v_opacities, v_channels, v_marks = kernels.composite_gradients(
+        v_means, v_conics, v_opacities, v_channels, v_marks, v_probe = kernels.composite_gradients(
             Splats(*fields), channels, ctx.bins, ctx.saved, v_outputs,
-            marks=marks, num_primary=ctx.num_primary, deviation=ctx.deviation,
+            marks=marks, num_primary=ctx.num_primary, deviation=ctx.deviation, probed=ctx.needs_input_grad[PROBE],
         )  # fmt: skip
-        return v_means, v_conics, v_opacities, None, None, v_channels, v_marks, None, None, None, None
+        return v_means, v_conics, v_opacities, None, None, v_channels, v_marks, v_probe, None, None, None, None

@@ -15,7 +15,14 @@ from glassplat.kernels.facing_normals import facing_normals
 from glassplat.kernels.reference.pane_hits import ray_grid
 from glassplat.kernels.shade_environment import shade_environment
 from glassplat.render.frame import Frame, ScreenPass
-from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, mean_depth, over_background, project_gaussians
+from glassplat.render.rasterize import (
+    NEAR_PER_EXTENT,
+    joined_splats,
+    mean_depth,
+    over_background,
+    probe_of,
+    project_gaussians,
+)
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
@@ -118,14 +125,15 @@ class Deferred:
         if mirrored is not None:
             values |= {"lost": shares * colors, "gained": shares * mirrored}
         channels = torch.cat(list(values.values()), dim=-1)[None]
-        result = composite(splats, channels, bin_tiles(splats, camera.width, camera.height))
+        probe = probe_of(projected)
+        result = composite(splats, channels, bin_tiles(splats, camera.width, camera.height), probe=probe)
         images = result.image[0].split([value.shape[1] for value in values.values()], dim=-1)
         layers, alpha = dict(zip(values, images, strict=True)), result.alpha[0]
         layers |= {"base": over_background(layers["base"], alpha, self.background), "alpha": alpha}
         layers["strength"] = layers["strength"][..., 0]
         if self.depth:
             layers["depth"] = mean_depth(layers["depth"][..., 0], alpha)
-        return layers, ScreenPass("primary", projected.means2d, projected.radii)
+        return layers, ScreenPass("primary", probe, projected.radii)
 
 
 def check_reflective(scene: Scene) -> None:

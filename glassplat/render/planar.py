@@ -15,7 +15,14 @@ from glassplat.kernels.pane_hits import pane_hits
 from glassplat.kernels.panes import PaneHits, Panes
 from glassplat.kernels.splats import Deviation
 from glassplat.render.frame import Frame, ScreenPass
-from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, mean_depth, over_background, project_gaussians
+from glassplat.render.rasterize import (
+    NEAR_PER_EXTENT,
+    joined_splats,
+    mean_depth,
+    over_background,
+    probe_of,
+    project_gaussians,
+)
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
@@ -122,11 +129,20 @@ class Planar:
         if self.deviation:
             index = pane_hits(panes, camera.intrinsics, camera.width, camera.height).pane
             deviation = Deviation(3, (index >= 0).to(colors.dtype)[None], self.deviation_depth_gradient)
-        result = composite(splats, channels, bins, marks=marks, num_primary=len(scene.primary), deviation=deviation)
+        probe, glass_probe = probe_of(primary), probe_of(glass)
+        result = composite(
+            splats,
+            channels,
+            bins,
+            marks=marks,
+            num_primary=len(scene.primary),
+            deviation=deviation,
+            probe=torch.cat([probe, glass_probe], dim=1),
+        )
         alpha = result.alpha[0]
         screen = (
-            ScreenPass("primary", primary.means2d, primary.radii),
-            ScreenPass("glass", glass.means2d, glass.radii),
+            ScreenPass("primary", probe, primary.radii),
+            ScreenPass("glass", glass_probe, glass.radii),
         )
         return FirstPass(
             transmission=over_background(result.image[0, ..., :3], alpha, self.background),
@@ -152,12 +168,13 @@ class Planar:
         bins = bin_tiles(splats, camera.width, camera.height, hits.tiles)
         intensity = torch.exp(primary.channels["log_intensity"]).expand(len(planes), -1)
         channels = torch.cat([projected.colors, intensity[..., None]], dim=-1)
-        result = composite(splats, channels, bins)
+        probe = probe_of(projected)
+        result = composite(splats, channels, bins, probe=probe)
         reflections = result.image
         if any(self.background):
             colors = over_background(reflections[..., :3], result.alpha, self.background)
             reflections = torch.cat([colors, reflections[..., 3:]], dim=-1)
-        return SecondPass(reflections, ScreenPass("primary", projected.means2d, projected.radii))
+        return SecondPass(reflections, ScreenPass("primary", probe, projected.radii))
 
 
 def panes_in_camera(planes: Planes, camera: Camera) -> Panes:

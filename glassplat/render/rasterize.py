@@ -55,6 +55,11 @@ def joined_splats(*parts: Projected) -> Splats:
     return Splats(*(torch.cat([getattr(part, name) for part in parts], dim=1) for name in names))
 
 
+def probe_of(projected: Projected) -> Tensor:
+    """A probe [C, N, 2] for `composite`; it asks for a gradient where the projected Gaussians have one."""
+    return torch.zeros_like(projected.means2d).requires_grad_(projected.means2d.requires_grad)
+
+
 def over_background(image: Tensor, alpha: Tensor, background: tuple[float, float, float]) -> Tensor:
     """Adds the light of a constant background [3] behind an image [..., 3] with coverage alpha [...]."""
     if not any(background):

@@ -9,7 +9,14 @@ import torch
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
 from glassplat.render.frame import Frame, ScreenPass
-from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, mean_depth, over_background, project_gaussians
+from glassplat.render.rasterize import (
+    NEAR_PER_EXTENT,
+    joined_splats,
+    mean_depth,
+    over_background,
+    probe_of,
+    project_gaussians,
+)
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
 
@@ -38,10 +45,11 @@ class Splat:
         channels = projected.colors
         if self.depth:
             channels = torch.cat([channels, projected.depths[..., None]], dim=-1)
-        result = composite(splats, channels, bin_tiles(splats, camera.width, camera.height))
+        probe = probe_of(projected)
+        result = composite(splats, channels, bin_tiles(splats, camera.width, camera.height), probe=probe)
         image, alpha = result.image[0], result.alpha[0]
         layers = {"alpha": alpha}
         if self.depth:
             layers["depth"] = mean_depth(image[..., 3], alpha)
         rgb = over_background(image[..., :3], alpha, self.background)
-        return Frame(rgb, layers, (ScreenPass("primary", projected.means2d, projected.radii),))
+        return Frame(rgb, layers, (ScreenPass("primary", probe, projected.radii),))

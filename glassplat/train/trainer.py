@@ -104,8 +104,8 @@ def differentiate(stage: Stage, scene: Scene, view: View) -> Differentiated:
     frame = stage.renderer(learning, view.camera)
     terms = weighted_terms(stage, frame, view, learning)
     total = torch.stack(list(terms.values())).sum()
-    tracked = [screen for screen in frame.screen if screen.means2d.requires_grad and screen.means2d.numel() > 0]
-    inputs = [*leaves.values(), *(screen.means2d for screen in tracked)]
+    tracked = [screen for screen in frame.screen if screen.probe.requires_grad and screen.probe.numel() > 0]
+    inputs = [*leaves.values(), *(screen.probe for screen in tracked)]
     found = torch.autograd.grad(total, inputs, allow_unused=True)
     gradients = {name: g for name, g in zip(leaves, found[: len(leaves)], strict=True) if g is not None}
     screen = [(s, g) for s, g in zip(tracked, found[len(leaves) :], strict=True) if g is not None]
@@ -132,7 +132,7 @@ def collect_statistics(state: TrainState, screen: list[tuple[ScreenPass, Tensor]
     for record, gradient in screen:
         known = state.statistics.get(record.part)
         if known is None:
-            known = ScreenStatistics.zeros(record.means2d.shape[1], device=gradient.device)
+            known = ScreenStatistics.zeros(record.probe.shape[1], device=gradient.device)
         state.statistics[record.part] = accumulate(
             known,
             gradient,

@@ -52,7 +52,7 @@ def test_statistics_do_not_depend_on_the_resolution() -> None:
 
 def test_small_ones_are_cloned_large_ones_split_and_the_rest_kept() -> None:
     gaussians = make_gaussians([0.001, 0.5, 0.001, 0.5])
-    after = densified(DefaultDensify(), gaussians, seen([1e-3, 1e-3, 1e-5, 1e-5]))
+    after = densified(DefaultDensify(gradient_threshold=1e-4), gaussians, seen([1e-3, 1e-3, 1e-5, 1e-5]))
     assert len(after) == 6
     sizes = after.log_scales[:, 0].exp()
     assert sizes.tolist() == pytest.approx([0.001, 0.001, 0.5, 0.5 / 1.6, 0.5 / 1.6, 0.001])
@@ -78,9 +78,9 @@ def test_large_ones_are_pruned_only_when_asked() -> None:
 
 def test_cap_lets_the_largest_gradients_grow() -> None:
     gaussians = make_gaussians([0.001] * 4)
-    after = densified(DefaultDensify(cap=6), gaussians, seen([3e-4, 9e-4, 8e-4, 0.0]))
+    after = densified(DefaultDensify(gradient_threshold=1e-4, cap=6), gaussians, seen([3e-4, 9e-4, 8e-4, 0.0]))
     assert after.means[4:].tolist() == gaussians.means[[1, 2]].tolist()
-    assert len(densified(DefaultDensify(cap=3), gaussians, seen([1.0] * 4))) == 4
+    assert len(densified(DefaultDensify(gradient_threshold=1e-4, cap=3), gaussians, seen([1.0] * 4))) == 4
 
 
 def test_same_seed_same_bits() -> None:

@@ -68,28 +68,31 @@ def composite(
 
 def composite_gradients(
     splats: Splats, channels: Tensor, bins: TileBins, saved: Saved, v_outputs: Sequence[Tensor],
-    *, marks: Tensor, num_primary: int, deviation: Deviation | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Gradients of means2d, conics, opacities, channels and marks, given those of image, alpha, mask and deviation."""
+    *, marks: Tensor, num_primary: int, deviation: Deviation | None, probed: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]:  # fmt: skip
+    """Gradients of means2d, conics, opacities, channels and marks, given those of image, alpha, mask and deviation.
+
+    Last the probe's, where `probed`.
+    """
     real = tile.real_of(splats)
     num_channels, count = channels.shape[2], channels.shape[1]
-    rows = new_pair_rows(bins, num_channels, real)
+    rows = new_pair_rows(bins, num_channels, real, probed)
     *v_images, v_deviation = v_outputs
     channel, through_mean = -1, False
     if deviation:
         channel, through_mean = deviation.channel, deviation.through_mean
         v_deviation = v_deviation * deviation.where
-    composite_backward(real)(
+    composite_backward(real, probed)(
         marks.numpy(), count, num_primary, num_channels, channel, through_mean,
         bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), *saved,
         *(v.contiguous().numpy() for v in (*v_images, v_deviation)), rows,
     )  # fmt: skip
-    v_means, v_conics, v_opacities, v_values = sum_pair_rows(rows, bins, splats)
+    v_means, v_conics, v_opacities, v_values, v_probe = sum_pair_rows(rows, bins, splats, num_channels)
     v_marks = torch.zeros_like(marks)
     if num_primary < count:
         v_marks.copy_(v_values[:, num_primary:, 0])
         v_values[:, num_primary:] = 0
-    return v_means, v_conics, v_opacities, v_values, v_marks
+    return v_means, v_conics, v_opacities, v_values, v_marks, v_probe if probed else None
 
 
 def _flat(splats: Splats, channels: Tensor) -> tuple[NDArray[Any], ...]:

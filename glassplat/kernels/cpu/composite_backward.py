@@ -8,6 +8,7 @@ values.
 from __future__ import annotations
 
 import functools
+import math
 
 import numpy as np
 from numba import prange
@@ -21,21 +22,21 @@ from glassplat.kernels.splats import LEAST_ALPHA
 # Planes of the backward pass; V_IMAGE has one per channel. BEHIND and BEHIND_GLASS hold what lies behind the current
 # splat, weighted by the incoming gradients; DOT the current splat's deviation and its channels beyond the first group,
 # so weighted; V_DEVIATION and CENTER the gradient of the deviation and the mean it is measured from. LANES is rows of
-# 16 column sums: g, g dy and g dy^2 as `geometry_gradient` takes them, then one per channel.
+# 16 column sums: g, g dy and g dy^2 as `geometry_gradient` takes them, the probe's two, then one per channel.
 BEHIND, BEHIND_GLASS, V_MASK, DOT = 5 * tile.PLANE, 6 * tile.PLANE, 7 * tile.PLANE, 8 * tile.PLANE
 V_DEVIATION, CENTER = 9 * tile.PLANE, 10 * tile.PLANE
 LANES, V_IMAGE = 11 * tile.PLANE, 14 * tile.PLANE
-LANE_VALUES = LANES + 48
+LANE_PROBE, LANE_VALUES = LANES + 48, LANES + 80
 
 
-def _unblend_primary(real: type) -> Scalar:
+def _unblend_primary(real: type, probed: bool) -> Scalar:
     clipped_alpha = blend_maths(real).clipped_alpha
     zero, half, one, alpha_max = real(0.0), real(0.5), real(1.0), real(ALPHA_MAX)
     T, LAST, COVERAGE, PLANE, VALUES = tile.T, tile.LAST, tile.COVERAGE, tile.PLANE, tile.VALUES
-    MEAN_Y = tile.MEAN_Y
+    MEAN_Y, probe = tile.MEAN_Y, _probe(real)
 
     @inlined
-    def unblend_primary(scratch, splat, order, y0, first, last):
+    def unblend_primary(scratch, splat, order, x0, y0, first, last):
         """Takes a splat off the pixels of its rows and adds up its lane sums."""
         c0, c1, c2, c3 = splat[VALUES], splat[VALUES + 1], splat[VALUES + 2], splat[VALUES + 3]
         mean_y = splat[MEAN_Y] - real(y0)
@@ -59,6 +60,8 @@ def _unblend_primary(real: type) -> Scalar:
                 scratch[LANES + i] += gain
                 scratch[LANES + 16 + i] += gain * dy
                 scratch[LANES + 32 + i] += gain * dy * dy
+                if probed:
+                    probe(scratch, splat, gain, i, x0, dy)
                 scratch[LANE_VALUES + i] += weight * v0
                 scratch[LANE_VALUES + 16 + i] += weight * v1
                 scratch[LANE_VALUES + 32 + i] += weight * v2
@@ -67,6 +70,21 @@ def _unblend_primary(real: type) -> Scalar:
                 scratch[COVERAGE + base + i] = weight
 
     return unblend_primary
+
+
+def _probe(real: type) -> Scalar:
+    half, nats, half_nats = real(0.5), real(-math.log(2.0)), real(-2.0 * math.log(2.0))
+    MEAN_X, FORM_XX, FORM_XY, FORM_YY = tile.MEAN_X, tile.FORM_XX, tile.FORM_XY, tile.FORM_YY
+
+    @inlined
+    def probe(scratch, splat, gain, i, x0, dy):
+        """Adds to the probe's lanes what one pixel's `gain` pulls at the mean, as `geometry_gradient` has it."""
+        xx, xy, yy = half_nats * splat[FORM_XX], nats * splat[FORM_XY], half_nats * splat[FORM_YY]
+        dx = real(np.int32(i)) + (half - (splat[MEAN_X] - real(x0)))
+        scratch[LANE_PROBE + i] += abs(gain * (xx * dx + xy * dy))
+        scratch[LANE_PROBE + 16 + i] += abs(gain * (xy * dx + yy * dy))
+
+    return probe
 
 
 def _more_channels(real: type) -> tuple[Scalar, Scalar]:
@@ -154,14 +172,14 @@ def _load_deviation(real: type) -> Scalar:
     return load_deviation
 
 
-def _unblend_glass(real: type) -> Scalar:
+def _unblend_glass(real: type, probed: bool) -> Scalar:
     clipped_alpha = blend_maths(real).clipped_alpha
     zero, half, one, alpha_max = real(0.0), real(0.5), real(1.0), real(ALPHA_MAX)
     T, T_GLASS, LAST_GLASS, COVERAGE = tile.T, tile.T_GLASS, tile.LAST_GLASS, tile.COVERAGE
-    MEAN_Y = tile.MEAN_Y
+    MEAN_Y, probe = tile.MEAN_Y, _probe(real)
 
     @inlined
-    def unblend_glass(scratch, splat, mark, order, y0, first, last):
+    def unblend_glass(scratch, splat, mark, order, x0, y0, first, last):
         """As `unblend_primary`; the first row of value lanes gets the gradient of the mark."""
         mean_y = splat[MEAN_Y] - real(y0)
         for row in range(first, last):
@@ -183,16 +201,18 @@ def _unblend_glass(real: type) -> Scalar:
                 scratch[LANES + i] += gain
                 scratch[LANES + 16 + i] += gain * dy
                 scratch[LANES + 32 + i] += gain * dy * dy
+                if probed:
+                    probe(scratch, splat, gain, i, x0, dy)
                 scratch[LANE_VALUES + i] += a * v_mark
 
     return unblend_glass
 
 
 @functools.cache
-def composite_backward(real: type) -> Kernel:
+def composite_backward(real: type, probed: bool) -> Kernel:
     """Builds the kernel that fills one gradient row per pair, given the final state of each tile."""
     _, place, _, _, _, load_state, fetch, cover, geometry_gradient = tile.tile_functions(real)
-    unblend_primary, unblend_glass = _unblend_primary(real), _unblend_glass(real)
+    unblend_primary, unblend_glass = _unblend_primary(real, probed), _unblend_glass(real, probed)
     dot_more, sum_more = _more_channels(real)
     dot_deviation, sum_deviation = _deviation(real)
     load_deviation = _load_deviation(real)
@@ -228,7 +248,7 @@ def composite_backward(real: type) -> Kernel:
             last = max(last, scratch[LAST_GLASS + i])
         return last
 
-    @kernel("composite_backward", real)
+    @kernel("composite_backward_probed" if probed else "composite_backward", real)
     def backward(
         marks, splats_per_camera, num_primary, num_channels, channel, through_mean,
         pair_splats, tile_offsets, active, packed, state, center, lean, v_image, v_alpha, v_mask, v_deviation, out,
@@ -265,7 +285,7 @@ def composite_backward(real: type) -> Kernel:
                     if top >= bottom:
                         out[p, :] = zero
                         continue
-                    for i in range(48 + groups * 64):
+                    for i in range(80 + groups * 64):
                         scratch[LANES + i] = zero
                     if glass < 0:
                         if groups > 1 or deviates:
@@ -274,19 +294,25 @@ def composite_backward(real: type) -> Kernel:
                             dot_more(scratch, splat, groups, top, bottom)
                         if deviates:
                             dot_deviation(scratch, splat[VALUES + channel], top, bottom)
-                        unblend_primary(scratch, splat, order, y0, top, bottom)
+                        unblend_primary(scratch, splat, order, x0, y0, top, bottom)
                         if groups > 1:
                             sum_more(scratch, groups, top, bottom)
                         if deviates:
                             lanes = LANE_VALUES + channel * 16
                             sum_deviation(scratch, splat[VALUES + channel], lanes, top, bottom)
                     else:
-                        unblend_glass(scratch, splat, marks[camera, glass], order, y0, top, bottom)
+                        unblend_glass(scratch, splat, marks[camera, glass], order, x0, y0, top, bottom)
                     geometry_gradient(out, p, scratch, LANES, splat, x0)
                     for d in range(num_channels):
                         total = zero
                         for i in range(16):
                             total += scratch[LANE_VALUES + (d & 31) * 16 + i]
                         out[p, V_VALUES + d] = total
+                    if probed:
+                        for d in range(2):
+                            total = zero
+                            for i in range(16):
+                                total += scratch[LANE_PROBE + d * 16 + i]
+                            out[p, V_VALUES + num_channels + d] = total
 
     return backward

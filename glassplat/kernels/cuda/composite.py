@@ -90,8 +90,8 @@ def composite(
 
 def composite_gradients(
     splats: Splats, channels: Tensor, bins: TileBins, saved: Saved, v_outputs: Sequence[Tensor],
-    *, marks: Tensor, num_primary: int, deviation: Deviation | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    *, marks: Tensor, num_primary: int, deviation: Deviation | None, probed: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]:  # fmt: skip
     """As `glassplat.kernels.cpu.composite.composite_gradients`."""
     real, (_, count, num_channels), tiles = REAL_OF[channels.dtype], channels.shape, len(bins.active)
     v_image, v_alpha, v_mask, v_deviation = v_outputs
@@ -106,19 +106,19 @@ def composite_gradients(
         tiles, PIXELS, channel, bins.active, saved.final, saved.center, image, mask, deviated,
         *(v.contiguous() for v in (v_image, v_alpha, v_mask, v_deviation, v_spread)), pulls,
     )  # fmt: skip
-    rows = new_pair_rows(bins, channels)
-    composite_backward(real, num_channels)(
+    rows = new_pair_rows(bins, num_channels, channels, probed)
+    composite_backward(real, num_channels, probed)(
         blocks_for(len(saved.bucket_tiles), WARPS), THREADS, *flat_geometry(splats), channels.view(-1, num_channels),
         marks, count, num_primary, channel, bins.width, bins.height, bins.pair_splats, bins.tile_offsets, bins.active,
         saved.last.view(-1), saved.looked_at, saved.bucket_tiles, saved.kept.view(-1), saved.kept_spread.view(-1),
         pulls.view(-1), rows,
     )  # fmt: skip
-    v_means, v_conics, v_opacities, v_values = sum_pair_rows(rows, bins, splats)
+    v_means, v_conics, v_opacities, v_values, v_probe = sum_pair_rows(rows, bins, splats, num_channels)
     v_marks = torch.zeros_like(marks)
     if num_primary < count:
         v_marks.copy_(v_values[:, num_primary:, 0])
         v_values[:, num_primary:] = 0
-    return v_means, v_conics, v_opacities, v_values, v_marks
+    return v_means, v_conics, v_opacities, v_values, v_marks, v_probe if probed else None
 
 
 def through_mean(

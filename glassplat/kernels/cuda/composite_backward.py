@@ -105,7 +105,7 @@ def _planes(num_channels: int) -> tuple[int, ...]:
 
 
 @cache
-def composite_backward(real: type, num_channels: int = 4) -> Kernel:
+def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -> Kernel:
     """Fills one gradient row per pair that any pixel blended; all rows start at zero."""
     place, load, coverage = tile_steps(real)
     clipped_alpha = blend_maths(real).clipped_alpha
@@ -114,7 +114,7 @@ def composite_backward(real: type, num_channels: int = 4) -> Kernel:
     enter = _enter(real, num_channels)
 
     @kernel(
-        f"composite_backward_{num_channels}",
+        f"composite_backward_{num_channels}{'_probed' if probed else ''}",
         real,
         "real2 real2 real1 real2 real2 int int int int int int1 long1 int1 int1 int1 int1 real1 real1 real1 real2",
     )
@@ -166,6 +166,10 @@ def composite_backward(real: type, num_channels: int = 4) -> Kernel:
         for d in range(num_channels):
             v_value[d] = zero
         g_x, g_y, g_xx, g_xy, g_yy, g_0, v_mark, v_apart = zero, zero, zero, zero, zero, zero, zero, zero
+        xx, xy, yy, pull_x, pull_y = zero, zero, zero, zero, zero
+        if probed and inside:
+            s = pair_splats[start + order]
+            xx, xy, yy = conics[s, 0], conics[s, 1], conics[s, 2]
         for step in range(rows * TILE + BUCKET - 1):
             # The lanes of a warp wait for each other; the simulator knows no warps, but blocks.
             if SIMULATED:
@@ -215,6 +219,9 @@ def composite_backward(real: type, num_channels: int = 4) -> Kernel:
                 g_xx += gain * dx * dx
                 g_xy += gain * dx * dy
                 g_yy += gain * dy * dy
+                if probed:
+                    pull_x += abs(gain * (xx * dx + xy * dy))
+                    pull_y += abs(gain * (xy * dx + yy * dy))
         if not inside:
             return
         pair = start + order
@@ -224,5 +231,7 @@ def composite_backward(real: type, num_channels: int = 4) -> Kernel:
             out[pair, MOMENTS + d] = v_value[d] + (v_apart if d == channel else zero)
         if glass:
             out[pair, MOMENTS] = v_mark
+        if probed:
+            out[pair, MOMENTS + num_channels], out[pair, MOMENTS + num_channels + 1] = pull_x, pull_y
 
     return backward

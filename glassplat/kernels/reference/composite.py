@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ TILE = 16
 def composite(
     splats: Splats, channels: Tensor, bins: TileBins,
     *, marks: Tensor | None = None, num_primary: int | None = None, deviation: Deviation | None = None,
+    probe: Tensor | None = None,
 ) -> Composite:  # fmt: skip
     """See `glassplat.kernels.composite.composite`. Of the bins, only the image size and active tiles are used."""
     num_primary = splats.opacities.shape[1] if num_primary is None else num_primary
@@ -24,7 +26,12 @@ def composite(
     images, alphas, masks, deviations = [], [], [], []
     for c in range(bins.num_cameras):
         image, alpha, mask, weights = _camera_composite(
-            splats_of_camera(splats, c), channels[c], bins, None if marks is None else marks[c], num_primary
+            splats_of_camera(splats, c),
+            channels[c],
+            bins,
+            None if marks is None else marks[c],
+            num_primary,
+            None if probe is None else probe[c],
         )
         images.append(image * active[c, ..., None])
         alphas.append(alpha * active[c])
@@ -46,7 +53,7 @@ def _spread(weights: dict[int, Tensor], values: Tensor, total: Tensor, alpha: Te
 
 
 def _camera_composite(
-    splats: Splats, channels: Tensor, bins: TileBins, marks: Tensor | None, num_primary: int
+    splats: Splats, channels: Tensor, bins: TileBins, marks: Tensor | None, num_primary: int, probe: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, dict[int, Tensor]]:
     """Image, alpha, mask and the weight [H, W] of every primary splat."""
     transmittance = splats.means2d.new_ones(bins.height, bins.width)
@@ -54,7 +61,7 @@ def _camera_composite(
     mask, glass_transmittance = torch.zeros_like(transmittance), torch.ones_like(transmittance)
     running = glass_running = torch.ones_like(transmittance, dtype=torch.bool)
     weights = {}
-    for index, alpha in alphas_front_to_back(splats, bins):
+    for index, alpha in alphas_front_to_back(splats, bins, probe):
         if index < num_primary:
             after = transmittance * (1 - alpha)
             running = running & (after >= TRANSMITTANCE_MIN)
@@ -71,8 +78,8 @@ def _camera_composite(
     return image, 1 - transmittance, mask, weights
 
 
-def alphas_front_to_back(splats: Splats, bins: TileBins) -> Iterator[tuple[int, Tensor]]:
-    """Index and coverage [H, W] of every splat of one camera that is drawn, nearest first."""
+def alphas_front_to_back(splats: Splats, bins: TileBins, probe: Tensor | None = None) -> Iterator[tuple[int, Tensor]]:
+    """Index and coverage [H, W] of every splat of one camera that is drawn, nearest first; `probe` [G, 2]."""
     like = splats.means2d
     x = torch.arange(bins.width, dtype=like.dtype) + 0.5
     y = torch.arange(bins.height, dtype=like.dtype)[:, None] + 0.5
@@ -81,9 +88,24 @@ def alphas_front_to_back(splats: Splats, bins: TileBins) -> Iterator[tuple[int, 
         if not bool((splats.radii[index] > 0).all() & (xx > 0) & (xx * yy - xy * xy > 0)):
             continue
         dx, dy = x - splats.means2d[index, 0], y - splats.means2d[index, 1]
+        if probe is not None:
+            moves = _MovePerPixel.apply(probe[index], bins.height, bins.width)
+            dx, dy = dx - moves[..., 0], dy - moves[..., 1]
         q = xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy
         coverage = splats.opacities[index] * torch.exp(-0.5 * q)
         yield index, torch.where(coverage >= ALPHA_MIN, coverage.clamp(max=ALPHA_MAX), 0)
+
+
+class _MovePerPixel(torch.autograd.Function):
+    """A move [H, W, 2] of a splat's centre for each pixel on its own, all zero; the gradient is summed unsigned."""
+
+    @staticmethod
+    def forward(ctx: Any, probe: Tensor, height: int, width: int) -> Tensor:
+        return probe.new_zeros(height, width, 2)
+
+    @staticmethod
+    def backward(ctx: Any, v_moves: Tensor) -> tuple[Tensor, None, None]:
+        return v_moves.abs().sum((0, 1)), None, None
 
 
 def active_pixels(bins: TileBins) -> Tensor:

@@ -200,7 +200,13 @@ Size = tuple[int, int]
 
 
 def blended(
-    splats: Splats, channels: Tensor, marks: Tensor, deviation: Deviation | None, modules: Any, size: Size
+    splats: Splats,
+    channels: Tensor,
+    marks: Tensor,
+    probe: Tensor,
+    deviation: Deviation | None,
+    modules: Any,
+    size: Size,
 ) -> list[Tensor]:
     """Image, alpha, mask and deviation of all cameras with glass; the last camera's first tile is left out."""
     binning, blending = modules
@@ -208,7 +214,8 @@ def blended(
     mask = torch.ones(splats.depths.shape[0], *bin_operation.tile_grid(*size), dtype=torch.bool)
     mask[-1, 0, 0] = False
     bins = binning.bin_tiles(splats, *size, mask.to(channels.device))
-    return list(blending.composite(splats, channels, bins, marks=marks, num_primary=primary, deviation=deviation))
+    options = {"marks": marks, "num_primary": primary, "deviation": deviation, "probe": probe}
+    return list(blending.composite(splats, channels, bins, **options))
 
 
 def check_composite(splats: Splats, glass: int, mean: bool | None, size: Size) -> None:
@@ -218,16 +225,19 @@ def check_composite(splats: Splats, glass: int, mean: bool | None, size: Size) -
     channels = draw(cameras, count, 4, seed=11).to(dtype).requires_grad_()
     marks = draw(cameras, glass, seed=12).to(dtype).sigmoid().requires_grad_()
     where = draw(cameras, *reversed(size), seed=13).to(dtype).clamp(min=0)
-    own_splats, own_channels, own_marks = on_device(splats), on_device(channels), on_device(marks)
+    probe = torch.zeros(cameras, count, 2, dtype=dtype, requires_grad=True)
+    own_splats, own_channels, own_marks, own_probe = map(on_device, (splats, channels, marks, probe))
     request = None if mean is None else Deviation(3, where, mean)
     own_request = None if mean is None else Deviation(3, where.to(DEVICE), mean)
-    found = blended(own_splats, own_channels, own_marks, own_request, (bin_operation, composite_operation), size)
-    expected = blended(splats, channels, marks, request, (bin_twin, composite_twin), size)
+    found = blended(
+        own_splats, own_channels, own_marks, own_probe, own_request, (bin_operation, composite_operation), size
+    )
+    expected = blended(splats, channels, marks, probe, request, False, size)
     for value, want in zip(found, expected, strict=True):
         close(value, want)
     outputs = 3 if mean is None else 4
-    own = [*own_splats[:3], own_channels, own_marks]
-    check_gradients(found[:outputs], expected[:outputs], own, [*splats[:3], channels, marks])
+    own = [*own_splats[:3], own_channels, own_marks, own_probe]
+    check_gradients(found[:outputs], expected[:outputs], own, [*splats[:3], channels, marks, probe])
 
 
 @pytest.mark.parametrize(
