@@ -200,16 +200,10 @@ Size = tuple[int, int]
 
 
 def blended(
-    splats: Splats,
-    channels: Tensor,
-    marks: Tensor,
-    probe: Tensor,
-    deviation: Deviation | None,
-    modules: Any,
-    size: Size,
+    splats: Splats, channels: Tensor, marks: Tensor, probe: Tensor, deviation: Deviation | None, own: bool, size: Size
 ) -> list[Tensor]:
     """Image, alpha, mask and deviation of all cameras with glass; the last camera's first tile is left out."""
-    binning, blending = modules
+    binning, blending = (bin_operation, composite_operation) if own else (bin_twin, composite_twin)
     primary = splats.depths.shape[1] - marks.shape[1]
     mask = torch.ones(splats.depths.shape[0], *bin_operation.tile_grid(*size), dtype=torch.bool)
     mask[-1, 0, 0] = False
