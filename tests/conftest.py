@@ -27,6 +27,9 @@ def fixed_state() -> Iterator[None]:
     random.seed(0)
     np.random.seed(0)  # Third-party code may still draw from the global state.
     torch.manual_seed(0)
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        # The cores are shared with other tests; threads that wait for each other would only stand in their way.
+        torch.set_num_threads(1)
     threads = torch.get_num_threads()
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     yield
