@@ -9,21 +9,34 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.devices import kernels_for
-from glassplat.kernels.panes import BlendedPanes
+from glassplat.kernels.maths_pane import LAWS
+from glassplat.kernels.panes import BlendedPanes, Fresnel
 from glassplat.kernels.tensor_checks import check_device, check_tensors
 
 
 def blend_panes(
     transmission: Tensor, mask: Tensor, reflections: Tensor, pane: Tensor,
     normals: Tensor, base_reflectances: Tensor, intrinsics: Tensor,
-    *, fresnel: bool = True, intensity: bool = True, linear: bool = True,
+    *, fresnel: Fresnel = "pane", intensity: bool = True, linear: bool = True,
 ) -> BlendedPanes:  # fmt: skip
     """Blends transmission and reflection by the strength of each pixel's pane (TR-Gaussians, Section III-A).
 
-        R_k = R0 + (1 - R0) (1 - |n . d|)^5          (Eq. 6), d the unit ray of the pixel
+        R_k = f(R0, c), c = |n . d|                  (in place of Eq. 6), d the unit ray of the pixel
         R = M R_k                                    (Eqs. 5, 19)
         C_r = C_raw A                                (Eq. 13)
         C = (1 - R) C_t + R C_r                      (Eq. 1)
+
+    f is what a real pane reflects of unpolarised light (`fresnel="pane"`): with r0 = R0 / (2 - R0) for one of its
+    surfaces and the index n = (1 + sqrt r0) / (1 - sqrt r0), Snell's and Fresnel's laws at one surface are
+
+        c_t = sqrt(1 - (1 - c^2) / n^2)
+        r_s = ((c - n c_t) / (c + n c_t))^2,  r_p = ((n c - c_t) / (n c + c_t))^2
+
+    and two surfaces, with all the light that goes to and fro between them, reflect
+
+        f = r_s / (1 + r_s) + r_p / (1 + r_p),       which is R0 at c = 1.
+
+    A mirror is a pane whose R0 is near 1.
 
     Where no pane is shown or the mask is 0, the image is the transmission, bit for bit, and strength and reflection
     are 0; also the image where the strength is 0.
@@ -38,12 +51,13 @@ def blend_panes(
         normals: [K, 3] unit normals in the camera frame; the sign does not matter.
         base_reflectances: [K] R0 in [0, 1].
         intrinsics: [4] fx, fy, cx, cy in pixels; no gradient.
-        fresnel: strength by Schlick; False uses R0 for every angle.
+        fresnel: "pane" is the f above; "schlick" the paper's, f = R0 + (1 - R0) (1 - c)^5 (Eq. 6), which is one
+            surface's; "none" is f = R0 for every angle.
         intensity: multiply by A; False sets C_r = C_raw.
         linear: blend and multiply linear radiance; False does so with sRGB values, as the paper does.
 
     Raises:
-        ValueError: shapes disagree.
+        ValueError: shapes disagree, or there is no such `fresnel`.
         TypeError: tensors of different or unsupported floating-point types, a pane that is not int32, or on
             different devices.
     """
@@ -61,7 +75,9 @@ def blend_panes(
     if pane.dtype != torch.int32 or tuple(pane.shape) != (height, width):
         raise TypeError(f"pane is {pane.dtype} of shape {tuple(pane.shape)}; expected int32 of {(height, width)}")
     check_device("pane", pane, "mask", mask)
-    switches = (fresnel, intensity, linear)
+    if fresnel not in LAWS:
+        raise ValueError(f"fresnel is {fresnel!r}; expected one of {', '.join(map(repr, LAWS))}")
+    switches = (LAWS.index(fresnel), intensity, linear)
     outputs = _BlendPanes.apply(transmission, mask, reflections, normals, base_reflectances, pane, intrinsics, switches)
     return BlendedPanes(*outputs)
 

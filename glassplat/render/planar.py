@@ -12,7 +12,7 @@ from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.blend_panes import blend_panes
 from glassplat.kernels.composite import composite
 from glassplat.kernels.pane_hits import pane_hits
-from glassplat.kernels.panes import PaneHits, Panes
+from glassplat.kernels.panes import Fresnel, PaneHits, Panes
 from glassplat.kernels.splats import Deviation
 from glassplat.render.frame import Frame, ScreenPass
 from glassplat.render.rasterize import (
@@ -55,7 +55,7 @@ class Planar:
     """Renders transmission, reflection and their blend (TR-Gaussians, Section III-A).
 
         C = (1 - R) C_t + R C_r                      (Eq. 1)
-        R = M sum_k H_k R_k,  R_k by Schlick         (Eqs. 5, 6, 19)
+        R = M sum_k H_k R_k                          (Eqs. 5, 19)
         C_r = C_raw A                                (Eq. 13)
 
     The first pass blends the primary Gaussians into C_t and, with the glass Gaussians among them,
@@ -68,7 +68,8 @@ class Planar:
 
     Attributes:
         background: colour behind everything, sRGB.
-        fresnel: strength by Schlick; False uses R0 for every angle.
+        fresnel: how R_k rises from R0 at normal incidence: as that of a pane with its two surfaces, by Schlick's curve
+            of one surface (Eq. 6), or not at all; see `glassplat.kernels.blend_panes`.
         intensity: use the learned intensity a(u); False sets C_r = C_raw.
         reflection_gradient: what the reflection image's gradient reaches: everything, or the planes alone.
         deviation: also compute the depth deviation where a pane is hit (Eq. 14), for training.
@@ -77,7 +78,7 @@ class Planar:
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    fresnel: bool = True
+    fresnel: Fresnel = "pane"
     intensity: bool = True
     reflection_gradient: Literal["all", "planes"] = "all"
     deviation: bool = False

@@ -38,7 +38,7 @@ def as_mirrors(scene: Scene, labels: Sequence[int]) -> Scene:
 
 
 def with_reflectance(scene: Scene, label: int, base_reflectance: float) -> Scene:
-    """The pane reflects this share of light at normal incidence; Schlick's law adds to it at an angle.
+    """The pane reflects this share of light at normal incidence; Fresnel's laws add to it at an angle.
 
     Raises:
         ValueError: no pane has the label, or the reflectance is not in [0, 1].

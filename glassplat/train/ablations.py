@@ -21,6 +21,7 @@ Switch = Literal[
     "mirrors",
     "seeded-reflections",
     "linear-blend",
+    "two-surfaces",
     "propagation",
     "sabotage",
     "deferred-shading",
@@ -69,11 +70,12 @@ PLANAR: dict[Switch, Ablation] = {
     "conflict": Ablation("w/o L_c", _without("conflict"), -0.27),
     "perturbation": Ablation("w/o opacity perturbation", _without_perturbation, -0.24),
     "intensity": Ablation("w/o reflection intensity", lambda r: replace(r, intensity=False), -0.37),
-    "fresnel": Ablation("w/o Fresnel-based reflection", lambda r: replace(r, fresnel=False), -0.24),
+    "fresnel": Ablation("w/o Fresnel-based reflection", lambda r: replace(r, fresnel="none"), -0.24),
     "mask": Ablation("w/o L_m", _without("mask")),
     "mirrors": Ablation("w/o mirror detection", lambda r: replace(r, detect_mirrors=False)),
     "seeded-reflections": Ablation("w/o seeded reflections", lambda r: replace(r, seed_reflections=False)),
     "linear-blend": Ablation("blended in sRGB", lambda r: replace(r, blend="srgb")),
+    "two-surfaces": Ablation("one surface (Schlick, the paper's)", lambda r: replace(r, fresnel="schlick")),
 }
 """The first seven are the rows of TR-Gaussians' Table IV, the others are parts that the paper does not ablate."""
 

@@ -9,6 +9,7 @@ from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
 from glassplat.init.planes import PlaneFit, fit_planes
+from glassplat.kernels.panes import Fresnel
 from glassplat.losses.geometry import depth_deviation_loss
 from glassplat.losses.reflection import gradient_conflict, mask_loss
 from glassplat.losses.term import LossTerm
@@ -95,7 +96,8 @@ class PlanarRecipe:
         background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         stage_shares: lengths of the three stages (paper: 3000, 3000 and 24,000 iterations).
         multi_stage: False skips stage 2 (ablation).
-        fresnel: False makes the strength independent of the angle (ablation).
+        fresnel: how the strength rises with the angle: as that of a pane with two surfaces, by Schlick's curve of one
+            surface as in the paper, or not at all (ablation).
         intensity: False drops the reflection intensity a(u) (ablation).
         blend: space in which transmission and reflection are blended: linear radiance, or sRGB as in the paper.
         detect_mirrors: treat panes that look like mirrors as mirrors, unless `plane_fit` names the mirrors.
@@ -121,7 +123,7 @@ class PlanarRecipe:
     background: tuple[float, float, float] | None = None
     stage_shares: tuple[float, float, float] = (0.1, 0.1, 0.8)
     multi_stage: bool = True
-    fresnel: bool = True
+    fresnel: Fresnel = "pane"
     intensity: bool = True
     blend: Blend = "linear"
     detect_mirrors: bool = True

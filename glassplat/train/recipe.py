@@ -89,6 +89,8 @@ def restored(hint: Any, value: Any) -> Any:
     if origin in (typing.Union, types.UnionType):
         inner = next(option for option in typing.get_args(hint) if option is not type(None))
         return None if value is None else restored(inner, value)
+    if origin is typing.Literal and value not in typing.get_args(hint):
+        raise ValueError(f"{value!r} where one of {typing.get_args(hint)} is expected")
     if origin is tuple:
         return tuple(value)
     return value

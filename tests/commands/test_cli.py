@@ -11,6 +11,7 @@ import torch
 
 from glassplat.cli import main
 from glassplat.commands.demo import SCENE
+from glassplat.kernels.maths_pane import LAWS
 
 PROMISED = {
     "method", "iterations", "resolution", "split", "seed", "num_gaussians", "train_seconds", "seconds_per_frame",
@@ -102,6 +103,14 @@ def test_an_unknown_option_is_refused(capsys: pytest.CaptureFixture[str]) -> Non
         main(["train", "splat", "--data", "x", "--output", "y", "--no-such-option"])
     assert stopped.value.code == 2
     assert "no-such-option" in capsys.readouterr().err
+
+
+def test_a_law_of_reflection_that_there_is_not_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        train("planar", Path("run"), "--fresnel", "metal")
+    assert stopped.value.code == 2
+    message = capsys.readouterr().err
+    assert "metal" in message and all(law in message for law in LAWS)
 
 
 def test_a_broken_scene_file_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.blend_panes import blend_panes
+from glassplat.kernels.maths_pane import LAWS
 from glassplat.kernels.pane_hits import pane_hits
-from glassplat.kernels.panes import BlendedPanes, Panes
+from glassplat.kernels.panes import BlendedPanes, Fresnel, Panes
 from glassplat.kernels.reference.blend_panes import blend_panes as blend_twin
 from glassplat.kernels.reference.pane_hits import pane_hits as hits_twin
 
@@ -81,7 +82,7 @@ def blend_case(dtype: torch.dtype, count: int = 3) -> dict[str, Tensor]:
     }
 
 
-def with_gradients(case: dict[str, Tensor], function: Callable[..., BlendedPanes], **switches: bool) -> list[Tensor]:
+def with_gradients(case: dict[str, Tensor], function: Callable[..., BlendedPanes], **switches: object) -> list[Tensor]:
     inputs = {name: case[name].detach().requires_grad_() for name in INPUTS}
     result = function(**(case | inputs), **switches)
     generator = torch.Generator().manual_seed(3)
@@ -92,11 +93,11 @@ def with_gradients(case: dict[str, Tensor], function: Callable[..., BlendedPanes
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-5), (torch.float64, 1e-11)])
-@pytest.mark.parametrize("fresnel", [True, False])
+@pytest.mark.parametrize("fresnel", LAWS)
 @pytest.mark.parametrize("intensity", [True, False])
 @pytest.mark.parametrize("linear", [True, False])
 def test_blend_matches_its_twin(
-    dtype: torch.dtype, tolerance: float, fresnel: bool, intensity: bool, linear: bool
+    dtype: torch.dtype, tolerance: float, fresnel: Fresnel, intensity: bool, linear: bool
 ) -> None:
     case = blend_case(dtype)
     switches = {"fresnel": fresnel, "intensity": intensity, "linear": linear}
@@ -106,7 +107,8 @@ def test_blend_matches_its_twin(
 
 
 @pytest.mark.parametrize("name", INPUTS)
-def test_blend_gradients_match_finite_differences(name: str) -> None:
+@pytest.mark.parametrize("fresnel", LAWS)
+def test_blend_gradients_match_finite_differences(name: str, fresnel: Fresnel) -> None:
     case = blend_case(torch.float64)
     if name == "mask":
         case["mask"] = case["mask"].clamp(min=0.05)
@@ -116,7 +118,7 @@ def test_blend_gradients_match_finite_differences(name: str) -> None:
     def objective(moved: Tensor) -> Tensor:
         return sum(
             (t * torch.cos(torch.arange(t.numel()).reshape(t.shape))).sum()
-            for t in blend_panes(**(case | {name: moved}))
+            for t in blend_panes(**(case | {name: moved}), fresnel=fresnel)
         )
 
     (gradient,) = torch.autograd.grad(objective(values), values)
@@ -126,10 +128,11 @@ def test_blend_gradients_match_finite_differences(name: str) -> None:
             assert math.isclose(float(slope), float((gradient * direction).sum()), rel_tol=1e-4, abs_tol=1e-4)
 
 
-def test_where_there_is_no_pane_the_image_is_the_transmission_bit_for_bit() -> None:
+@pytest.mark.parametrize("fresnel", ["pane", "none"])
+def test_where_there_is_no_pane_the_image_is_the_transmission_bit_for_bit(fresnel: Fresnel) -> None:
     case = blend_case(torch.float32)
     case["base_reflectances"][1] = 0
-    result = blend_panes(**case, fresnel=False)
+    result = blend_panes(**case, fresnel=fresnel)
     shown = (case["pane"] >= 0) & (case["mask"] > 0)
     assert bool(shown.any()) and not bool(shown.all())
     plain = ~shown | (case["pane"] == 1)
@@ -160,6 +163,8 @@ def test_bad_input_is_named() -> None:
         blend_panes(**(case | {"reflections": case["reflections"][:1]}))
     with pytest.raises(TypeError, match="int32"):
         blend_panes(**(case | {"pane": case["pane"].long()}))
+    with pytest.raises(ValueError, match="fresnel is True; expected one of 'pane', 'schlick', 'none'"):
+        blend_panes(**case, fresnel=True)  # type: ignore[arg-type]
     panes, intrinsics = random_panes(2, torch.float32)
     with pytest.raises(ValueError, match="mask"):
         pane_hits(panes, intrinsics, WIDTH, HEIGHT, torch.ones(3, 3))

@@ -7,6 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from glassplat.kernels.maths_pane import LAWS
+from glassplat.kernels.panes import Fresnel
+from glassplat.kernels.reference.blend_panes import REFLECTANCE
 from glassplat.kernels.reference.color_space import linear_from_srgb
 from glassplat.render.planar import Planar, detached
 from glassplat.render.splat import Splat
@@ -46,11 +49,12 @@ def test_the_reflection_shows_the_room_and_not_what_is_behind_the_pane() -> None
     torch.testing.assert_close(without_case.layers["reflection"][visible], reflection[visible])
 
 
-def test_zero_reflectance_is_splat_bit_for_bit() -> None:
+@pytest.mark.parametrize("fresnel", ["pane", "none"])
+def test_zero_reflectance_is_splat_bit_for_bit(fresnel: Fresnel) -> None:
     scene = in_single_precision(showcase())
     scene = replace(scene, planes=scene.planes.with_tensors({"logit_reflectances": torch.tensor([-200.0])}))
     camera = replace(CAMERA, cam_from_world=CAMERA.cam_from_world.float())
-    planar = Planar(fresnel=False)(scene, camera)
+    planar = Planar(fresnel=fresnel)(scene, camera)
     assert torch.equal(planar.rgb, Splat()(scene, camera).rgb)
     assert torch.equal(planar.layers["depth"], Splat()(scene, camera).layers["depth"])
 
@@ -142,11 +146,13 @@ def test_a_pane_behind_the_camera_is_not_hit() -> None:
     assert not bool(nearest_hits(pane(-3.0), CAMERA).any())
 
 
-def test_strength_rises_from_base_reflectance_to_one_at_grazing_angles() -> None:
+@pytest.mark.parametrize("fresnel", LAWS)
+def test_the_strength_of_each_pixel_is_that_of_its_angle(fresnel: Fresnel) -> None:
     scene = showcase(planes := pane(2.0, base_reflectance=0.2))
-    layers = Planar()(scene, CAMERA).layers
+    layers = Planar(fresnel=fresnel)(scene, CAMERA).layers
     cosine = (CAMERA.ray_directions() @ planes.normals[0]).abs()
-    torch.testing.assert_close(layers["strength"], layers["mask"] * (0.2 + 0.8 * (1 - cosine) ** 5))
+    expected = REFLECTANCE[fresnel](planes.base_reflectances[0], cosine)
+    torch.testing.assert_close(layers["strength"], layers["mask"] * expected)
     assert float(layers["mask"].max()) > 0.5
 
 
@@ -160,12 +166,13 @@ def test_two_panes_keep_their_own_reflections() -> None:
 
 
 @pytest.mark.parametrize("name", ["centers", "raw_normals", "logit_reflectances"])
-def test_plane_gradients_match_finite_differences_through_the_whole_renderer(name: str) -> None:
-    scene = showcase()
+@pytest.mark.parametrize("fresnel", LAWS)
+def test_plane_gradients_match_finite_differences_through_the_whole_renderer(name: str, fresnel: Fresnel) -> None:
+    scene, renderer = showcase(), Planar(fresnel=fresnel)
     weights = torch.randn(28, 40, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
 
     def objective(values: torch.Tensor) -> torch.Tensor:
-        return (Planar()(scene.with_parameters({f"planes.{name}": values}), CAMERA).rgb * weights).sum()
+        return (renderer(scene.with_parameters({f"planes.{name}": values}), CAMERA).rgb * weights).sum()
 
     values = scene.parameters()[f"planes.{name}"].clone().requires_grad_()
     (gradient,) = torch.autograd.grad(objective(values), values)
@@ -203,7 +210,7 @@ def test_a_mirror_keeps_its_reflectance() -> None:
 
 def test_switches_change_what_they_name() -> None:
     scene = showcase()
-    constant = Planar(fresnel=False)(scene, CAMERA).layers
+    constant = Planar(fresnel="none")(scene, CAMERA).layers
     torch.testing.assert_close(constant["strength"], scene.planes.base_reflectances * constant["mask"])
     assert not torch.equal(Planar(intensity=False)(scene, CAMERA).rgb, Planar()(scene, CAMERA).rgb)
 

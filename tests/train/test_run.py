@@ -79,8 +79,14 @@ def test_the_exported_scene_is_the_trained_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "recipe", [RECIPE, PlanarRecipe(fresnel=False, weights=ReflectionWeights(depth=0.0), background=(1.0, 1.0, 1.0))]
+    "recipe", [RECIPE, PlanarRecipe(fresnel="none", weights=ReflectionWeights(depth=0.0), background=(1.0, 1.0, 1.0))]
 )
 def test_a_recipe_survives_its_file(recipe: Any) -> None:
     assert recipe_from_json(recipe_to_json(recipe)) == recipe
     assert recipe_from_json(recipe_to_json(recipe)) != replace(recipe, sh_degree=0)
+
+
+def test_a_recipe_with_a_choice_that_there_is_no_more_is_refused() -> None:
+    text = recipe_to_json(PlanarRecipe()).replace('"fresnel": "pane"', '"fresnel": true')
+    with pytest.raises(InputError, match=r"True where one of .'pane', 'schlick', 'none'. is expected"):
+        recipe_from_json(text)

@@ -34,8 +34,8 @@ V_RGB, V_BRIGHT, V_SHARE, V_GAIN = (plane * RUN for plane in (18, 21, 24, 25))
 BACKWARD_PLANES = 26
 
 
-def blend_panes(inputs: Sequence[Tensor], switches: tuple[bool, bool, bool]) -> tuple[Tensor, ...]:
-    """The fields of `BlendedPanes`; inputs in the order of the kernel, switches (fresnel, intensity, linear)."""
+def blend_panes(inputs: Sequence[Tensor], switches: tuple[int, bool, bool]) -> tuple[Tensor, ...]:
+    """The fields of `BlendedPanes`; inputs in the order of the kernel, switches (law, intensity, linear)."""
     transmission, mask = inputs[:2]
     outputs = tuple(torch.empty_like(like) for like in (transmission, transmission, mask))
     blend_panes_forward(REAL_OF[mask.dtype])(*_arrays(inputs), *switches, *_arrays(outputs))
@@ -43,7 +43,7 @@ def blend_panes(inputs: Sequence[Tensor], switches: tuple[bool, bool, bool]) -> 
 
 
 def blend_panes_gradients(
-    inputs: Sequence[Tensor], switches: tuple[bool, bool, bool], cotangents: Sequence[Tensor]
+    inputs: Sequence[Tensor], switches: tuple[int, bool, bool], cotangents: Sequence[Tensor]
 ) -> tuple[Tensor, ...]:
     """Gradients of the first five inputs."""
     found = tuple(torch.zeros_like(tensor) for tensor in inputs[:5])
@@ -85,11 +85,11 @@ def _load(real: type) -> Scalar:
 
 
 def _shine(real: type) -> Scalar:
-    schlick, _, ray_length = pane_maths(real)
+    strength, _, ray_length = pane_maths(real)
     zero, one, half = real(0.0), real(1.0), real(0.5)
 
     @inlined
-    def shine(run, normals, bases, k, row, first, intrinsics, fresnel):
+    def shine(run, normals, bases, k, row, first, intrinsics, law):
         """Strength of every pixel of a run, before the mask in RAW and after it in SHARE; returns the rays' y."""
         inverse_f, c_x = one / intrinsics[0], intrinsics[2]
         y = (real(np.int32(row)) + half - intrinsics[3]) / intrinsics[1]
@@ -98,7 +98,7 @@ def _shine(real: type) -> Scalar:
         for i in range(RUN):
             x = (start + real(np.int32(i))) * inverse_f
             along, length = n_x * x + n_row, ray_length(x, y)
-            raw = schlick(base, abs(along) / length) if fresnel else base
+            raw = strength(law, base, abs(along) / length)
             marked = run[MASK + i]
             run[ALONG + i], run[LENGTH + i], run[RAW + i] = along, length, raw
             run[SHARE + i] = raw * marked if marked > zero else zero
@@ -138,7 +138,7 @@ def blend_panes_forward(real: type) -> Kernel:
 
     @kernel("blend_panes_forward", real)
     def forward(
-        transmission, mask, reflections, normals, bases, pane, intrinsics, fresnel, intensity, linear,
+        transmission, mask, reflections, normals, bases, pane, intrinsics, law, intensity, linear,
         rgb, reflection, strength,
     ):  # fmt: skip
         height = mask.shape[0]
@@ -152,7 +152,7 @@ def blend_panes_forward(real: type) -> Kernel:
                 for first in range(begin, end, RUN):
                     count = min(RUN, end - first)
                     load(run, transmission, mask, reflections, pane, intensity, row, k, first, count)
-                    shine(run, normals, bases, k, row, first, intrinsics, fresnel)
+                    shine(run, normals, bases, k, row, first, intrinsics, law)
                     for d in range(3):
                         mix(run, d, linear)
                     for i in range(count):
@@ -202,11 +202,11 @@ def _unmix(real: type) -> Scalar:
 
 
 def _dim(real: type) -> Scalar:
-    schlick_slopes = pane_maths(real).schlick_slopes
+    strength_slopes = pane_maths(real).strength_slopes
     zero, one, half = real(0.0), real(1.0), real(0.5)
 
     @inlined
-    def dim(run, base, first, intrinsics, fresnel):
+    def dim(run, base, first, intrinsics, law):
         """From the gradient of SHARE to sums over the run for the normal (x, 1) and the base reflectance."""
         inverse_f = one / intrinsics[0]
         start = real(np.int32(first)) + half - intrinsics[2]
@@ -214,13 +214,12 @@ def _dim(real: type) -> Scalar:
         for i in range(RUN):
             marked, along, length = run[MASK + i], run[ALONG + i], run[LENGTH + i]
             v_raw = run[V_SHARE + i] * marked if marked > zero else zero
-            by_base, by_cosine = schlick_slopes(base, abs(along) / length)
+            by_base, by_cosine = strength_slopes(law, base, abs(along) / length)
             slope = v_raw * by_cosine / length
             slope = slope if along > zero else -slope
-            slope = slope if fresnel else zero
             sum_x += slope * (start + real(np.int32(i))) * inverse_f
             sum_1 += slope
-            sum_base += v_raw * by_base if fresnel else v_raw
+            sum_base += v_raw * by_base
         return sum_x, sum_1, sum_base
 
     return dim
@@ -234,7 +233,7 @@ def blend_panes_backward(real: type) -> Kernel:
 
     @kernel("blend_panes_backward", real)
     def backward(
-        transmission, mask, reflections, normals, bases, pane, intrinsics, fresnel, intensity, linear,
+        transmission, mask, reflections, normals, bases, pane, intrinsics, law, intensity, linear,
         v_rgb, v_reflection, v_strength, v_transmission, v_mask, v_reflections, v_normals, v_bases,
     ):  # fmt: skip
         height, panes = mask.shape[0], normals.shape[0]
@@ -249,7 +248,7 @@ def blend_panes_backward(real: type) -> Kernel:
                 for first in range(begin, end, RUN):
                     count = min(RUN, end - first)
                     load(run, transmission, mask, reflections, pane, intensity, row, k, first, count)
-                    y = shine(run, normals, bases, k, row, first, intrinsics, fresnel)
+                    y = shine(run, normals, bases, k, row, first, intrinsics, law)
                     for i in range(RUN):
                         column = first + min(i, count - 1)
                         run[V_SHARE + i], run[V_GAIN + i] = v_strength[row, column], zero
@@ -258,7 +257,7 @@ def blend_panes_backward(real: type) -> Kernel:
                             run[V_BRIGHT + d * RUN + i] = v_reflection[row, column, d]
                     for d in range(3):
                         unmix(run, d, linear)
-                    sum_x, sum_1, sum_base = dim(run, bases[k], first, intrinsics, fresnel)
+                    sum_x, sum_1, sum_base = dim(run, bases[k], first, intrinsics, law)
                     sums[row, k, 0] += sum_x
                     sums[row, k, 1] += sum_1 * y
                     sums[row, k, 2] += sum_1

@@ -18,10 +18,10 @@ from glassplat.kernels.maths_pane import pane_maths
 from glassplat.kernels.tensor_checks import REAL_OF
 
 THREADS = 128
-INPUTS = "real3 real2 real4 real2 real1 int2 real1 bool bool bool"
+INPUTS = "real3 real2 real4 real2 real1 int2 real1 int bool bool"
 
 
-def blend_panes(inputs: Sequence[Tensor], switches: tuple[bool, bool, bool]) -> tuple[Tensor, ...]:
+def blend_panes(inputs: Sequence[Tensor], switches: tuple[int, bool, bool]) -> tuple[Tensor, ...]:
     """As `glassplat.kernels.cpu.blend_panes.blend_panes`."""
     transmission, mask = inputs[:2]
     outputs = tuple(torch.empty_like(like) for like in (transmission, transmission, mask))
@@ -31,7 +31,7 @@ def blend_panes(inputs: Sequence[Tensor], switches: tuple[bool, bool, bool]) -> 
 
 
 def blend_panes_gradients(
-    inputs: Sequence[Tensor], switches: tuple[bool, bool, bool], cotangents: Sequence[Tensor]
+    inputs: Sequence[Tensor], switches: tuple[int, bool, bool], cotangents: Sequence[Tensor]
 ) -> tuple[Tensor, ...]:
     """As `glassplat.kernels.cpu.blend_panes.blend_panes_gradients`."""
     mask, normals, pane = inputs[1], inputs[3], inputs[5]
@@ -46,16 +46,16 @@ def blend_panes_gradients(
 
 
 def _shine(real: type) -> Scalar:
-    schlick, _, ray_length = pane_maths(real)
+    strength, _, ray_length = pane_maths(real)
     one, half = real(1.0), real(0.5)
 
     @inlined
-    def shine(row, column, k, normals, bases, intrinsics, fresnel):
+    def shine(row, column, k, normals, bases, intrinsics, law):
         """Strength before the mask, the ray's x and y, its product with the normal and its length."""
         x = (real(np.int32(column)) + half - intrinsics[2]) * (one / intrinsics[0])
         y = (real(np.int32(row)) + half - intrinsics[3]) / intrinsics[1]
         along, length = normals[k, 0] * x + (normals[k, 1] * y + normals[k, 2]), ray_length(x, y)
-        raw = schlick(bases[k], abs(along) / length) if fresnel else bases[k]
+        raw = strength(law, bases[k], abs(along) / length)
         return raw, x, y, along, length
 
     return shine
@@ -70,7 +70,7 @@ def blend_panes_forward(real: type) -> Kernel:
 
     @kernel("blend_panes_forward", real, f"{INPUTS} real3 real3 real2")
     def forward(
-        transmission, mask, reflections, normals, bases, pane, intrinsics, fresnel, intensity, linear,
+        transmission, mask, reflections, normals, bases, pane, intrinsics, law, intensity, linear,
         rgb, reflection, strength,
     ):  # fmt: skip
         i = cuda.grid(1)
@@ -81,7 +81,7 @@ def blend_panes_forward(real: type) -> Kernel:
         shown = k >= 0 and marked > zero
         share, gain = zero, one
         if shown:
-            raw, _, _, _, _ = shine(row, column, k, normals, bases, intrinsics, fresnel)
+            raw, _, _, _, _ = shine(row, column, k, normals, bases, intrinsics, law)
             share = raw * marked
             gain = reflections[k, row, column, 3] if intensity else one
         strength[row, column] = share
@@ -107,13 +107,13 @@ def blend_panes_backward(real: type) -> Kernel:
     """Fills the gradients of transmission, mask and reflections, and each pixel's share [H, W, 4] of those of its
     pane's normal and base reflectance; all but the first start at zero.
     """
-    shine, schlick_slopes = _shine(real), pane_maths(real).schlick_slopes
+    shine, strength_slopes = _shine(real), pane_maths(real).strength_slopes
     linear_of, linear_slope, encoded, encoded_slope = color_space_maths(real)
     zero, one = real(0.0), real(1.0)
 
     @kernel("blend_panes_backward", real, f"{INPUTS} real3 real3 real2 real3 real2 real4 real3")
     def backward(
-        transmission, mask, reflections, normals, bases, pane, intrinsics, fresnel, intensity, linear,
+        transmission, mask, reflections, normals, bases, pane, intrinsics, law, intensity, linear,
         v_rgb, v_reflection, v_strength, v_transmission, v_mask, v_reflections, shares,
     ):  # fmt: skip
         i = cuda.grid(1)
@@ -125,7 +125,7 @@ def blend_panes_backward(real: type) -> Kernel:
             for d in range(3):
                 v_transmission[row, column, d] = v_rgb[row, column, d]
             return
-        raw, x, y, along, length = shine(row, column, k, normals, bases, intrinsics, fresnel)
+        raw, x, y, along, length = shine(row, column, k, normals, bases, intrinsics, law)
         share, v_share, v_gain = raw * marked, v_strength[row, column], zero
         gain = reflections[k, row, column, 3] if intensity else one
         for d in range(3):
@@ -152,12 +152,12 @@ def blend_panes_backward(real: type) -> Kernel:
         v_reflections[k, row, column, 3] = v_gain if intensity else zero
         v_mask[row, column] = v_share * raw
         v_raw = v_share * marked
-        by_base, by_cosine = schlick_slopes(bases[k], abs(along) / length)
-        slope = v_raw * by_cosine / length if fresnel else zero
+        by_base, by_cosine = strength_slopes(law, bases[k], abs(along) / length)
+        slope = v_raw * by_cosine / length
         slope = slope if along > zero else -slope
         shares[row, column, 0] = slope * x
         shares[row, column, 1] = slope * y
         shares[row, column, 2] = slope
-        shares[row, column, 3] = v_raw * by_base if fresnel else v_raw
+        shares[row, column, 3] = v_raw * by_base
 
     return backward

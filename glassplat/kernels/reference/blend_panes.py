@@ -2,18 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
-from glassplat.kernels.panes import BlendedPanes
+from glassplat.kernels.panes import BlendedPanes, Fresnel
 from glassplat.kernels.reference.color_space import linear_from_srgb, srgb_from_linear
 from glassplat.kernels.reference.pane_hits import ray_grid
+
+
+def two_surfaces(base: Tensor, cosine: Tensor) -> Tensor:
+    """Snell's and Fresnel's laws at a surface, for both polarisations, and light going to and fro between two."""
+    one_surface = torch.sqrt(base / (2 - base))
+    inverse_index = (1 - one_surface) / (1 + one_surface)
+    inside = torch.sqrt(1 - inverse_index**2 * (1 - cosine**2))
+    across = ((inverse_index * cosine - inside) / (inverse_index * cosine + inside)) ** 2
+    along = ((cosine - inverse_index * inside) / (cosine + inverse_index * inside)) ** 2
+    return across / (1 + across) + along / (1 + along)
+
+
+REFLECTANCE: dict[Fresnel, Callable[[Tensor, Tensor], Tensor]] = {
+    "pane": two_surfaces,
+    "schlick": lambda base, cosine: base + (1 - base) * (1 - cosine) ** 5,
+    "none": lambda base, cosine: base,
+}
 
 
 def blend_panes(
     transmission: Tensor, mask: Tensor, reflections: Tensor, pane: Tensor,
     normals: Tensor, base_reflectances: Tensor, intrinsics: Tensor,
-    *, fresnel: bool = True, intensity: bool = True, linear: bool = True,
+    *, fresnel: Fresnel = "pane", intensity: bool = True, linear: bool = True,
 ) -> BlendedPanes:  # fmt: skip
     """See `glassplat.kernels.blend_panes.blend_panes`."""
     height, width = mask.shape
@@ -23,8 +42,7 @@ def blend_panes(
         shown = (pane == k) & (mask > 0)
         cosine = (rays @ normals[k]).abs().clamp(max=1)
         base = base_reflectances[k]
-        raw = base + (1 - base) * (1 - cosine) ** 5 if fresnel else base
-        strength = torch.where(shown, raw * mask, strength)
+        strength = torch.where(shown, REFLECTANCE[fresnel](base, cosine) * mask, strength)
         gain = reflections[k, ..., 3:] if intensity else torch.ones_like(mask)[..., None]
         color = reflections[k, ..., :3]
         bright = srgb_from_linear(linear_from_srgb(color) * gain) if linear else color * gain

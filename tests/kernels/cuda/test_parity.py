@@ -26,7 +26,7 @@ from glassplat.kernels import photometric as photometric_operation
 from glassplat.kernels import project as project_operation
 from glassplat.kernels import shade_environment as shade_operation
 from glassplat.kernels.devices import SIMULATED, cuda_problem, kernels_for
-from glassplat.kernels.panes import Panes
+from glassplat.kernels.panes import Fresnel, Panes
 from glassplat.kernels.reference import adam as adam_twin
 from glassplat.kernels.reference import bin_tiles as bin_twin
 from glassplat.kernels.reference import blend_panes as blend_twin
@@ -310,8 +310,10 @@ def test_no_pane_is_hit_where_there_is_none() -> None:
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("switches", [(True, True, True), (False, True, False), (True, False, True)])
-def test_blend_panes(switches: tuple[bool, bool, bool], dtype: torch.dtype) -> None:
+@pytest.mark.parametrize(
+    "switches", [("pane", True, True), ("schlick", True, True), ("none", True, False), ("pane", False, True)]
+)
+def test_blend_panes(switches: tuple[Fresnel, bool, bool], dtype: torch.dtype) -> None:
     panes, intrinsics = two_panes(dtype)
     pane = hits_twin.pane_hits(panes, intrinsics, WIDTH, HEIGHT).pane
     mask = draw(HEIGHT, WIDTH, seed=1).to(dtype).clamp(min=0, max=1)
