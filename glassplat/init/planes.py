@@ -56,7 +56,7 @@ class PlaneFit:
 
     mirror_labels: tuple[int, ...] = ()
     glass_reflectance: float = 0.2
-    mirror_reflectance: float = 0.99
+    mirror_reflectance: float = 0.999
     band: float = 20 / 1200
     inlier_distance: float = 0.01
     hypotheses: int = 1000

@@ -49,7 +49,7 @@ def test_every_label_gets_its_own_pane() -> None:
         assert normal_error(planes, index, pane) < 1
         assert offset_error(planes, index, pane) < 0.01 * EXTENT
         assert covers(planes, index, pane)
-    assert planes.base_reflectances.tolist() == pytest.approx([0.2, 0.99])
+    assert planes.base_reflectances.tolist() == pytest.approx([0.2, 0.999])
 
 
 def test_a_pane_photographed_all_the_way_round_is_found() -> None:
