@@ -88,7 +88,7 @@ class DefaultDensify:
         start: share of the run after which densification begins.
         stop: share of the run after which it ends.
         gradient_threshold: mean pull, in normalised device coordinates, above which a Gaussian is densified;
-            eight times what 3DGS compares with its signed sums.
+            six times what 3DGS compares with its signed sums (docs/experiments.md).
         dense_fraction: Gaussians whose longest axis is above this share of the scene extent are
             split, smaller ones cloned.
         prune_opacity: Gaussians less opaque than this are removed.
@@ -104,7 +104,7 @@ class DefaultDensify:
     interval: int = 100
     start: float = 500 / 30_000
     stop: float = 15_000 / 30_000
-    gradient_threshold: float = 1.6e-3
+    gradient_threshold: float = 1.2e-3
     dense_fraction: float = 0.01
     prune_opacity: float = 0.005
     prune_large_start: float = 1.0
