@@ -293,6 +293,8 @@ def _forward(real: type) -> Kernel:
                     else:
                         blend_glass(scratch, splat, marks[camera, glass], order, top, bottom)
             save_state(state, n, scratch)
+            if start == stop:
+                continue
             write_tile(scratch, image, alpha, mask, camera, x0, y0, columns, rows)
             if deviation_channel < 0:
                 continue
