@@ -91,6 +91,7 @@ def assert_close(found: dict[str, Tensor], expected: dict[str, Tensor], toleranc
         (1, 1, 1, 1, (16, 16)),
         (1, 40, 0, 1, (37, 29)),
         (2, 60, 20, 5, (40, 33)),
+        (2, 60, 20, 7, (40, 33)),
         (1, 40, 10, 9, (17, 50)),
     ],
 )

@@ -104,10 +104,28 @@ def _flat(splats: Splats, channels: Tensor) -> tuple[NDArray[Any], ...]:
     )
 
 
-def _blend_primary(real: type) -> Scalar:
+def _weigh(real: type) -> Scalar:
     clipped_alpha = blend_maths(real).clipped_alpha
     zero, t_min = real(0.0), real(TRANSMITTANCE_MIN)
-    T, LAST, COVERAGE, PLANE, VALUES = tile.T, tile.LAST, tile.COVERAGE, tile.PLANE, tile.VALUES
+    T, LAST, COVERAGE = tile.T, tile.LAST, tile.COVERAGE
+
+    @inlined
+    def weigh(scratch, at, order):
+        """How much of a splat a pixel shows; moves the pixel's transmittance behind the splat."""
+        a = clipped_alpha(scratch[COVERAGE + at])
+        t = scratch[T + at]
+        weight = a * t
+        after = t - weight
+        alive = after >= t_min
+        scratch[T + at] = after if alive else -abs(t)
+        scratch[LAST + at] = order if alive else scratch[LAST + at]
+        return weight if alive else zero
+
+    return weigh
+
+
+def _blend_primary(real: type) -> Scalar:
+    COVERAGE, PLANE, VALUES, weigh = tile.COVERAGE, tile.PLANE, tile.VALUES, _weigh(real)
 
     @inlined
     def blend_primary(scratch, splat, order, first, last):
@@ -115,14 +133,7 @@ def _blend_primary(real: type) -> Scalar:
         for row in range(first, last):
             base = (row & 15) * 16
             for i in range(16):
-                a = clipped_alpha(scratch[COVERAGE + base + i])
-                t = scratch[T + base + i]
-                weight = a * t
-                after = t - weight
-                alive = after >= t_min
-                scratch[T + base + i] = after if alive else -abs(t)
-                scratch[LAST + base + i] = order if alive else scratch[LAST + base + i]
-                weight = weight if alive else zero
+                weight = weigh(scratch, base + i, order)
                 scratch[SUMS + base + i] += weight * c0
                 scratch[SUMS + PLANE + base + i] += weight * c1
                 scratch[SUMS + 2 * PLANE + base + i] += weight * c2
@@ -131,6 +142,29 @@ def _blend_primary(real: type) -> Scalar:
                 scratch[COVERAGE + base + i] = weight
 
     return blend_primary
+
+
+def _blend_seven(real: type) -> Scalar:
+    PLANE, VALUES, weigh = tile.PLANE, tile.VALUES, _weigh(real)
+
+    @inlined
+    def blend_seven(scratch, splat, order, first, last):
+        """Adds colour, normal and strength of `deferred` at once: no weights to keep, and no eighth channel."""
+        c0, c1, c2, c3 = splat[VALUES], splat[VALUES + 1], splat[VALUES + 2], splat[VALUES + 3]
+        c4, c5, c6 = splat[VALUES + 4], splat[VALUES + 5], splat[VALUES + 6]
+        for row in range(first, last):
+            base = (row & 15) * 16
+            for i in range(16):
+                weight = weigh(scratch, base + i, order)
+                scratch[SUMS + base + i] += weight * c0
+                scratch[SUMS + PLANE + base + i] += weight * c1
+                scratch[SUMS + 2 * PLANE + base + i] += weight * c2
+                scratch[SUMS + 3 * PLANE + base + i] += weight * c3
+                scratch[SUMS + 4 * PLANE + base + i] += weight * c4
+                scratch[SUMS + 5 * PLANE + base + i] += weight * c5
+                scratch[SUMS + 6 * PLANE + base + i] += weight * c6
+
+    return blend_seven
 
 
 def _blend_more(real: type) -> Scalar:
@@ -201,7 +235,7 @@ def _deviate(real: type) -> Scalar:
 def _forward(real: type) -> Kernel:
     pack, place, begin, is_finished, save_state, _, fetch, cover, _ = tile.tile_functions(real)
     blend_primary, blend_more, blend_glass = _blend_primary(real), _blend_more(real), _blend_glass(real)
-    deviate = _deviate(real)
+    blend_seven, deviate = _blend_seven(real), _deviate(real)
     one, zero, least_alpha = real(1.0), real(0.0), real(LEAST_ALPHA)
     T, LAST, PIXELS, PLANE, VALUES, BATCH = tile.T, tile.LAST, tile.PIXELS, tile.PLANE, tile.VALUES, tile.BATCH
 
@@ -286,12 +320,14 @@ def _forward(real: type) -> Kernel:
                     if glass >= 0 and glass_finished:
                         continue
                     top, bottom = cover(scratch, splat, x0, y0, rows)
-                    if glass < 0:
+                    if glass >= 0:
+                        blend_glass(scratch, splat, marks[camera, glass], order, top, bottom)
+                    elif num_channels == 7:
+                        blend_seven(scratch, splat, order, top, bottom)
+                    else:
                         blend_primary(scratch, splat, order, top, bottom)
                         for group in range(1, groups):
                             blend_more(scratch, splat, group, top, bottom)
-                    else:
-                        blend_glass(scratch, splat, marks[camera, glass], order, top, bottom)
             save_state(state, n, scratch)
             if start == stop:
                 continue
