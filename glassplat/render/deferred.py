@@ -14,6 +14,7 @@ from glassplat.kernels.cube_lookup import cube_lookup
 from glassplat.kernels.facing_normals import facing_normals
 from glassplat.kernels.reference.pane_hits import ray_grid
 from glassplat.kernels.shade_environment import shade_environment
+from glassplat.kernels.shaded import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
 from glassplat.render.frame import Frame, ScreenPass
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
@@ -89,17 +90,17 @@ class Deferred:
     def _shade_pixels(
         self, scene: Scene, camera: Camera, surface: Surface
     ) -> tuple[Tensor, dict[str, Tensor], ScreenPass]:
-        layers, screen = self._blend(scene, camera, surface)
+        image, layers, screen = self._blend(scene, camera, surface)
         shaded = shade_environment(
-            layers["base"],
-            layers["normal"],
-            layers["strength"],
+            image,
+            layers["alpha"],
             scene.environment.raw,
             camera.intrinsics,
             camera.cam_from_world[:3, :3].T.contiguous(),
+            background=self.background,
             least_strength=self.least_strength,
         )
-        return shaded.rgb, layers | {"reflection": shaded.reflection}, screen
+        return shaded.rgb, layers | {"base": shaded.base, "reflection": shaded.reflection}, screen
 
     def _shade_gaussians(
         self, scene: Scene, camera: Camera, surface: Surface
@@ -107,33 +108,36 @@ class Deferred:
         to_eye = torch.nn.functional.normalize(camera.center - scene.primary.means, dim=1)
         cosines = (surface.normals * to_eye).sum(-1, keepdim=True)
         mirrored = torch.sigmoid(cube_lookup(scene.environment.raw, 2 * cosines * surface.normals - to_eye))
-        layers, screen = self._blend(scene, camera, surface, mirrored)
-        gained = layers.pop("gained")
-        rgb = layers["base"] - layers.pop("lost") + gained
-        return rgb, layers | {"reflection": gained / layers["strength"][..., None].clamp(min=1e-6)}, screen
+        image, layers, screen = self._blend(scene, camera, surface, mirrored)
+        base = over_background(image[..., :NORMAL_AT], layers["alpha"], self.background)
+        lost, gained = image[..., -6:-3], image[..., -3:]
+        reflection = gained / layers["strength"][..., None].clamp(min=1e-6)
+        return base - lost + gained, layers | {"base": base, "reflection": reflection}, screen
 
     def _blend(
         self, scene: Scene, camera: Camera, surface: Surface, mirrored: Tensor | None = None
-    ) -> tuple[dict[str, Tensor], ScreenPass]:
-        """The blended layers; given what each Gaussian mirrors [N, 3], also `lost` and `gained`."""
+    ) -> tuple[Tensor, dict[str, Tensor], ScreenPass]:
+        """The blended image [H, W, D] and its layers but for the base.
+
+        Channels are those of `shade_environment`, then depth, if asked for; given what each Gaussian mirrors [N, 3],
+        the colours lost and gained come last.
+        """
         projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
         splats = joined_splats(projected)
         colors, shares = projected.colors[0], surface.strengths[:, None]
-        values = {"base": colors, "normal": surface.normals, "strength": shares}
+        values = [colors, surface.normals, shares]
         if self.depth:
-            values["depth"] = projected.depths[0, :, None]
+            values.append(projected.depths[0, :, None])
         if mirrored is not None:
-            values |= {"lost": shares * colors, "gained": shares * mirrored}
-        channels = torch.cat(list(values.values()), dim=-1)[None]
+            values += [shares * colors, shares * mirrored]
+        channels = torch.cat(values, dim=-1)[None]
         probe = probe_of(projected)
         result = composite(splats, channels, bin_tiles(splats, camera.width, camera.height), probe=probe)
-        images = result.image[0].split([value.shape[1] for value in values.values()], dim=-1)
-        layers, alpha = dict(zip(values, images, strict=True)), result.alpha[0]
-        layers |= {"base": over_background(layers["base"], alpha, self.background), "alpha": alpha}
-        layers["strength"] = layers["strength"][..., 0]
+        image, alpha = result.image[0], result.alpha[0]
+        layers = {"alpha": alpha, "normal": image[..., NORMAL_AT:STRENGTH_AT], "strength": image[..., STRENGTH_AT]}
         if self.depth:
-            layers["depth"] = mean_depth(layers["depth"][..., 0], alpha)
-        return layers, ScreenPass("primary", probe, projected.radii)
+            layers["depth"] = mean_depth(image[..., SURFACE_CHANNELS], alpha)
+        return image, layers, ScreenPass("primary", probe, projected.radii)
 
 
 def check_reflective(scene: Scene) -> None:

@@ -22,7 +22,7 @@ from glassplat.kernels.cpu.schedule import even_stride
 from glassplat.kernels.maths import vector_maths
 from glassplat.kernels.maths_blend import Scalar
 from glassplat.kernels.maths_cube import cube_maths, mirror_maths
-from glassplat.kernels.shaded import NORMAL_MIN
+from glassplat.kernels.shaded import NORMAL_AT, NORMAL_MIN, STRENGTH_AT, Shaded
 from glassplat.kernels.tensor_checks import REAL_OF
 
 RUN = 32
@@ -37,30 +37,36 @@ COLUMN, AXIS, FACE, CELL_ROW, CELL, FIRST = (plane * RUN for plane in range(6))
 WHOLE_PLANES = 6
 
 
-def shade_environment(inputs: Sequence[Tensor], least_strength: float) -> tuple[Tensor, Tensor]:
-    """The fields of `Shaded`; inputs in the order of the kernel."""
-    base, normals, strength, texels, *camera = inputs
-    real = REAL_OF[base.dtype]
-    rgb, reflection = torch.empty_like(base), torch.empty_like(base)
-    tensors = (base, normals, strength, padded_faces(texels), *camera, rgb, reflection)
+def shade_environment(inputs: Sequence[Tensor], least_strength: float) -> Shaded:
+    """As the operation; inputs in the order of the kernel."""
+    blended, alpha, texels, *rest = inputs
+    real = REAL_OF[blended.dtype]
+    shaded = Shaded(*(alpha.new_empty(*alpha.shape, 3) for _ in range(3)))
+    tensors = (blended, alpha, padded_faces(texels), *rest, *shaded)
     shade_environment_forward(real)(real(least_strength), *(tensor.numpy() for tensor in tensors))
-    return rgb, reflection
+    return shaded
 
 
 def shade_environment_gradients(
-    inputs: Sequence[Tensor], least_strength: float, reflection: Tensor, cotangents: Sequence[Tensor]
-) -> tuple[Tensor, ...]:
-    """Gradients of base, normals, strength and texels, given the reflection that the kernel found."""
-    base, normals, strength, texels, *camera = inputs
-    real = REAL_OF[base.dtype]
-    found = tuple(torch.empty_like(like) for like in (base, normals, strength))
-    first_cells = torch.empty(*strength.shape, 2, dtype=torch.int32)
-    fractions, v_raw = base.new_empty(*strength.shape, 2), torch.empty_like(base)
-    tensors = (*inputs[:3], padded_faces(texels), *camera, reflection, *cotangents, *found)
+    inputs: Sequence[Tensor], least_strength: float, found: Sequence[Tensor], cotangents: Sequence[Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradients of blended, alpha and texels, given the base and the reflection that the kernel found."""
+    blended, alpha, texels, *rest = inputs
+    real = REAL_OF[blended.dtype]
+    v_blended, v_alpha = torch.empty_like(blended), torch.empty_like(alpha)
+    first_cells = torch.empty(*alpha.shape, 2, dtype=torch.int32)
+    fractions, v_raw = alpha.new_empty(*alpha.shape, 2), alpha.new_empty(*alpha.shape, 3)
     lookups = (first_cells, fractions, v_raw)
-    shade_environment_backward(real)(real(least_strength), *(tensor.numpy() for tensor in (*tensors, *lookups)))
+    tensors = (blended, padded_faces(texels), *rest, *found, *cotangents, v_blended, v_alpha, *lookups)
+    shade_environment_backward(real)(real(least_strength), *(tensor.numpy() for tensor in tensors))
     first_cells, fractions, v_raw = (tensor.flatten(0, 1) for tensor in lookups)
-    return (*found, texel_gradients(first_cells, fractions, v_raw, texels.shape[1]))
+    return v_blended, v_alpha, texel_gradients(first_cells, fractions, v_raw, texels.shape[1])
+
+
+@inlined
+def normal_of(blended, row, column):
+    """The blended normal of a pixel."""
+    return blended[row, column, NORMAL_AT], blended[row, column, NORMAL_AT + 1], blended[row, column, NORMAL_AT + 2]
 
 
 def _place(real: type) -> Scalar:
@@ -99,7 +105,7 @@ def _place(real: type) -> Scalar:
 
 @cache
 def shade_environment_forward(real: type) -> Kernel:
-    """Fills rgb and reflection."""
+    """Fills rgb, base and reflection."""
     logistic, place, dot = cube_maths(real).logistic, _place(real), vector_maths().dot
     shortest = real(NORMAL_MIN**2)
     zero, one = real(0.0), real(1.0)
@@ -117,8 +123,10 @@ def shade_environment_forward(real: type) -> Kernel:
             run[SEEN + i] = logistic(run[SEEN + i])
 
     @kernel("shade_environment_forward", real)
-    def forward(least_strength, base, normals, strength, padded, intrinsics, rotation, rgb, reflection):
-        height, width = strength.shape
+    def forward(
+        least_strength, blended, alpha, padded, intrinsics, rotation, background, rgb, base, reflection
+    ):  # fmt: skip
+        height, width = alpha.shape
         side, flat = np.int32(padded.shape[1]), padded.reshape(padded.size)
         stride = even_stride(height)
         for task in prange(height):
@@ -127,8 +135,11 @@ def shade_environment_forward(real: type) -> Kernel:
             whole: NDArray[Any] = np.zeros(WHOLE_PLANES * RUN, np.int32)
             count = 0
             for column in range(width):
-                normal = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
-                if dot(normal, normal) <= shortest or abs(strength[row, column]) < least_strength:
+                clear = one - alpha[row, column]
+                for d in range(3):
+                    base[row, column, d] = blended[row, column, d] + clear * background[d]
+                normal = normal_of(blended, row, column)
+                if dot(normal, normal) <= shortest or abs(blended[row, column, STRENGTH_AT]) < least_strength:
                     for d in range(3):
                         rgb[row, column, d], reflection[row, column, d] = base[row, column, d], zero
                 else:
@@ -145,7 +156,7 @@ def shade_environment_forward(real: type) -> Kernel:
                     for d in range(3):
                         seen, behind = run[SEEN + d * RUN + i], base[row, at, d]
                         reflection[row, at, d] = seen
-                        rgb[row, at, d] = behind + strength[row, at] * (seen - behind)
+                        rgb[row, at, d] = behind + blended[row, at, STRENGTH_AT] * (seen - behind)
                 count = 0
 
     return forward
@@ -192,17 +203,17 @@ def _turn(real: type) -> Scalar:
 
 @cache
 def shade_environment_backward(real: type) -> Kernel:
-    """Fills the gradients of base, normals, strength and of what was looked up, and which cells each pixel blends."""
+    """Fills the gradients of blended, alpha and of what was looked up, and which cells each pixel blends."""
     place, slopes, turn, dot = _place(real), _slopes(real), _turn(real), vector_maths().dot
     shortest = real(NORMAL_MIN**2)
     zero, one = real(0.0), real(1.0)
 
     @kernel("shade_environment_backward", real)
     def backward(
-        least_strength, base, normals, strength, padded, intrinsics, rotation, reflection, v_rgb, v_reflection,
-        v_base, v_normals, v_strength, first_cells, fractions, v_raw,
+        least_strength, blended, padded, intrinsics, rotation, background, base, reflection,
+        v_rgb, v_base, v_reflection, v_blended, v_alpha, first_cells, fractions, v_raw,
     ):  # fmt: skip
-        height, width = strength.shape
+        height, width = v_alpha.shape
         side, flat = np.int32(padded.shape[1]), padded.reshape(padded.size)
         stride = even_stride(height)
         for task in prange(height):
@@ -211,21 +222,25 @@ def shade_environment_backward(real: type) -> Kernel:
             whole: NDArray[Any] = np.zeros(WHOLE_PLANES * RUN, np.int32)
             count = 0
             for column in range(width):
-                normal = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
-                if dot(normal, normal) <= shortest or abs(strength[row, column]) < least_strength:
-                    v_strength[row, column], first_cells[row, column, 0] = zero, NO_LOOKUP
-                    for d in range(3):
-                        v_base[row, column, d], v_normals[row, column, d] = v_rgb[row, column, d], zero
-                else:
-                    share, v_share = strength[row, column], zero
-                    for d in range(3):
-                        seen, v = reflection[row, column, d], v_rgb[row, column, d]
-                        v_base[row, column, d] = v * (one - share)
+                for d in range(NORMAL_AT, blended.shape[2]):
+                    v_blended[row, column, d] = zero
+                normal, share = normal_of(blended, row, column), blended[row, column, STRENGTH_AT]
+                bare = dot(normal, normal) <= shortest or abs(share) < least_strength
+                kept, v_share, v_clear = one if bare else one - share, zero, zero
+                for d in range(3):
+                    v = v_rgb[row, column, d]
+                    v_blended[row, column, d] = v_base[row, column, d] + v * kept
+                    v_clear += v_blended[row, column, d] * background[d]
+                    if not bare:
+                        seen = reflection[row, column, d]
                         v_share += v * (seen - base[row, column, d])
                         v = (v * share + v_reflection[row, column, d]) * seen * (one - seen)
                         v_raw[row, column, d] = v
                         run[V_RAW + d * RUN + count] = v
-                    v_strength[row, column] = v_share
+                v_alpha[row, column], v_blended[row, column, STRENGTH_AT] = -v_clear, v_share
+                if bare:
+                    first_cells[row, column, 0] = NO_LOOKUP
+                else:
                     whole[COLUMN + count] = column
                     run[NORMAL + count], run[NORMAL + RUN + count], run[NORMAL + 2 * RUN + count] = normal
                     count += 1
@@ -238,7 +253,7 @@ def shade_environment_backward(real: type) -> Kernel:
                 for i in range(count):
                     at = whole[COLUMN + i]
                     for d in range(3):
-                        v_normals[row, at, d] = run[NORMAL + d * RUN + i]
+                        v_blended[row, at, NORMAL_AT + d] = run[NORMAL + d * RUN + i]
                     first_cells[row, at, 0], first_cells[row, at, 1] = whole[CELL_ROW + i], whole[CELL + i]
                     fractions[row, at, 0], fractions[row, at, 1] = run[ALONG + i], run[DOWN + i]
                 count = 0

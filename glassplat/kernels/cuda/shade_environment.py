@@ -16,38 +16,36 @@ from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
 from glassplat.kernels.maths import vector_maths
 from glassplat.kernels.maths_blend import Scalar
 from glassplat.kernels.maths_cube import cube_maths, mirror_maths
-from glassplat.kernels.shaded import NORMAL_MIN
+from glassplat.kernels.shaded import NORMAL_AT, NORMAL_MIN, STRENGTH_AT, Shaded
 from glassplat.kernels.tensor_checks import REAL_OF
 
 THREADS = 128
-INPUTS = "real real3 real3 real2 real4 real1 real2"
 
 
-def shade_environment(inputs: Sequence[Tensor], least_strength: float) -> tuple[Tensor, Tensor]:
+def shade_environment(inputs: Sequence[Tensor], least_strength: float) -> Shaded:
     """As `glassplat.kernels.cpu.shade_environment.shade_environment`."""
-    base, normals, strength, texels, *camera = inputs
-    rgb, reflection = torch.empty_like(base), torch.empty_like(base)
-    shade_environment_forward(REAL_OF[base.dtype])(
-        blocks_for(strength.numel(), THREADS), THREADS, least_strength,
-        base, normals, strength, padded_faces(texels), *camera, rgb, reflection,
+    blended, alpha, texels, *rest = inputs
+    shaded = Shaded(*(alpha.new_empty(*alpha.shape, 3) for _ in range(3)))
+    shade_environment_forward(REAL_OF[blended.dtype])(
+        blocks_for(alpha.numel(), THREADS), THREADS, least_strength,
+        blended, alpha, padded_faces(texels), *rest, *shaded,
     )  # fmt: skip
-    return rgb, reflection
+    return shaded
 
 
 def shade_environment_gradients(
-    inputs: Sequence[Tensor], least_strength: float, reflection: Tensor, cotangents: Sequence[Tensor]
-) -> tuple[Tensor, ...]:
+    inputs: Sequence[Tensor], least_strength: float, found: Sequence[Tensor], cotangents: Sequence[Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
     """As `glassplat.kernels.cpu.shade_environment.shade_environment_gradients`."""
-    base, normals, strength, texels, *camera = inputs
-    found = tuple(torch.empty_like(like) for like in (base, normals, strength))
-    first_cells = torch.empty(strength.numel(), dtype=torch.int32, device=base.device)
-    fractions, v_raw = base.new_empty(strength.numel(), 2), torch.empty_like(base)
-    shade_environment_backward(REAL_OF[base.dtype])(
-        blocks_for(strength.numel(), THREADS), THREADS, least_strength,
-        base, normals, strength, padded_faces(texels), *camera, reflection, *cotangents, *found,
-        first_cells, fractions, v_raw,
+    blended, alpha, texels, *rest = inputs
+    v_blended, v_alpha = torch.empty_like(blended), torch.empty_like(alpha)
+    first_cells = torch.empty(alpha.numel(), dtype=torch.int32, device=alpha.device)
+    fractions, v_raw = alpha.new_empty(alpha.numel(), 2), alpha.new_empty(alpha.numel(), 3)
+    shade_environment_backward(REAL_OF[blended.dtype])(
+        blocks_for(alpha.numel(), THREADS), THREADS, least_strength,
+        blended, padded_faces(texels), *rest, *found, *cotangents, v_blended, v_alpha, first_cells, fractions, v_raw,
     )  # fmt: skip
-    return (*found, texel_gradients(first_cells, fractions, v_raw.view(-1, 3), texels.shape[1]))
+    return v_blended, v_alpha, texel_gradients(first_cells, fractions, v_raw, texels.shape[1])
 
 
 def _place(real: type) -> Scalar:
@@ -75,18 +73,21 @@ def _place(real: type) -> Scalar:
 
 @cache
 def shade_environment_forward(real: type) -> Kernel:
-    """Fills rgb and reflection."""
+    """Fills rgb, base and reflection."""
     logistic, place, dot = cube_maths(real).logistic, _place(real), vector_maths().dot
     shortest, zero, one = real(NORMAL_MIN**2), real(0.0), real(1.0)
 
-    @kernel("shade_environment_forward", real, f"{INPUTS} real3 real3")
-    def forward(least_strength, base, normals, strength, padded, intrinsics, rotation, rgb, reflection):
+    @kernel("shade_environment_forward", real, "real real3 real2 real4 real1 real2 real1 real3 real3 real3")
+    def forward(least_strength, blended, alpha, padded, intrinsics, rotation, background, rgb, base, reflection):
         i = cuda.grid(1)
-        if i >= strength.size:
+        if i >= alpha.size:
             return
-        row, column = i // strength.shape[1], i % strength.shape[1]
-        normal = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
-        if dot(normal, normal) <= shortest or abs(strength[row, column]) < least_strength:
+        row, column = i // alpha.shape[1], i % alpha.shape[1]
+        pixel, clear = blended[row, column], one - alpha[row, column]
+        for d in range(3):
+            base[row, column, d] = pixel[d] + clear * background[d]
+        normal, share = (pixel[NORMAL_AT], pixel[NORMAL_AT + 1], pixel[NORMAL_AT + 2]), pixel[STRENGTH_AT]
+        if dot(normal, normal) <= shortest or abs(share) < least_strength:
             for d in range(3):
                 rgb[row, column, d], reflection[row, column, d] = base[row, column, d], zero
             return
@@ -97,51 +98,62 @@ def shade_environment_forward(real: type) -> Kernel:
             lower = padded[face, top + 1, left, d] * (one - along) + padded[face, top + 1, left + 1, d] * along
             seen, behind = logistic(upper * (one - down) + lower * down), base[row, column, d]
             reflection[row, column, d] = seen
-            rgb[row, column, d] = behind + strength[row, column] * (seen - behind)
+            rgb[row, column, d] = behind + share * (seen - behind)
 
     return forward
 
 
 @cache
 def shade_environment_backward(real: type) -> Kernel:
-    """Fills the gradients of base, normals, strength and of what was looked up, and which cells each pixel blends."""
+    """Fills the gradients of blended, alpha and of what was looked up, and which cells each pixel blends."""
     from_face, place, dot = cube_maths(real).from_face, _place(real), vector_maths().dot
     mirrored_gradient = mirror_maths(real).gradient
     shortest, zero, half, one = real(NORMAL_MIN**2), real(0.0), real(0.5), real(1.0)
 
-    @kernel("shade_environment_backward", real, f"{INPUTS} real3 real3 real3 real3 real3 real2 int1 real2 real3")
+    @kernel(
+        "shade_environment_backward",
+        real,
+        "real real3 real4 real1 real2 real1 real3 real3 real3 real3 real3 real3 real2 int1 real2 real2",
+    )
     def backward(
-        least_strength, base, normals, strength, padded, intrinsics, rotation, reflection, v_rgb, v_reflection,
-        v_base, v_normals, v_strength, first_cells, fractions, v_raw,
+        least_strength, blended, padded, intrinsics, rotation, background, base, reflection,
+        v_rgb, v_base, v_reflection, v_blended, v_alpha, first_cells, fractions, v_raw,
     ):  # fmt: skip
         i, side = cuda.grid(1), padded.shape[1]
-        if i >= strength.size:
+        if i >= v_alpha.size:
             return
-        row, column = i // strength.shape[1], i % strength.shape[1]
-        normal = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
-        if dot(normal, normal) <= shortest or abs(strength[row, column]) < least_strength:
-            v_strength[row, column], first_cells[i] = zero, 6 * side * side
-            for d in range(3):
-                v_base[row, column, d], v_normals[row, column, d] = v_rgb[row, column, d], zero
+        row, column = i // v_alpha.shape[1], i % v_alpha.shape[1]
+        pixel, v_pixel = blended[row, column], v_blended[row, column]
+        for d in range(NORMAL_AT, v_pixel.size):
+            v_pixel[d] = zero
+        normal, share = (pixel[NORMAL_AT], pixel[NORMAL_AT + 1], pixel[NORMAL_AT + 2]), pixel[STRENGTH_AT]
+        bare = dot(normal, normal) <= shortest or abs(share) < least_strength
+        kept, v_clear = one if bare else one - share, zero
+        for d in range(3):
+            v = v_base[row, column, d] + v_rgb[row, column, d] * kept
+            v_pixel[d] = v
+            v_clear += v * background[d]
+        v_alpha[row, column] = -v_clear
+        if bare:
+            first_cells[i] = 6 * side * side
             return
         ray, at, left, along, top, down = place(row, column, normal, intrinsics, rotation, side - 2)
-        face, share, v_share, by_column, by_row = at[1], strength[row, column], zero, zero, zero
+        face, v_share, by_column, by_row = at[1], zero, zero, zero
         for d in range(3):
             seen, v = reflection[row, column, d], v_rgb[row, column, d]
-            v_base[row, column, d] = v * (one - share)
             v_share += v * (seen - base[row, column, d])
             v = (v * share + v_reflection[row, column, d]) * seen * (one - seen)
-            v_raw[row, column, d] = v
+            v_raw[i, d] = v
             first, under = padded[face, top, left, d], padded[face, top + 1, left, d]
             across = padded[face, top, left + 1, d] - first
             twist = padded[face, top + 1, left + 1, d] - under - across
             by_column += v * (across + down * twist)
             by_row += v * (under - first + along * twist)
-        v_strength[row, column] = v_share
+        v_pixel[STRENGTH_AT] = v_share
         cells_per_u = half * real(side - 2)
         g = from_face(at, by_column * cells_per_u, by_row * cells_per_u)
         x, y, z = mirrored_gradient(ray, normal, g)
-        v_normals[row, column, 0], v_normals[row, column, 1], v_normals[row, column, 2] = x, y, z
+        v_pixel[NORMAL_AT], v_pixel[NORMAL_AT + 1], v_pixel[NORMAL_AT + 2] = x, y, z
         first_cells[i] = (face * side + top) * side + left
         fractions[i, 0], fractions[i, 1] = along, down
 

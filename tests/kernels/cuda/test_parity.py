@@ -380,10 +380,13 @@ def test_shade_environment(dtype: torch.dtype) -> None:
     base, strength = draw(height, width, 3, seed=1).sigmoid(), draw(height, width, seed=3).clamp(min=0, max=1)
     texels, rotation = draw(6, size, size, 3, seed=4), torch.linalg.qr(draw(3, 3, seed=5))[0].to(dtype)
     intrinsics = torch.tensor([0.9 * width, 0.8 * width, width / 2 + 0.3, height / 2 - 0.4], dtype=dtype)
-    leaves = [tensor.to(dtype).detach().requires_grad_() for tensor in (base, normals, strength, texels)]
+    blended = torch.cat([base, normals, strength[..., None], draw(height, width, 1, seed=6)], dim=-1)
+    alpha = draw(height, width, seed=7).sigmoid()
+    leaves = [tensor.to(dtype).detach().requires_grad_() for tensor in (blended, alpha, texels)]
     own = [on_device(leaf) for leaf in leaves]
-    found = shade_operation.shade_environment(*own, intrinsics.to(DEVICE), rotation.to(DEVICE), least_strength=0.2)
-    expected = shade_twin.shade_environment(*leaves, intrinsics, rotation, least_strength=0.2)
+    options = {"background": (0.5, 1.0, 0.25), "least_strength": 0.2}
+    found = shade_operation.shade_environment(*own, intrinsics.to(DEVICE), rotation.to(DEVICE), **options)
+    expected = shade_twin.shade_environment(*leaves, intrinsics, rotation, **options)
     for value, want in zip(found, expected, strict=True):
         close(value, want)
     check_gradients(found, expected, own, leaves)
