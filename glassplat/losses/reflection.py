@@ -26,3 +26,12 @@ def mask_loss(frame: Frame, view: View, scene: Scene) -> Tensor | None:
         return None
     annotated = (view.pane_labels > 0).to(frame.rgb.device).to(frame.rgb.dtype)
     return (frame.layers["mask"] - annotated).abs().mean()
+
+
+def intensity_departure(frame: Frame, view: View, scene: Scene) -> Tensor:
+    """Mean square of log a(u) over the Gaussians: how far reflections are from as bright as what they mirror.
+
+    A dim reflection of a bright thing looks like a bright reflection by a pane of lower R0. Photographs tell the two
+    apart by little; this decides where they do not (not in the paper).
+    """
+    return scene.primary.channels["log_intensity"].square().mean()

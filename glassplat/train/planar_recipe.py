@@ -11,7 +11,7 @@ from glassplat.densify.mcmc import McmcDensify
 from glassplat.init.planes import PlaneFit, fit_planes
 from glassplat.kernels.panes import Fresnel
 from glassplat.losses.geometry import depth_deviation_loss
-from glassplat.losses.reflection import gradient_conflict, mask_loss
+from glassplat.losses.reflection import gradient_conflict, intensity_departure, mask_loss
 from glassplat.losses.term import LossTerm
 from glassplat.render.planar import Blend, Planar
 from glassplat.render.splat import Splat
@@ -55,11 +55,19 @@ class PlaneRates:
 
 @dataclass(frozen=True)
 class ReflectionWeights:
-    """Weights of the terms that tell reflection from transmission (TR-Gaussians, Eq. 17)."""
+    """Weights of the terms that tell reflection from transmission (TR-Gaussians, Eq. 17).
+
+    Attributes:
+        depth: of the depth deviation behind panes (Eq. 14).
+        conflict: of edges that transmission and reflection share (Eq. 15).
+        mask: of the difference between glass and annotation (Eq. 16).
+        intensity: of the departure of a(u) from one, which the paper leaves free.
+    """
 
     depth: float = 0.005
     conflict: float = 0.2
     mask: float = 0.5
+    intensity: float = 0.0
 
     def terms(self) -> tuple[LossTerm, ...]:
         """The terms whose weight is not zero."""
@@ -67,6 +75,7 @@ class ReflectionWeights:
             LossTerm("depth", self.depth, depth_deviation_loss),
             LossTerm("conflict", self.conflict, gradient_conflict),
             LossTerm("mask", self.mask, mask_loss),
+            LossTerm("intensity", self.intensity, intensity_departure),
         )
         return tuple(term for term in terms if term.weight != 0)
 
