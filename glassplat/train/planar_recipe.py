@@ -67,7 +67,7 @@ class ReflectionWeights:
     depth: float = 0.005
     conflict: float = 0.2
     mask: float = 0.5
-    intensity: float = 0.0
+    intensity: float = 0.05
 
     def terms(self) -> tuple[LossTerm, ...]:
         """The terms whose weight is not zero."""
