@@ -22,6 +22,7 @@ Switch = Literal[
     "seeded-reflections",
     "linear-blend",
     "two-surfaces",
+    "bright-reflections",
     "propagation",
     "sabotage",
     "deferred-shading",
@@ -76,6 +77,7 @@ PLANAR: dict[Switch, Ablation] = {
     "seeded-reflections": Ablation("w/o seeded reflections", lambda r: replace(r, seed_reflections=False)),
     "linear-blend": Ablation("blended in sRGB", lambda r: replace(r, blend="srgb")),
     "two-surfaces": Ablation("one surface (Schlick, the paper's)", lambda r: replace(r, fresnel="schlick")),
+    "bright-reflections": Ablation("a(u) left free (the paper's)", _without("intensity")),
 }
 """The first seven are the rows of TR-Gaussians' Table IV, the others are parts that the paper does not ablate."""
 

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from glassplat.losses.geometry import depth_deviation_loss
-from glassplat.losses.reflection import gradient_conflict, mask_loss
+from glassplat.losses.reflection import gradient_conflict, intensity_departure, mask_loss
 from glassplat.render.frame import Frame
 
 
@@ -47,6 +47,16 @@ def test_mask_loss_applies_to_annotated_views_only() -> None:
     assert mask_loss(frame, SimpleNamespace(pane_labels=None), SimpleNamespace()) is None
     annotated = mask_loss(frame, SimpleNamespace(pane_labels=labels), SimpleNamespace())
     torch.testing.assert_close(annotated, torch.tensor(0.5 * 0.75 + 0.5 * 0.25))
+
+
+def test_reflections_depart_from_what_they_mirror_as_much_darker_as_brighter() -> None:
+    def departure(intensity: float) -> float:
+        primary = SimpleNamespace(channels={"log_intensity": torch.tensor([0.0, intensity]).log1p()})
+        return float(intensity_departure(frame_with(), SimpleNamespace(), SimpleNamespace(primary=primary)))
+
+    assert departure(0.0) == 0
+    assert abs(departure(1.0) - departure(-0.5)) < 1e-6
+    assert departure(2.0) > departure(1.0) > 0
 
 
 def test_depth_deviation_loss_does_not_depend_on_the_unit_of_length() -> None:
