@@ -40,11 +40,7 @@ class NormalPropagation:
 
     @torch.no_grad()
     def propagate(self, gaussians: Gaussians, moments: Moments) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
-        """Raised opacities and strengths, and reflective Gaussians grown.
-
-        The rows that were raised forget their moments. A Gaussian that grew keeps those of its size, which is only
-        shifted in log space: steps after forgetting are several times as long, and thin Gaussians collapse.
-        """
+        """Raised opacities and strengths, and reflective Gaussians grown; what changed forgets its moments."""
         if not self.propagates:
             return gaussians, dict(moments)
         opacities = gaussians.logit_opacities.clamp(min=logit(self.least_opacity))
@@ -53,9 +49,7 @@ class NormalPropagation:
         shortest = torch.nn.functional.one_hot(gaussians.log_scales.argmin(dim=1), 3).bool()
         log_scales = gaussians.log_scales + math.log(self.growth) * (grows[:, None] & ~shortest)
         changed = {"logit_opacities": opacities, "logit_strength": strengths, "log_scales": log_scales}
-        moments = forget(moments, ["primary.logit_opacities"], opacities != gaussians.logit_opacities)
-        moments = forget(moments, ["primary.logit_strength"], strengths != gaussians.channels["logit_strength"])
-        return gaussians.with_tensors(changed), moments
+        return gaussians.with_tensors(changed), forget(moments, [f"primary.{name}" for name in changed])
 
     @torch.no_grad()
     def disturb(
