@@ -71,8 +71,6 @@ class Planar:
         fresnel: how R_k rises from R0 at normal incidence: as that of a pane with its two surfaces, by Schlick's curve
             of one surface (Eq. 6), or not at all; see `glassplat.kernels.blend_panes`.
         intensity: use the learned intensity a(u); False sets C_r = C_raw.
-        mirrored_sh_degree: highest SH degree of the colours in the mirrored images. A pane shows things from where no
-            photograph does, and what high degrees say about those directions is made up.
         reflection_gradient: what the reflection image's gradient reaches: everything, or the planes alone.
         deviation: also compute the depth deviation where a pane is hit (Eq. 14), for training.
         deviation_depth_gradient: let the deviation's gradient pass through the mean depth D_t.
@@ -82,7 +80,6 @@ class Planar:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     fresnel: Fresnel = "pane"
     intensity: bool = True
-    mirrored_sh_degree: int = 3
     reflection_gradient: Literal["all", "planes"] = "all"
     deviation: bool = False
     deviation_depth_gradient: bool = False
@@ -159,7 +156,6 @@ class Planar:
 
     def _second_pass(self, scene: Scene, camera: Camera, planes: Planes, hits: PaneHits) -> SecondPass:
         primary = scene.primary if self.reflection_gradient == "all" else detached(scene.primary)
-        primary = replace(primary, active_sh_degree=min(primary.active_sh_degree, self.mirrored_sh_degree))
         mirrored_poses = camera.cam_from_world @ mirror_matrices(planes.centers, planes.normals)
         projected = project_gaussians(
             primary,

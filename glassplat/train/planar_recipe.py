@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify
@@ -108,7 +108,6 @@ class PlanarRecipe:
         fresnel: how the strength rises with the angle: as that of a pane with two surfaces, by Schlick's curve of one
             surface as in the paper, or not at all (ablation).
         intensity: False drops the reflection intensity a(u) (ablation).
-        mirrored_sh_degree: highest degree of the view-dependent colour in reflections (paper: all).
         blend: space in which transmission and reflection are blended: linear radiance, or sRGB as in the paper.
         detect_mirrors: treat panes that look like mirrors as mirrors, unless `plane_fit` names the mirrors.
         seed_reflections: start what no photograph shows directly from the virtual points behind the panes.
@@ -135,7 +134,6 @@ class PlanarRecipe:
     multi_stage: bool = True
     fresnel: Fresnel = "pane"
     intensity: bool = True
-    mirrored_sh_degree: int = 3
     blend: Blend = "linear"
     detect_mirrors: bool = True
     seed_reflections: bool = True
@@ -164,13 +162,7 @@ class PlanarRecipe:
 
     def renderer(self) -> Planar:
         """The renderer of the finished scene, with all its layers."""
-        return Planar(
-            self.background or BLACK,
-            fresnel=self.fresnel,
-            intensity=self.intensity,
-            mirrored_sh_degree=self.mirrored_sh_degree,
-            blend=self.blend,
-        )
+        return Planar(self.background or BLACK, fresnel=self.fresnel, intensity=self.intensity, blend=self.blend)
 
     def stages(self, seed: int) -> tuple[Stage, ...]:
         """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
@@ -233,5 +225,12 @@ class PlanarRecipe:
             self.strategy, default=self.densify, mcmc=self.mcmc, rhythm=self.rhythm, means_rate=means_rate
         )
 
-    def _training_renderer(self, gradient: Literal["all", "planes"]) -> Planar:
-        return replace(self.renderer(), reflection_gradient=gradient, deviation=self.weights.depth != 0)
+    def _training_renderer(self, gradient: str) -> Planar:
+        return Planar(
+            self.background or BLACK,
+            fresnel=self.fresnel,
+            intensity=self.intensity,
+            blend=self.blend,
+            reflection_gradient="all" if gradient == "all" else "planes",
+            deviation=self.weights.depth != 0,
+        )
