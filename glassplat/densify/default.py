@@ -17,31 +17,40 @@ from glassplat.scene.gaussians import Gaussians
 class ScreenStatistics:
     """What the views since the last densification saw of each Gaussian.
 
+    Gradients are in normalised device coordinates: the image spans [-1, 1] both ways.
+
     Attributes:
-        gradient_sum: [N] sum over views of how strongly single pixels pull at the centre on screen: the norm of
-            sums of absolute gradients, in normalised device coordinates (the image spans [-1, 1] both ways).
+        gradient_sum: [N] sum over views of the norm of the loss gradient with respect to the centre on screen.
+        pull_sum: [N] the same of what single pixels contribute to that gradient, added up without signs.
         view_count: [N] number of views that saw the Gaussian; a view in a mirror counts by its strength.
         max_radius: [N] largest radius on screen, as a share of the longer image side.
     """
 
     gradient_sum: Tensor
+    pull_sum: Tensor
     view_count: Tensor
     max_radius: Tensor
 
     @staticmethod
     def zeros(count: int, *, device: torch.device | str = "cpu") -> ScreenStatistics:
         """Statistics of `count` Gaussians that no view has seen."""
-        return ScreenStatistics(*(torch.zeros(count, device=device) for _ in range(3)))
+        return ScreenStatistics(*(torch.zeros(count, device=device) for _ in range(4)))
 
     @property
     def mean_gradient(self) -> Tensor:
         """[N] mean gradient norm over the views that saw the Gaussian; 0 where none did."""
         return self.gradient_sum / self.view_count.clamp(min=1)
 
+    @property
+    def mean_pull(self) -> Tensor:
+        """[N] mean pull of single pixels over the views that saw the Gaussian; 0 where none did."""
+        return self.pull_sum / self.view_count.clamp(min=1)
+
 
 @torch.no_grad()
 def accumulate(
     statistics: ScreenStatistics,
+    means2d_gradient: Tensor,
     probe_gradient: Tensor,
     radii: Tensor,
     *,
@@ -52,11 +61,12 @@ def accumulate(
     """The statistics with the views of one training step added.
 
     A shift by one pixel is 2 / width in normalised device coordinates, so gradients per pixel are
-    multiplied by width / 2 and height / 2; that makes the threshold independent of resolution.
+    multiplied by width / 2 and height / 2; that makes the thresholds independent of resolution.
 
     Args:
         statistics: the record so far.
-        probe_gradient: [C, N, 2] gradient of one view's loss with respect to the probe of `composite`, per pixel.
+        means2d_gradient: [C, N, 2] gradient of one view's loss with respect to `means2d` in pixels.
+        probe_gradient: [C, N, 2] that of the probe of `composite`: the same without signs.
         radii: [C, N, 2] bounds on screen in pixels; 0 where a view does not see the Gaussian.
         width: image width in pixels.
         height: image height in pixels.
@@ -64,11 +74,15 @@ def accumulate(
             as large; counted as a full view it would dilute the mean of what is also seen directly.
     """
     visible = (radii > 0).all(dim=-1)
-    pixels_per_unit = probe_gradient.new_tensor([width / 2, height / 2])
-    norms = torch.where(visible, (probe_gradient * pixels_per_unit).norm(dim=-1), 0)
+    pixels_per_unit = means2d_gradient.new_tensor([width / 2, height / 2])
+
+    def norms(gradient: Tensor) -> Tensor:
+        return torch.where(visible, (gradient * pixels_per_unit).norm(dim=-1), 0).sum(dim=0)
+
     shares = torch.where(visible, radii.amax(dim=-1) / max(width, height), 0)
     return ScreenStatistics(
-        gradient_sum=statistics.gradient_sum + norms.sum(dim=0),
+        gradient_sum=statistics.gradient_sum + norms(means2d_gradient),
+        pull_sum=statistics.pull_sum + norms(probe_gradient),
         view_count=statistics.view_count + weight * visible.sum(dim=0),
         max_radius=torch.maximum(statistics.max_radius, shares.amax(dim=0).to(statistics.max_radius.dtype)),
     )
@@ -76,19 +90,20 @@ def accumulate(
 
 @dataclass(frozen=True)
 class DefaultDensify:
-    """When and how 3DGS adds and removes Gaussians, by the measure of AbsGS (arXiv 2404.10484).
+    """When and how 3DGS adds and removes Gaussians, with the criterion of AbsGS (arXiv 2404.10484) for splits.
 
-    A Gaussian at which the pixels pull more strongly than the threshold is under-reconstructed: a small one is
-    cloned, a large one split in two. Nearly transparent ones are removed. 3DGS sums the pulls with their signs:
-    where a large Gaussian smears detail they cancel, and it stays (docs/experiments.md).
+    A small Gaussian whose mean screen gradient exceeds a threshold is cloned; a large one at which single pixels pull
+    more than another threshold is split in two. Where a large Gaussian smears detail, pixels pull it to all sides;
+    3DGS, which looks at the gradient here too, lets it be. Nearly transparent ones are removed.
 
     Attributes:
         interval: steps between densifications; at least about one pass over the views, so that
             every Gaussian has been seen when it is judged.
         start: share of the run after which densification begins.
         stop: share of the run after which it ends.
-        gradient_threshold: mean pull, in normalised device coordinates, above which a Gaussian is densified;
-            six times what 3DGS compares with its signed sums (docs/experiments.md).
+        gradient_threshold: mean gradient norm, in normalised device coordinates, above which a small Gaussian is
+            cloned.
+        pull_threshold: mean pull of single pixels, in the same unit, above which a large Gaussian is split.
         dense_fraction: Gaussians whose longest axis is above this share of the scene extent are
             split, smaller ones cloned.
         prune_opacity: Gaussians less opaque than this are removed.
@@ -104,7 +119,8 @@ class DefaultDensify:
     interval: int = 100
     start: float = 500 / 30_000
     stop: float = 15_000 / 30_000
-    gradient_threshold: float = 1.2e-3
+    gradient_threshold: float = 2e-4
+    pull_threshold: float = 1.2e-3
     dense_fraction: float = 0.01
     prune_opacity: float = 0.005
     prune_large_start: float = 1.0
@@ -151,20 +167,21 @@ class DefaultDensify:
     def _growth(
         self, gaussians: Gaussians, statistics: ScreenStatistics, *, extent: float, generator: torch.Generator
     ) -> Edit:
-        chosen = self._chosen(statistics.mean_gradient)
         large = gaussians.log_scales.amax(dim=1) > math.log(self.dense_fraction * extent)
+        gradients, pulls = statistics.mean_gradient, statistics.mean_pull
+        chosen = self._within_cap(torch.where(large, pulls / self.pull_threshold, gradients / self.gradient_threshold))
         halved = split(gaussians, (chosen & large).nonzero().squeeze(1), generator=generator)
         # What was not split moved forward by as many rows as were split before it.
         row_after_split = (~(chosen & large)).cumsum(dim=0) - 1
         return halved.then(clone(len(halved), row_after_split[chosen & ~large]))
 
-    def _chosen(self, mean_gradient: Tensor) -> Tensor:
-        """[N] bool: what to clone or split; under a cap, those with the largest gradients."""
-        chosen = mean_gradient >= self.gradient_threshold
+    def _within_cap(self, need: Tensor) -> Tensor:
+        """[N] bool: what to clone or split, of what needs it by 1 or more; under a cap, what needs it most."""
+        chosen = need >= 1
         if self.cap is None:
             return chosen
-        room = max(self.cap - mean_gradient.shape[0], 0)
-        order = torch.where(chosen, mean_gradient, -1).argsort(descending=True, stable=True)
+        room = max(self.cap - need.shape[0], 0)
+        order = torch.where(chosen, need, -1).argsort(descending=True, stable=True)
         within = torch.zeros_like(chosen)
         within[order[:room]] = True
         return chosen & within

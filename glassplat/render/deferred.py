@@ -137,7 +137,7 @@ class Deferred:
         layers = {"alpha": alpha, "normal": image[..., NORMAL_AT:STRENGTH_AT], "strength": image[..., STRENGTH_AT]}
         if self.depth:
             layers["depth"] = mean_depth(image[..., SURFACE_CHANNELS], alpha)
-        return image, layers, ScreenPass("primary", probe, projected.radii)
+        return image, layers, ScreenPass("primary", projected.means2d, probe, projected.radii)
 
 
 def check_reflective(scene: Scene) -> None:

@@ -16,17 +16,19 @@ from glassplat.scene.scene import Scene
 class ScreenPass:
     """Where the Gaussians of one scene part landed on screen, in one rasterisation pass.
 
-    The gradient of a loss with respect to `probe` is the statistic that densification collects;
-    ask for it with `torch.autograd.grad`.
+    The gradients of a loss with respect to `means2d` and `probe` are the statistics that densification collects;
+    ask for them with `torch.autograd.grad`.
 
     Attributes:
         part: name of the scene part, as in `Scene.gaussian_sets`.
+        means2d: [C, N, 2] projected centres, pixels; part of the autograd graph.
         probe: [C, N, 2] that `composite` got; its gradient is how strongly single pixels pull at the centres.
         radii: [C, N, 2] half extents in pixels; 0 where not visible.
         weight: share of the image that the pass contributes where it is seen.
     """
 
     part: str
+    means2d: Tensor
     probe: Tensor
     radii: Tensor
     weight: float = 1.0

@@ -142,8 +142,8 @@ class Planar:
         )
         alpha = result.alpha[0]
         screen = (
-            ScreenPass("primary", probe, primary.radii),
-            ScreenPass("glass", glass_probe, glass.radii),
+            ScreenPass("primary", primary.means2d, probe, primary.radii),
+            ScreenPass("glass", glass.means2d, glass_probe, glass.radii),
         )
         return FirstPass(
             transmission=over_background(result.image[0, ..., :3], alpha, self.background),
@@ -175,7 +175,7 @@ class Planar:
         if any(self.background):
             colors = over_background(reflections[..., :3], result.alpha, self.background)
             reflections = torch.cat([colors, reflections[..., 3:]], dim=-1)
-        return SecondPass(reflections, ScreenPass("primary", probe, projected.radii))
+        return SecondPass(reflections, ScreenPass("primary", projected.means2d, probe, projected.radii))
 
 
 def panes_in_camera(planes: Planes, camera: Camera) -> Panes:

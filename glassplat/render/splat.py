@@ -52,4 +52,4 @@ class Splat:
         if self.depth:
             layers["depth"] = mean_depth(image[..., 3], alpha)
         rgb = over_background(image[..., :3], alpha, self.background)
-        return Frame(rgb, layers, (ScreenPass("primary", probe, projected.radii),))
+        return Frame(rgb, layers, (ScreenPass("primary", projected.means2d, probe, projected.radii),))

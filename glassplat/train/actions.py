@@ -74,8 +74,13 @@ class Densify:
         gaussians = state.scene.gaussian_sets()[self.part]
         if statistics is None or len(gaussians) == 0:
             return
-        threshold = self.densifier.gradient_threshold * threshold_factor(dataset)
-        edited, moments = replace(self.densifier, gradient_threshold=threshold).densify(
+        factor = threshold_factor(dataset)
+        densifier = replace(
+            self.densifier,
+            gradient_threshold=self.densifier.gradient_threshold * factor,
+            pull_threshold=self.densifier.pull_threshold * factor,
+        )
+        edited, moments = densifier.densify(
             gaussians,
             state.optimizer.moments,
             statistics,

@@ -24,11 +24,11 @@ class TrainingDivergedError(FloatingPointError):
 
 
 class Differentiated(NamedTuple):
-    """One view's losses and their gradients."""
+    """One view's losses and their gradients; of each pass on screen those of its centres and of its probe."""
 
     losses: dict[str, float]
     gradients: dict[str, Tensor]
-    screen: list[tuple[ScreenPass, Tensor]]
+    screen: list[tuple[ScreenPass, Tensor, Tensor]]
 
 
 def train(stages: tuple[Stage, ...], dataset: Dataset, state: TrainState, iterations: int) -> Iterator[Message]:
@@ -105,10 +105,11 @@ def differentiate(stage: Stage, scene: Scene, view: View) -> Differentiated:
     terms = weighted_terms(stage, frame, view, learning)
     total = torch.stack(list(terms.values())).sum()
     tracked = [screen for screen in frame.screen if screen.probe.requires_grad and screen.probe.numel() > 0]
-    inputs = [*leaves.values(), *(screen.probe for screen in tracked)]
-    found = torch.autograd.grad(total, inputs, allow_unused=True)
+    centers, probes = [screen.means2d for screen in tracked], [screen.probe for screen in tracked]
+    found = torch.autograd.grad(total, [*leaves.values(), *centers, *probes], allow_unused=True)
     gradients = {name: g for name, g in zip(leaves, found[: len(leaves)], strict=True) if g is not None}
-    screen = [(s, g) for s, g in zip(tracked, found[len(leaves) :], strict=True) if g is not None]
+    pulls = zip(tracked, found[len(leaves) :], found[len(leaves) + len(tracked) :], strict=False)
+    screen = [(s, v_means, v_probe) for s, v_means, v_probe in pulls if v_means is not None and v_probe is not None]
     return Differentiated({name: float(value.detach()) for name, value in terms.items()}, gradients, screen)
 
 
@@ -127,15 +128,16 @@ def update(stage: Stage, state: TrainState, gradients: Mapping[str, Tensor], ite
     state.optimizer.step(parameters, gradients, rates)
 
 
-def collect_statistics(state: TrainState, screen: list[tuple[ScreenPass, Tensor]], view: View) -> None:
+def collect_statistics(state: TrainState, screen: list[tuple[ScreenPass, Tensor, Tensor]], view: View) -> None:
     """Adds the step's screen gradients to the statistics that densification reads."""
-    for record, gradient in screen:
+    for record, v_means, v_probe in screen:
         known = state.statistics.get(record.part)
         if known is None:
-            known = ScreenStatistics.zeros(record.probe.shape[1], device=gradient.device)
+            known = ScreenStatistics.zeros(record.probe.shape[1], device=v_means.device)
         state.statistics[record.part] = accumulate(
             known,
-            gradient,
+            v_means,
+            v_probe,
             record.radii,
             width=view.camera.width,
             height=view.camera.height,

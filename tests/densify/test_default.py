@@ -22,9 +22,13 @@ def make_gaussians(scales: list[float], opacities: list[float] | None = None) ->
     )
 
 
-def seen(gradients: list[float], radius: float = 0.01) -> ScreenStatistics:
+def seen(gradients: list[float], pulls: list[float] | None = None, radius: float = 0.01) -> ScreenStatistics:
+    """What one view saw; pixels pull six times as strongly as the gradient says unless given."""
     count = len(gradients)
-    return ScreenStatistics(torch.tensor(gradients), torch.ones(count), torch.full((count,), radius))
+    pulls = pulls or [6 * gradient for gradient in gradients]
+    return ScreenStatistics(
+        torch.tensor(gradients), torch.tensor(pulls), torch.ones(count), torch.full((count,), radius)
+    )
 
 
 def densified(options: DefaultDensify, gaussians: Gaussians, statistics: ScreenStatistics, **extra: bool) -> Gaussians:
@@ -35,28 +39,36 @@ def densified(options: DefaultDensify, gaussians: Gaussians, statistics: ScreenS
 def test_accumulate_counts_visible_views_in_device_coordinates() -> None:
     gradient = torch.tensor([[[3.0, 0.0], [0.0, 1.0], [5.0, 5.0]], [[0.0, 1.0], [9.0, 9.0], [5.0, 5.0]]])
     radii = torch.tensor([[[4, 2], [1, 1], [0, 0]], [[8, 40], [0, 3], [0, 0]]])
-    statistics = accumulate(ScreenStatistics.zeros(3), gradient, radii, width=400, height=200)
+    statistics = accumulate(ScreenStatistics.zeros(3), gradient, 2 * gradient, radii, width=400, height=200)
     assert statistics.gradient_sum.tolist() == [3 * 200 + 1 * 100, 100, 0]
+    assert statistics.pull_sum.tolist() == [2 * (3 * 200 + 1 * 100), 200, 0]
     assert statistics.view_count.tolist() == [2, 1, 0]
     assert statistics.max_radius.tolist() == pytest.approx([0.1, 1 / 400, 0])
     assert statistics.mean_gradient.tolist() == [350, 100, 0]
+    assert statistics.mean_pull.tolist() == [700, 200, 0]
 
 
 def test_statistics_do_not_depend_on_the_resolution() -> None:
     gradient, radii = torch.rand(1, 5, 2), torch.full((1, 5, 2), 6)
-    small = accumulate(ScreenStatistics.zeros(5), gradient, radii, width=100, height=80)
-    large = accumulate(ScreenStatistics.zeros(5), gradient / 2, radii * 2, width=200, height=160)
+    small = accumulate(ScreenStatistics.zeros(5), gradient, gradient, radii, width=100, height=80)
+    large = accumulate(ScreenStatistics.zeros(5), gradient / 2, gradient / 2, radii * 2, width=200, height=160)
     assert torch.allclose(small.gradient_sum, large.gradient_sum)
     assert torch.allclose(small.max_radius, large.max_radius)
 
 
 def test_small_ones_are_cloned_large_ones_split_and_the_rest_kept() -> None:
     gaussians = make_gaussians([0.001, 0.5, 0.001, 0.5])
-    after = densified(DefaultDensify(gradient_threshold=1e-4), gaussians, seen([1e-3, 1e-3, 1e-5, 1e-5]))
+    after = densified(DefaultDensify(), gaussians, seen([1e-3, 1e-3, 1e-5, 1e-5]))
     assert len(after) == 6
     sizes = after.log_scales[:, 0].exp()
     assert sizes.tolist() == pytest.approx([0.001, 0.001, 0.5, 0.5 / 1.6, 0.5 / 1.6, 0.001])
     assert torch.equal(after.means[5], gaussians.means[0])
+
+
+def test_pixels_that_pull_against_each_other_split_what_is_large_only() -> None:
+    gaussians = make_gaussians([0.001, 0.5, 0.5])
+    after = densified(DefaultDensify(), gaussians, seen([0.0, 0.0, 1e-3], pulls=[1e-2, 1e-2, 1e-4]))
+    assert after.log_scales[:, 0].exp().tolist() == pytest.approx([0.001, 0.5, 0.5 / 1.6, 0.5 / 1.6])
 
 
 def test_transparent_gaussians_are_pruned_together_with_their_moments() -> None:
@@ -78,9 +90,9 @@ def test_large_ones_are_pruned_only_when_asked() -> None:
 
 def test_cap_lets_the_largest_gradients_grow() -> None:
     gaussians = make_gaussians([0.001] * 4)
-    after = densified(DefaultDensify(gradient_threshold=1e-4, cap=6), gaussians, seen([3e-4, 9e-4, 8e-4, 0.0]))
+    after = densified(DefaultDensify(cap=6), gaussians, seen([3e-4, 9e-4, 8e-4, 0.0]))
     assert after.means[4:].tolist() == gaussians.means[[1, 2]].tolist()
-    assert len(densified(DefaultDensify(gradient_threshold=1e-4, cap=3), gaussians, seen([1.0] * 4))) == 4
+    assert len(densified(DefaultDensify(cap=3), gaussians, seen([1.0] * 4))) == 4
 
 
 def test_same_seed_same_bits() -> None:
