@@ -1,4 +1,4 @@
-"""Keeping the primary Gaussians transparent and small unless the photographs need them (3DGS-MCMC)."""
+"""Keeping the primary Gaussians transparent, small and evenly coloured unless the photographs need them otherwise."""
 
 from __future__ import annotations
 
@@ -26,3 +26,13 @@ def mean_scale(frame: Frame, view: View, scene: Scene) -> Tensor:
     """
     scales = scene.primary.log_scales.exp()
     return scales.sum() / max(scales.numel(), 1) / scene.extent
+
+
+def view_dependence(frame: Frame, view: View, scene: Scene) -> Tensor:
+    """Squares of the spherical harmonics beyond the constant one, per Gaussian (not in the papers).
+
+    What is seen from few directions has coefficients that no photograph decides, and its colour from other directions,
+    from which a pane shows it, is whatever they happen to be.
+    """
+    higher = scene.primary.sh[:, 1:]
+    return higher.square().sum() / max(higher.shape[0], 1)

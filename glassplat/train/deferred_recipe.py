@@ -23,7 +23,7 @@ from glassplat.scene.scene import Scene
 from glassplat.train.background import BLACK
 from glassplat.train.optimizer import Rate
 from glassplat.train.propagation import GrowShAfterPropagation, Propagate, PropagationSchedule, RefineEnvironment
-from glassplat.train.splat_recipe import GaussianRates, photometric_term
+from glassplat.train.splat_recipe import GaussianRates, image_terms
 from glassplat.train.stage import Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
 
@@ -52,6 +52,7 @@ class DeferredRecipe:
     Attributes:
         sh_degree: highest degree of the view-dependent colour, which grows once propagation has ended.
         ssim_weight: lambda, share of D-SSIM in the photometric loss.
+        view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
         background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         shading: per pixel (`deferred`), or per Gaussian (`forward`, ablation).
         bootstrap: share of the run without reflection (paper: a few thousand iterations).
@@ -77,6 +78,7 @@ class DeferredRecipe:
 
     sh_degree: int = 3
     ssim_weight: float = 0.2
+    view_dependence_weight: float = 0.0
     background: tuple[float, float, float] | None = None
     shading: Shading = "deferred"
     bootstrap: float = 0.043
@@ -115,12 +117,12 @@ class DeferredRecipe:
     def stages(self, seed: int) -> tuple[Stage, ...]:
         """Bootstrap, then everything; what changes in between is up to `Propagate`."""
         population = self._population()
-        photometric = photometric_term(self.ssim_weight)
+        image = image_terms(self.ssim_weight, self.view_dependence_weight)
         bootstrap = Stage(
             name="1 bootstrap",
             share=self.bootstrap,
             renderer=Splat(self.background or BLACK, depth=False),
-            losses=(photometric, *population.terms),
+            losses=(*image, *population.terms),
             rates=self.rates.of("primary"),
             actions=population.edits,
             motions=population.motions,
@@ -134,7 +136,7 @@ class DeferredRecipe:
             name="2 reflection",
             share=self.schedule.stop - self.bootstrap,
             renderer=Deferred(self.background or BLACK, self.shading, depth=self.consistency_weight != 0),
-            losses=(photometric, *(term for term in guidance if term.weight != 0), *population.terms),
+            losses=(*image, *(term for term in guidance if term.weight != 0), *population.terms),
             rates=self.rates.of("primary") | self.reflection_rates.of(),
             actions=(
                 *population.edits,

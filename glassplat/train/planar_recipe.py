@@ -20,7 +20,7 @@ from glassplat.train.actions import Densify, GrowSh, PerturbOpacity
 from glassplat.train.background import BLACK
 from glassplat.train.optimizer import Rate
 from glassplat.train.plane_entry import PlaneEntry, annotations_of
-from glassplat.train.splat_recipe import GaussianRates, photometric_term
+from glassplat.train.splat_recipe import GaussianRates, image_terms
 from glassplat.train.stage import Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
 
@@ -102,6 +102,7 @@ class PlanarRecipe:
     Attributes:
         sh_degree: highest degree of the view-dependent colour.
         ssim_weight: lambda, share of D-SSIM in the photometric loss.
+        view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
         background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         stage_shares: lengths of the three stages (paper: 3000, 3000 and 24,000 iterations).
         multi_stage: False skips stage 2 (ablation).
@@ -129,6 +130,7 @@ class PlanarRecipe:
 
     sh_degree: int = 3
     ssim_weight: float = 0.2
+    view_dependence_weight: float = 0.0
     background: tuple[float, float, float] | None = None
     stage_shares: tuple[float, float, float] = (0.1, 0.1, 0.8)
     multi_stage: bool = True
@@ -173,7 +175,7 @@ class PlanarRecipe:
             name="1 initialisation",
             share=first,
             renderer=Splat(self.background or BLACK, depth=False),
-            losses=(photometric_term(self.ssim_weight), *population.terms),
+            losses=(*image_terms(self.ssim_weight, self.view_dependence_weight), *population.terms),
             rates=self.rates.of("primary"),
             actions=(*population.edits, GrowSh(Every(self.rhythm.sh))),
             motions=population.motions,
@@ -189,7 +191,11 @@ class PlanarRecipe:
             name="2 plane adjustment",
             share=share,
             renderer=self._training_renderer("planes"),
-            losses=(photometric_term(self.ssim_weight), *self.weights.terms(), *population.terms),
+            losses=(
+                *image_terms(self.ssim_weight, self.view_dependence_weight),
+                *self.weights.terms(),
+                *population.terms,
+            ),
             rates=self.rates.of("primary") | self.rates.of("glass") | self.plane_rates.of(1.0),
             actions=(*population.edits, GrowSh(Every(self.rhythm.sh)), Densify(self.densify, part="glass")),
             motions=population.motions,
@@ -204,7 +210,11 @@ class PlanarRecipe:
             name="3 joint optimisation",
             share=share,
             renderer=self._training_renderer("all"),
-            losses=(photometric_term(self.ssim_weight), *self.weights.terms(), *population.terms),
+            losses=(
+                *image_terms(self.ssim_weight, self.view_dependence_weight),
+                *self.weights.terms(),
+                *population.terms,
+            ),
             rates=self.rates.of("primary")
             | self.rates.of("glass")
             | self.plane_rates.of(self.plane_rates.joint_factor)
@@ -218,6 +228,10 @@ class PlanarRecipe:
             ),
             motions=population.motions,
         )
+
+    def _joint_terms(self, population: Population) -> tuple[LossTerm, ...]:
+        image = image_terms(self.ssim_weight, self.view_dependence_weight)
+        return (*image, *self.weights.terms(), *population.terms)
 
     def _population(self) -> Population:
         means_rate = self.rates.of("primary")["primary.means"]

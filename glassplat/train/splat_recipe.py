@@ -8,6 +8,7 @@ from typing import ClassVar
 from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
+from glassplat.losses.parsimony import view_dependence
 from glassplat.losses.photometric import PhotometricLoss
 from glassplat.losses.term import LossTerm
 from glassplat.render.splat import Splat
@@ -49,9 +50,13 @@ class GaussianRates:
         }
 
 
-def photometric_term(ssim_weight: float) -> LossTerm:
-    """(1 - lambda) L1 + lambda D-SSIM (TR-Gaussians, Eq. 18)."""
-    return LossTerm("photometric", 1.0, PhotometricLoss(ssim_weight))
+def image_terms(ssim_weight: float, view_dependence_weight: float) -> tuple[LossTerm, ...]:
+    """(1 - lambda) L1 + lambda D-SSIM (TR-Gaussians, Eq. 18), and what keeps colours from turning with the view."""
+    terms = (
+        LossTerm("photometric", 1.0, PhotometricLoss(ssim_weight)),
+        LossTerm("view dependence", view_dependence_weight, view_dependence),
+    )
+    return tuple(term for term in terms if term.weight != 0)
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,7 @@ class SplatRecipe:
     Attributes:
         sh_degree: highest degree of the view-dependent colour.
         ssim_weight: lambda, share of D-SSIM in the photometric loss.
+        view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
         background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         rates: learning rates.
         rhythm: when opacities are reset and the SH degree grows.
@@ -73,6 +79,7 @@ class SplatRecipe:
 
     sh_degree: int = 3
     ssim_weight: float = 0.2
+    view_dependence_weight: float = 0.0
     background: tuple[float, float, float] | None = None
     rates: GaussianRates = field(default_factory=GaussianRates)
     rhythm: Rhythm = field(default_factory=Rhythm)
@@ -96,7 +103,7 @@ class SplatRecipe:
                 name="splat",
                 share=1.0,
                 renderer=Splat(self.background or BLACK, depth=False),
-                losses=(photometric_term(self.ssim_weight), *population.terms),
+                losses=(*image_terms(self.ssim_weight, self.view_dependence_weight), *population.terms),
                 rates=self.rates.of("primary"),
                 actions=(*population.edits, GrowSh(Every(self.rhythm.sh)), *population.resets),
                 motions=population.motions,

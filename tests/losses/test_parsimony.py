@@ -1,13 +1,14 @@
-"""Opacity and scale regularisation."""
+"""Regularisation of opacity, scale and view-dependent colour."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 
-from glassplat.losses.parsimony import mean_opacity, mean_scale
+from glassplat.losses.parsimony import mean_opacity, mean_scale, view_dependence
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
@@ -49,3 +50,16 @@ def test_no_gaussians_cost_nothing() -> None:
     scene = scene_of([], scale=0.3)
     assert mean_opacity(UNUSED, UNUSED, scene).item() == 0
     assert mean_scale(UNUSED, UNUSED, scene).item() == 0
+
+
+def test_only_colours_that_turn_with_the_view_are_held() -> None:
+    scene = scene_of([0.5, 0.5], scale=0.3)
+    sh = torch.zeros(2, 4, 3)
+    sh[:, 0] = 7.0
+    constant = replace(scene, primary=scene.primary.with_tensors({"sh": sh}))
+    assert view_dependence(UNUSED, UNUSED, constant).item() == 0
+    sh = sh.clone()
+    sh[1, 2] = torch.tensor([1.0, -2.0, 0.0])
+    turning = replace(scene, primary=scene.primary.with_tensors({"sh": sh}))
+    assert view_dependence(UNUSED, UNUSED, turning).item() == pytest.approx(5 / 2)
+    assert view_dependence(UNUSED, UNUSED, scene).item() == 0
