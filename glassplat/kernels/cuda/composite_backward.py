@@ -99,6 +99,26 @@ def _enter(real: type, num_channels: int) -> Scalar:
     return enter
 
 
+def _write(num_channels: int, probed: bool) -> Scalar:
+    @inlined
+    def write(
+        out, pair, g_x, g_y, g_xx, g_xy, g_yy, g_0, v_value, channel, v_apart, glass, v_mark, pull_x, pull_y
+    ):  # fmt: skip
+        """Fills the gradient row of a pair; the mark's gradient takes the place of the first channel's."""
+        out[pair, 0], out[pair, 1], out[pair, 2] = g_x, g_y, g_xx
+        out[pair, 3], out[pair, 4], out[pair, 5] = g_xy, g_yy, g_0
+        for d in range(num_channels):
+            out[pair, MOMENTS + d] = v_value[d]
+        if channel >= 0:
+            out[pair, MOMENTS + channel] += v_apart
+        if glass:
+            out[pair, MOMENTS] = v_mark
+        if probed:
+            out[pair, MOMENTS + num_channels], out[pair, MOMENTS + num_channels + 1] = pull_x, pull_y
+
+    return write
+
+
 def _planes(num_channels: int) -> tuple[int, ...]:
     """Where the planes of a tile's pulls beyond those of its channels begin."""
     return tuple(PIXELS * (num_channels + i) for i in range(PULLS))
@@ -111,7 +131,7 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
     clipped_alpha = blend_maths(real).clipped_alpha
     zero, one, half, alpha_max = real(0.0), real(1.0), real(0.5), real(ALPHA_MAX)
     shown, spread, middle, _, _ = _planes(num_channels)
-    enter = _enter(real, num_channels)
+    enter, write = _enter(real, num_channels), _write(num_channels, probed)
 
     @kernel(
         f"composite_backward_{num_channels}{'_probed' if probed else ''}",
@@ -153,10 +173,11 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
             )  # fmt: skip
         order = first + lane
         inside, glass, mark, apart, own_last = order < looked_at[n], False, zero, zero, tile_last
+        xx, xy, yy, pull_x, pull_y = zero, zero, zero, zero, zero
         if inside:
             s = pair_splats[start + order]
             load(geometry, membership, 0, s, means, conics, opacities, x0, y0, rows)
-            glass = s >= first_glass
+            xx, xy, yy, glass = conics[s, 0], conics[s, 1], conics[s, 2], s >= first_glass
             if glass:
                 mark, own_last = marks[camera, s - first_glass], tile_last + PIXELS
             else:
@@ -166,10 +187,6 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
         for d in range(num_channels):
             v_value[d] = zero
         g_x, g_y, g_xx, g_xy, g_yy, g_0, v_mark, v_apart = zero, zero, zero, zero, zero, zero, zero, zero
-        xx, xy, yy, pull_x, pull_y = zero, zero, zero, zero, zero
-        if probed and inside:
-            s = pair_splats[start + order]
-            xx, xy, yy = conics[s, 0], conics[s, 1], conics[s, 2]
         for step in range(rows * TILE + BUCKET - 1):
             # The lanes of a warp wait for each other; the simulator knows no warps, but blocks.
             if SIMULATED:
@@ -222,16 +239,10 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
                 if probed:
                     pull_x += abs(gain * (xx * dx + xy * dy))
                     pull_y += abs(gain * (xy * dx + yy * dy))
-        if not inside:
-            return
-        pair = start + order
-        out[pair, 0], out[pair, 1], out[pair, 2] = g_x, g_y, g_xx
-        out[pair, 3], out[pair, 4], out[pair, 5] = g_xy, g_yy, g_0
-        for d in range(num_channels):
-            out[pair, MOMENTS + d] = v_value[d] + (v_apart if d == channel else zero)
-        if glass:
-            out[pair, MOMENTS] = v_mark
-        if probed:
-            out[pair, MOMENTS + num_channels], out[pair, MOMENTS + num_channels + 1] = pull_x, pull_y
+        if inside:
+            write(
+                out, start + order, g_x, g_y, g_xx, g_xy, g_yy, g_0, v_value, channel, v_apart,
+                glass, v_mark, pull_x, pull_y,
+            )  # fmt: skip
 
     return backward
