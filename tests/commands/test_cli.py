@@ -124,7 +124,7 @@ def test_a_broken_scene_file_is_reported(tmp_path: Path, capsys: pytest.CaptureF
 def test_the_demo_compares_both_methods_and_can_be_repeated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for _ in range(2):
         assert main(["demo", "--output", str(tmp_path), "--iterations", "10"]) == 0
-        shown = capsys.readouterr().out
+        shown = "".join(capsys.readouterr().out.split())
         assert "planar" in shown and "splat" in shown and "index.html" in shown
     assert (tmp_path / "planar" / "index.html").is_file()
 
