@@ -21,3 +21,8 @@ class LossTerm:
     name: str
     weight: float
     function: LossFunction
+
+
+def weighted(*terms: LossTerm) -> tuple[LossTerm, ...]:
+    """The terms whose weight is not zero; the others are not even computed."""
+    return tuple(term for term in terms if term.weight != 0)

@@ -14,7 +14,7 @@ from glassplat.densify.propagate import NormalPropagation
 from glassplat.init.region import reflective_region
 from glassplat.losses.geometry import normal_consistency
 from glassplat.losses.reflectors import strength_outside
-from glassplat.losses.term import LossTerm
+from glassplat.losses.term import LossTerm, weighted
 from glassplat.render.deferred import INVISIBLE, Deferred, Shading
 from glassplat.render.splat import Splat
 from glassplat.scene.activations import logit
@@ -128,7 +128,7 @@ class DeferredRecipe:
             motions=population.motions,
         )
         beat = Every(self.rhythm.beat, 0.0, self.schedule.stop, self.rhythm.least, skip_multiples_of=3)
-        guidance = (
+        guidance = weighted(
             LossTerm("outside", self.outside_weight, strength_outside),
             LossTerm("consistency", self.consistency_weight, normal_consistency),
         )
@@ -136,7 +136,7 @@ class DeferredRecipe:
             name="2 reflection",
             share=self.schedule.stop - self.bootstrap,
             renderer=Deferred(self.background or BLACK, self.shading, depth=self.consistency_weight != 0),
-            losses=(*image, *(term for term in guidance if term.weight != 0), *population.terms),
+            losses=(*image, *guidance, *population.terms),
             rates=self.rates.of("primary") | self.reflection_rates.of(),
             actions=(
                 *population.edits,

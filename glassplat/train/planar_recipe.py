@@ -12,7 +12,7 @@ from glassplat.init.planes import PlaneFit, fit_planes
 from glassplat.kernels.panes import Fresnel
 from glassplat.losses.geometry import depth_deviation_loss
 from glassplat.losses.reflection import gradient_conflict, intensity_departure, mask_loss
-from glassplat.losses.term import LossTerm
+from glassplat.losses.term import LossTerm, weighted
 from glassplat.render.planar import Blend, Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
@@ -71,13 +71,12 @@ class ReflectionWeights:
 
     def terms(self) -> tuple[LossTerm, ...]:
         """The terms whose weight is not zero."""
-        terms = (
+        return weighted(
             LossTerm("depth", self.depth, depth_deviation_loss),
             LossTerm("conflict", self.conflict, gradient_conflict),
             LossTerm("mask", self.mask, mask_loss),
             LossTerm("intensity", self.intensity, intensity_departure),
         )
-        return tuple(term for term in terms if term.weight != 0)
 
 
 @dataclass(frozen=True)
@@ -191,11 +190,7 @@ class PlanarRecipe:
             name="2 plane adjustment",
             share=share,
             renderer=self._training_renderer("planes"),
-            losses=(
-                *image_terms(self.ssim_weight, self.view_dependence_weight),
-                *self.weights.terms(),
-                *population.terms,
-            ),
+            losses=self._joint_terms(population),
             rates=self.rates.of("primary") | self.rates.of("glass") | self.plane_rates.of(1.0),
             actions=(*population.edits, GrowSh(Every(self.rhythm.sh)), Densify(self.densify, part="glass")),
             motions=population.motions,
@@ -210,11 +205,7 @@ class PlanarRecipe:
             name="3 joint optimisation",
             share=share,
             renderer=self._training_renderer("all"),
-            losses=(
-                *image_terms(self.ssim_weight, self.view_dependence_weight),
-                *self.weights.terms(),
-                *population.terms,
-            ),
+            losses=self._joint_terms(population),
             rates=self.rates.of("primary")
             | self.rates.of("glass")
             | self.plane_rates.of(self.plane_rates.joint_factor)

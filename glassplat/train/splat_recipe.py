@@ -10,7 +10,7 @@ from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
 from glassplat.losses.parsimony import view_dependence
 from glassplat.losses.photometric import PhotometricLoss
-from glassplat.losses.term import LossTerm
+from glassplat.losses.term import LossTerm, weighted
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import GrowSh
@@ -52,11 +52,10 @@ class GaussianRates:
 
 def image_terms(ssim_weight: float, view_dependence_weight: float) -> tuple[LossTerm, ...]:
     """(1 - lambda) L1 + lambda D-SSIM (TR-Gaussians, Eq. 18), and what keeps colours from turning with the view."""
-    terms = (
+    return weighted(
         LossTerm("photometric", 1.0, PhotometricLoss(ssim_weight)),
         LossTerm("view dependence", view_dependence_weight, view_dependence),
     )
-    return tuple(term for term in terms if term.weight != 0)
 
 
 @dataclass(frozen=True)

@@ -108,7 +108,8 @@ def differentiate(stage: Stage, scene: Scene, view: View) -> Differentiated:
     centers, probes = [screen.means2d for screen in tracked], [screen.probe for screen in tracked]
     found = torch.autograd.grad(total, [*leaves.values(), *centers, *probes], allow_unused=True)
     gradients = {name: g for name, g in zip(leaves, found[: len(leaves)], strict=True) if g is not None}
-    pulls = zip(tracked, found[len(leaves) :], found[len(leaves) + len(tracked) :], strict=False)
+    on_screen = found[len(leaves) :]
+    pulls = zip(tracked, on_screen[: len(tracked)], on_screen[len(tracked) :], strict=True)
     screen = [(s, v_means, v_probe) for s, v_means, v_probe in pulls if v_means is not None and v_probe is not None]
     return Differentiated({name: float(value.detach()) for name, value in terms.items()}, gradients, screen)
 

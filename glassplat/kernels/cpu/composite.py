@@ -124,8 +124,17 @@ def _weigh(real: type) -> Scalar:
     return weigh
 
 
+@inlined
+def add_group(scratch, at, weight, c0, c1, c2, c3):
+    """Adds four channels of a splat to a pixel's sums, the first of which is at `at`."""
+    scratch[at] += weight * c0
+    scratch[at + tile.PLANE] += weight * c1
+    scratch[at + 2 * tile.PLANE] += weight * c2
+    scratch[at + 3 * tile.PLANE] += weight * c3
+
+
 def _blend_primary(real: type) -> Scalar:
-    COVERAGE, PLANE, VALUES, weigh = tile.COVERAGE, tile.PLANE, tile.VALUES, _weigh(real)
+    COVERAGE, VALUES, weigh = tile.COVERAGE, tile.VALUES, _weigh(real)
 
     @inlined
     def blend_primary(scratch, splat, order, first, last):
@@ -134,10 +143,7 @@ def _blend_primary(real: type) -> Scalar:
             base = (row & 15) * 16
             for i in range(16):
                 weight = weigh(scratch, base + i, order)
-                scratch[SUMS + base + i] += weight * c0
-                scratch[SUMS + PLANE + base + i] += weight * c1
-                scratch[SUMS + 2 * PLANE + base + i] += weight * c2
-                scratch[SUMS + 3 * PLANE + base + i] += weight * c3
+                add_group(scratch, SUMS + base + i, weight, c0, c1, c2, c3)
                 # From here on the plane holds weights, for the channels of `blend_more`.
                 scratch[COVERAGE + base + i] = weight
 
@@ -156,10 +162,7 @@ def _blend_seven(real: type) -> Scalar:
             base = (row & 15) * 16
             for i in range(16):
                 weight = weigh(scratch, base + i, order)
-                scratch[SUMS + base + i] += weight * c0
-                scratch[SUMS + PLANE + base + i] += weight * c1
-                scratch[SUMS + 2 * PLANE + base + i] += weight * c2
-                scratch[SUMS + 3 * PLANE + base + i] += weight * c3
+                add_group(scratch, SUMS + base + i, weight, c0, c1, c2, c3)
                 scratch[SUMS + 4 * PLANE + base + i] += weight * c4
                 scratch[SUMS + 5 * PLANE + base + i] += weight * c5
                 scratch[SUMS + 6 * PLANE + base + i] += weight * c6
@@ -179,10 +182,7 @@ def _blend_more(real: type) -> Scalar:
             base = (row & 15) * 16
             for i in range(16):
                 weight = scratch[COVERAGE + base + i]
-                scratch[sums + base + i] += weight * c0
-                scratch[sums + PLANE + base + i] += weight * c1
-                scratch[sums + 2 * PLANE + base + i] += weight * c2
-                scratch[sums + 3 * PLANE + base + i] += weight * c3
+                add_group(scratch, sums + base + i, weight, c0, c1, c2, c3)
 
     return blend_more
 

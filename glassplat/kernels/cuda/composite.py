@@ -106,7 +106,7 @@ def composite_gradients(
         tiles, PIXELS, channel, bins.active, saved.final, saved.center, image, mask, deviated,
         *(v.contiguous() for v in (v_image, v_alpha, v_mask, v_deviation, v_spread)), pulls,
     )  # fmt: skip
-    rows = new_pair_rows(bins, num_channels, channels, probed)
+    rows = new_pair_rows(bins, channels, probed)
     composite_backward(real, num_channels, probed)(
         blocks_for(len(saved.bucket_tiles), WARPS), THREADS, *flat_geometry(splats), channels.view(-1, num_channels),
         marks, count, num_primary, channel, bins.width, bins.height, bins.pair_splats, bins.tile_offsets, bins.active,

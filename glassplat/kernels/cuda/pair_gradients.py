@@ -20,9 +20,9 @@ THREADS = 256
 MOMENTS = 6
 
 
-def new_pair_rows(bins: TileBins, num_values: int, like: Tensor, probed: bool) -> Tensor:
+def new_pair_rows(bins: TileBins, channels: Tensor, probed: bool) -> Tensor:
     """One gradient row per pair [P, 6 + D, + 2 if probed], all zero: a tile fills those of pairs that it blended."""
-    return like.new_zeros(len(bins.pair_splats), MOMENTS + num_values + (2 if probed else 0))
+    return channels.new_zeros(len(bins.pair_splats), MOMENTS + channels.shape[2] + (2 if probed else 0))
 
 
 def sum_pair_rows(
