@@ -23,6 +23,7 @@ Switch = Literal[
     "linear-blend",
     "two-surfaces",
     "bright-reflections",
+    "calm-colors",
     "propagation",
     "sabotage",
     "deferred-shading",
@@ -78,6 +79,7 @@ PLANAR: dict[Switch, Ablation] = {
     "linear-blend": Ablation("blended in sRGB", lambda r: replace(r, blend="srgb")),
     "two-surfaces": Ablation("one surface (Schlick, the paper's)", lambda r: replace(r, fresnel="schlick")),
     "bright-reflections": Ablation("a(u) left free (the paper's)", _without("intensity")),
+    "calm-colors": Ablation("harmonics left free (the paper's)", lambda r: replace(r, view_dependence_weight=0.0)),
 }
 """The first seven are the rows of TR-Gaussians' Table IV, the others are parts that the paper does not ablate."""
 

@@ -101,7 +101,8 @@ class PlanarRecipe:
     Attributes:
         sh_degree: highest degree of the view-dependent colour.
         ssim_weight: lambda, share of D-SSIM in the photometric loss.
-        view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
+        view_dependence_weight: of the squares of the spherical harmonics beyond the constant one. Mirrored views see
+            Gaussians from where no photograph does, so that harmonics extrapolate; the paper has no such term.
         background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         stage_shares: lengths of the three stages (paper: 3000, 3000 and 24,000 iterations).
         multi_stage: False skips stage 2 (ablation).
@@ -129,7 +130,7 @@ class PlanarRecipe:
 
     sh_degree: int = 3
     ssim_weight: float = 0.2
-    view_dependence_weight: float = 0.0
+    view_dependence_weight: float = 0.1
     background: tuple[float, float, float] | None = None
     stage_shares: tuple[float, float, float] = (0.1, 0.1, 0.8)
     multi_stage: bool = True
