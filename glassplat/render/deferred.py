@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -11,10 +11,11 @@ from torch import Tensor
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
 from glassplat.kernels.cube_lookup import cube_lookup
-from glassplat.kernels.facing_normals import facing_normals
 from glassplat.kernels.reference.pane_hits import ray_grid
 from glassplat.kernels.shade_environment import shade_environment
 from glassplat.kernels.shaded import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
+from glassplat.kernels.splats import Projected
+from glassplat.kernels.surface_channels import surface_channels
 from glassplat.render.frame import Frame, ScreenPass
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
@@ -31,13 +32,6 @@ from glassplat.scene.scene import Scene
 Shading = Literal["deferred", "forward"]
 INVISIBLE = 1 / 512
 """A pixel that reflects less changes by at most half a step of eight bits, from black to white."""
-
-
-class Surface(NamedTuple):
-    """What each Gaussian adds to the image besides its colour: normals [N, 3] facing the camera, strengths [N]."""
-
-    normals: Tensor
-    strengths: Tensor
 
 
 @dataclass(frozen=True)
@@ -77,20 +71,30 @@ class Deferred:
         """
         check_reflective(scene)
         camera = camera.to(scene.primary.means.device)
-        surface = surface_of(scene.primary, camera)
-        rgb, layers, screen = (
-            self._shade_pixels(scene, camera, surface)
-            if self.shading == "deferred"
-            else self._shade_gaussians(scene, camera, surface)
-        )
+        projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
+        shade = self._shade_pixels if self.shading == "deferred" else self._shade_gaussians
+        rgb, layers, screen = shade(scene, camera, projected, self._channels_of(scene.primary, camera, projected))
         if self.environment:
             layers["environment"] = torch.sigmoid(cube_lookup(scene.environment.raw, view_directions(camera)))
         return Frame(rgb, layers, (screen,))
 
+    def _channels_of(self, gaussians: Gaussians, camera: Camera, projected: Projected) -> Tensor:
+        """[N, D] what each Gaussian adds to the image: as `shade_environment` reads it, then depth, if asked for."""
+        return surface_channels(
+            projected.colors[0],
+            projected.radii[0],
+            gaussians.quats,
+            gaussians.log_scales,
+            gaussians.means,
+            gaussians.channels["logit_strength"],
+            camera.center,
+            projected.depths[0, :, None] if self.depth else None,
+        )
+
     def _shade_pixels(
-        self, scene: Scene, camera: Camera, surface: Surface
+        self, scene: Scene, camera: Camera, projected: Projected, channels: Tensor
     ) -> tuple[Tensor, dict[str, Tensor], ScreenPass]:
-        image, layers, screen = self._blend(scene, camera, surface)
+        image, layers, screen = self._blend(camera, projected, channels)
         shaded = shade_environment(
             image,
             layers["alpha"],
@@ -103,36 +107,25 @@ class Deferred:
         return shaded.rgb, layers | {"base": shaded.base, "reflection": shaded.reflection}, screen
 
     def _shade_gaussians(
-        self, scene: Scene, camera: Camera, surface: Surface
+        self, scene: Scene, camera: Camera, projected: Projected, channels: Tensor
     ) -> tuple[Tensor, dict[str, Tensor], ScreenPass]:
+        colors, normals, strengths = channels[:, :SURFACE_CHANNELS].split((NORMAL_AT, 3, 1), dim=1)
         to_eye = torch.nn.functional.normalize(camera.center - scene.primary.means, dim=1)
-        cosines = (surface.normals * to_eye).sum(-1, keepdim=True)
-        mirrored = torch.sigmoid(cube_lookup(scene.environment.raw, 2 * cosines * surface.normals - to_eye))
-        image, layers, screen = self._blend(scene, camera, surface, mirrored)
+        cosines = (normals * to_eye).sum(-1, keepdim=True)
+        mirrored = torch.sigmoid(cube_lookup(scene.environment.raw, 2 * cosines * normals - to_eye))
+        channels = torch.cat([channels, strengths * colors, strengths * mirrored], dim=1)
+        image, layers, screen = self._blend(camera, projected, channels)
         base = over_background(image[..., :NORMAL_AT], layers["alpha"], self.background)
         lost, gained = image[..., -6:-3], image[..., -3:]
         reflection = gained / layers["strength"][..., None].clamp(min=1e-6)
         return base - lost + gained, layers | {"base": base, "reflection": reflection}, screen
 
     def _blend(
-        self, scene: Scene, camera: Camera, surface: Surface, mirrored: Tensor | None = None
+        self, camera: Camera, projected: Projected, channels: Tensor
     ) -> tuple[Tensor, dict[str, Tensor], ScreenPass]:
-        """The blended image [H, W, D] and its layers but for the base.
-
-        Channels are those of `shade_environment`, then depth, if asked for; given what each Gaussian mirrors [N, 3],
-        the colours lost and gained come last.
-        """
-        projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
-        splats = joined_splats(projected)
-        colors, shares = projected.colors[0], surface.strengths[:, None]
-        values = [colors, surface.normals, shares]
-        if self.depth:
-            values.append(projected.depths[0, :, None])
-        if mirrored is not None:
-            values += [shares * colors, shares * mirrored]
-        channels = torch.cat(values, dim=-1)[None]
-        probe = probe_of(projected)
-        result = composite(splats, channels, bin_tiles(splats, camera.width, camera.height), probe=probe)
+        """The blended image [H, W, D] of channels [N, D], and its layers but for the base."""
+        splats, probe = joined_splats(projected), probe_of(projected)
+        result = composite(splats, channels[None], bin_tiles(splats, camera.width, camera.height), probe=probe)
         image, alpha = result.image[0], result.alpha[0]
         layers = {"alpha": alpha, "normal": image[..., NORMAL_AT:STRENGTH_AT], "strength": image[..., STRENGTH_AT]}
         if self.depth:
@@ -149,12 +142,6 @@ def check_reflective(scene: Scene) -> None:
             f"the Gaussians have the channels {sorted(scene.primary.channels)}; expected logit_strength, as "
             "`deferred` trains it"
         )
-
-
-def surface_of(gaussians: Gaussians, camera: Camera) -> Surface:
-    """Normals and strengths of the Gaussians, as seen from a camera."""
-    normals = facing_normals(gaussians.quats, gaussians.log_scales, gaussians.means, camera.center)
-    return Surface(normals, torch.sigmoid(gaussians.channels["logit_strength"]))
 
 
 def view_directions(camera: Camera) -> Tensor:

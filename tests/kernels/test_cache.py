@@ -73,7 +73,6 @@ from glassplat.kernels.blend_panes import blend_panes
 from glassplat.kernels.composite import composite
 from glassplat.kernels.cpu.jit import Kernel
 from glassplat.kernels.cube_lookup import cube_lookup
-from glassplat.kernels.facing_normals import facing_normals
 from glassplat.kernels.gradient_conflict import gradient_conflict
 from glassplat.kernels.pane_hits import pane_hits
 from glassplat.kernels.panes import Panes
@@ -81,6 +80,7 @@ from glassplat.kernels.project import project
 from glassplat.kernels.shade_environment import shade_environment
 from glassplat.kernels.splats import CameraBatch, Deviation, RawGaussians, Splats
 from glassplat.kernels.photometric import photometric
+from glassplat.kernels.surface_channels import surface_channels
 
 means = torch.tensor([[0.0, 0.0, 2.0], [0.1, 0.0, 3.0]])
 raw = RawGaussians(means, torch.randn(2, 4), torch.full((2, 3), -2.0), torch.zeros(2), torch.zeros(2, 1, 3))
@@ -99,8 +99,9 @@ blended = blend_panes(result.image[0], result.alpha[0], reflections, pane, norma
 loss = photometric(blended.rgb, torch.zeros(16, 20, 3, dtype=torch.uint8)).ssim + result.deviation.sum()
 loss = loss + gradient_conflict(result.image[0], blended.reflection, result.alpha[0])
 texels = torch.zeros(6, 2, 2, 3, requires_grad=True)
-normals = facing_normals(raw.quats, raw.log_scales.detach(), means.detach(), torch.zeros(3))
-directions = normals[0].expand(16, 20, 3)
+fixed = raw.log_scales.detach(), means.detach(), torch.zeros(2), torch.zeros(3)
+surface = surface_channels(projected.colors[0], torch.ones(2, 2), raw.quats, *fixed)
+directions = surface[0, 3:6].expand(16, 20, 3)
 surfaces = torch.cat([blended.rgb, directions, result.alpha[0][..., None]], dim=-1)
 shaded = shade_environment(surfaces, result.alpha[0], texels, intrinsics, torch.eye(3))
 loss = loss + shaded.rgb.sum() + cube_lookup(texels, directions).sum()

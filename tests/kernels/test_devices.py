@@ -92,11 +92,11 @@ def test_tensors_on_a_gpu_without_its_kernels_are_refused(monkeypatch: pytest.Mo
         "blend_panes",
         "composite",
         "cube_lookup",
-        "facing_normals",
         "pane_hits",
         "photometric",
         "project",
         "shade_environment",
+        "surface_channels",
     ],
 )
 def test_every_operation_has_the_same_functions_on_both_devices(name: str) -> None:

@@ -20,11 +20,11 @@ from glassplat.kernels import bin_tiles as bin_operation
 from glassplat.kernels import blend_panes as blend_operation
 from glassplat.kernels import composite as composite_operation
 from glassplat.kernels import cube_lookup as lookup_operation
-from glassplat.kernels import facing_normals as normals_operation
 from glassplat.kernels import pane_hits as hits_operation
 from glassplat.kernels import photometric as photometric_operation
 from glassplat.kernels import project as project_operation
 from glassplat.kernels import shade_environment as shade_operation
+from glassplat.kernels import surface_channels as surface_operation
 from glassplat.kernels.devices import SIMULATED, cuda_problem, kernels_for
 from glassplat.kernels.panes import Fresnel, Panes
 from glassplat.kernels.reference import adam as adam_twin
@@ -32,11 +32,11 @@ from glassplat.kernels.reference import bin_tiles as bin_twin
 from glassplat.kernels.reference import blend_panes as blend_twin
 from glassplat.kernels.reference import composite as composite_twin
 from glassplat.kernels.reference import cube_lookup as lookup_twin
-from glassplat.kernels.reference import facing_normals as normals_twin
 from glassplat.kernels.reference import pane_hits as hits_twin
 from glassplat.kernels.reference import photometric as photometric_twin
 from glassplat.kernels.reference import project as project_twin
 from glassplat.kernels.reference import shade_environment as shade_twin
+from glassplat.kernels.reference import surface_channels as surface_twin
 from glassplat.kernels.splats import CameraBatch, Deviation, RawGaussians, Splats
 from tests.kernels.gaussians_and_cameras import draw, random_cameras, random_gaussians
 
@@ -394,17 +394,19 @@ def test_shade_environment(dtype: torch.dtype) -> None:
 
 @pytest.mark.parametrize("count", [0, 1, many(40, 4000)])
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_facing_normals(count: int, dtype: torch.dtype) -> None:
-    quats, log_scales, means = (draw(count, k, seed=k).to(dtype) for k in (4, 3, 2))
-    means = torch.cat([means, means[:, :1]], dim=1)
+def test_surface_channels(count: int, dtype: torch.dtype) -> None:
+    colors, quats, log_scales, means = (draw(count, k, seed=seed).to(dtype) for seed, k in enumerate((3, 4, 3, 3)))
+    strengths, extra = draw(count, seed=5).to(dtype), draw(count, 2, seed=6).to(dtype)
+    radii = (draw(count, 2, seed=7) > -1).to(dtype)
     log_scales[: count // 3], quats[count // 2 : count // 2 + 2] = -1, 0
     eye = torch.tensor([0.2, 0.1, -0.3], dtype=dtype)
-    quats.requires_grad_()
-    own = on_device(quats)
-    found = normals_operation.facing_normals(own, *(tensor.to(DEVICE) for tensor in (log_scales, means, eye)))
-    expected = normals_twin.facing_normals(quats, log_scales, means, eye)
+    leaves = [tensor.requires_grad_() for tensor in (colors, quats, strengths, extra)]
+    own = [on_device(leaf) for leaf in leaves]
+    fixed = [tensor.to(DEVICE) for tensor in (radii, log_scales, means, eye)]
+    found = surface_operation.surface_channels(own[0], fixed[0], own[1], *fixed[1:3], own[2], fixed[3], own[3])
+    expected = surface_twin.surface_channels(colors, radii, quats, log_scales, means, strengths, eye, extra)
     close(found, expected)
-    check_gradients([found], [expected], [own], [quats])
+    check_gradients([found], [expected], own, leaves)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
