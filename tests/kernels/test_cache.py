@@ -59,7 +59,7 @@ if __name__ == "__main__":
     scale = scale_in_place(np.float32)
     scale(values)
     scale(values)
-    print(values.tolist(), "misses", sum(scale.dispatcher.stats.cache_misses.values()))
+    print(values.tolist(), "compiled", scale.compilations)
 """
 
 OPERATIONS = """
@@ -109,7 +109,7 @@ loss.backward()
 adam(means, raw.means.grad, torch.zeros(2, 3), torch.zeros(2, 3), lr=1e-3, step=1)
 
 used = [k for k in gc.get_objects() if type(k) is Kernel and k.dispatcher.signatures]
-missed = [k.name for k in used if sum(k.dispatcher.stats.cache_misses.values())]
+missed = [k.name for k in used if k.compilations]
 print(len(used), "kernels used, compiled:", *missed)
 """
 
@@ -131,12 +131,12 @@ def test_a_kernel_is_announced_then_cached_and_compiled_again_when_its_formula_c
     assert len(announced) == 2
     assert announced[0].startswith("compiling scale_float32 for this machine")
     assert announced[1].startswith("compiled scale_float32 in")
-    assert result == "[4.0, 4.0] misses 1"
+    assert result == "[4.0, 4.0] compiled 1"
 
-    assert printed_by(script, NUMBA_CACHE_DIR=cache) == ["[4.0, 4.0] misses 0"]
+    assert printed_by(script, NUMBA_CACHE_DIR=cache) == ["[4.0, 4.0] compiled 0"]
 
     (tmp_path / "formula.py").write_text(FORMULA.replace("OFFSET = 0", "OFFSET = 2"))
-    assert printed_by(script, NUMBA_CACHE_DIR=cache)[-1] == "[10.0, 10.0] misses 1"
+    assert printed_by(script, NUMBA_CACHE_DIR=cache)[-1] == "[10.0, 10.0] compiled 1"
 
 
 def test_another_process_compiles_no_operation(tmp_path: Path) -> None:
@@ -148,6 +148,45 @@ def test_another_process_compiles_no_operation(tmp_path: Path) -> None:
     used, _, compiled = result.partition(" kernels used, compiled:")
     assert int(used) >= 8
     assert compiled == ""
+
+
+GRADIENT = """
+import torch
+
+from glassplat.kernels.photometric import photometric
+
+generator = torch.Generator().manual_seed(1)
+image = torch.rand(90, 120, 3, generator=generator).requires_grad_()
+target = torch.randint(256, (90, 120, 3), dtype=torch.uint8, generator=generator)
+loss = photometric(image, target)
+(loss.l1 + loss.ssim).backward()
+print(image.grad.numpy().tobytes().hex())
+"""
+
+
+def test_the_process_that_compiles_runs_the_same_kernels_as_the_next_one(tmp_path: Path) -> None:
+    # This loss is where the body of a parallel loop differed in its last bits from the same body within its kernel.
+    script, cache = tmp_path / "gradient.py", str(tmp_path / "cache")
+    script.write_text(GRADIENT)
+    first, second = (printed_by(script, NUMBA_CACHE_DIR=cache)[-1] for _ in range(2))
+    assert first == second
+
+
+def test_a_disk_that_refuses_costs_the_cache_and_nothing_else(tmp_path: Path) -> None:
+    script = tmp_path / "small_kernel.py"
+    refuse = """
+from numba.core.caching import FunctionCache
+
+def refuse(*_):
+    raise OSError("no space left")
+
+FunctionCache.save_overload = refuse
+"""
+    script.write_text(refuse + SMALL_KERNEL)
+    (tmp_path / "formula.py").write_text(FORMULA)
+    lines = printed_by(script, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+    assert "cannot keep scale_float32 for the next time: no space left" in lines
+    assert lines[-1] == "[4.0, 4.0] compiled 1"
 
 
 KERNEL_SOURCE = """

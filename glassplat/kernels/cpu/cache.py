@@ -7,11 +7,14 @@ import hashlib
 import logging
 import time
 from collections.abc import Callable, Iterator
+from functools import cache
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
 from numba.core.caching import FunctionCache
+from numba.core.cpu import CPUContext
+from numba.core.registry import cpu_target
 
 log = logging.getLogger("glassplat.kernels")
 
@@ -83,34 +86,54 @@ def _globals_read(code: CodeType) -> set[str]:
     return read.union(*map(_globals_read, nested))
 
 
+@cache
+def loading_context() -> CPUContext:
+    """Where kernels are loaded that this process has compiled itself: apart from what the compiler left."""
+    return CPUContext(cpu_target.typing_context, "cpu")
+
+
 class KernelCache(FunctionCache):
-    """Numba's on-disk cache, under keys that hold across processes, and with an announcement of each compilation.
+    """Numba's on-disk cache, under keys that hold across processes, with an announcement of each compilation, and with
+    the same kernel in the process that compiles it as in all others.
 
     Numba's own key pickles what a function closes over. Those bytes depend on which strings happen to be one object
     in memory, so that another program that imports in another order compiles everything again.
+
+    The compiler optimises the body of a `prange` twice: by itself, and again as a part of the kernel. The process that
+    compiles would run the first result, those that load the kernel the second, and the two may round differently. So
+    what has been compiled is loaded from the disk like everything else.
     """
 
-    def __init__(self, function: Callable[..., Any], flags: str) -> None:
+    def __init__(self, function: Callable[..., Any], compiled: Callable[..., Any], flags: str) -> None:
         super().__init__(function)
+        self._function, self._compiled = function, compiled
         self._name_shown = function.__name__
         self._fingerprint = fingerprint(function, flags)
-        self._started = 0.0
+        self.compilations = 0
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, Any, str]:
         return sig, codegen.magic_tuple(), self._fingerprint
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The compiled kernel for a signature; None, announced, when the compiler has to run."""
+        """The kernel for a signature; where the disk does not have it, the compiler runs first, which is announced."""
         found = super().load_overload(sig, target_context)
         if found is None:
-            log.info("compiling %s for this machine (first use only, then cached on disk) ...", self._name_shown)
-            self._started = time.perf_counter()
+            made = self._compile(sig)
+            # Without a place on the disk, what the compiler left has to do, but for its notes on time taken.
+            found = super().load_overload(sig, loading_context()) or made._replace(metadata=None)
         return found
 
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Keeps what the compiler made; goes on without when the disk refuses."""
-        log.info("compiled %s in %.1f s", self._name_shown, time.perf_counter() - self._started)
+    def _compile(self, sig: Any) -> Any:
+        """Compiles the kernel and keeps it; goes on without when the disk refuses."""
+        log.info("compiling %s for this machine (first use only, then cached on disk) ...", self._name_shown)
+        started = time.perf_counter()
+        dispatcher = self._compiled(self._function)
+        dispatcher.compile(sig)
+        (made,) = dispatcher.overloads.values()
+        self.compilations += 1
+        log.info("compiled %s in %.1f s", self._name_shown, time.perf_counter() - started)
         try:
-            super().save_overload(sig, data)
+            self.save_overload(sig, made)
         except OSError as error:
             log.warning("cannot keep %s for the next time: %s", self._name_shown, error)
+        return made

@@ -35,6 +35,11 @@ class Kernel:
         """Runs the kernel, compiled at the first call unless the disk has it."""
         return self.dispatcher(*arguments)
 
+    @property
+    def compilations(self) -> int:
+        """How often this process had to compile it, once for each combination of argument types."""
+        return int(self.dispatcher._cache.compilations)
+
 
 def kernel(name: str, real: type, *, parallel: bool = True) -> Callable[[Callable[..., Any]], Kernel]:
     """Compiles a kernel function made by a factory for one floating-point type.
@@ -51,8 +56,9 @@ def kernel(name: str, real: type, *, parallel: bool = True) -> Callable[[Callabl
         full_name = f"{name}_{np.dtype(real).name}"
         function.__name__ = full_name
         function.__qualname__ = full_name
-        dispatcher = numba.njit(parallel=parallel, fastmath=set(FAST_MATH), error_model="numpy")(function)
-        dispatcher._cache = KernelCache(function, flags=f"parallel={parallel} {HOW}")
+        compiled = numba.njit(parallel=parallel, fastmath=set(FAST_MATH), error_model="numpy")
+        dispatcher = compiled(function)
+        dispatcher._cache = KernelCache(function, compiled, flags=f"parallel={parallel} {HOW}")
         return Kernel(dispatcher, full_name)
 
     return decorate
