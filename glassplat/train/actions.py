@@ -33,11 +33,14 @@ class GrowSh:
         """Whether to act after this step."""
         return self.when.due(clock)
 
-    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
-        """Edits `state`."""
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`, if there is anything to edit."""
         gaussians = state.scene.gaussian_sets()[self.part]
-        degree = min(gaussians.active_sh_degree + 1, gaussians.max_sh_degree)
-        state.scene = state.scene.with_gaussians(self.part, replace(gaussians, active_sh_degree=degree))
+        if gaussians.active_sh_degree == gaussians.max_sh_degree:
+            return False
+        raised = replace(gaussians, active_sh_degree=gaussians.active_sh_degree + 1)
+        state.scene = state.scene.with_gaussians(self.part, raised)
+        return True
 
 
 def threshold_factor(dataset: Dataset) -> float:
@@ -68,12 +71,12 @@ class Densify:
         least = max(self.densifier.interval, min(clock.views, 2 * self.densifier.interval))
         return Every(0.0, self.densifier.start, self.densifier.stop, least).due(clock)
 
-    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
-        """Edits `state`."""
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`, if there is anything to edit."""
         statistics = state.statistics.pop(self.part, None)
         gaussians = state.scene.gaussian_sets()[self.part]
         if statistics is None or len(gaussians) == 0:
-            return
+            return False
         factor = threshold_factor(dataset)
         densifier = replace(
             self.densifier,
@@ -90,6 +93,7 @@ class Densify:
             prune_large=self.part == "primary" and clock.progress > self.densifier.prune_large_start,
         )
         put_in_order(state, edited, moments, self.part)
+        return True
 
 
 def put_in_order(state: TrainState, gaussians: Gaussians, moments: Moments, part: str = "primary") -> None:
@@ -118,8 +122,8 @@ class Relocate:
         """Whether to act after this step."""
         return Every(0.0, self.densifier.start, self.densifier.stop, self.densifier.interval).due(clock)
 
-    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
-        """Edits `state`."""
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`, if there is anything to edit."""
         edited, moments = self.densifier.densify(
             state.scene.primary,
             state.optimizer.moments,
@@ -129,6 +133,7 @@ class Relocate:
         put_in_order(state, edited, moments)
         # Nothing here reads the screen gradients, but what was gathered no longer fits the rows.
         state.statistics.pop("primary", None)
+        return True
 
 
 @dataclass(frozen=True)
@@ -163,12 +168,13 @@ class ResetOpacity:
         """Whether to act after this step."""
         return self.when.due(clock)
 
-    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
-        """Edits `state`."""
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`, if there is anything to edit."""
         lowered, state.optimizer.moments = reset_opacity(
             state.scene.primary, state.optimizer.moments, ceiling=self.ceiling
         )
         state.scene = replace(state.scene, primary=lowered)
+        return True
 
 
 @dataclass(frozen=True)
@@ -183,8 +189,8 @@ class PerturbOpacity:
         """Whether to act after this step."""
         return self.amplitude > 0 and self.when.due(clock)
 
-    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
-        """Edits `state`."""
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`, if there is anything to edit."""
         perturbed, selected = perturb_opacities(
             state.scene.primary,
             state.scene.planes,
@@ -194,3 +200,4 @@ class PerturbOpacity:
         )
         state.scene = replace(state.scene, primary=perturbed)
         state.optimizer.moments = forget(state.optimizer.moments, ("primary.logit_opacities",), selected)
+        return bool(selected.any())

@@ -28,7 +28,7 @@ class StepDone:
 
 @dataclass(frozen=True)
 class ActionDone:
-    """An action edited the state after a step."""
+    """An action edited the state after a step; one that found nothing to edit says nothing."""
 
     step: int
     action: str

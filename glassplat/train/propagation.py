@@ -61,19 +61,20 @@ class Propagate:
         """Whether to act after this step."""
         return self.when.due(clock) or clock.step == self._last(clock)
 
-    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
-        """Edits `state`."""
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`, until propagation has ended."""
         if has_ended(state):
-            return
+            return False
         if self._settles(state, clock) or clock.step >= self._last(clock):
             state.records[ENDED] = clock.step
             log.info("step %d: normal propagation has ended, %d reflective Gaussians", clock.step, self._count(state))
-            return
+            return False
         primary, moments = self.propagation.propagate(state.scene.primary, state.optimizer.moments)
         primary, moments = self.propagation.disturb(primary, moments, state.generator(self.name))
         state.scene, state.optimizer.moments = replace(state.scene, primary=primary), moments
         if self.propagation.propagates:
             state.optimizer.paused["primary.logit_opacities"] = self.schedule.pause
+        return True
 
     def _last(self, clock: Clock) -> int:
         """The step at which it ends at the latest."""
@@ -98,10 +99,9 @@ class GrowShAfterPropagation(GrowSh):
     what reflects.
     """
 
-    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
-        """Edits `state`."""
-        if has_ended(state):
-            super().apply(state, dataset, clock)
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`, once propagation has ended."""
+        return has_ended(state) and super().apply(state, dataset, clock)
 
 
 @dataclass(frozen=True)
@@ -125,11 +125,14 @@ class RefineEnvironment:
         return clock.step in {round(moment * clock.iterations) for moment in self.moments}
 
     @torch.no_grad()
-    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
-        """Edits `state`; the optimiser forgets the environment's moments, whose shape has changed."""
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`, until the environment is as fine as it gets; the optimiser forgets its moments."""
         environment = state.scene.environment
+        if environment.size >= self.largest:
+            return False
         finer = resized(environment, min(2 * environment.size, self.largest))
         state.scene = replace(state.scene, environment=finer)
+        return True
 
 
 def has_ended(state: TrainState) -> bool:

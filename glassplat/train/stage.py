@@ -75,8 +75,8 @@ class Action(Protocol):
         """Whether to act after this step."""
         ...
 
-    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
-        """Edits `state`."""
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`; False where there was nothing to edit."""
         ...
 
 

@@ -77,11 +77,9 @@ def advance(stage: Stage, dataset: Dataset, state: TrainState, iterations: int) 
     clock = Clock(state.step, iterations, len(dataset.train))
     for motion in stage.motions:
         motion(state, clock)
-    due = [action for action in stage.actions if action.due(clock)]
-    for action in due:
-        action.apply(state, dataset, clock)
+    done = [action for action in stage.actions if action.due(clock) and action.apply(state, dataset, clock)]
     yield StepDone(state.step, view.name, sum(result.losses.values()), result.losses, counts_of(state.scene))
-    for action in due:
+    for action in done:
         yield ActionDone(state.step, action.name, counts_of(state.scene))
 
 

@@ -65,6 +65,13 @@ def test_colours_turn_with_the_view_only_after_propagation() -> None:
     assert degrees[13] == 0 and degrees[20] == 1
 
 
+def test_the_log_tells_only_of_what_was_done() -> None:
+    done = [(m.step, m.action) for m in run(fresh_state()) if isinstance(m, ActionDone)]
+    grown = [step for step, action in done if action == "grow SH"]
+    propagated = [step for step, action in done if action == "propagate normals"]
+    assert len(grown) == RECIPE.sh_degree and propagated and max(propagated) < min(grown)
+
+
 def test_propagation_and_resets_never_meet() -> None:
     done = [m for m in run(fresh_state()) if isinstance(m, ActionDone)]
     raised = {m.step for m in done if m.action == "propagate normals"}

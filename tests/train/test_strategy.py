@@ -92,9 +92,10 @@ def test_the_strategy_decides_what_happens_to_the_primary_gaussians(recipe: Any)
         assert not {"opacity", "scale"} & {term.name for term in stage.losses}
 
 
-def test_the_planar_objective_is_that_of_equation_20_but_for_the_intensity() -> None:
+def test_the_planar_objective_is_that_of_equation_20_but_for_two_terms() -> None:
     recipe = RECIPES[1]
-    *_, joint = replace(recipe, weights=replace(recipe.weights, intensity=0.0)).stages(seed=0)
+    paper = replace(recipe, weights=replace(recipe.weights, intensity=0.0), view_dependence_weight=0.0)
+    *_, joint = paper.stages(seed=0)
     assert joint.losses[0].function == PhotometricLoss(ssim_weight=0.2)
     assert {term.name: term.weight for term in joint.losses} == pytest.approx(
         {"photometric": 1.0, "depth": 0.005, "conflict": 0.2, "mask": 0.5, "opacity": 0.01, "scale": 0.01}
