@@ -114,6 +114,10 @@ class DefaultDensify:
             this share of its longer side are removed; None keeps them. 3DGS states a limit of 20
             pixels but clears the radii before it looks at them, so its published results have none.
         cap: largest number of Gaussians to grow to; None for no limit.
+        least_contribution: Gaussians that add less than so many pixels to every training view, directly and mirrored,
+            are removed; 0 keeps them.
+        contribution_moments: shares of the run at which they are: when the set has stopped growing, and in `planar`
+            once more when nothing is perturbed any longer.
     """
 
     interval: int = 100
@@ -127,6 +131,8 @@ class DefaultDensify:
     prune_scale_fraction: float = 0.1
     prune_radius_fraction: float | None = None
     cap: int | None = None
+    least_contribution: float = 0.2
+    contribution_moments: tuple[float, ...] = (0.5, 0.8)
 
     @torch.no_grad()
     def densify(

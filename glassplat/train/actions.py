@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, replace
 
+import torch
+
 from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify, reset_opacity
-from glassplat.densify.edit import Moments, apply_edit, forget
+from glassplat.densify.edit import Moments, apply_edit, forget, keep
 from glassplat.densify.mcmc import McmcDensify
 from glassplat.densify.order import in_morton_order
 from glassplat.densify.perturb import perturb_opacities
+from glassplat.render.contribution import contributions
 from glassplat.scene.gaussians import Gaussians
 from glassplat.train.optimizer import Rate
 from glassplat.train.stage import Clock, Every
@@ -93,6 +97,34 @@ class Densify:
             prune_large=self.part == "primary" and clock.progress > self.densifier.prune_large_start,
         )
         put_in_order(state, edited, moments, self.part)
+        return True
+
+
+@dataclass(frozen=True)
+class PruneIdle:
+    """Removes the primary Gaussians that add next to nothing to any training view.
+
+    What stood behind a pane for a reflection, and has lost that to the mirrored image, ends as such.
+    """
+
+    densifier: DefaultDensify
+    name: str = "prune idle primary"
+
+    def due(self, clock: Clock) -> bool:
+        """Whether to act after this step."""
+        moments = {round(share * clock.iterations) for share in self.densifier.contribution_moments}
+        return self.densifier.least_contribution > 0 and clock.step in moments
+
+    @torch.no_grad()
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`, if there is anything to edit."""
+        most = functools.reduce(torch.maximum, (contributions(state.scene, view.camera) for view in dataset.train))
+        busy = most >= self.densifier.least_contribution
+        if bool(busy.all()):
+            return False
+        primary, state.optimizer.moments = apply_edit(state.scene.primary, state.optimizer.moments, keep(busy))
+        state.scene = replace(state.scene, primary=primary)
+        state.statistics.pop("primary", None)
         return True
 
 

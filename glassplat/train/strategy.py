@@ -12,7 +12,7 @@ from glassplat.init.points import gaussians_from_points
 from glassplat.losses.parsimony import mean_opacity, mean_scale
 from glassplat.losses.term import LossTerm
 from glassplat.scene.gaussians import Gaussians
-from glassplat.train.actions import Densify, Explore, Relocate, ResetOpacity
+from glassplat.train.actions import Densify, Explore, PruneIdle, Relocate, ResetOpacity
 from glassplat.train.optimizer import Rate
 from glassplat.train.stage import Action, Every, Motion
 
@@ -80,9 +80,9 @@ def population_of(
 
 
 def default_population(densifier: DefaultDensify, rhythm: Rhythm) -> Population:
-    """3DGS: clone, split, prune, and reset the opacities."""
+    """3DGS: clone, split, prune, and reset the opacities; and what adds to no view is removed in the end."""
     reset = ResetOpacity(Every(rhythm.beat, 0.0, rhythm.reset_stop, rhythm.least, only_multiples_of=3))
-    return Population(edits=(Densify(densifier),), resets=(reset,))
+    return Population(edits=(Densify(densifier), PruneIdle(densifier)), resets=(reset,))
 
 
 def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:

@@ -1,0 +1,47 @@
+"""What Gaussians add to views."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from glassplat.render.contribution import contributions
+from glassplat.render.planar import Planar
+from glassplat.render.splat import Splat
+from glassplat.scene.plane import Planes
+from tests.render.tiny_scene import camera_at, showcase
+
+CAMERA = camera_at(0.0, 0.0, -0.2)
+
+
+def test_without_panes_they_add_up_to_the_coverage() -> None:
+    scene = replace(showcase(), planes=Planes.empty())
+    coverage = Splat()(scene, CAMERA).layers["alpha"]
+    torch.testing.assert_close(contributions(scene, CAMERA).sum(), coverage.sum())
+
+
+def test_what_is_seen_in_the_pane_alone_counts() -> None:
+    scene = showcase()
+    direct, with_panes = (contributions(s, CAMERA) for s in (replace(scene, planes=Planes.empty()), scene))
+    assert bool((with_panes >= direct).all())
+    behind_the_camera = scene.primary.means[:, 2] < -0.2
+    assert float(direct[behind_the_camera].max()) == 0 and float(with_panes[behind_the_camera].max()) > 1
+
+
+def test_what_adds_nothing_can_go() -> None:
+    scene = showcase()
+    means = scene.primary.means.clone()
+    means[0] = torch.tensor([50.0, 0.0, 1.0])
+    scene = replace(scene, primary=scene.primary.with_tensors({"means": means}))
+    busy = contributions(scene, CAMERA) > 0
+    assert busy.tolist() == [False] + [True] * (len(means) - 1)
+    left = replace(scene, primary=scene.primary.select(busy))
+    torch.testing.assert_close(Planar()(left, CAMERA).rgb, Planar()(scene, CAMERA).rgb)
+
+
+def test_they_leave_no_graph() -> None:
+    scene = showcase()
+    means = scene.primary.means.requires_grad_()
+    found = contributions(replace(scene, primary=scene.primary.with_tensors({"means": means})), CAMERA)
+    assert not found.requires_grad and means.grad is None

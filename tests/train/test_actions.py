@@ -1,0 +1,43 @@
+"""Edits of the training state that no recipe's test looks at by itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from glassplat.densify.default import DefaultDensify
+from glassplat.scene.scene import Scene
+from glassplat.train.actions import PruneIdle
+from glassplat.train.splat_recipe import SplatRecipe
+from glassplat.train.stage import Clock
+from glassplat.train.state import TrainState
+from tests.train.tiny_capture import tiny_capture
+
+
+def state_with_one_out_of_sight() -> TrainState:
+    scene: Scene = SplatRecipe(sh_degree=1).initialise(tiny_capture())
+    means = scene.primary.means.clone()
+    means[3] = 1000.0
+    state = TrainState(replace(scene, primary=scene.primary.with_tensors({"means": means})), seed=0)
+    rows = torch.arange(len(means), dtype=torch.float32)[:, None].expand(-1, 3).contiguous()
+    state.optimizer.moments["primary.means"] = (rows.clone(), rows.clone())
+    return state
+
+
+def test_what_no_view_needs_is_removed_with_its_moments() -> None:
+    state, action = state_with_one_out_of_sight(), PruneIdle(DefaultDensify(least_contribution=1e-3))
+    before = state.scene.primary.means
+    assert action.apply(state, tiny_capture(), Clock(50, 100, 5))
+    kept = state.optimizer.moments["primary.means"][0][:, 0].long()
+    assert 0 < len(kept) < len(before) and 3 not in kept.tolist()
+    assert torch.equal(state.scene.primary.means, before[kept])
+    assert not action.apply(state, tiny_capture(), Clock(80, 100, 5))
+
+
+def test_idle_gaussians_are_looked_for_at_the_moments_that_were_asked_for() -> None:
+    def due(densifier: DefaultDensify) -> list[int]:
+        return [step for step in range(1, 101) if PruneIdle(densifier).due(Clock(step, 100, 5))]
+
+    assert due(DefaultDensify(contribution_moments=(0.5, 0.8))) == [50, 80]
+    assert due(DefaultDensify(least_contribution=0)) == []
