@@ -1,4 +1,4 @@
-"""Where the Gaussians may reflect (3DGS-DR, Section 4)."""
+"""Where the Gaussians may reflect (3DGS-DR, Section 4), and what it costs them."""
 
 from __future__ import annotations
 
@@ -22,3 +22,8 @@ def strength_outside(frame: Frame, view: View, scene: Scene) -> Tensor | None:
     outside = (means - means.new_tensor(center)).norm(dim=1) > radius
     strengths = torch.sigmoid(scene.primary.channels["logit_strength"])
     return (strengths * outside).sum() / outside.sum().clamp(min=1)
+
+
+def mean_strength(frame: Frame, view: View, scene: Scene) -> Tensor:
+    """Mean reflection strength of all Gaussians: a price, so that what a colour explains as well does not reflect."""
+    return torch.sigmoid(scene.primary.channels["logit_strength"]).mean()

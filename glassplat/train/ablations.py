@@ -28,6 +28,7 @@ Switch = Literal[
     "sabotage",
     "deferred-shading",
     "coarse-to-fine",
+    "strength-price",
 ]
 Ablated = Literal["planar", "deferred"]
 
@@ -88,6 +89,7 @@ DEFERRED: dict[Switch, Ablation] = {
     "sabotage": Ablation("w/o colour sabotage", _without_sabotage, -3.66),
     "deferred-shading": Ablation("forward shading", lambda r: replace(r, shading="forward"), -6.02),
     "coarse-to-fine": Ablation("w/o coarse-to-fine environment", lambda r: replace(r, first_texels=r.texels)),
+    "strength-price": Ablation("strength without a price (the paper's)", lambda r: replace(r, strength_weight=0.0)),
 }
 """The rows of 3DGS-DR's Table 5 and its forward variant (Table 1, `ball`), and what the paper does not have."""
 

@@ -13,7 +13,7 @@ from glassplat.densify.mcmc import McmcDensify
 from glassplat.densify.propagate import NormalPropagation
 from glassplat.init.region import reflective_region
 from glassplat.losses.geometry import normal_consistency
-from glassplat.losses.reflectors import strength_outside
+from glassplat.losses.reflectors import mean_strength, strength_outside
 from glassplat.losses.term import LossTerm, weighted
 from glassplat.render.deferred import INVISIBLE, Deferred, Shading
 from glassplat.render.splat import Splat
@@ -63,6 +63,8 @@ class DeferredRecipe:
         region: only what lies in this sphere may reflect: centre and radius, world units. None finds the place that
             the cameras stand around, if there is one.
         outside_weight: weight of the mean strength outside of the region in the objective.
+        strength_weight: of the mean strength of all Gaussians in the objective, which the paper does not have: a matte
+            thing would learn to reflect a little.
         consistency_weight: weight of the difference between normals and the slope of the depths, while normals spread.
         propagation: how normals spread and colours are sabotaged.
         schedule: when they do.
@@ -88,6 +90,7 @@ class DeferredRecipe:
     first_strength: float = 1e-3
     region: tuple[float, float, float, float] | None = None
     outside_weight: float = 0.4
+    strength_weight: float = 0.02
     consistency_weight: float = 0.3
     propagation: NormalPropagation = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
@@ -130,6 +133,7 @@ class DeferredRecipe:
         beat = Every(self.rhythm.beat, 0.0, self.schedule.stop, self.rhythm.least, skip_multiples_of=3)
         guidance = weighted(
             LossTerm("outside", self.outside_weight, strength_outside),
+            LossTerm("strength", self.strength_weight, mean_strength),
             LossTerm("consistency", self.consistency_weight, normal_consistency),
         )
         reflection = Stage(
