@@ -90,7 +90,7 @@ class DeferredRecipe:
     first_strength: float = 1e-3
     region: tuple[float, float, float, float] | None = None
     outside_weight: float = 0.4
-    strength_weight: float = 0.02
+    strength_weight: float = 0.005
     consistency_weight: float = 0.3
     propagation: NormalPropagation = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
