@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -9,10 +11,9 @@ from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
 from glassplat.kernels.pane_hits import pane_hits
 from glassplat.kernels.splats import Projected
-from glassplat.render.planar import detached, half_spaces_of, panes_in_camera, those_seen
+from glassplat.render.planar import detached, panes_in_camera, project_mirrored, those_seen
 from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, project_gaussians
 from glassplat.scene.camera import Camera
-from glassplat.scene.pose import mirror_matrices
 from glassplat.scene.scene import Scene
 
 
@@ -28,20 +29,14 @@ def contributions(scene: Scene, camera: Camera) -> Tensor:
         camera: of the view.
     """
     camera = camera.to(scene.primary.means.device)
-    primary, near = detached(scene.primary), NEAR_PER_EXTENT * scene.extent
+    # Colours do not matter here.
+    primary, near = replace(detached(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
     most = _weight_sums(project_gaussians(primary, camera, near=near), camera)
     hits = pane_hits(panes_in_camera(scene.planes, camera), camera.intrinsics, camera.width, camera.height)
     if not hits.tiles.any():
         return most
     planes, hits = those_seen(scene.planes, hits)
-    mirrored = project_gaussians(
-        primary,
-        camera,
-        near=near,
-        poses=camera.cam_from_world @ mirror_matrices(planes.centers, planes.normals),
-        clip_planes=half_spaces_of(planes, camera),
-        windows=hits.windows,
-    )
+    mirrored = project_mirrored(primary, camera, planes, hits, near=near)
     return torch.maximum(most, _weight_sums(mirrored, camera, hits.tiles))
 
 

@@ -13,7 +13,7 @@ from glassplat.kernels.blend_panes import blend_panes
 from glassplat.kernels.composite import composite
 from glassplat.kernels.pane_hits import pane_hits
 from glassplat.kernels.panes import Fresnel, PaneHits, Panes
-from glassplat.kernels.splats import Deviation
+from glassplat.kernels.splats import Deviation, Projected
 from glassplat.render.frame import Frame, ScreenPass
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
@@ -156,15 +156,7 @@ class Planar:
 
     def _second_pass(self, scene: Scene, camera: Camera, planes: Planes, hits: PaneHits) -> SecondPass:
         primary = scene.primary if self.reflection_gradient == "all" else detached(scene.primary)
-        mirrored_poses = camera.cam_from_world @ mirror_matrices(planes.centers, planes.normals)
-        projected = project_gaussians(
-            primary,
-            camera,
-            near=NEAR_PER_EXTENT * scene.extent,
-            poses=mirrored_poses,
-            clip_planes=half_spaces_of(planes, camera),
-            windows=hits.windows,
-        )
+        projected = project_mirrored(primary, camera, planes, hits, near=NEAR_PER_EXTENT * scene.extent)
         splats = joined_splats(projected)
         bins = bin_tiles(splats, camera.width, camera.height, hits.tiles)
         intensity = torch.exp(primary.channels["log_intensity"]).expand(len(planes), -1)
@@ -204,6 +196,26 @@ def those_seen(planes: Planes, hits: PaneHits) -> tuple[Planes, PaneHits]:
 def detached(gaussians: Gaussians) -> Gaussians:
     """The same Gaussians, cut off from the autograd graph."""
     return gaussians.with_tensors({name: tensor.detach() for name, tensor in gaussians.tensors().items()})
+
+
+def project_mirrored(gaussians: Gaussians, camera: Camera, planes: Planes, hits: PaneHits, *, near: float) -> Projected:
+    """Projects the Gaussians of the camera's side into the camera mirrored about each plane (Eqs. 8-12).
+
+    Args:
+        gaussians: the set to project.
+        camera: whose mirror images are wanted.
+        planes: K planes that the camera sees.
+        hits: where it sees them; what lies outside of a plane's window is culled.
+        near: depth below which a Gaussian is culled, world units.
+    """
+    return project_gaussians(
+        gaussians,
+        camera,
+        near=near,
+        poses=camera.cam_from_world @ mirror_matrices(planes.centers, planes.normals),
+        clip_planes=half_spaces_of(planes, camera),
+        windows=hits.windows,
+    )
 
 
 def half_spaces_of(planes: Planes, camera: Camera) -> Tensor:

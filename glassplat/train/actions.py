@@ -112,8 +112,7 @@ class PruneIdle:
 
     def due(self, clock: Clock) -> bool:
         """Whether to act after this step."""
-        moments = {round(share * clock.iterations) for share in self.densifier.contribution_moments}
-        return self.densifier.least_contribution > 0 and clock.step in moments
+        return self.densifier.least_contribution > 0 and clock.is_at(self.densifier.contribution_moments)
 
     @torch.no_grad()
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:

@@ -122,7 +122,7 @@ class RefineEnvironment:
 
     def due(self, clock: Clock) -> bool:
         """Whether to act after this step."""
-        return clock.step in {round(moment * clock.iterations) for moment in self.moments}
+        return clock.is_at(self.moments)
 
     @torch.no_grad()
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -31,6 +31,10 @@ class Clock:
     def progress(self) -> float:
         """Share of the run that is done, in [0, 1]."""
         return self.step / self.iterations
+
+    def is_at(self, shares: Iterable[float]) -> bool:
+        """Whether this step is one of those that lie at these shares of the run."""
+        return self.step in {round(share * self.iterations) for share in shares}
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
 from glassplat.init.points import gaussians_from_points
 from glassplat.losses.parsimony import mean_opacity, mean_scale
-from glassplat.losses.term import LossTerm
+from glassplat.losses.term import LossTerm, weighted
 from glassplat.scene.gaussians import Gaussians
 from glassplat.train.actions import Densify, Explore, PruneIdle, Relocate, ResetOpacity
 from glassplat.train.optimizer import Rate
@@ -90,7 +90,7 @@ def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
 
     The regularisers are those of TR-Gaussians, Eq. 20, which adds them to whatever the objective is otherwise.
     """
-    terms = (
+    terms = weighted(
         LossTerm("opacity", densifier.opacity_weight, mean_opacity),
         LossTerm("scale", densifier.scale_weight, mean_scale),
     )
@@ -99,5 +99,5 @@ def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
         spread=densifier.initial_spread,
         edits=(Relocate(densifier),),
         motions=(Explore(densifier, means_rate),) if densifier.noise_rate != 0 else (),
-        terms=tuple(term for term in terms if term.weight != 0),
+        terms=terms,
     )
