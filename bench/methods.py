@@ -74,7 +74,7 @@ def step_work(scene: Scene, stage: Stage, view: View) -> Work:
     state = TrainState(scene, seed=0)
 
     def work() -> None:
-        result = differentiate(stage, state.scene, view)
+        result = differentiate(stage, state.scene, view, probed=True)
         update(stage, state, result.gradients, iterations=1000)
 
     return work

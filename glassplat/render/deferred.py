@@ -63,7 +63,7 @@ class Deferred:
     environment: bool = False
     least_strength: float = 0.0
 
-    def __call__(self, scene: Scene, camera: Camera) -> Frame:
+    def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are.
 
         Raises:
@@ -73,10 +73,12 @@ class Deferred:
         camera = camera.to(scene.primary.means.device)
         projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
         shade = self._shade_pixels if self.shading == "deferred" else self._shade_gaussians
-        rgb, layers, screen = shade(scene, camera, projected, self._channels_of(scene.primary, camera, projected))
+        channels = self._channels_of(scene.primary, camera, projected)
+        probe = probe_of(projected) if probed else None
+        rgb, layers = shade(scene, camera, projected, channels, probe)
         if self.environment:
             layers["environment"] = torch.sigmoid(cube_lookup(scene.environment.raw, view_directions(camera)))
-        return Frame(rgb, layers, (screen,))
+        return Frame(rgb, layers, (ScreenPass("primary", projected.means2d, probe, projected.radii),))
 
     def _channels_of(self, gaussians: Gaussians, camera: Camera, projected: Projected) -> Tensor:
         """[N, D] what each Gaussian adds to the image: as `shade_environment` reads it, then depth, if asked for."""
@@ -92,9 +94,9 @@ class Deferred:
         )
 
     def _shade_pixels(
-        self, scene: Scene, camera: Camera, projected: Projected, channels: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor], ScreenPass]:
-        image, layers, screen = self._blend(camera, projected, channels)
+        self, scene: Scene, camera: Camera, projected: Projected, channels: Tensor, probe: Tensor | None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        image, layers = self._blend(camera, projected, channels, probe)
         shaded = shade_environment(
             image,
             layers["alpha"],
@@ -104,33 +106,33 @@ class Deferred:
             background=self.background,
             least_strength=self.least_strength,
         )
-        return shaded.rgb, layers | {"base": shaded.base, "reflection": shaded.reflection}, screen
+        return shaded.rgb, layers | {"base": shaded.base, "reflection": shaded.reflection}
 
     def _shade_gaussians(
-        self, scene: Scene, camera: Camera, projected: Projected, channels: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor], ScreenPass]:
+        self, scene: Scene, camera: Camera, projected: Projected, channels: Tensor, probe: Tensor | None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         colors, normals, strengths = channels[:, :SURFACE_CHANNELS].split((NORMAL_AT, 3, 1), dim=1)
         to_eye = torch.nn.functional.normalize(camera.center - scene.primary.means, dim=1)
         cosines = (normals * to_eye).sum(-1, keepdim=True)
         mirrored = torch.sigmoid(cube_lookup(scene.environment.raw, 2 * cosines * normals - to_eye))
         channels = torch.cat([channels, strengths * colors, strengths * mirrored], dim=1)
-        image, layers, screen = self._blend(camera, projected, channels)
+        image, layers = self._blend(camera, projected, channels, probe)
         base = over_background(image[..., :NORMAL_AT], layers["alpha"], self.background)
         lost, gained = image[..., -6:-3], image[..., -3:]
         reflection = gained / layers["strength"][..., None].clamp(min=1e-6)
-        return base - lost + gained, layers | {"base": base, "reflection": reflection}, screen
+        return base - lost + gained, layers | {"base": base, "reflection": reflection}
 
     def _blend(
-        self, camera: Camera, projected: Projected, channels: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor], ScreenPass]:
+        self, camera: Camera, projected: Projected, channels: Tensor, probe: Tensor | None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         """The blended image [H, W, D] of channels [N, D], and its layers but for the base."""
-        splats, probe = joined_splats(projected), probe_of(projected)
+        splats = joined_splats(projected)
         result = composite(splats, channels[None], bin_tiles(splats, camera.width, camera.height), probe=probe)
         image, alpha = result.image[0], result.alpha[0]
         layers = {"alpha": alpha, "normal": image[..., NORMAL_AT:STRENGTH_AT], "strength": image[..., STRENGTH_AT]}
         if self.depth:
             layers["depth"] = mean_depth(image[..., SURFACE_CHANNELS], alpha)
-        return image, layers, ScreenPass("primary", projected.means2d, probe, projected.radii)
+        return image, layers
 
 
 def check_reflective(scene: Scene) -> None:

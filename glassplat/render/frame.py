@@ -22,14 +22,15 @@ class ScreenPass:
     Attributes:
         part: name of the scene part, as in `Scene.gaussian_sets`.
         means2d: [C, N, 2] projected centres, pixels; part of the autograd graph.
-        probe: [C, N, 2] that `composite` got; its gradient is how strongly single pixels pull at the centres.
+        probe: [C, N, 2] that `composite` got; its gradient is how strongly single pixels pull at the centres. None
+            where the frame was not probed.
         radii: [C, N, 2] half extents in pixels; 0 where not visible.
         weight: share of the image that the pass contributes where it is seen.
     """
 
     part: str
     means2d: Tensor
-    probe: Tensor
+    probe: Tensor | None
     radii: Tensor
     weight: float = 1.0
 
@@ -52,6 +53,13 @@ class Frame:
 class Renderer(Protocol):
     """Anything that turns a scene and a camera into a frame."""
 
-    def __call__(self, scene: Scene, camera: Camera) -> Frame:
-        """Renders `scene` from `camera`; differentiable in every tensor of the scene."""
+    def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
+        """Renders `scene` from `camera`; differentiable in every tensor of the scene.
+
+        Args:
+            scene: what is there.
+            camera: from where it is seen.
+            probed: also prepare the statistics of densification, the probes of the passes on screen; they make the
+                backward pass slower.
+        """
         ...

@@ -85,11 +85,11 @@ class Planar:
     deviation_depth_gradient: bool = False
     blend: Blend = "linear"
 
-    def __call__(self, scene: Scene, camera: Camera) -> Frame:
+    def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are."""
         camera = camera.to(scene.primary.means.device)
         panes = panes_in_camera(scene.planes, camera)
-        first = self._first_pass(scene, camera, panes)
+        first = self._first_pass(scene, camera, panes, probed)
         layers = {"transmission": first.transmission, "depth": first.depth, "alpha": first.alpha, "mask": first.mask}
         hits = pane_hits(panes, camera.intrinsics, camera.width, camera.height, first.mask)
         hit = (hits.pane >= 0).to(first.mask.dtype)
@@ -100,7 +100,7 @@ class Planar:
             layers |= {"reflection": torch.zeros_like(first.transmission), "strength": torch.zeros_like(hit)}
             return Frame(first.transmission, layers, first.screen)
         planes, hits = those_seen(scene.planes, hits)
-        second = self._second_pass(scene, camera, planes, hits)
+        second = self._second_pass(scene, camera, planes, hits, probed)
         result = blend_panes(
             first.transmission,
             first.mask,
@@ -117,7 +117,7 @@ class Planar:
         mirrored = replace(second.screen, weight=float(result.strength.detach().sum() / hit.sum()))
         return Frame(result.rgb, layers, (*first.screen, mirrored))
 
-    def _first_pass(self, scene: Scene, camera: Camera, panes: Panes) -> FirstPass:
+    def _first_pass(self, scene: Scene, camera: Camera, panes: Panes, probed: bool) -> FirstPass:
         near = NEAR_PER_EXTENT * scene.extent
         primary = project_gaussians(scene.primary, camera, near=near)
         glass = project_gaussians(scene.glass, camera, near=near)
@@ -130,7 +130,7 @@ class Planar:
         if self.deviation:
             index = pane_hits(panes, camera.intrinsics, camera.width, camera.height).pane
             deviation = Deviation(3, (index >= 0).to(colors.dtype)[None], self.deviation_depth_gradient)
-        probe, glass_probe = probe_of(primary), probe_of(glass)
+        probes = (probe_of(primary), probe_of(glass)) if probed else (None, None)
         result = composite(
             splats,
             channels,
@@ -138,12 +138,12 @@ class Planar:
             marks=marks,
             num_primary=len(scene.primary),
             deviation=deviation,
-            probe=torch.cat([probe, glass_probe], dim=1),
+            probe=torch.cat([probe for probe in probes if probe is not None], dim=1) if probed else None,
         )
         alpha = result.alpha[0]
         screen = (
-            ScreenPass("primary", primary.means2d, probe, primary.radii),
-            ScreenPass("glass", glass.means2d, glass_probe, glass.radii),
+            ScreenPass("primary", primary.means2d, probes[0], primary.radii),
+            ScreenPass("glass", glass.means2d, probes[1], glass.radii),
         )
         return FirstPass(
             transmission=over_background(result.image[0, ..., :3], alpha, self.background),
@@ -154,14 +154,14 @@ class Planar:
             screen=screen,
         )
 
-    def _second_pass(self, scene: Scene, camera: Camera, planes: Planes, hits: PaneHits) -> SecondPass:
+    def _second_pass(self, scene: Scene, camera: Camera, planes: Planes, hits: PaneHits, probed: bool) -> SecondPass:
         primary = scene.primary if self.reflection_gradient == "all" else detached(scene.primary)
         projected = project_mirrored(primary, camera, planes, hits, near=NEAR_PER_EXTENT * scene.extent)
         splats = joined_splats(projected)
         bins = bin_tiles(splats, camera.width, camera.height, hits.tiles)
         intensity = torch.exp(primary.channels["log_intensity"]).expand(len(planes), -1)
         channels = torch.cat([projected.colors, intensity[..., None]], dim=-1)
-        probe = probe_of(projected)
+        probe = probe_of(projected) if probed else None
         result = composite(splats, channels, bins, probe=probe)
         reflections = result.image
         if any(self.background):

@@ -56,8 +56,8 @@ def joined_splats(*parts: Projected) -> Splats:
 
 
 def probe_of(projected: Projected) -> Tensor:
-    """A probe [C, N, 2] for `composite`; it asks for a gradient where the projected Gaussians have one."""
-    return torch.zeros_like(projected.means2d).requires_grad_(projected.means2d.requires_grad)
+    """A probe [C, N, 2] for `composite` that asks for a gradient."""
+    return torch.zeros_like(projected.means2d).requires_grad_()
 
 
 def over_background(image: Tensor, alpha: Tensor, background: tuple[float, float, float]) -> Tensor:

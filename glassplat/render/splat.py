@@ -37,7 +37,7 @@ class Splat:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     depth: bool = True
 
-    def __call__(self, scene: Scene, camera: Camera) -> Frame:
+    def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are."""
         camera = camera.to(scene.primary.means.device)
         projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
@@ -45,7 +45,7 @@ class Splat:
         channels = projected.colors
         if self.depth:
             channels = torch.cat([channels, projected.depths[..., None]], dim=-1)
-        probe = probe_of(projected)
+        probe = probe_of(projected) if probed else None
         result = composite(splats, channels, bin_tiles(splats, camera.width, camera.height), probe=probe)
         image, alpha = result.image[0], result.alpha[0]
         layers = {"alpha": alpha}

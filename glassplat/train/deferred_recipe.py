@@ -129,6 +129,7 @@ class DeferredRecipe:
             rates=self.rates.of("primary"),
             actions=population.edits,
             motions=population.motions,
+            densify_until=population.densify_until,
         )
         beat = Every(self.rhythm.beat, 0.0, self.schedule.stop, self.rhythm.least, skip_multiples_of=3)
         guidance = weighted(
@@ -150,6 +151,7 @@ class DeferredRecipe:
                 RefineEnvironment(self.refinements, self.texels),
             ),
             motions=population.motions,
+            densify_until=population.densify_until,
         )
         refinement = replace(
             reflection,

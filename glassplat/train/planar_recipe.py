@@ -179,6 +179,7 @@ class PlanarRecipe:
             rates=self.rates.of("primary"),
             actions=(*population.edits, GrowSh(Every(self.rhythm.sh))),
             motions=population.motions,
+            densify_until=population.densify_until,
         )
         if not self.multi_stage:
             return initialisation, replace(self._joint(second + third), entry=entry)
@@ -196,6 +197,7 @@ class PlanarRecipe:
             actions=(*population.edits, GrowSh(Every(self.rhythm.sh)), Densify(self.densify, part="glass")),
             motions=population.motions,
             entry=entry,
+            densify_until=self.densify.stop,
         )
 
     def _joint(self, share: float) -> Stage:
@@ -219,6 +221,7 @@ class PlanarRecipe:
                 PerturbOpacity(beat, self.perturbation.amplitude),
             ),
             motions=population.motions,
+            densify_until=self.densify.stop,
         )
 
     def _joint_terms(self, population: Population) -> tuple[LossTerm, ...]:

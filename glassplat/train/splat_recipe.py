@@ -106,6 +106,7 @@ class SplatRecipe:
                 rates=self.rates.of("primary"),
                 actions=(*population.edits, GrowSh(Every(self.rhythm.sh)), *population.resets),
                 motions=population.motions,
+                densify_until=population.densify_until,
             ),
         )
 

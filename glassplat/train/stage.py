@@ -113,6 +113,7 @@ class Stage:
         actions: recurring edits, in the order in which they act.
         motions: what follows the optimiser at every step, before the actions.
         entry: what to do once when the stage begins.
+        densify_until: share of the run until which screen gradients are collected, for whoever densifies by them.
     """
 
     name: str
@@ -123,6 +124,7 @@ class Stage:
     actions: tuple[Action, ...] = ()
     motions: tuple[Motion, ...] = ()
     entry: Entry | None = None
+    densify_until: float = 0.0
 
 
 def stage_starts(stages: tuple[Stage, ...], iterations: int) -> list[int]:

@@ -50,6 +50,7 @@ class Population:
         resets: opacity resets; a recipe decides in which stages they happen.
         motions: what moves the primary Gaussians besides the optimiser.
         terms: regularisers of the objective.
+        densify_until: share of the run until which `edits` read screen gradients.
     """
 
     opacity: float = 0.1
@@ -58,6 +59,7 @@ class Population:
     resets: tuple[Action, ...] = ()
     motions: tuple[Motion, ...] = ()
     terms: tuple[LossTerm, ...] = ()
+    densify_until: float = 0.0
 
     def initial(self, points: PointCloud, sh_degree: int) -> Gaussians:
         """The first primary Gaussians, one per point."""
@@ -82,7 +84,8 @@ def population_of(
 def default_population(densifier: DefaultDensify, rhythm: Rhythm) -> Population:
     """3DGS: clone, split, prune, and reset the opacities; and what adds to no view is removed in the end."""
     reset = ResetOpacity(Every(rhythm.beat, 0.0, rhythm.reset_stop, rhythm.least, only_multiples_of=3))
-    return Population(edits=(Densify(densifier), PruneIdle(densifier)), resets=(reset,))
+    edits = (Densify(densifier), PruneIdle(densifier))
+    return Population(edits=edits, resets=(reset,), densify_until=densifier.stop)
 
 
 def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:

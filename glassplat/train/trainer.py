@@ -64,7 +64,7 @@ def train(stages: tuple[Stage, ...], dataset: Dataset, state: TrainState, iterat
 def advance(stage: Stage, dataset: Dataset, state: TrainState, iterations: int) -> Iterator[Message]:
     """One optimisation step and the actions that are due after it."""
     view = scheduled_view(dataset, state)
-    result = differentiate(stage, state.scene, view)
+    result = differentiate(stage, state.scene, view, probed=state.step < stage.densify_until * iterations)
     for name, value in result.losses.items():
         if not math.isfinite(value):
             raise TrainingDivergedError(
@@ -91,19 +91,24 @@ def scheduled_view(dataset: Dataset, state: TrainState) -> View:
     return dataset.train[int(torch.randperm(count, generator=generator)[position])]
 
 
-def differentiate(stage: Stage, scene: Scene, view: View) -> Differentiated:
-    """Renders a view and returns the weighted losses with the gradients of all that learns."""
+def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Differentiated:
+    """Renders a view and returns the weighted losses with the gradients of all that learns.
+
+    Those on screen come only if the view is `probed`.
+    """
     leaves = {
         name: tensor.detach().requires_grad_()
         for name, tensor in scene.parameters().items()
         if name in stage.rates and tensor.numel() > 0
     }
     learning = scene.with_parameters(leaves)
-    frame = stage.renderer(learning, view.camera)
+    frame = stage.renderer(learning, view.camera, probed=probed)
     terms = weighted_terms(stage, frame, view, learning)
     total = torch.stack(list(terms.values())).sum()
-    tracked = [screen for screen in frame.screen if screen.probe.requires_grad and screen.probe.numel() > 0]
-    centers, probes = [screen.means2d for screen in tracked], [screen.probe for screen in tracked]
+    passes = [screen for screen in frame.screen if screen.means2d.requires_grad and screen.means2d.numel() > 0]
+    tracked = passes if probed else []
+    centers = [screen.means2d for screen in tracked]
+    probes = [screen.probe for screen in tracked if screen.probe is not None]
     found = torch.autograd.grad(total, [*leaves.values(), *centers, *probes], allow_unused=True)
     gradients = {name: g for name, g in zip(leaves, found[: len(leaves)], strict=True) if g is not None}
     on_screen = found[len(leaves) :]
@@ -132,7 +137,7 @@ def collect_statistics(state: TrainState, screen: list[tuple[ScreenPass, Tensor,
     for record, v_means, v_probe in screen:
         known = state.statistics.get(record.part)
         if known is None:
-            known = ScreenStatistics.zeros(record.probe.shape[1], device=v_means.device)
+            known = ScreenStatistics.zeros(record.means2d.shape[1], device=v_means.device)
         state.statistics[record.part] = accumulate(
             known,
             v_means,

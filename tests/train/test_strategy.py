@@ -106,7 +106,7 @@ def test_the_regularisers_reach_the_gaussians() -> None:
     (stage,) = RECIPES[0].stages(seed=0)
     scene, view = fresh_state(RECIPES[0]).scene, tiny_capture().train[0]
     plain = replace(stage, losses=tuple(term for term in stage.losses if term.name not in ("opacity", "scale")))
-    gradients = [differentiate(s, scene, view).gradients for s in (stage, plain)]
+    gradients = [differentiate(s, scene, view, probed=False).gradients for s in (stage, plain)]
     opacities, scales = torch.sigmoid(scene.primary.logit_opacities), scene.primary.log_scales.exp()
     expected = {
         "primary.logit_opacities": 0.01 * opacities * (1 - opacities) / len(opacities),
@@ -145,3 +145,13 @@ def test_weights_and_noise_of_zero_are_left_out() -> None:
 @BOTH
 def test_a_recipe_survives_its_file(recipe: Any) -> None:
     assert recipe_from_json(recipe_to_json(recipe)) == recipe
+
+
+def test_screen_gradients_are_collected_for_who_densifies_by_them() -> None:
+    sampled, default = (SplatRecipe(strategy=strategy).stages(seed=0)[0] for strategy in ("mcmc", "default"))
+    assert sampled.densify_until == 0
+    assert default.densify_until == SplatRecipe().densify.stop
+    first, *later = PlanarRecipe(strategy="mcmc").stages(seed=0)
+    assert first.densify_until == 0
+    # The glass is densified under either strategy.
+    assert {stage.densify_until for stage in later} == {PlanarRecipe().densify.stop}

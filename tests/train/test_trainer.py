@@ -19,7 +19,7 @@ from glassplat.train.planar_recipe import PlanarRecipe, PlaneEntry
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Stage
 from glassplat.train.state import TrainState
-from glassplat.train.trainer import TrainingDivergedError, train
+from glassplat.train.trainer import TrainingDivergedError, differentiate, train
 from tests.train.tiny_capture import tiny_capture, true_scene
 
 
@@ -84,6 +84,32 @@ def test_the_same_seed_gives_the_same_scene_and_another_seed_another() -> None:
         run(state, planar_stages(), 12)
     assert_same_scene(states[0].scene, states[1].scene)
     assert not torch.equal(states[0].scene.primary.sh, states[2].scene.primary.sh)
+
+
+def test_screen_gradients_are_collected_as_long_as_densification_reads_them() -> None:
+    stages, state = tuple(replace(stage, actions=()) for stage in planar_stages()), fresh_state()
+    seen = []
+    for until in (10, 20):
+        run(state, stages, 20, until=until)
+        seen.append({part: statistics.view_count.clone() for part, statistics in state.statistics.items()})
+    assert PlanarRecipe().densify.stop == 0.5
+    assert seen[0]["primary"].sum() > 0
+    assert seen[0]["glass"].sum() > 0
+    for part, views in seen[0].items():
+        assert torch.equal(views, seen[1][part]), part
+
+
+def test_collecting_screen_gradients_changes_no_other_gradient() -> None:
+    state = fresh_state()
+    run(state, planar_stages(), 20, until=12)
+    results = [
+        differentiate(planar_stages()[-1], state.scene, tiny_capture().train[0], probed=p) for p in (True, False)
+    ]
+    assert len(results[0].screen) == 3
+    assert not results[1].screen
+    assert results[0].losses == results[1].losses
+    for name, gradient in results[0].gradients.items():
+        assert torch.allclose(gradient, results[1].gradients[name], rtol=1e-4, atol=1e-9), name
 
 
 @pytest.mark.parametrize("pause", [3, 4, 7])
