@@ -63,3 +63,15 @@ def test_only_colours_that_turn_with_the_view_are_held() -> None:
     turning = replace(scene, primary=scene.primary.with_tensors({"sh": sh}))
     assert view_dependence(UNUSED, UNUSED, turning).item() == pytest.approx(5 / 2)
     assert view_dependence(UNUSED, UNUSED, scene).item() == 0
+
+
+def test_the_gradient_holds_harmonics_and_leaves_the_constant_alone() -> None:
+    scene = scene_of([0.5, 0.5, 0.5], scale=0.3)
+    sh = torch.randn(3, 9, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+
+    def penalty(values: torch.Tensor) -> torch.Tensor:
+        return view_dependence(UNUSED, UNUSED, replace(scene, primary=scene.primary.with_tensors({"sh": values})))
+
+    assert torch.autograd.gradcheck(penalty, sh)
+    (gradient,) = torch.autograd.grad(penalty(sh), sh)
+    assert not gradient[:, 0].any()
