@@ -24,6 +24,7 @@ Switch = Literal[
     "two-surfaces",
     "bright-reflections",
     "calm-colors",
+    "averaging",
     "propagation",
     "sabotage",
     "deferred-shading",
@@ -58,6 +59,10 @@ def _without_perturbation(recipe: PlanarRecipe) -> PlanarRecipe:
     return replace(recipe, perturbation=replace(recipe.perturbation, amplitude=0.0))
 
 
+def _without_averaging(recipe: PlanarRecipe) -> PlanarRecipe:
+    return replace(recipe, rhythm=replace(recipe.rhythm, averaged_passes=0.0))
+
+
 def _without_propagation(recipe: DeferredRecipe) -> DeferredRecipe:
     return replace(recipe, propagation=replace(recipe.propagation, propagates=False))
 
@@ -81,6 +86,7 @@ PLANAR: dict[Switch, Ablation] = {
     "two-surfaces": Ablation("one surface (Schlick, the paper's)", lambda r: replace(r, fresnel="schlick")),
     "bright-reflections": Ablation("a(u) left free (the paper's)", _without("intensity")),
     "calm-colors": Ablation("harmonics left free (the paper's)", lambda r: replace(r, view_dependence_weight=0.0)),
+    "averaging": Ablation("last step, not the mean of a pass", _without_averaging),
 }
 """The first seven are the rows of TR-Gaussians' Table IV, the others are parts that the paper does not ablate."""
 

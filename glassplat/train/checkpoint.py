@@ -43,6 +43,7 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
         tensors |= {f"first/{name}": first, f"second/{name}": second}
     for part, statistics in state.statistics.items():
         tensors |= {f"statistics/{part}/{name}": t for name, t in vars(statistics).items()}
+    tensors |= {f"means/{name}": mean for name, mean in state.means.items()}
     header = {
         "format": FORMAT,
         "step": state.step,
@@ -136,6 +137,7 @@ def restored_state(header: dict, tensors: dict[str, Tensor]) -> TrainState:
             paused=dict(header.get("paused", {})),
         ),
         statistics={part: ScreenStatistics(**under(statistics, f"{part}/")) for part in sorted(parts)},
+        means=under(tensors, "means/"),
     )
 
 

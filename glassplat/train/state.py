@@ -6,6 +6,7 @@ import zlib
 from dataclasses import dataclass, field, replace
 
 import torch
+from torch import Tensor
 
 from glassplat.densify.default import ScreenStatistics
 from glassplat.scene.scene import Scene
@@ -24,6 +25,7 @@ class TrainState:
         statistics: screen gradients collected for densification, by scene part.
         seconds: time spent training so far, over all sittings.
         records: numbers that an action keeps from one turn to the next, by name.
+        means: running means of the parameters over the last steps of the run, see `AverageLast`.
     """
 
     scene: Scene
@@ -33,6 +35,7 @@ class TrainState:
     statistics: dict[str, ScreenStatistics] = field(default_factory=dict)
     seconds: float = 0.0
     records: dict[str, float] = field(default_factory=dict)
+    means: dict[str, Tensor] = field(default_factory=dict)
 
     def generator(self, purpose: str) -> torch.Generator:
         """A random generator for one purpose at this step.
@@ -53,4 +56,5 @@ class TrainState:
             for part, known in self.statistics.items()
         }
         optimizer = replace(self.optimizer, moments=moments)
-        return replace(self, scene=self.scene.to(device), optimizer=optimizer, statistics=statistics)
+        means = {name: mean.to(device) for name, mean in self.means.items()}
+        return replace(self, scene=self.scene.to(device), optimizer=optimizer, statistics=statistics, means=means)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from glassplat.data.capture import PointCloud
@@ -13,6 +13,7 @@ from glassplat.losses.parsimony import mean_opacity, mean_scale
 from glassplat.losses.term import LossTerm, weighted
 from glassplat.scene.gaussians import Gaussians
 from glassplat.train.actions import Densify, Explore, PruneIdle, Relocate, ResetOpacity
+from glassplat.train.averaging import AverageLast
 from glassplat.train.optimizer import Rate
 from glassplat.train.stage import Action, Every, Motion
 
@@ -21,7 +22,9 @@ Strategy = Literal["default", "mcmc"]
 
 @dataclass(frozen=True)
 class Rhythm:
-    """When opacities are disturbed and the SH degree grows, in shares of the run (3DGS: of 30,000 iterations).
+    """When opacities are disturbed, when the SH degree grows, and how a run ends.
+
+    Times are shares of the run (3DGS: of 30,000 iterations).
 
     Every third beat resets the opacities, as in 3DGS; `planar` perturbs them at the other two, so that
     the two never meet (TR-Gaussians, Section III-C3).
@@ -31,12 +34,15 @@ class Rhythm:
         least: fewest iterations between beats; what a beat disturbs needs as many to recover.
         reset_stop: share of the run after which no reset happens; the `mcmc` strategy has none.
         sh: distance between rises of the SH degree, as a share of the run.
+        averaged_passes: passes over the views at the end of the run of which the scene becomes the mean; 0 keeps the
+            last step.
     """
 
     beat: float = 1 / 30
     least: int = 250
     reset_stop: float = 0.45
     sh: float = 1 / 30
+    averaged_passes: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -48,7 +54,7 @@ class Population:
         spread: standard deviation of the first Gaussians, as a share of the distance to their neighbours.
         edits: what changes the number of primary Gaussians.
         resets: opacity resets; a recipe decides in which stages they happen.
-        motions: what moves the primary Gaussians besides the optimiser.
+        motions: what follows the optimiser in every step.
         terms: regularisers of the objective.
         densify_until: share of the run until which `edits` read screen gradients.
     """
@@ -75,10 +81,13 @@ def population_of(
         strategy: name on the command line.
         default: options of `default`.
         mcmc: options of `mcmc`.
-        rhythm: when opacities are reset.
+        rhythm: when opacities are reset, and what is averaged in the end.
         means_rate: learning rate of the positions, which the noise of `mcmc` follows.
     """
-    return mcmc_population(mcmc, means_rate) if strategy == "mcmc" else default_population(default, rhythm)
+    population = mcmc_population(mcmc, means_rate) if strategy == "mcmc" else default_population(default, rhythm)
+    if rhythm.averaged_passes == 0:
+        return population
+    return replace(population, motions=(*population.motions, AverageLast(rhythm.averaged_passes)))
 
 
 def default_population(densifier: DefaultDensify, rhythm: Rhythm) -> Population:

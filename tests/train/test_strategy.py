@@ -11,7 +11,8 @@ import torch
 
 from glassplat.densify.mcmc import McmcDensify
 from glassplat.losses.photometric import PhotometricLoss
-from glassplat.train.actions import Densify, Relocate, ResetOpacity, cap_of
+from glassplat.train.actions import Densify, Explore, Relocate, ResetOpacity, cap_of
+from glassplat.train.averaging import AverageLast
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.messages import ActionDone, Message, StepDone
 from glassplat.train.planar_recipe import PlanarRecipe
@@ -19,6 +20,7 @@ from glassplat.train.recipe import recipe_from_json, recipe_to_json
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Clock, Stage
 from glassplat.train.state import TrainState
+from glassplat.train.strategy import Rhythm
 from glassplat.train.trainer import differentiate, train
 from tests.train.tiny_capture import tiny_capture, true_scene
 
@@ -85,10 +87,12 @@ def test_resuming_continues_to_the_same_result(recipe: Any, pause: int, tmp_path
 def test_the_strategy_decides_what_happens_to_the_primary_gaussians(recipe: Any) -> None:
     for stage in recipe.stages(seed=0):
         kinds = [type(action) for action in stage.actions]
-        assert kinds.count(Relocate) == 1 and ResetOpacity not in kinds and len(stage.motions) == 1
+        assert kinds.count(Relocate) == 1 and ResetOpacity not in kinds
+        assert [type(motion) for motion in stage.motions] == [Explore, AverageLast]
         assert all(action.part == "glass" for action in stage.actions if isinstance(action, Densify))
     for stage in replace(recipe, strategy="default").stages(seed=0):
-        assert not stage.motions and not any(isinstance(action, Relocate) for action in stage.actions)
+        assert [type(motion) for motion in stage.motions] == [AverageLast]
+        assert not any(isinstance(action, Relocate) for action in stage.actions)
         assert not {"opacity", "scale"} & {term.name for term in stage.losses}
 
 
@@ -138,7 +142,7 @@ def test_relocation_keeps_its_share_of_the_run() -> None:
 
 def test_weights_and_noise_of_zero_are_left_out() -> None:
     bare = McmcDensify(noise_rate=0.0, opacity_weight=0.0, scale_weight=0.0)
-    (stage,) = SplatRecipe(strategy="mcmc", mcmc=bare).stages(seed=0)
+    (stage,) = SplatRecipe(strategy="mcmc", mcmc=bare, rhythm=Rhythm(averaged_passes=0)).stages(seed=0)
     assert not stage.motions and {term.name for term in stage.losses} == {"photometric"}
 
 
