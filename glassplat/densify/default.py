@@ -17,12 +17,14 @@ from glassplat.scene.gaussians import Gaussians
 class ScreenStatistics:
     """What the views since the last densification saw of each Gaussian.
 
-    Gradients are in normalised device coordinates: the image spans [-1, 1] both ways.
+    Gradients are in normalised device coordinates: the image spans [-1, 1] both ways. Sums and counts have two rows,
+    over all views and over those that see the Gaussian directly. In a mirror it is small and has small gradients,
+    which must not hide that it is too coarse where it is close.
 
     Attributes:
-        gradient_sum: [N] sum over views of the norm of the loss gradient with respect to the centre on screen.
-        pull_sum: [N] the same of what single pixels contribute to that gradient, added up without signs.
-        view_count: [N] number of views that saw the Gaussian; a view in a mirror counts by its strength.
+        gradient_sum: [2, N] sum over views of the norm of the loss gradient with respect to the centre on screen.
+        pull_sum: [2, N] the same of what single pixels contribute to that gradient, added up without signs.
+        view_count: [2, N] number of views that saw the Gaussian; a view in a mirror counts by its strength.
         max_radius: [N] largest radius on screen, as a share of the longer image side.
     """
 
@@ -34,17 +36,18 @@ class ScreenStatistics:
     @staticmethod
     def zeros(count: int, *, device: torch.device | str = "cpu") -> ScreenStatistics:
         """Statistics of `count` Gaussians that no view has seen."""
-        return ScreenStatistics(*(torch.zeros(count, device=device) for _ in range(4)))
+        gradients, pulls, views = torch.zeros(3, 2, count, device=device)
+        return ScreenStatistics(gradients, pulls, views, torch.zeros(count, device=device))
 
     @property
     def mean_gradient(self) -> Tensor:
-        """[N] mean gradient norm over the views that saw the Gaussian; 0 where none did."""
-        return self.gradient_sum / self.view_count.clamp(min=1)
+        """[N] mean gradient norm over the views that saw the Gaussian, all or direct, the larger; 0 where none did."""
+        return (self.gradient_sum / self.view_count.clamp(min=1)).amax(dim=0)
 
     @property
     def mean_pull(self) -> Tensor:
-        """[N] mean pull of single pixels over the views that saw the Gaussian; 0 where none did."""
-        return self.pull_sum / self.view_count.clamp(min=1)
+        """[N] mean pull of single pixels over the views that saw the Gaussian, as `mean_gradient`."""
+        return (self.pull_sum / self.view_count.clamp(min=1)).amax(dim=0)
 
 
 @torch.no_grad()
@@ -57,6 +60,7 @@ def accumulate(
     width: int,
     height: int,
     weight: float = 1.0,
+    direct: bool = True,
 ) -> ScreenStatistics:
     """The statistics with the views of one training step added.
 
@@ -72,6 +76,7 @@ def accumulate(
         height: image height in pixels.
         weight: share of the image that this pass contributes. A reflection of strength 0.1 has gradients a tenth
             as large; counted as a full view it would dilute the mean of what is also seen directly.
+        direct: whether the views see the Gaussians themselves, and not their mirror images.
     """
     visible = (radii > 0).all(dim=-1)
     pixels_per_unit = means2d_gradient.new_tensor([width / 2, height / 2])
@@ -79,11 +84,12 @@ def accumulate(
     def norms(gradient: Tensor) -> Tensor:
         return torch.where(visible, (gradient * pixels_per_unit).norm(dim=-1), 0).sum(dim=0)
 
+    rows = means2d_gradient.new_tensor([[1.0], [float(direct)]])
     shares = torch.where(visible, radii.amax(dim=-1) / max(width, height), 0)
     return ScreenStatistics(
-        gradient_sum=statistics.gradient_sum + norms(means2d_gradient),
-        pull_sum=statistics.pull_sum + norms(probe_gradient),
-        view_count=statistics.view_count + weight * visible.sum(dim=0),
+        gradient_sum=statistics.gradient_sum + rows * norms(means2d_gradient),
+        pull_sum=statistics.pull_sum + rows * norms(probe_gradient),
+        view_count=statistics.view_count + rows * weight * visible.sum(dim=0),
         max_radius=torch.maximum(statistics.max_radius, shares.amax(dim=0).to(statistics.max_radius.dtype)),
     )
 
@@ -160,9 +166,9 @@ class DefaultDensify:
             prune_large: also remove what is too large; 3DGS does so once the opacities have been
                 reset for the first time.
         """
-        if statistics.view_count.shape[0] != len(gaussians):
+        if statistics.max_radius.shape[0] != len(gaussians):
             raise ValueError(
-                f"statistics hold {statistics.view_count.shape[0]} rows for {len(gaussians)} Gaussians; "
+                f"statistics hold {statistics.max_radius.shape[0]} rows for {len(gaussians)} Gaussians; "
                 "start new statistics whenever the set has changed"
             )
         grown = self._growth(gaussians, statistics, extent=extent, generator=generator)

@@ -26,6 +26,7 @@ class ScreenPass:
             where the frame was not probed.
         radii: [C, N, 2] half extents in pixels; 0 where not visible.
         weight: share of the image that the pass contributes where it is seen.
+        direct: whether it shows the Gaussians themselves, and not their mirror images.
     """
 
     part: str
@@ -33,6 +34,7 @@ class ScreenPass:
     probe: Tensor | None
     radii: Tensor
     weight: float = 1.0
+    direct: bool = True
 
 
 @dataclass(frozen=True)

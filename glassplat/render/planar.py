@@ -167,7 +167,8 @@ class Planar:
         if any(self.background):
             colors = over_background(reflections[..., :3], result.alpha, self.background)
             reflections = torch.cat([colors, reflections[..., 3:]], dim=-1)
-        return SecondPass(reflections, ScreenPass("primary", projected.means2d, probe, projected.radii))
+        screen = ScreenPass("primary", projected.means2d, probe, projected.radii, direct=False)
+        return SecondPass(reflections, screen)
 
 
 def panes_in_camera(planes: Planes, camera: Camera) -> Panes:

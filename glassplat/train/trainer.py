@@ -146,6 +146,7 @@ def collect_statistics(state: TrainState, screen: list[tuple[ScreenPass, Tensor,
             width=view.camera.width,
             height=view.camera.height,
             weight=record.weight,
+            direct=record.direct,
         )
 
 

@@ -26,9 +26,8 @@ def seen(gradients: list[float], pulls: list[float] | None = None, radius: float
     """What one view saw; pixels pull six times as strongly as the gradient says unless given."""
     count = len(gradients)
     pulls = pulls or [6 * gradient for gradient in gradients]
-    return ScreenStatistics(
-        torch.tensor(gradients), torch.tensor(pulls), torch.ones(count), torch.full((count,), radius)
-    )
+    sums = (torch.tensor(values).expand(2, -1) for values in (gradients, pulls, [1.0] * count))
+    return ScreenStatistics(*sums, torch.full((count,), radius))
 
 
 def densified(options: DefaultDensify, gaussians: Gaussians, statistics: ScreenStatistics, **extra: bool) -> Gaussians:
@@ -40,12 +39,26 @@ def test_accumulate_counts_visible_views_in_device_coordinates() -> None:
     gradient = torch.tensor([[[3.0, 0.0], [0.0, 1.0], [5.0, 5.0]], [[0.0, 1.0], [9.0, 9.0], [5.0, 5.0]]])
     radii = torch.tensor([[[4, 2], [1, 1], [0, 0]], [[8, 40], [0, 3], [0, 0]]])
     statistics = accumulate(ScreenStatistics.zeros(3), gradient, 2 * gradient, radii, width=400, height=200)
-    assert statistics.gradient_sum.tolist() == [3 * 200 + 1 * 100, 100, 0]
-    assert statistics.pull_sum.tolist() == [2 * (3 * 200 + 1 * 100), 200, 0]
-    assert statistics.view_count.tolist() == [2, 1, 0]
+    assert statistics.gradient_sum.tolist() == [[3 * 200 + 1 * 100, 100, 0]] * 2
+    assert statistics.pull_sum.tolist() == [[2 * (3 * 200 + 1 * 100), 200, 0]] * 2
+    assert statistics.view_count.tolist() == [[2, 1, 0]] * 2
     assert statistics.max_radius.tolist() == pytest.approx([0.1, 1 / 400, 0])
     assert statistics.mean_gradient.tolist() == [350, 100, 0]
     assert statistics.mean_pull.tolist() == [700, 200, 0]
+
+
+def test_mirror_images_do_not_dilute_what_is_seen_directly() -> None:
+    statistics, radii = ScreenStatistics.zeros(2), torch.full((1, 2, 2), 6)
+    for weight, gradients in ((1.0, [8.0, 0.0]), (1.0, [4.0, 0.0]), (0.5, [0.0, 3.0])):
+        gradient = torch.tensor(gradients)[None, :, None] * torch.tensor([0.01, 0.0])
+        seen_here = radii * (gradient != 0).any(dim=-1, keepdim=True) if weight == 1 else radii
+        statistics = accumulate(
+            statistics, gradient, 2 * gradient, seen_here, width=200, height=100, weight=weight, direct=weight == 1
+        )
+    assert statistics.view_count.tolist() == [[2.5, 0.5], [2, 0]]
+    # The first one is seen twice directly, the second only in the mirror.
+    assert statistics.mean_gradient.tolist() == pytest.approx([6, 3])
+    assert statistics.mean_pull.tolist() == pytest.approx([12, 6])
 
 
 def test_statistics_do_not_depend_on_the_resolution() -> None:
