@@ -77,7 +77,8 @@ class Train:
     def settings(self) -> RunSettings:
         """What the run's directory records beside the recipe."""
         device = str(chosen_device(self.device))
-        return RunSettings(str(self.data), self.iterations, self.downscale, self.seed, device, self.mask_polarity)
+        data = str(self.data.resolve())  # The run may be looked at from another folder than it was started in.
+        return RunSettings(data, self.iterations, self.downscale, self.seed, device, self.mask_polarity)
 
     def resuming(self, begun: bool) -> Train:
         """The same run, going on from its checkpoint if it has begun."""

@@ -25,7 +25,7 @@ class RunSettings:
     """What was asked for, beside the recipe.
 
     Attributes:
-        data: directory of the capture.
+        data: directory of the capture, from the root of the file system.
         iterations: length of the run.
         downscale: factor by which photographs are shrunk.
         seed: fixes every random choice.

@@ -62,6 +62,15 @@ def test_a_run_is_not_overwritten_and_resumes_only_as_it_was_started(
     assert train("splat", run, "--iterations", "3", "--resume") == 0
 
 
+def test_a_run_finds_its_capture_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(SCENE.parent)
+    options = ["--data", SCENE.name, "--output", str(tmp_path / "run"), "--downscale", "4", "--iterations", "3"]
+    assert main(["train", "splat", *options]) == 0
+    monkeypatch.chdir(tmp_path)
+    assert main(["render", "run", "--layers", "rgb", "--output", "out"]) == 0
+    assert main(["train", "splat", "--data", str(SCENE), *options[2:], "--resume"]) == 0
+
+
 def test_the_strategy_and_its_cap_are_chosen_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = tmp_path / "run"
     assert train("splat", run, "--iterations", "3", "--strategy", "mcmc", "--cap", "5000") == 0
