@@ -16,14 +16,15 @@ from glassplat.kernels.shade_environment import shade_environment
 from glassplat.kernels.shaded import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
 from glassplat.kernels.splats import Projected
 from glassplat.kernels.surface_channels import surface_channels
-from glassplat.render.frame import Frame, ScreenPass
+from glassplat.render.frame import Frame
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
+    joined_probe,
     joined_splats,
     mean_depth,
     over_background,
-    probe_of,
     project_gaussians,
+    screen_pass,
 )
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
@@ -74,11 +75,11 @@ class Deferred:
         projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
         shade = self._shade_pixels if self.shading == "deferred" else self._shade_gaussians
         channels = self._channels_of(scene.primary, camera, projected)
-        probe = probe_of(projected) if probed else None
-        rgb, layers = shade(scene, camera, projected, channels, probe)
+        screen = (screen_pass("primary", projected),) if probed else ()
+        rgb, layers = shade(scene, camera, projected, channels, joined_probe(screen))
         if self.environment:
             layers["environment"] = torch.sigmoid(cube_lookup(scene.environment.raw, view_directions(camera)))
-        return Frame(rgb, layers, (ScreenPass("primary", projected.means2d, probe, projected.radii),))
+        return Frame(rgb, layers, screen)
 
     def _channels_of(self, gaussians: Gaussians, camera: Camera, projected: Projected) -> Tensor:
         """[N, D] what each Gaussian adds to the image: as `shade_environment` reads it, then depth, if asked for."""

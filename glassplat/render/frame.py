@@ -22,8 +22,7 @@ class ScreenPass:
     Attributes:
         part: name of the scene part, as in `Scene.gaussian_sets`.
         means2d: [C, N, 2] projected centres, pixels; part of the autograd graph.
-        probe: [C, N, 2] that `composite` got; its gradient is how strongly single pixels pull at the centres. None
-            where the frame was not probed.
+        probe: [C, N, 2] that `composite` got; its gradient is how strongly single pixels pull at the centres.
         radii: [C, N, 2] half extents in pixels; 0 where not visible.
         weight: share of the image that the pass contributes where it is seen.
         direct: whether it shows the Gaussians themselves, and not their mirror images.
@@ -31,7 +30,7 @@ class ScreenPass:
 
     part: str
     means2d: Tensor
-    probe: Tensor | None
+    probe: Tensor
     radii: Tensor
     weight: float = 1.0
     direct: bool = True
@@ -44,7 +43,7 @@ class Frame:
     Attributes:
         rgb: [H, W, 3] the image, sRGB, not clamped.
         layers: further images by name, [H, W] or [H, W, 3]; a renderer's docstring lists its own.
-        screen: one record per rasterised part and pass.
+        screen: one record per rasterised part and pass of a probed frame.
     """
 
     rgb: Tensor
@@ -61,7 +60,6 @@ class Renderer(Protocol):
         Args:
             scene: what is there.
             camera: from where it is seen.
-            probed: also prepare the statistics of densification, the probes of the passes on screen; they make the
-                backward pass slower.
+            probed: also prepare `Frame.screen`, the statistics of densification; they make the backward pass slower.
         """
         ...

@@ -17,11 +17,12 @@ from glassplat.kernels.splats import Deviation, Projected
 from glassplat.render.frame import Frame, ScreenPass
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
+    joined_probe,
     joined_splats,
     mean_depth,
     over_background,
-    probe_of,
     project_gaussians,
+    screen_pass,
 )
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
@@ -47,7 +48,7 @@ class SecondPass(NamedTuple):
     """What the panes mirror: colours and intensity [K, H, W, 4] of each."""
 
     reflections: Tensor
-    screen: ScreenPass
+    screen: tuple[ScreenPass, ...]
 
 
 @dataclass(frozen=True)
@@ -114,8 +115,9 @@ class Planar:
             linear=self.blend == "linear",
         )
         layers |= {"reflection": result.reflection, "strength": result.strength}
-        mirrored = replace(second.screen, weight=float(result.strength.detach().sum() / hit.sum()))
-        return Frame(result.rgb, layers, (*first.screen, mirrored))
+        share = float(result.strength.detach().sum() / hit.sum()) if probed else 0.0
+        mirrored = (replace(record, weight=share) for record in second.screen)
+        return Frame(result.rgb, layers, (*first.screen, *mirrored))
 
     def _first_pass(self, scene: Scene, camera: Camera, panes: Panes, probed: bool) -> FirstPass:
         near = NEAR_PER_EXTENT * scene.extent
@@ -130,7 +132,7 @@ class Planar:
         if self.deviation:
             index = pane_hits(panes, camera.intrinsics, camera.width, camera.height).pane
             deviation = Deviation(3, (index >= 0).to(colors.dtype)[None], self.deviation_depth_gradient)
-        probes = (probe_of(primary), probe_of(glass)) if probed else (None, None)
+        screen = (screen_pass("primary", primary), screen_pass("glass", glass)) if probed else ()
         result = composite(
             splats,
             channels,
@@ -138,13 +140,9 @@ class Planar:
             marks=marks,
             num_primary=len(scene.primary),
             deviation=deviation,
-            probe=torch.cat([probe for probe in probes if probe is not None], dim=1) if probed else None,
+            probe=joined_probe(screen),
         )
         alpha = result.alpha[0]
-        screen = (
-            ScreenPass("primary", primary.means2d, probes[0], primary.radii),
-            ScreenPass("glass", glass.means2d, probes[1], glass.radii),
-        )
         return FirstPass(
             transmission=over_background(result.image[0, ..., :3], alpha, self.background),
             alpha=alpha,
@@ -161,13 +159,12 @@ class Planar:
         bins = bin_tiles(splats, camera.width, camera.height, hits.tiles)
         intensity = torch.exp(primary.channels["log_intensity"]).expand(len(planes), -1)
         channels = torch.cat([projected.colors, intensity[..., None]], dim=-1)
-        probe = probe_of(projected) if probed else None
-        result = composite(splats, channels, bins, probe=probe)
+        screen = (screen_pass("primary", projected, direct=False),) if probed else ()
+        result = composite(splats, channels, bins, probe=joined_probe(screen))
         reflections = result.image
         if any(self.background):
             colors = over_background(reflections[..., :3], result.alpha, self.background)
             reflections = torch.cat([colors, reflections[..., 3:]], dim=-1)
-        screen = ScreenPass("primary", projected.means2d, probe, projected.radii, direct=False)
         return SecondPass(reflections, screen)
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from glassplat.kernels.project import project
 from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians, Splats
+from glassplat.render.frame import ScreenPass
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 
@@ -55,9 +58,15 @@ def joined_splats(*parts: Projected) -> Splats:
     return Splats(*(torch.cat([getattr(part, name) for part in parts], dim=1) for name in names))
 
 
-def probe_of(projected: Projected) -> Tensor:
-    """A probe [C, N, 2] for `composite` that asks for a gradient."""
-    return torch.zeros_like(projected.means2d).requires_grad_()
+def screen_pass(part: str, projected: Projected, *, direct: bool = True) -> ScreenPass:
+    """The record of a projected scene part, with a probe that asks for a gradient."""
+    probe = torch.zeros_like(projected.means2d).requires_grad_()
+    return ScreenPass(part, projected.means2d, probe, projected.radii, direct=direct)
+
+
+def joined_probe(screen: Sequence[ScreenPass]) -> Tensor | None:
+    """The probe [C, G, 2] that `composite` wants for the parts in this order; None where nothing is probed."""
+    return torch.cat([record.probe for record in screen], dim=1) if screen else None
 
 
 def over_background(image: Tensor, alpha: Tensor, background: tuple[float, float, float]) -> Tensor:

@@ -8,14 +8,15 @@ import torch
 
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
-from glassplat.render.frame import Frame, ScreenPass
+from glassplat.render.frame import Frame
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
+    joined_probe,
     joined_splats,
     mean_depth,
     over_background,
-    probe_of,
     project_gaussians,
+    screen_pass,
 )
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
@@ -45,11 +46,12 @@ class Splat:
         channels = projected.colors
         if self.depth:
             channels = torch.cat([channels, projected.depths[..., None]], dim=-1)
-        probe = probe_of(projected) if probed else None
-        result = composite(splats, channels, bin_tiles(splats, camera.width, camera.height), probe=probe)
+        screen = (screen_pass("primary", projected),) if probed else ()
+        bins = bin_tiles(splats, camera.width, camera.height)
+        result = composite(splats, channels, bins, probe=joined_probe(screen))
         image, alpha = result.image[0], result.alpha[0]
         layers = {"alpha": alpha}
         if self.depth:
             layers["depth"] = mean_depth(image[..., 3], alpha)
         rgb = over_background(image[..., :3], alpha, self.background)
-        return Frame(rgb, layers, (ScreenPass("primary", projected.means2d, probe, projected.radii),))
+        return Frame(rgb, layers, screen)

@@ -105,10 +105,8 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Di
     frame = stage.renderer(learning, view.camera, probed=probed)
     terms = weighted_terms(stage, frame, view, learning)
     total = torch.stack(list(terms.values())).sum()
-    passes = [screen for screen in frame.screen if screen.means2d.requires_grad and screen.means2d.numel() > 0]
-    tracked = passes if probed else []
-    centers = [screen.means2d for screen in tracked]
-    probes = [screen.probe for screen in tracked if screen.probe is not None]
+    tracked = [record for record in frame.screen if record.means2d.requires_grad and record.means2d.numel() > 0]
+    centers, probes = [record.means2d for record in tracked], [record.probe for record in tracked]
     found = torch.autograd.grad(total, [*leaves.values(), *centers, *probes], allow_unused=True)
     gradients = {name: g for name, g in zip(leaves, found[: len(leaves)], strict=True) if g is not None}
     on_screen = found[len(leaves) :]
