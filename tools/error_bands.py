@@ -65,7 +65,7 @@ def error_bands(stored: StoredRun, views: list[tuple[View, TrueView]], sigma: fl
             place = (true.labels > 0).numpy() == pane
             for band, values in zip(BANDS, (error, coarse, error - coarse), strict=True):
                 squares.setdefault((pane, band), []).append(values[place] ** 2)
-    return [psnr_of(squares[pane, band]) for pane in (True, False) for band in BANDS]
+    return [psnr_of_squares(squares[pane, band]) for pane in (True, False) for band in BANDS]
 
 
 def noise_of_photographs(views: list[tuple[View, TrueView]]) -> float:
@@ -77,10 +77,10 @@ def noise_of_photographs(views: list[tuple[View, TrueView]]) -> float:
         image = quantized(srgb_from_linear((1 - strength) * transmission + strength * reflection))
         place = (true.labels > 0) & (true.reflection < 255).all(dim=-1)
         squares.append((image[place].numpy().astype(np.float64) - view.photo[place].numpy()) ** 2)
-    return psnr_of(squares)
+    return psnr_of_squares(squares)
 
 
-def psnr_of(squares: list[NDArray[np.float64]]) -> float:
+def psnr_of_squares(squares: list[NDArray[np.float64]]) -> float:
     """PSNR of squared differences of eight-bit values."""
     return -10 * math.log10(float(np.concatenate([values.ravel() for values in squares]).mean()) / 255**2)
 

@@ -10,25 +10,23 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
+import statistics
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.data.dataset import Dataset, load_dataset
+from glassplat.evaluate.plane_errors import plane_table
+from glassplat.evaluate.truth import GroundTruth, load_truth
+from glassplat.files.markdown_table import Table
 from glassplat.files.ply import read_gaussians
 from glassplat.init.planes import PlaneFitError, fit_planes
-from glassplat.scene.camera import Camera
 
-Array = NDArray[np.float64]
-Annotations = list[tuple[Camera, Tensor]]
-
+COLUMNS = ("scene / pane", "fits", "refused", "good", "degrees, median (max)", "% of extent, median (max)", "seconds")
 LEAST_SHARE = 0.01
 """Masks that show a pane on less of the image are not among those that are chosen from."""
 LIMITS = 1.0, 1.0
@@ -41,20 +39,19 @@ class Fit:
 
     Attributes:
         names: of the photographs whose masks were used.
-        degrees: angle between the planes; infinite where no plane was found.
-        percent: distance of the true pane's centre from the fitted plane, % of the extent.
+        errors: angle between the planes, degrees, and distance of the true pane's centre from the fitted plane, % of
+            the extent; None where no plane was found.
         seconds: processor time taken by the fit.
     """
 
     names: tuple[str, ...]
-    degrees: float
-    percent: float
+    errors: tuple[float, float] | None
     seconds: float
 
     @property
     def good(self) -> bool:
         """Whether the plane is within the limits."""
-        return self.degrees <= LIMITS[0] and self.percent <= LIMITS[1]
+        return self.errors is not None and self.errors[0] <= LIMITS[0] and self.errors[1] <= LIMITS[1]
 
 
 def main() -> None:
@@ -66,57 +63,50 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=1, help="use every n-th choice of masks")
     parser.add_argument("--verbose", action="store_true", help="print every fit")
     arguments = parser.parse_args()
-    print("| scene / pane | fits | refused | good | degrees, median (max) | % of extent, median (max) | seconds |")
-    print("|---|---|---|---|---|---|---|")
-    for number, root in enumerate(arguments.data):
+    table = Table("Errors of fitted planes", COLUMNS)
+    for root, splats in zip(arguments.data, arguments.splats or [None] * len(arguments.data), strict=True):
         dataset = load_dataset(root)
-        splats = arguments.splats[number] if arguments.splats else None
+        truth = load_truth(dataset.truth)
+        if truth is None:
+            raise SystemExit(f"{root} has no ground truth; expected gt/planes.json with the true panes")
         centers = dataset.points.positions if splats is None else read_gaussians(splats).means
-        for pane in json.loads((root / "gt" / "planes.json").read_text()):
+        for pane in truth.planes:
             fits = []
-            for fit in fits_of(dataset, centers, pane, arguments.masks, arguments.every):
+            for fit in fits_of(dataset, centers, truth, pane.label, arguments.masks, arguments.every):
                 fits.append(fit)
                 if arguments.verbose:
-                    print(f"  {' '.join(fit.names)}: {fit.degrees:.2f} deg {fit.percent:.2f} % {fit.seconds:.1f} s")
-            print(row(f"{root.name} {pane['label']}", fits), flush=True)
+                    print(f"  {' '.join(fit.names)}: {fit.errors or 'refused'}, {fit.seconds:.1f} s", flush=True)
+            table.add(*row(f"{root.name} {pane.label}", fits))
+    print(table.markdown())
 
 
-def fits_of(dataset: Dataset, centers: Tensor, pane: dict, masks: int | None, every: int) -> Iterator[Fit]:
-    """Every fit of one pane, from each choice of so many masks."""
-    label = pane["label"]
+def fits_of(
+    dataset: Dataset, centers: Tensor, truth: GroundTruth, label: int, masks: int | None = None, every: int = 1
+) -> Iterator[Fit]:
+    """Every fit of one pane, from each choice of so many of the masks that show it."""
     shown = [
         (view.name, view.camera, torch.where(view.pane_labels == label, label, 0))
         for view in dataset.train
         if view.pane_labels is not None and float((view.pane_labels == label).float().mean()) >= LEAST_SHARE
     ]
     for chosen in list(itertools.combinations(shown, masks or len(shown)))[::every]:
-        names = tuple(Path(name).stem for name, _, _ in chosen)
         start = time.process_time()
-        degrees, percent = errors([(c, labels) for _, c, labels in chosen], centers, dataset.extent, pane)
-        yield Fit(names, degrees, percent, time.process_time() - start)
+        try:
+            planes = fit_planes(centers, [(camera, labels) for _, camera, labels in chosen], extent=dataset.extent)
+        except PlaneFitError:
+            errors = None
+        else:
+            (entry,) = plane_table(planes, truth, dataset.extent)
+            errors = entry["normal_error_deg"], 100 * entry["offset_error"]
+        yield Fit(tuple(Path(name).stem for name, _, _ in chosen), errors, time.process_time() - start)
 
 
-def errors(annotations: Annotations, centers: Tensor, extent: float, pane: dict) -> tuple[float, float]:
-    """Degrees and % of the extent between the fitted plane and the true one; infinite if there is none."""
-    try:
-        planes = fit_planes(centers, annotations, extent=extent)
-    except PlaneFitError:
-        return float("inf"), float("inf")
-    normal = planes.normals[0].double().numpy()
-    cosine = abs(float(normal @ np.array(pane["normal"])))
-    away = float((np.array(pane["center"]) - planes.centers[0].double().numpy()) @ normal)
-    return float(np.degrees(np.arccos(min(cosine, 1.0)))), 100 * abs(away) / extent
-
-
-def row(name: str, fits: Sequence[Fit]) -> str:
+def row(name: str, fits: Sequence[Fit]) -> list[object]:
     """One line of the table."""
-    found = [fit for fit in fits if np.isfinite(fit.degrees)]
-    degrees, percent = np.array([fit.degrees for fit in found]), np.array([fit.percent for fit in found])
-    cells = [name, str(len(fits)), str(len(fits) - len(found)), str(sum(fit.good for fit in fits))]
-    for values in (degrees, percent):
-        cells.append(f"{np.median(values):.2f} ({values.max():.2f})" if len(values) else "-")
-    cells.append(f"{np.mean([fit.seconds for fit in fits]):.1f}")
-    return "| " + " | ".join(cells) + " |"
+    found = [fit.errors for fit in fits if fit.errors is not None]
+    spreads = [f"{statistics.median(values):.2f} ({max(values):.2f})" for values in zip(*found, strict=True)]
+    seconds = statistics.fmean(fit.seconds for fit in fits) if fits else "-"
+    return [name, len(fits), len(fits) - len(found), sum(f.good for f in fits), *(spreads or ["-", "-"]), seconds]
 
 
 if __name__ == "__main__":

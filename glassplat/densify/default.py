@@ -42,12 +42,15 @@ class ScreenStatistics:
     @property
     def mean_gradient(self) -> Tensor:
         """[N] mean gradient norm over the views that saw the Gaussian, all or direct, the larger; 0 where none did."""
-        return (self.gradient_sum / self.view_count.clamp(min=1)).amax(dim=0)
+        return self._mean(self.gradient_sum)
 
     @property
     def mean_pull(self) -> Tensor:
         """[N] mean pull of single pixels over the views that saw the Gaussian, as `mean_gradient`."""
-        return (self.pull_sum / self.view_count.clamp(min=1)).amax(dim=0)
+        return self._mean(self.pull_sum)
+
+    def _mean(self, total: Tensor) -> Tensor:
+        return (total / self.view_count.clamp(min=1)).amax(dim=0)
 
 
 @torch.no_grad()
