@@ -16,6 +16,7 @@ from glassplat.data.errors import InputError, first_names
 from glassplat.data.masks import MaskSet, Polarity, find_masks, known_masks
 from glassplat.data.random_points import points_in_view
 from glassplat.data.view import WHITE, PreparedView, Rgb, View, ViewOptions, prepare_view
+from glassplat.files.images import is_transparent
 
 __all__ = ["Dataset", "PointCloud", "View", "load_dataset"]
 
@@ -88,6 +89,7 @@ def load_dataset(
     masks = _masks(root, capture, shots, mask_polarity)
     options = ViewOptions(downscale, background)
     prepared = [prepare_view(shot, masks.masks.get(shot.name), options) for shot in shots]
+    transparent = _any_transparent(shots)
     train, test, split = _split([p.view for p in prepared], capture)
     points, point_warnings = _points(capture, train)
     extent = _extent(train)
@@ -96,7 +98,7 @@ def load_dataset(
     warnings = (
         *capture.warnings,
         *masks.warnings,
-        *_view_warnings(prepared, background),
+        *_view_warnings(prepared, background if transparent else None),
         *point_warnings,
         *_far_off(train, extent),
     )
@@ -112,7 +114,7 @@ def load_dataset(
         warnings=warnings,
         split=split,
         measured_points=measured,
-        background=background if any(p.transparent for p in prepared) else None,
+        background=background if transparent else None,
     )
 
 
@@ -146,6 +148,14 @@ def _check_axes(train: tuple[View, ...], points: PointCloud | None, format_name:
             "down and +z forward in a COLMAP model, +y up and -z forward in transforms.json; turn the y and z axes of "
             "the poses round"
         )
+
+
+def _any_transparent(shots: list[Shot]) -> bool:
+    """Whether a photograph has transparent pixels."""
+    try:
+        return any(is_transparent(shot.image_path) for shot in shots)
+    except ValueError as error:
+        raise InputError(str(error)) from error
 
 
 def _check_names(shots: list[Shot]) -> None:
@@ -207,7 +217,7 @@ def _points(capture: Capture, train: tuple[View, ...]) -> tuple[PointCloud, list
     return kept, [f"{int((~finite).sum())} points that are not finite are left out."]
 
 
-def _view_warnings(prepared: list[PreparedView], background: Rgb) -> list[str]:
+def _view_warnings(prepared: list[PreparedView], background: Rgb | None) -> list[str]:
     """What was assumed about photographs, once for all of them."""
     warnings = []
     rescaled = [p.view.name for p in prepared if p.rescaled]
@@ -216,7 +226,6 @@ def _view_warnings(prepared: list[PreparedView], background: Rgb) -> list[str]:
             f"{len(rescaled)} photographs are scaled copies of what was calibrated; intrinsics were scaled with them "
             f"({first_names(rescaled)})."
         )
-    transparent = [p.view.name for p in prepared if p.transparent]
-    if transparent:
-        warnings.append(f"{len(transparent)} photographs have transparency; they are laid over sRGB {background}.")
+    if background is not None:
+        warnings.append(f"The photographs have transparent pixels; they are laid over sRGB {background}.")
     return warnings

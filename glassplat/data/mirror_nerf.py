@@ -137,7 +137,7 @@ def _in_pixels_of(path: Path, intrinsics: tuple[float, float, float, float]) -> 
         InputError: the photograph cannot be read, or is of another shape than what was calibrated.
     """
     try:
-        width, height, _ = image_size(path)
+        width, height = image_size(path)
     except ValueError as error:
         raise InputError(str(error)) from error
     fx, fy, cx, cy = intrinsics

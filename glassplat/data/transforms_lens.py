@@ -52,7 +52,7 @@ def _size(settings: Mapping[str, Any], image_path: Path) -> tuple[int, int]:
     """Width and height the intrinsics refer to."""
     if "w" in settings and "h" in settings:
         return round(float(settings["w"])), round(float(settings["h"]))
-    return image_size(image_path)[:2]
+    return image_size(image_path)
 
 
 def _focal_lengths(settings: Mapping[str, Any], width: int, height: int) -> tuple[float, float]:

@@ -116,7 +116,6 @@ class PreparedView:
 
     view: View
     rescaled: bool
-    transparent: bool
 
 
 def prepare_view(shot: Shot, mask: PaneMask | None, options: ViewOptions) -> PreparedView:
@@ -126,7 +125,7 @@ def prepare_view(shot: Shot, mask: PaneMask | None, options: ViewOptions) -> Pre
         InputError: unreadable file, sizes that disagree, a pose that is not rigid, a lens that cannot be undistorted.
     """
     try:
-        width, height, transparent = image_size(shot.image_path)
+        width, height = image_size(shot.image_path)
     except ValueError as error:
         raise InputError(str(error)) from error
     lens = lens_for_image(shot.lens, (width, height), shot.name)
@@ -142,13 +141,13 @@ def prepare_view(shot: Shot, mask: PaneMask | None, options: ViewOptions) -> Pre
         read_photo=PhotoFile(shot.image_path, pixel_map, options.background),
         read_pane_labels=None if mask is None else _mask_file(mask, (width, height), pixel_map),
     )
-    return PreparedView(view, lens is not shot.lens, transparent)
+    return PreparedView(view, lens is not shot.lens)
 
 
 def _mask_file(mask: PaneMask, size: tuple[int, int], pixel_map: PixelMap) -> MaskFile:
     """The mask at the photograph's size, which it must have up to an integer factor."""
     try:
-        mask_size = image_size(mask.path)[:2]
+        mask_size = image_size(mask.path)
     except ValueError as error:
         raise InputError(str(error)) from error
     if not (_is_multiple(mask_size, size) or _is_multiple(size, mask_size)):

@@ -76,7 +76,7 @@ def _read_beside(view: View, mark: str) -> NDArray[np.float32] | None:
     path = view.image_path.with_name(f"{view.image_path.stem}{mark}.png")
     if not path.is_file():
         return None
-    photo_size = image_size(view.image_path)[:2]
+    photo_size = image_size(view.image_path)
     pixels = _read(path)
     if pixels.shape[1::-1] != photo_size:
         raise InputError(

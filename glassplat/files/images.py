@@ -31,15 +31,28 @@ def open_image(path: Path) -> Image.Image:
         return image
 
 
-def image_size(path: Path) -> tuple[int, int, bool]:
-    """Width, height, and whether the image stores transparency; reads the header only.
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height; reads the header only.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: the file is no image.
     """
     with _readable(path), Image.open(path) as image:
-        return image.width, image.height, image.has_transparency_data
+        return image.width, image.height
+
+
+def is_transparent(path: Path) -> bool:
+    """Whether any pixel lets through what is behind it; decodes only images that store transparency.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is no image, or is cut off.
+    """
+    with _readable(path), Image.open(path) as image:
+        if not image.has_transparency_data:
+            return False
+        return bool((np.asarray(image.convert("RGBA").getchannel("A")) < 255).any())
 
 
 def read_image(path: Path | str) -> NDArray[np.uint8]:

@@ -71,7 +71,19 @@ def test_transparent_pixels_show_the_background(capture, background, behind: int
     pixels = np.array(Image.open(view.image_path)).astype(float)
     alpha = pixels[:, :, 3:] / 255
     np.testing.assert_allclose(view.photo.numpy(), pixels[:, :, :3] * alpha + behind * (1 - alpha), atol=0.51)
-    assert any("10 photographs have transparency" in warning for warning in data.warnings)
+    assert data.background == background
+    assert any("transparent pixels" in warning for warning in data.warnings)
+
+
+def test_photographs_that_store_an_opaque_alpha_channel_are_opaque(capture) -> None:
+    capture.write_colmap()
+    for path in sorted((capture.root / "images").iterdir()):
+        photo = Image.open(path).convert("RGB")
+        photo.putalpha(255)
+        photo.save(path.with_suffix(".png"))
+    data = load_dataset(capture.root)
+    assert data.background is None
+    assert not any("transparent pixels" in warning for warning in data.warnings)
 
 
 def test_grey_photographs_have_three_equal_channels(capture) -> None:

@@ -99,7 +99,7 @@ def test_blender_scene(capture) -> None:
     assert data.split == "shipped with the data"
     assert len(data.points) == 100_000
     assert 1.29 < data.points.positions.abs().max() <= 1.3
-    assert any("transparency" in warning for warning in data.warnings)
+    assert any("transparent pixels" in warning for warning in data.warnings)
 
 
 def test_train_file_alone_is_split(capture) -> None:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from glassplat.files.images import image_size, open_image, read_image, read_image_float, write_image
+from glassplat.files.images import image_size, is_transparent, open_image, read_image, read_image_float, write_image
 
 GENERATOR = np.random.default_rng(0)
 
@@ -45,8 +45,17 @@ def test_palette_and_transparency(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_image(tmp_path / "palette.png")[0, 0], [200, 100, 50])
     palette.save(tmp_path / "clear.png", transparency=1)
     np.testing.assert_array_equal(read_image(tmp_path / "clear.png")[0, 0], [200, 100, 50, 0])
-    assert image_size(tmp_path / "clear.png") == (4, 3, True)
-    assert image_size(tmp_path / "palette.png") == (4, 3, False)
+    assert image_size(tmp_path / "clear.png") == image_size(tmp_path / "palette.png") == (4, 3)
+    assert is_transparent(tmp_path / "clear.png")
+    assert not is_transparent(tmp_path / "palette.png")
+
+
+@pytest.mark.parametrize("alpha", [255, 254, 0])
+def test_an_image_is_transparent_where_a_pixel_is(tmp_path: Path, alpha: int) -> None:
+    pixels = np.full((3, 4, 4), 255, dtype=np.uint8)
+    pixels[2, 1, 3] = alpha
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    assert is_transparent(tmp_path / "a.png") == (alpha < 255)
 
 
 def test_orientation_tag_is_not_applied(tmp_path: Path) -> None:
@@ -57,7 +66,7 @@ def test_orientation_tag_is_not_applied(tmp_path: Path) -> None:
     assert read_image(tmp_path / "a.jpg").shape == (4, 8, 3)
 
 
-@pytest.mark.parametrize("read", [read_image, read_image_float, image_size, open_image])
+@pytest.mark.parametrize("read", [read_image, read_image_float, image_size, open_image, is_transparent])
 def test_files_that_cannot_be_read(tmp_path: Path, read) -> None:
     with pytest.raises(FileNotFoundError):
         read(tmp_path / "nothing.png")
