@@ -81,7 +81,7 @@ def torus_depth(major: float, minor: float, tilt_deg: float) -> float:
     return major * float(np.sin(np.radians(tilt_deg))) + minor
 
 
-def solid_noise(points: Array, frequency: float, seed: int) -> Array:
+def solid_noise(points: Array, frequency: float, seed: int, waves: int = WAVES) -> Array:
     """A smooth random pattern in space: [...] in about [0, 1] at points [..., 3].
 
     A solid pattern has neither seams nor poles, whatever surface it is cut by.
@@ -90,14 +90,15 @@ def solid_noise(points: Array, frequency: float, seed: int) -> Array:
         points: world units.
         frequency: typical waves per world unit.
         seed: chooses the pattern.
+        waves: how many waves add up; fewer are faster, and less even.
     """
     generator = np.random.default_rng(seed)
-    vectors = generator.normal(scale=2 * np.pi * frequency / np.sqrt(3), size=(WAVES, 3))
-    phases = generator.uniform(0, 2 * np.pi, WAVES)
+    vectors = generator.normal(scale=2 * np.pi * frequency / np.sqrt(3), size=(waves, 3))
+    phases = generator.uniform(0, 2 * np.pi, waves)
     total = np.zeros(points.shape[:-1])
     for vector, phase in zip(vectors, phases, strict=True):
         total += np.cos(points @ vector + phase)
-    return 0.5 + total / np.sqrt(8 * WAVES)
+    return 0.5 + total / np.sqrt(8 * waves)
 
 
 def ground_texture(radius: float, size: int) -> NDArray[np.float32]:

@@ -1,0 +1,118 @@
+"""The ray tracer of panes keeps to the laws of optics, and what it writes is a capture that fits its truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from glassplat.data.dataset import load_dataset
+from glassplat.evaluate.truth import load_truth
+from glassplat.kernels.panes import Panes
+from glassplat.kernels.reference.blend_panes import two_surfaces
+from glassplat.kernels.reference.pane_hits import pane_hits
+from tools.make_pane_scene import Arguments, main
+from tools.pane_tracer import Ball, Box, Pane, Place
+
+ROOM = Box((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), seed=1, room=True)
+X, Y = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
+WINDOW = Pane(1, np.zeros(3), Y, X, (1.0, 1.0))
+
+
+def towards_window(count: int = 200) -> tuple[np.ndarray, np.ndarray]:
+    """Rays from one point, most of which meet the window."""
+    generator = np.random.default_rng(0)
+    directions = np.concatenate([generator.uniform(-0.9, 0.9, (count, 1)), np.ones((count, 1))], axis=1)
+    directions = np.concatenate([directions, generator.uniform(-0.9, 0.9, (count, 1))], axis=1)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.broadcast_to([0.1, -1.0, 0.2], directions.shape), directions
+
+
+def test_a_ray_ends_at_the_first_thing() -> None:
+    place = Place((ROOM, Ball((0.0, 1.0, 0.0), 0.25, seed=2), Box((-0.5, 1.5, -0.5), (0.5, 1.7, 0.5), seed=3)), ())
+    origins = np.array([[0.0, -1.0, 0.0], [0.4, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.3, 0.0]])
+    _, distance = place.without_panes(origins, np.broadcast_to(Y, origins.shape))
+    assert distance == pytest.approx([1.75, 2.5, 3.0, 0.2])
+
+
+def test_glass_reflects_by_fresnels_law_at_both_of_its_surfaces() -> None:
+    cosines = np.linspace(0, 1, 50)[1:]
+    expected = two_surfaces(torch.tensor(WINDOW.base_reflectance), torch.from_numpy(cosines))
+    assert WINDOW.base_reflectance == pytest.approx(2 * 0.04 / 1.04)
+    np.testing.assert_allclose(WINDOW.reflectances(cosines), expected, rtol=1e-6)
+    assert (replace(WINDOW, refraction=None).reflectances(cosines) == 1).all()
+
+
+def test_one_pane_adds_its_reflection_to_what_is_behind_it() -> None:
+    seen = Place((ROOM, Ball((0.0, 1.0, 0.0), 0.25, seed=2)), (WINDOW,)).seen(*towards_window())
+    share = seen.strength[:, None]
+    hit = seen.label == 1
+    assert 0.3 < hit.mean() < 1
+    np.testing.assert_allclose(seen.radiance, (1 - share) * seen.transmission + share * seen.reflection)
+    assert (seen.strength[~hit] == 0).all()
+    assert (np.abs(seen.reflection - seen.transmission)[hit] > 0.05).any(axis=1).mean() > 0.3
+
+
+def test_a_mirror_shows_what_a_mirrored_camera_sees() -> None:
+    origins, directions = towards_window()
+    seen = Place((ROOM,), (replace(WINDOW, refraction=None),)).seen(origins, directions)
+    image, _ = Place((ROOM,), ()).without_panes(origins * [1, -1, 1], directions * [1, -1, 1])
+    hit = seen.label == 1
+    np.testing.assert_allclose(seen.radiance[hit], image[hit], atol=1e-9)
+
+
+def test_a_pane_behind_a_pane_returns_light_through_the_first() -> None:
+    second = replace(WINDOW, label=2, center=np.array([0.0, 0.5, 0.0]))
+    origins, directions = np.array([[0.0, -1.0, 0.0]]), Y[None]
+    behind, front = (
+        Place((ROOM,), ()).without_panes(origins + start * Y, sign * directions)[0]
+        for start, sign in ((0.0, 1), (0.0, -1))
+    )
+    share = WINDOW.base_reflectance
+    # Seen head-on the room is the same for both panes; light may be thrown to and fro between them once more.
+    once = (1 - share) ** 2 * behind + (share + (1 - share) ** 2 * share) * front
+    more = (1 - share) ** 2 * share**2 * (behind + share * front)
+    radiance = Place((ROOM,), (WINDOW, second)).radiance(origins, directions, reflections=3)
+    np.testing.assert_allclose(radiance, once + more, atol=share**4)
+    swapped = Place((ROOM,), (second, WINDOW)).radiance(origins, directions, reflections=3)
+    np.testing.assert_allclose(radiance, swapped)
+
+
+def test_the_capture_fits_its_truth(tmp_path: Path) -> None:
+    main(Arguments(tmp_path / "scene", width=40, views=16, masks=4, points=200))
+    dataset = load_dataset(tmp_path / "scene")
+    truth = load_truth(dataset.truth)
+    assert truth is not None
+    assert dataset.pane_labels == (1, 2, 3)
+    assert [plane.mirror for plane in truth.planes] == [False, False, True]
+    checked = 0
+    for view in dataset.train:
+        if view.pane_labels is None:
+            continue
+        pose, camera = view.camera.cam_from_world.double(), view.camera
+        vectors = {
+            name: torch.tensor([getattr(plane, name) for plane in truth.planes], dtype=torch.float64)
+            for name in ("center", "normal", "half_u", "half_v")
+        }
+        turned = {name: value @ pose[:3, :3].T for name, value in vectors.items()}
+        halves = torch.stack([turned["half_u"], turned["half_v"]], dim=1)
+        sizes = halves.norm(dim=-1)
+        panes = Panes(turned["center"] + pose[:3, 3], turned["normal"], halves / sizes[..., None], sizes)
+        hits = pane_hits(panes, camera.intrinsics.double(), camera.width, camera.height).pane + 1
+        masked = view.pane_labels > 0
+        # Things may stand before a pane; nowhere else is there one.
+        assert (hits[masked] == view.pane_labels[masked]).float().mean() > 0.98
+        checked += int(masked.sum())
+    assert checked > 200
+    view = dataset.test[0]
+    layers = truth.view(view.name, view.camera.width, view.camera.height)
+    assert layers is not None
+    assert (view.photo[layers.strength == 0] == layers.transmission[layers.strength == 0]).all()
+
+
+def test_a_scene_is_not_overwritten(tmp_path: Path) -> None:
+    with pytest.raises(FileExistsError, match="expected a new folder"):
+        main(Arguments(tmp_path))

@@ -1,0 +1,246 @@
+"""Makes a capture of a room with free-standing panes, photographed all the way round, with exact layers.
+
+    python -m tools.make_pane_scene --output scenes/screens
+
+Two panes of glass, one upright, one leaning, through which the other is seen, stand between things; a mirror hangs on
+a wall. docs/scenes.md describes the files. Needs nothing but glassplat's own dependencies.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from tools.make_demo_scene import TEST_EVERY, srgb_from_linear
+from tools.pane_tracer import Array, Ball, Box, Pane, Place, Seen
+
+LOOKED_AT = np.array([0.0, 0.1, 0.8])
+UP = np.array([0.0, 0.0, 1.0])
+ORBIT = (1.45, 1.75)
+"""Least and largest distance of cameras from the vertical through `LOOKED_AT`, world units."""
+HEIGHTS = (0.7, 1.7)
+GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))
+FOCAL_PER_WIDTH = 0.85
+SUBPIXELS = 3
+"""Rays per pixel and axis."""
+POINT_NOISE = 0.005
+"""Standard deviation of the sparse points about the surfaces, world units."""
+VIRTUAL_SHARE = 0.1
+"""Share of the sparse points that lie where a pane shows what it mirrors, as structure from motion finds them."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Ray-traces a room with free-standing panes."""
+
+    output: Path
+    """Folder to write; must not exist yet."""
+    width: int = 256
+    """Of the photographs, pixels; heights are three quarters of it."""
+    views: int = 96
+    """Photographs; every eighth is a test view."""
+    masks: int = 10
+    """Annotated training views."""
+    points: int = 6000
+    """Sparse points."""
+    seed: int = 0
+    """Of cameras and points."""
+
+
+def make_place() -> Place:
+    """The room, what is in it, and its panes."""
+    things = (
+        Box((-2.2, -2.2, 0.0), (2.2, 2.2, 2.6), seed=10, room=True),
+        Ball((0.35, 0.15, 0.25), 0.25, seed=20),
+        Ball((-0.6, -0.9, 0.3), 0.3, seed=30),
+        Box((-0.95, 0.85, 0.0), (-0.6, 1.15, 0.9), seed=40),
+        Box((0.85, -0.95, 0.0), (1.1, -0.7, 0.6), seed=50),
+        Box((0.5, 1.05, 0.0), (0.85, 1.3, 0.5), seed=60),
+    )
+    return Place(
+        things,
+        (
+            standing_pane(1, (0.0, -0.3, 0.85), turn_deg=10, lean_deg=0, half_sizes=(0.75, 0.55)),
+            standing_pane(2, (0.1, 0.65, 0.8), turn_deg=-20, lean_deg=25, half_sizes=(0.6, 0.5)),
+            standing_pane(3, (2.19, 0.0, 1.1), turn_deg=90, lean_deg=0, half_sizes=(0.7, 0.5), refraction=None),
+        ),
+    )
+
+
+def standing_pane(
+    label: int,
+    center: tuple[float, float, float],
+    *,
+    turn_deg: float,
+    lean_deg: float,
+    half_sizes: tuple[float, float],
+    refraction: float | None = 1.5,
+) -> Pane:
+    """A pane whose lower side is level: turned about the vertical from facing -y, then leaning back."""
+    axes = Rotation.from_euler("xz", [-lean_deg, turn_deg], degrees=True).as_matrix()
+    return Pane(label, np.array(center), -axes[:, 1], axes[:, 0], half_sizes, refraction)
+
+
+def world_from_cam(position: Array, target: Array) -> Array:
+    """Pose [4, 4] of a camera that looks at `target`: +x right, +y down, +z forward."""
+    forward = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(forward, UP)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(forward, right), forward, position], axis=1)
+    return pose
+
+
+def camera_poses(count: int, seed: int) -> list[Array]:
+    """Two of three cameras look at the panes from all around, one of three looks around in the room."""
+    generator = np.random.default_rng(seed)
+    poses = []
+    for number in range(count):
+        angle, distance = GOLDEN_ANGLE_RAD * number, generator.uniform(*ORBIT)
+        around = np.array([math.cos(angle), math.sin(angle), 0.0])
+        position = np.array([0.0, 0.1, generator.uniform(*HEIGHTS)]) + distance * around
+        target = LOOKED_AT + generator.normal(scale=0.15, size=3)
+        if number % 3 == 2:
+            # Across the room, past the panes.
+            turned = Rotation.from_euler("z", 180 + generator.choice([-55, 55]), degrees=True).as_matrix() @ around
+            target = position + turned + [0, 0, generator.uniform(-0.35, 0.25)]
+        poses.append(world_from_cam(position, target))
+    return poses
+
+
+def see(place: Place, pose: Array, width: int, height: int) -> Seen:
+    """What the rays of an image see; [H, W, SUBPIXELS^2, ...] each."""
+    fine = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS
+    x, y, dx, dy = np.meshgrid(np.arange(width), np.arange(height), fine, fine, indexing="xy")
+    focal = FOCAL_PER_WIDTH * width
+    rays = np.stack([(x + dx - width / 2) / focal, (y + dy - height / 2) / focal, np.ones_like(dx)], axis=-1)
+    directions = rays.reshape(-1, 3) @ pose[:3, :3].T
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    seen = place.seen(np.broadcast_to(pose[:3, 3], directions.shape), directions)
+    return Seen(*(layer.reshape(height, width, SUBPIXELS**2, *layer.shape[1:]) for layer in seen))
+
+
+def picture(radiance: Array) -> NDArray[np.uint8]:
+    """sRGB [H, W, 3] of the radiance [H, W, S, 3] of the rays in each pixel."""
+    return np.round(255 * srgb_from_linear(np.clip(radiance.mean(axis=2), 0, 1))).astype(np.uint8)
+
+
+def whole_labels(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """[H, W] label that all rays of a pixel agree on, else 0."""
+    return np.where(labels.min(axis=2) == labels.max(axis=2), labels[:, :, 0], 0).astype(np.uint8)
+
+
+def write_view(folder: Path, name: str, seen: Seen, *, annotated: bool, test: bool) -> None:
+    """Writes a photograph, with its mask if it is annotated and its layers if it is a test view."""
+    Image.fromarray(picture(seen.radiance)).save(folder / "images" / name)
+    if annotated:
+        Image.fromarray(seen.label[:, :, SUBPIXELS**2 // 2]).save(folder / "masks" / name)
+    if test:
+        Image.fromarray(picture(seen.transmission)).save(folder / "gt/trans" / name)
+        # Of rays that meet no pane, a pixel at the edge of one has nothing to show.
+        share = np.maximum((seen.label > 0).mean(axis=2), 1e-9)[..., None, None]
+        Image.fromarray(picture(seen.reflection / share)).save(folder / "gt/refl" / name)
+        strength = np.round(65535 * seen.strength.mean(axis=2)).astype(np.uint16)
+        Image.fromarray(strength).save(folder / "gt/strength" / name)
+        Image.fromarray(whole_labels(seen.label)).save(folder / "gt/strength" / name.replace(".png", "_pane.png"))
+
+
+def sparse_points(place: Place, poses: list[Array], count: int, seed: int) -> tuple[Array, NDArray[np.uint8]]:
+    """Positions and colours [P, 3] of surface points that random rays of the cameras meet, some of them mirrored."""
+    generator = np.random.default_rng(seed)
+    eyes = np.stack(poses)[generator.integers(len(poses), size=count)]
+    rays = np.concatenate([generator.uniform(-0.55, 0.55, (count, 2)) * [1, 0.75], np.ones((count, 1))], axis=1)
+    directions = np.einsum("nij,nj->ni", eyes[:, :3, :3], rays)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = eyes[:, :3, 3].copy()
+    colors, length = place.without_panes(origins, directions)
+    for pane in place.panes:
+        to_pane = pane.distances(origins, directions)
+        chosen = (to_pane < length) & (generator.random(count) < VIRTUAL_SHARE * (4 if pane.refraction else 10))
+        points = origins[chosen] + to_pane[chosen, None] * directions[chosen]
+        colors[chosen], beyond = place.without_panes(points, pane.mirrored(directions[chosen]))
+        # Straight on behind the pane, as far as the light has come.
+        length[chosen] = to_pane[chosen] + beyond
+    positions = origins + length[:, None] * directions + generator.normal(scale=POINT_NOISE, size=(count, 3))
+    return positions, np.round(255 * srgb_from_linear(colors)).astype(np.uint8)
+
+
+def write_model(folder: Path, arguments: Arguments, poses: list[Array], place: Place) -> None:
+    """Writes the COLMAP text model."""
+    width, height = arguments.width, arguments.width * 3 // 4
+    focal = FOCAL_PER_WIDTH * width
+    (folder / "cameras.txt").write_text(f"1 PINHOLE {width} {height} {focal} {focal} {width / 2} {height / 2}\n")
+    lines = []
+    for number, pose in enumerate(poses):
+        inverse = np.linalg.inv(pose)
+        x, y, z, w = Rotation.from_matrix(inverse[:3, :3]).as_quat()
+        values = " ".join(f"{value:.9f}" for value in (w, x, y, z, *inverse[:3, 3]))
+        lines.append(f"{number + 1} {values} 1 {view_name(number)}\n\n")
+    (folder / "images.txt").write_text("".join(lines))
+    positions, colors = sparse_points(place, poses, arguments.points, arguments.seed)
+    rows = [
+        f"{number + 1} {x:.6f} {y:.6f} {z:.6f} {r} {g} {b} 0.5\n"
+        for number, ((x, y, z), (r, g, b)) in enumerate(zip(positions, colors, strict=True))
+    ]
+    (folder / "points3D.txt").write_text("".join(rows))
+
+
+def write_planes(path: Path, place: Place) -> None:
+    """Writes the true panes."""
+    entries = [
+        {
+            "label": pane.label,
+            "center": pane.center.tolist(),
+            "normal": pane.normal.tolist(),
+            "half_u": (pane.half_sizes[0] * pane.tangent).tolist(),
+            "half_v": (pane.half_sizes[1] * pane.bitangent).tolist(),
+            "mirror": pane.refraction is None,
+            "base_reflectance": pane.base_reflectance,
+        }
+        for pane in place.panes
+    ]
+    path.write_text(json.dumps(entries, indent=1) + "\n")
+
+
+def view_name(number: int) -> str:
+    """File name of a photograph."""
+    return f"{number:04d}.png"
+
+
+def annotated_views(arguments: Arguments) -> set[int]:
+    """Numbers of the training views that get a mask, spread evenly over those that look at the panes."""
+    looking = [number for number in range(arguments.views) if number % TEST_EVERY and number % 3 != 2]
+    chosen = np.linspace(0, len(looking) - 1, arguments.masks).round().astype(int)
+    return {looking[place] for place in chosen}
+
+
+def main(arguments: Arguments) -> None:
+    """Makes the scene."""
+    folder = arguments.output
+    if folder.exists():
+        raise FileExistsError(f"{folder} exists; expected a new folder, so remove it first")
+    for part in ("images", "masks", "sparse/0", "gt/trans", "gt/refl", "gt/strength"):
+        (folder / part).mkdir(parents=True)
+    place, poses = make_place(), camera_poses(arguments.views, arguments.seed)
+    write_model(folder / "sparse/0", arguments, poses, place)
+    write_planes(folder / "gt/planes.json", place)
+    annotated, started = annotated_views(arguments), time.monotonic()
+    for number, pose in enumerate(poses):
+        seen = see(place, pose, arguments.width, arguments.width * 3 // 4)
+        test = number % TEST_EVERY == 0
+        write_view(folder, view_name(number), seen, annotated=number in annotated, test=test)
+        print(f"\r{folder.name} {number + 1}/{len(poses)}, {time.monotonic() - started:.0f} s", end="", flush=True)
+    print()
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments, description=__doc__))

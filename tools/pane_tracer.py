@@ -1,0 +1,208 @@
+"""A small exact ray tracer of luminous, matte things and thin panes, in numpy: what the laws of optics say, by itself.
+
+Things shine with the radiance of their texture, the same in all directions, so that a picture has no noise. Panes are
+thin: light goes through without a bend, and what comes back is the sum over all passages between the two surfaces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.scene_surfaces import INK, solid_noise
+
+Array = NDArray[np.float64]
+
+TEXTURE_WAVES = 16
+SELF = 1e-6
+"""A ray does not meet the pane from which it starts: distances below this do not count, world units."""
+
+
+class Thing(Protocol):
+    """Something opaque."""
+
+    @property
+    def seed(self) -> int:
+        """Chooses its texture."""
+        ...
+
+    def distances(self, origins: Array, directions: Array) -> Array:
+        """How far [N] rays with unit directions go until they meet it; infinite where they do not."""
+        ...
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A ball."""
+
+    center: tuple[float, float, float]
+    radius: float
+    seed: int
+
+    def distances(self, origins: Array, directions: Array) -> Array:
+        """See `Thing`."""
+        offset = origins - np.array(self.center)
+        along = (offset * directions).sum(axis=1)
+        discriminant = along**2 - (offset**2).sum(axis=1) + self.radius**2
+        near = -along - np.sqrt(np.maximum(discriminant, 0))
+        return np.where((discriminant > 0) & (near > 0), near, np.inf)
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box along the axes, seen from outside, or as a room from inside."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    seed: int
+    room: bool = False
+
+    def distances(self, origins: Array, directions: Array) -> Array:
+        """See `Thing`."""
+        with np.errstate(divide="ignore"):
+            to_low, to_high = (np.array(self.low) - origins) / directions, (np.array(self.high) - origins) / directions
+        enters, leaves = np.minimum(to_low, to_high).max(axis=1), np.maximum(to_low, to_high).min(axis=1)
+        if self.room:
+            return leaves
+        return np.where((enters < leaves) & (enters > 0), enters, np.inf)
+
+
+@dataclass(frozen=True)
+class Pane:
+    """A flat rectangle of glass, or a mirror on both sides.
+
+    Attributes:
+        label: its number, from 1.
+        center: world units.
+        normal: unit.
+        tangent: unit, along the first side.
+        half_sizes: half the lengths of the sides.
+        refraction: refractive index; None for a mirror.
+    """
+
+    label: int
+    center: Array
+    normal: Array
+    tangent: Array
+    half_sizes: tuple[float, float]
+    refraction: float | None = 1.5
+
+    @property
+    def bitangent(self) -> Array:
+        """Unit, along the second side."""
+        return np.cross(self.normal, self.tangent)
+
+    @property
+    def base_reflectance(self) -> float:
+        """Share of the light that comes back at normal incidence."""
+        return float(self.reflectances(np.ones(1))[0])
+
+    def distances(self, origins: Array, directions: Array) -> Array:
+        """How far [N] rays go until they meet it; infinite where they do not."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = ((self.center - origins) @ self.normal) / (directions @ self.normal)
+            offset = origins + distance[:, None] * directions - self.center
+            inside = (np.abs(offset @ self.tangent) <= self.half_sizes[0]) & (
+                np.abs(offset @ self.bitangent) <= self.half_sizes[1]
+            )
+        return np.where(inside & (distance > SELF), distance, np.inf)
+
+    def reflectances(self, cosines: Array) -> Array:
+        """Share [N] of unpolarised light that comes back, by the cosine between ray and normal.
+
+        Fresnel's law for each polarisation, r; between the two surfaces light goes to and fro, 2 r / (1 + r) in all.
+        """
+        if self.refraction is None:
+            return np.ones_like(cosines)
+        inside = np.sqrt(1 - (1 - cosines**2) / self.refraction**2)
+        across = (cosines - self.refraction * inside) / (cosines + self.refraction * inside)
+        along = (inside - self.refraction * cosines) / (inside + self.refraction * cosines)
+        return (2 * across**2 / (1 + across**2) + 2 * along**2 / (1 + along**2)) / 2
+
+    def mirrored(self, directions: Array) -> Array:
+        """Directions [N, 3] after a reflection."""
+        return directions - 2 * np.outer(directions @ self.normal, self.normal)
+
+
+class Seen(NamedTuple):
+    """What rays see.
+
+    Attributes:
+        radiance: [N, 3] linear, with all panes.
+        transmission: [N, 3] without the panes.
+        reflection: [N, 3] what the first pane would show as a perfect mirror, were there no others; 0 without a pane.
+        strength: [N] reflectance of the first pane.
+        label: [N] the first pane's label, 0 where there is none.
+    """
+
+    radiance: Array
+    transmission: Array
+    reflection: Array
+    strength: Array
+    label: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Things and panes; some thing must be a room, so that every ray ends."""
+
+    things: Sequence[Thing]
+    panes: Sequence[Pane]
+
+    def without_panes(self, origins: Array, directions: Array) -> tuple[Array, Array]:
+        """Radiance [N, 3] along rays of a place without panes, and how far [N] they go."""
+        distances = np.stack([thing.distances(origins, directions) for thing in self.things])
+        distance, nearest = distances.min(axis=0), distances.argmin(axis=0)
+        points = origins + distance[:, None] * directions
+        radiance = np.empty_like(points)
+        for number, thing in enumerate(self.things):
+            of_it = nearest == number
+            radiance[of_it] = painted(points[of_it], thing.seed)
+        return radiance, distance
+
+    def radiance(self, origins: Array, directions: Array, reflections: int = 3) -> Array:
+        """Radiance [N, 3] along rays; panes that light meets after so many reflections are not there for it."""
+        result, end = self.without_panes(origins, directions)
+        if not reflections or not len(origins):
+            return result
+        distances = np.stack([pane.distances(origins, directions) for pane in self.panes])
+        order = distances.argsort(axis=0)
+        # From the last pane on the way to the first one.
+        for place in reversed(range(len(self.panes))):
+            for number, pane in enumerate(self.panes):
+                hit = (order[place] == number) & (distances[number] < end)
+                points = origins[hit] + distances[number, hit, None] * directions[hit]
+                share = pane.reflectances(np.abs(directions[hit] @ pane.normal))[:, None]
+                returned = self.radiance(points, pane.mirrored(directions[hit]), reflections - 1)
+                result[hit] = (1 - share) * result[hit] + share * returned
+        return result
+
+    def seen(self, origins: Array, directions: Array) -> Seen:
+        """The radiance along rays and its layers."""
+        transmission, end = self.without_panes(origins, directions)
+        distances = np.stack([pane.distances(origins, directions) for pane in self.panes])
+        first = distances.argmin(axis=0)
+        reflection, strength = np.zeros_like(origins), np.zeros(len(origins))
+        label = np.zeros(len(origins), dtype=np.uint8)
+        for number, pane in enumerate(self.panes):
+            hit = (first == number) & (distances[number] < end)
+            points = origins[hit] + distances[number, hit, None] * directions[hit]
+            reflection[hit], _ = self.without_panes(points, pane.mirrored(directions[hit]))
+            strength[hit] = pane.reflectances(np.abs(directions[hit] @ pane.normal))
+            label[hit] = pane.label
+        return Seen(self.radiance(origins, directions), transmission, reflection, strength, label)
+
+
+def painted(points: Array, seed: int) -> Array:
+    """Radiance [N, 3] of a texture at points: patches of a few colours, some of them checked, with a fine grain."""
+    level = solid_noise(points, frequency=0.7, seed=seed, waves=TEXTURE_WAVES)
+    colors = INK[np.clip((level * len(INK)).astype(int), 0, len(INK) - 1)]
+    checks = np.floor(points / 0.25 + 0.5).sum(axis=-1) % 2 == 0
+    checked = solid_noise(points, frequency=0.4, seed=seed + 1, waves=TEXTURE_WAVES) > 0.5
+    grain = 0.75 + 0.5 * solid_noise(points, frequency=6.0, seed=seed + 2, waves=TEXTURE_WAVES)
+    shade = np.where(checks & checked, 0.45, 1.0) * grain
+    return np.clip(colors * shade[:, None], 0.01, 1.0)
