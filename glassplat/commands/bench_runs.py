@@ -73,7 +73,7 @@ class PlannedRun:
     def results(self) -> dict[str, Any] | None:
         """The metrics of the finished run, None before it is finished."""
         try:
-            results = json.loads(self.directory.results.read_text())
+            results = json.loads(self.directory.results.read_text(encoding="utf-8"))
         except (FileNotFoundError, json.JSONDecodeError):
             return None
         made = (results.get("method"), results.get("iterations"), results.get("seed"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import statistics
 import sys
 import time
@@ -135,7 +134,7 @@ def evaluate(
     per_view = {name: plain(m.metrics) | {"seconds": m.seconds} for name, m in measurements.items()}
     results = _description(scene, dataset)
     results["seconds_per_frame"] = statistics.median(m.seconds for m in measurements.values())
-    results["peak_memory_mib"] = peak_memory_mib()
+    results |= plain({"peak_memory_mib": peak_memory_mib()})
     results |= plain(_means([m.metrics for m in measurements.values()]))
     results |= plain(environment_metrics(learned_environment(scene), true_environment(dataset.root), lpips))
     results |= _footnotes(results, lpips, truth, gain)
@@ -165,8 +164,12 @@ def timed_render(renderer: Renderer, scene: Scene, view: View) -> tuple[Frame, f
     return frame, seconds
 
 
-def peak_memory_mib() -> float:
-    """Largest resident size of this process so far, in MiB."""
+def peak_memory_mib() -> Outcome:
+    """Largest resident size of this process so far, in MiB, or why it is not known."""
+    try:
+        import resource  # Windows has none.
+    except ImportError:
+        return f"{sys.platform} does not tell"
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
 

@@ -42,7 +42,7 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
 
 def _flush_to_disk(path: Path) -> None:
     """Force the contents out, so that a crash cannot leave the new name on an empty file."""
-    descriptor = os.open(path, os.O_RDONLY)
+    descriptor = os.open(path, os.O_RDWR)  # Windows flushes only what may be written.
     try:
         os.fsync(descriptor)
     finally:

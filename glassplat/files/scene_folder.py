@@ -32,7 +32,7 @@ def write_scene(folder: Path, scene: Scene) -> None:
         write_environment(folder / ENVIRONMENT, scene.environment)
     header = {"extent": scene.extent, "active_sh_degree": scene.primary.active_sh_degree}
     with atomic_write(folder / SCENE) as temporary:
-        temporary.write_text(json.dumps(header, indent=2) + "\n")
+        temporary.write_text(json.dumps(header, indent=2) + "\n", encoding="utf-8")
 
 
 def read_scene(folder: Path) -> Scene:
@@ -41,7 +41,7 @@ def read_scene(folder: Path) -> Scene:
     Raises:
         FileNotFoundError, ValueError: a file is missing, truncated or foreign.
     """
-    header = json.loads((folder / SCENE).read_text())
+    header = json.loads((folder / SCENE).read_text(encoding="utf-8"))
     primary = replace(read_gaussians(folder / PRIMARY), active_sh_degree=header["active_sh_degree"])
     scene = Scene(primary, header["extent"])
     if (folder / PLANES).is_file():

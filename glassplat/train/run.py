@@ -109,9 +109,11 @@ def open_log(directory: RunDirectory, step: int) -> TextIO:
     """The log, cut back to the step from which the run goes on."""
     kept = []
     if step and directory.log.is_file():
-        kept = [line for line in directory.log.read_text().splitlines() if json.loads(line)["step"] <= step]
-    directory.log.write_text("".join(line + "\n" for line in kept))
-    return directory.log.open("a")
+        kept = [
+            line for line in directory.log.read_text(encoding="utf-8").splitlines() if json.loads(line)["step"] <= step
+        ]
+    directory.log.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+    return directory.log.open("a", encoding="utf-8")
 
 
 def write_log(log: TextIO, message: Message) -> None:

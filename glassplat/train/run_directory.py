@@ -119,10 +119,10 @@ class RunDirectory:
             raise InputError(
                 f"{self.path} is not a run directory: no {name} in it; expected what `glassplat train --output` wrote"
             )
-        return file.read_text()
+        return file.read_text(encoding="utf-8")
 
 
 def write_text(path: Path, text: str) -> None:
     """Writes a text file atomically."""
     with atomic_write(path) as temporary:
-        temporary.write_text(text + "\n")
+        temporary.write_text(text + "\n", encoding="utf-8")

@@ -1,5 +1,6 @@
 import json
 import math
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import torch
 
 from glassplat.data.dataset import load_dataset
 from glassplat.data.errors import InputError
-from glassplat.evaluate.evaluate import EvaluatedView, evaluate
+from glassplat.evaluate.evaluate import EvaluatedView, evaluate, peak_memory_mib
 from glassplat.evaluate.metrics import psnr
 from glassplat.evaluate.outcome import plain
 from glassplat.evaluate.plane_errors import plane_table
@@ -231,3 +232,10 @@ def test_lpips_is_taken_with_its_backbone(case, monkeypatch: pytest.MonkeyPatch)
 def test_plain_gives_a_reason_for_every_missing_number() -> None:
     assert plain({"a": 1.5, "b": "because"}) == {"a": 1.5, "b": None, "b_reason": "because"}
     assert plain({"a": math.inf})["a"] is None
+
+
+def test_peak_memory_is_a_number_where_the_system_tells_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    peak = peak_memory_mib()
+    assert isinstance(peak, float) and 50 < peak < 1e6
+    monkeypatch.setitem(sys.modules, "resource", None)
+    assert peak_memory_mib() == f"{sys.platform} does not tell"
