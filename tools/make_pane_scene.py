@@ -30,6 +30,8 @@ ORBIT = (1.45, 1.75)
 HEIGHTS = (0.7, 1.7)
 GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))
 FOCAL_PER_WIDTH = 0.85
+PREVIEW = (16, 12)
+"""Width and height at which views are compared before they are rendered."""
 SUBPIXELS = 3
 """Rays per pixel and axis."""
 POINT_NOISE = 0.005
@@ -48,8 +50,8 @@ class Arguments:
     """Of the photographs, pixels; heights are three quarters of it."""
     views: int = 96
     """Photographs; every eighth is a test view."""
-    masks: int = 10
-    """Annotated training views."""
+    masks: int = 5
+    """Annotated training views of each pane."""
     points: int = 6000
     """Sparse points."""
     seed: int = 0
@@ -216,11 +218,15 @@ def view_name(number: int) -> str:
     return f"{number:04d}.png"
 
 
-def annotated_views(arguments: Arguments) -> set[int]:
-    """Numbers of the training views that get a mask, spread evenly over those that look at the panes."""
-    looking = [number for number in range(arguments.views) if number % TEST_EVERY and number % 3 != 2]
-    chosen = np.linspace(0, len(looking) - 1, arguments.masks).round().astype(int)
-    return {looking[place] for place in chosen}
+def annotated_views(place: Place, poses: list[Array], masks: int) -> set[int]:
+    """Numbers of the training views that get a mask: for each pane some of the third in which it is largest."""
+    training = [number for number in range(len(poses)) if number % TEST_EVERY]
+    labels = np.stack([see(place, poses[number], *PREVIEW).label for number in training])
+    chosen = set()
+    for pane in place.panes:
+        largest = np.argsort(-(labels == pane.label).sum(axis=(1, 2, 3)), kind="stable")[: len(training) // 3]
+        chosen |= {training[index] for index in sorted(largest)[:: max(len(largest) // masks, 1)][:masks]}
+    return chosen
 
 
 def main(arguments: Arguments) -> None:
@@ -233,7 +239,7 @@ def main(arguments: Arguments) -> None:
     place, poses = make_place(), camera_poses(arguments.views, arguments.seed)
     write_model(folder / "sparse/0", arguments, poses, place)
     write_planes(folder / "gt/planes.json", place)
-    annotated, started = annotated_views(arguments), time.monotonic()
+    annotated, started = annotated_views(place, poses, arguments.masks), time.monotonic()
     for number, pose in enumerate(poses):
         seen = see(place, pose, arguments.width, arguments.width * 3 // 4)
         test = number % TEST_EVERY == 0

@@ -29,6 +29,7 @@ class PaneView:
         cam_from_world: [4, 4] rigid transform, world to camera.
         intrinsics: [4] fx, fy, cx, cy in pixels.
         mask: [H, W] true on the pane.
+        hidden: [H, W] true on other panes, behind which this one may go on.
         distance: [H, W] pixels from a pixel's centre to the edge of the mask, positive inside. Where
             the mask leaves the image there is no edge, because the pane goes on.
         edge: [E, 2] points (x, y) half-way between a pixel on the pane and a neighbour off it.
@@ -38,6 +39,7 @@ class PaneView:
     cam_from_world: Array
     intrinsics: Array
     mask: Mask
+    hidden: Mask
     distance: Array
     edge: Array
     outward: Array
@@ -89,6 +91,13 @@ class PaneView:
         found[held] = self.mask[row, column]
         return found
 
+    def tells(self, pixels: Array, held: Mask) -> Mask:
+        """[...] whether it is known if the pane is at pixel positions [..., 2]; false where `held` is."""
+        known = held.copy()
+        column, row = np.floor(pixels[held]).astype(np.int64).T
+        known[held] = ~self.hidden[row, column]
+        return known
+
     def edge_distance(self, pixels: Array) -> Array:
         """[P] signed distance to the mask's edge at pixel positions [P, 2], interpolated."""
         centred = pixels[:, ::-1].T - 0.5
@@ -119,12 +128,14 @@ def pane_view(camera: Camera, labels: Tensor, label: int) -> PaneView:
             f"a mask of shape {tuple(labels.shape)} belongs to a camera of {camera.height} x {camera.width} pixels; "
             "resize both the same way"
         )
-    mask = _without_slivers(labels.cpu().numpy() == label)
+    image = labels.cpu().numpy()
+    mask = _without_slivers(image == label)
     edge = _edge_points(mask)
     return PaneView(
         cam_from_world=_array(camera.cam_from_world),
         intrinsics=np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
         mask=mask,
+        hidden=~mask & (image != label) & (image != 0),
         distance=_signed_distance(mask),
         edge=edge,
         outward=_outward(mask, edge),

@@ -2,7 +2,8 @@
 
 A plane maps every pixel of one view to a pixel of another. On the pane's own plane the mask of the
 first view lands on the mask of the second; on any other plane parallax pulls them apart. Outside of
-an image nothing is known, so that a mask which leaves its image is no contradiction.
+an image nothing is known, so that a mask which leaves its image is no contradiction; nor is anything
+known where a mask shows another pane, which may stand in front.
 """
 
 from __future__ import annotations
@@ -48,6 +49,7 @@ def mask_agreement(planes: PlaneEquations, views: Sequence[PaneView], *, pixels_
     both, either, unknown = np.zeros(len(planes)), np.zeros(len(planes)), np.zeros(len(planes))
     for source in views:
         pixels = source.grid(pixels_per_view)
+        pixels = pixels[source.tells(pixels, np.ones(len(pixels), dtype=bool))]
         on_pane = source.covers(pixels, np.ones(len(pixels), dtype=bool))
         points, hit = meet(planes, source.center, source.directions(pixels))
         # A plane behind the camera cannot hold a pane that the camera sees.
@@ -55,7 +57,7 @@ def mask_agreement(planes: PlaneEquations, views: Sequence[PaneView], *, pixels_
         for target in views:
             if target is not source:
                 landed, held = target.project(points)
-                held &= hit
+                held = target.tells(landed, held & hit)
                 covered = target.covers(landed, held)
                 both += (covered & on_pane).sum(axis=1)
                 either += (held & (covered | on_pane)).sum(axis=1)

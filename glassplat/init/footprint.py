@@ -66,6 +66,7 @@ def _is_pane(points: Array, views: Sequence[PaneView], normal: Array) -> Mask:
         pixels, held = view.project(points)
         rays = points - view.center
         held &= np.abs(rays @ normal) > GRAZING * np.linalg.norm(rays, axis=1)
+        held = view.tells(pixels, held)
         shown += view.covers(pixels, held)
         held_count += held
     return (shown > 0) & (shown >= AGREEMENT * held_count)

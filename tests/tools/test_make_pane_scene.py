@@ -82,7 +82,7 @@ def test_a_pane_behind_a_pane_returns_light_through_the_first() -> None:
 
 
 def test_the_capture_fits_its_truth(tmp_path: Path) -> None:
-    main(Arguments(tmp_path / "scene", width=40, views=16, masks=4, points=200))
+    main(Arguments(tmp_path / "scene", width=40, views=16, masks=2, points=200))
     dataset = load_dataset(tmp_path / "scene")
     truth = load_truth(dataset.truth)
     assert truth is not None
