@@ -93,6 +93,22 @@ def test_two_panes_that_overlap_in_the_image_are_both_found() -> None:
         assert offset_error(planes, index, pane) < 0.01 * EXTENT
 
 
+@pytest.mark.parametrize("turn", [0.0, 0.6])
+def test_a_pane_is_found_that_is_mostly_seen_through_another(turn: float) -> None:
+    normal = np.array([np.sin(turn), 0.0, -np.cos(turn)])
+    behind = Pane(np.array([0.4, -0.1, 3.0]), normal, np.array([np.cos(turn), 0.0, np.sin(turn)]), (0.8, 0.5))
+    eyes = (*EYES, (-1.3, 0.2, 0.4), (0.6, 0.3, -0.2), (2.2, -0.4, 4.4), (-0.8, 0.3, 4.9))
+    annotations = scene_of([FRONT, behind], eyes)
+    assert sum(float((labels == 2).sum()) < float((labels == 1).sum()) for _, labels in annotations) >= 4
+    planes = fit_planes(BARE, annotations, extent=EXTENT, options=QUICK)
+    for index, pane in enumerate((FRONT, behind)):
+        # Cameras stand on both sides.
+        error = normal_error(planes, index, pane)
+        assert min(error, 180 - error) < 1
+        assert offset_error(planes, index, pane) < 0.01 * EXTENT
+        assert covers(planes, index, pane.larger(0.95))
+
+
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_the_scale_of_the_capture_changes_nothing(scale: float) -> None:
     def scaled(camera: Camera) -> Camera:
