@@ -16,7 +16,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from glassplat.data.dataset import Dataset, load_dataset
@@ -85,14 +84,15 @@ def fits_of(
 ) -> Iterator[Fit]:
     """Every fit of one pane, from each choice of so many of the masks that show it."""
     shown = [
-        (view.name, view.camera, torch.where(view.pane_labels == label, label, 0))
+        (view.name, view.camera, view.pane_labels)
         for view in dataset.train
         if view.pane_labels is not None and float((view.pane_labels == label).float().mean()) >= LEAST_SHARE
     ]
     for chosen in list(itertools.combinations(shown, masks or len(shown)))[::every]:
         start = time.process_time()
         try:
-            planes = fit_planes(centers, [(camera, labels) for _, camera, labels in chosen], extent=dataset.extent)
+            annotations = [(camera, labels) for _, camera, labels in chosen]
+            planes = fit_planes(centers, annotations, extent=dataset.extent, labels=[label])
         except PlaneFitError:
             errors = None
         else:

@@ -83,6 +83,7 @@ def fit_planes(
     *,
     extent: float,
     weights: Tensor | None = None,
+    labels: Sequence[int] | None = None,
     options: PlaneFit | None = None,
 ) -> Planes:
     """A reflection plane for every pane that the masks name, in the order of their labels.
@@ -98,6 +99,7 @@ def fit_planes(
         annotations: cameras and their label images [H, W]; 0 is no pane.
         extent: radius of the capture in world units.
         weights: [N] how much each centre counts, such as its opacity; all the same if None.
+        labels: the panes to fit; all that the masks name if None.
         options: how to fit; the defaults if None.
 
     Returns:
@@ -108,8 +110,9 @@ def fit_planes(
             masks agree on no plane or on many.
     """
     options = options or PlaneFit()
-    labels = sorted({int(label) for _, image in annotations for label in image.unique()} - {0})
-    if not labels:
+    named = sorted({int(label) for _, image in annotations for label in image.unique()} - {0})
+    labels = named if labels is None else labels
+    if not named:
         raise PlaneFitError(
             f"none of the {len(annotations)} masks names a pane; expected pixels with labels 1, 2, ... in at least two"
         )
