@@ -7,16 +7,14 @@ from numpy.typing import NDArray
 
 from glassplat.init.consistency import mask_agreement
 from glassplat.init.plane_moves import planes_nearby, planes_through_masks
-from glassplat.init.plane_objective import COARSE, EDGES, FINE, MIDDLE, USUAL_FRAME, Objective
+from glassplat.init.plane_objective import COARSE, FINE, MIDDLE, USUAL_FRAME, Objective
 from glassplat.init.plane_refinement import refined
 from glassplat.init.ransac import FramedPlanes, joined, random_planes
 
 Array = NDArray[np.float64]
 
-AGREEMENT_WEIGHT = 0.3
-"""Weight of the agreement of the masks against that of their edges, which know of frames but not of things in front."""
-SUPPORT_WEIGHT = 0.3
-"""Weight of points on a plane against the agreement of the masks, while hypotheses are many."""
+AGREEMENT_WEIGHT = 0.1
+"""Weight of the agreement of the masks against that of their edges, which know of frames."""
 BEAM, CHILDREN = 12, 30
 """Number of hypotheses that are followed, and of the planes tried around each of them in each round."""
 ROUNDS = ((0.3, 0.1, 2 * COARSE), (0.1, 0.03, COARSE))
@@ -64,7 +62,7 @@ def _hypotheses(objective: Objective, count: int, rng: np.random.Generator) -> F
         drawn.append(through.select(np.argsort(-objective.support(through), kind="stable")[: count // 4]))
     usual = USUAL_FRAME * objective.extent
     planes = joined([FramedPlanes(part, np.full(len(part), usual)) for part in drawn])
-    scores = _agreement(planes, objective) + SUPPORT_WEIGHT * objective.support(planes.planes)
+    scores = _agreement(planes, objective) + AGREEMENT_WEIGHT * objective.support(planes.planes)
     return planes.select(np.argsort(-scores, kind="stable")[:BEAM])
 
 
@@ -78,14 +76,14 @@ def _followed(
     factors = np.exp(FRAME_SPREAD * rng.standard_normal((len(beam), 1 + CHILDREN)))
     factors[:, 0] = 1
     family = FramedPlanes(around, (beam.frames[:, None] * factors).ravel())
-    costs = _cost(family, objective, (tolerance,), edges=COARSE_EDGES).reshape(factors.shape)
+    costs = objective.terms(family, tolerance, edges=COARSE_EDGES).cost.reshape(factors.shape)
     best = np.arange(len(beam)) * (1 + CHILDREN) + costs.argmin(axis=1)
     return family.select(best[np.argsort(costs.min(axis=1), kind="stable")])
 
 
-def _cost(planes: FramedPlanes, objective: Objective, tolerances: tuple[float, ...], *, edges: int = EDGES) -> Array:
+def _cost(planes: FramedPlanes, objective: Objective, tolerances: tuple[float, ...]) -> Array:
     """[H] what tells against planes, their masks included, at several tolerances."""
-    costs = [objective.terms(planes, tolerance, edges=edges).cost for tolerance in tolerances]
+    costs = [objective.terms(planes, tolerance).cost for tolerance in tolerances]
     mean: Array = np.mean(costs, axis=0) - AGREEMENT_WEIGHT * _agreement(planes, objective)
     return mean
 
