@@ -21,14 +21,14 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from tools.make_demo_scene import TEST_EVERY, srgb_from_linear
+from tools.make_scenes import GOLDEN_ANGLE_RAD, as_bytes, world_from_opengl
 from tools.pane_tracer import Array, Ball, Box, Pane, Place, Seen
 
 LOOKED_AT = np.array([0.0, 0.1, 0.8])
-UP = np.array([0.0, 0.0, 1.0])
+OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
 ORBIT = (1.45, 1.75)
 """Least and largest distance of cameras from the vertical through `LOOKED_AT`, world units."""
 HEIGHTS = (0.7, 1.7)
-GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))
 FOCAL_PER_WIDTH = 0.85
 PREVIEW = (16, 12)
 """Width and height at which views are compared before they are rendered."""
@@ -36,8 +36,8 @@ SUBPIXELS = 3
 """Rays per pixel and axis."""
 POINT_NOISE = 0.005
 """Standard deviation of the sparse points about the surfaces, world units."""
-VIRTUAL_SHARE = 0.1
-"""Share of the sparse points that lie where a pane shows what it mirrors, as structure from motion finds them."""
+VIRTUAL_IN_GLASS, VIRTUAL_IN_MIRROR = 0.4, 1.0
+"""Share of the sparse points seen in a pane that lie where it shows what it mirrors, as structure from motion finds."""
 
 
 @dataclass(frozen=True)
@@ -92,18 +92,8 @@ def standing_pane(
     return Pane(label, np.array(center), -axes[:, 1], axes[:, 0], half_sizes, refraction)
 
 
-def world_from_cam(position: Array, target: Array) -> Array:
-    """Pose [4, 4] of a camera that looks at `target`: +x right, +y down, +z forward."""
-    forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, UP)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3] = np.stack([right, np.cross(forward, right), forward, position], axis=1)
-    return pose
-
-
 def camera_poses(count: int, seed: int) -> list[Array]:
-    """Two of three cameras look at the panes from all around, one of three looks around in the room."""
+    """Camera-to-world [4, 4]: two of three look at the panes from all around, one of three looks around in the room."""
     generator = np.random.default_rng(seed)
     poses = []
     for number in range(count):
@@ -115,7 +105,7 @@ def camera_poses(count: int, seed: int) -> list[Array]:
             # Across the room, past the panes.
             turned = Rotation.from_euler("z", 180 + generator.choice([-55, 55]), degrees=True).as_matrix() @ around
             target = position + turned + [0, 0, generator.uniform(-0.35, 0.25)]
-        poses.append(world_from_cam(position, target))
+        poses.append(world_from_opengl(position, target) @ OPENGL_FROM_CAM)
     return poses
 
 
@@ -133,7 +123,7 @@ def see(place: Place, pose: Array, width: int, height: int) -> Seen:
 
 def picture(radiance: Array) -> NDArray[np.uint8]:
     """sRGB [H, W, 3] of the radiance [H, W, S, 3] of the rays in each pixel."""
-    return np.round(255 * srgb_from_linear(np.clip(radiance.mean(axis=2), 0, 1))).astype(np.uint8)
+    return as_bytes(srgb_from_linear(np.clip(radiance.mean(axis=2), 0, 1)))
 
 
 def whole_labels(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -167,13 +157,14 @@ def sparse_points(place: Place, poses: list[Array], count: int, seed: int) -> tu
     colors, length = place.without_panes(origins, directions)
     for pane in place.panes:
         to_pane = pane.distances(origins, directions)
-        chosen = (to_pane < length) & (generator.random(count) < VIRTUAL_SHARE * (4 if pane.refraction else 10))
-        points = origins[chosen] + to_pane[chosen, None] * directions[chosen]
-        colors[chosen], beyond = place.without_panes(points, pane.mirrored(directions[chosen]))
+        share = VIRTUAL_IN_GLASS if pane.refraction else VIRTUAL_IN_MIRROR
+        chosen = (to_pane < length) & (generator.random(count) < share)
+        met = pane.meeting(origins[chosen], directions[chosen], to_pane[chosen])
+        colors[chosen], beyond = place.without_panes(met.points, met.mirrored)
         # Straight on behind the pane, as far as the light has come.
         length[chosen] = to_pane[chosen] + beyond
     positions = origins + length[:, None] * directions + generator.normal(scale=POINT_NOISE, size=(count, 3))
-    return positions, np.round(255 * srgb_from_linear(colors)).astype(np.uint8)
+    return positions, as_bytes(srgb_from_linear(colors))
 
 
 def write_model(folder: Path, arguments: Arguments, poses: list[Array], place: Place) -> None:

@@ -98,9 +98,9 @@ def camera_positions(count: int, azimuth_rad: float) -> Array:
     return LOOKED_AT + CAMERA_DISTANCE * directions
 
 
-def world_from_opengl(position: Array) -> Array:
-    """Pose [4, 4] of a camera at `position` [3] that looks at `LOOKED_AT`: +x right, +y up, -z forward."""
-    backward = (position - LOOKED_AT) / np.linalg.norm(position - LOOKED_AT)
+def world_from_opengl(position: Array, target: Array = LOOKED_AT) -> Array:
+    """Pose [4, 4] of a camera at `position` [3] that looks at `target` [3]: +x right, +y up, -z forward."""
+    backward = (position - target) / np.linalg.norm(position - target)
     right = np.cross([0.0, 0.0, 1.0], backward)
     right /= np.linalg.norm(right)
     pose = np.eye(4)

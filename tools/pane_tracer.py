@@ -18,6 +18,8 @@ from tools.scene_surfaces import INK, solid_noise
 Array = NDArray[np.float64]
 
 TEXTURE_WAVES = 16
+REFLECTIONS = 3
+"""How many reflections one after the other are followed."""
 SELF = 1e-6
 """A ray does not meet the pane from which it starts: distances below this do not count, world units."""
 
@@ -69,6 +71,14 @@ class Box:
         if self.room:
             return leaves
         return np.where((enters < leaves) & (enters > 0), enters, np.inf)
+
+
+class Meeting(NamedTuple):
+    """Where rays meet a pane, where they go on to after a reflection, and the share of the light that does."""
+
+    points: Array
+    mirrored: Array
+    share: Array
 
 
 @dataclass(frozen=True)
@@ -123,9 +133,11 @@ class Pane:
         along = (inside - self.refraction * cosines) / (inside + self.refraction * cosines)
         return (2 * across**2 / (1 + across**2) + 2 * along**2 / (1 + along**2)) / 2
 
-    def mirrored(self, directions: Array) -> Array:
-        """Directions [N, 3] after a reflection."""
-        return directions - 2 * np.outer(directions @ self.normal, self.normal)
+    def meeting(self, origins: Array, directions: Array, distances: Array) -> Meeting:
+        """What happens at the pane to rays that meet it after distances [N]."""
+        along = directions @ self.normal
+        mirrored = directions - 2 * np.outer(along, self.normal)
+        return Meeting(origins + distances[:, None] * directions, mirrored, self.reflectances(np.abs(along)))
 
 
 class Seen(NamedTuple):
@@ -164,37 +176,49 @@ class Place:
             radiance[of_it] = painted(points[of_it], thing.seed)
         return radiance, distance
 
-    def radiance(self, origins: Array, directions: Array, reflections: int = 3) -> Array:
+    def radiance(self, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> Array:
         """Radiance [N, 3] along rays; panes that light meets after so many reflections are not there for it."""
-        result, end = self.without_panes(origins, directions)
+        behind, end = self.without_panes(origins, directions)
         if not reflections or not len(origins):
-            return result
+            return behind
+        return self._with_panes(
+            origins, directions, behind, self._pane_distances(origins, directions, end), reflections
+        )
+
+    def _pane_distances(self, origins: Array, directions: Array, end: Array) -> Array:
+        """[K, N] how far it is to each pane; infinite where a ray meets it after its end [N], or never."""
         distances = np.stack([pane.distances(origins, directions) for pane in self.panes])
-        order = distances.argsort(axis=0)
+        return np.where(distances < end, distances, np.inf)
+
+    def _with_panes(
+        self, origins: Array, directions: Array, behind: Array, distances: Array, reflections: int
+    ) -> Array:
+        """Radiance [N, 3] of what is behind all panes, after each of them has taken and added its share."""
+        result, order = behind.copy(), distances.argsort(axis=0)
         # From the last pane on the way to the first one.
         for place in reversed(range(len(self.panes))):
             for number, pane in enumerate(self.panes):
-                hit = (order[place] == number) & (distances[number] < end)
-                points = origins[hit] + distances[number, hit, None] * directions[hit]
-                share = pane.reflectances(np.abs(directions[hit] @ pane.normal))[:, None]
-                returned = self.radiance(points, pane.mirrored(directions[hit]), reflections - 1)
+                hit = (order[place] == number) & (distances[number] < np.inf)
+                met = pane.meeting(origins[hit], directions[hit], distances[number, hit])
+                share = met.share[:, None]
+                returned = self.radiance(met.points, met.mirrored, reflections - 1)
                 result[hit] = (1 - share) * result[hit] + share * returned
         return result
 
     def seen(self, origins: Array, directions: Array) -> Seen:
         """The radiance along rays and its layers."""
         transmission, end = self.without_panes(origins, directions)
-        distances = np.stack([pane.distances(origins, directions) for pane in self.panes])
+        distances = self._pane_distances(origins, directions, end)
         first = distances.argmin(axis=0)
         reflection, strength = np.zeros_like(origins), np.zeros(len(origins))
         label = np.zeros(len(origins), dtype=np.uint8)
         for number, pane in enumerate(self.panes):
-            hit = (first == number) & (distances[number] < end)
-            points = origins[hit] + distances[number, hit, None] * directions[hit]
-            reflection[hit], _ = self.without_panes(points, pane.mirrored(directions[hit]))
-            strength[hit] = pane.reflectances(np.abs(directions[hit] @ pane.normal))
-            label[hit] = pane.label
-        return Seen(self.radiance(origins, directions), transmission, reflection, strength, label)
+            hit = (first == number) & (distances[number] < np.inf)
+            met = pane.meeting(origins[hit], directions[hit], distances[number, hit])
+            reflection[hit], _ = self.without_panes(met.points, met.mirrored)
+            strength[hit], label[hit] = met.share, pane.label
+        radiance = self._with_panes(origins, directions, transmission, distances, REFLECTIONS)
+        return Seen(radiance, transmission, reflection, strength, label)
 
 
 def painted(points: Array, seed: int) -> Array:

@@ -115,8 +115,9 @@ class Planar:
             linear=self.blend == "linear",
         )
         layers |= {"reflection": result.reflection, "strength": result.strength}
-        share = float(result.strength.detach().sum() / hit.sum()) if probed else 0.0
-        mirrored = (replace(record, weight=share) for record in second.screen)
+        mirrored = (
+            replace(record, weight=float(result.strength.detach().sum() / hit.sum())) for record in second.screen
+        )
         return Frame(result.rgb, layers, (*first.screen, *mirrored))
 
     def _first_pass(self, scene: Scene, camera: Camera, panes: Panes, probed: bool) -> FirstPass:
