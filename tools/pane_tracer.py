@@ -144,9 +144,9 @@ class Seen(NamedTuple):
     """What rays see.
 
     Attributes:
-        radiance: [N, 3] linear, with all panes.
-        transmission: [N, 3] without the panes.
-        reflection: [N, 3] what the first pane would show as a perfect mirror, were there no others; 0 without a pane.
+        radiance: [N, 3] linear, with all panes: (1 - strength) transmission + strength reflection.
+        transmission: [N, 3] what comes through the first pane, with what panes behind it reflect.
+        reflection: [N, 3] what the first pane would show as a perfect mirror; 0 without a pane.
         strength: [N] reflectance of the first pane.
         label: [N] the first pane's label, 0 where there is none.
     """
@@ -178,46 +178,26 @@ class Place:
 
     def radiance(self, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> Array:
         """Radiance [N, 3] along rays; panes that light meets after so many reflections are not there for it."""
-        behind, end = self.without_panes(origins, directions)
         if not reflections or not len(origins):
-            return behind
-        return self._with_panes(
-            origins, directions, behind, self._pane_distances(origins, directions, end), reflections
-        )
+            return self.without_panes(origins, directions)[0]
+        return self.seen(origins, directions, reflections).radiance
 
-    def _pane_distances(self, origins: Array, directions: Array, end: Array) -> Array:
-        """[K, N] how far it is to each pane; infinite where a ray meets it after its end [N], or never."""
+    def seen(self, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> Seen:
+        """The radiance along rays and its layers; there must be a pane."""
+        radiance, end = self.without_panes(origins, directions)
         distances = np.stack([pane.distances(origins, directions) for pane in self.panes])
-        return np.where(distances < end, distances, np.inf)
-
-    def _with_panes(
-        self, origins: Array, directions: Array, behind: Array, distances: Array, reflections: int
-    ) -> Array:
-        """Radiance [N, 3] of what is behind all panes, after each of them has taken and added its share."""
-        result, order = behind.copy(), distances.argsort(axis=0)
+        distances = np.where(distances < end, distances, np.inf)
+        order = distances.argsort(axis=0)
         # From the last pane on the way to the first one.
         for place in reversed(range(len(self.panes))):
+            transmission, reflection = radiance, np.zeros_like(radiance)
+            strength, label = np.zeros(len(end)), np.zeros(len(end), dtype=np.uint8)
             for number, pane in enumerate(self.panes):
                 hit = (order[place] == number) & (distances[number] < np.inf)
                 met = pane.meeting(origins[hit], directions[hit], distances[number, hit])
-                share = met.share[:, None]
-                returned = self.radiance(met.points, met.mirrored, reflections - 1)
-                result[hit] = (1 - share) * result[hit] + share * returned
-        return result
-
-    def seen(self, origins: Array, directions: Array) -> Seen:
-        """The radiance along rays and its layers."""
-        transmission, end = self.without_panes(origins, directions)
-        distances = self._pane_distances(origins, directions, end)
-        first = distances.argmin(axis=0)
-        reflection, strength = np.zeros_like(origins), np.zeros(len(origins))
-        label = np.zeros(len(origins), dtype=np.uint8)
-        for number, pane in enumerate(self.panes):
-            hit = (first == number) & (distances[number] < np.inf)
-            met = pane.meeting(origins[hit], directions[hit], distances[number, hit])
-            reflection[hit], _ = self.without_panes(met.points, met.mirrored)
-            strength[hit], label[hit] = met.share, pane.label
-        radiance = self._with_panes(origins, directions, transmission, distances, REFLECTIONS)
+                reflection[hit] = self.radiance(met.points, met.mirrored, reflections - 1)
+                strength[hit], label[hit] = met.share, pane.label
+            radiance = (1 - strength[:, None]) * transmission + strength[:, None] * reflection
         return Seen(radiance, transmission, reflection, strength, label)
 
 

@@ -23,7 +23,17 @@ from glassplat.render.deferred import Deferred
 from glassplat.render.frame import Frame
 
 Layer = Literal[
-    "rgb", "transmission", "reflection", "strength", "mask", "depth", "alpha", "base", "normal", "environment"
+    "rgb",
+    "transmission",
+    "without_panes",
+    "reflection",
+    "strength",
+    "mask",
+    "depth",
+    "alpha",
+    "base",
+    "normal",
+    "environment",
 ]
 
 

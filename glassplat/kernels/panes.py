@@ -26,11 +26,13 @@ class PaneHits(NamedTuple):
     """Which pane each pixel shows.
 
     pane [H, W] int32: the nearest pane that the pixel's ray meets, -1 where there is none.
+    depth [H, W]: where it does, infinite where there is none.
     tiles [K, rows, columns] bool: tiles in which a pixel shows the pane.
     windows [K, 4]: left, top, right and bottom edge, in pixels, of the pixels that show it; all 0 where none does.
     """
 
     pane: Tensor
+    depth: Tensor
     tiles: Tensor
     windows: Tensor
 

@@ -14,10 +14,11 @@ def gradient_conflict(frame: Frame, view: View, scene: Scene) -> Tensor:
     """Gradient conflict loss L_c (TR-Gaussians, Eq. 15).
 
     The image mean of H |grad C_t . sg(grad C_r)|, per colour channel: an edge of the reflection should
-    not appear in the transmission. No gradient reaches the reflection.
+    not appear in the transmission. No gradient reaches the reflection. C_t is the image without any pane, also where
+    panes are seen through one another.
     """
     layers = frame.layers
-    return shared_edges(layers["transmission"], layers["reflection"], layers["hit"])
+    return shared_edges(layers["without_panes"], layers["reflection"], layers["hit"])
 
 
 def mask_loss(frame: Frame, view: View, scene: Scene) -> Tensor | None:

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
-from glassplat.kernels.pane_hits import pane_hits
 from glassplat.kernels.splats import Projected
-from glassplat.render.planar import detached, panes_in_camera, project_mirrored, those_seen
+from glassplat.render.planar import detached, project_mirrored
 from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, project_gaussians
+from glassplat.render.seen_panes import nearest_hits, seen_panes
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
 
@@ -32,12 +32,12 @@ def contributions(scene: Scene, camera: Camera) -> Tensor:
     # Colours do not matter here.
     primary, near = replace(detached(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
     most = _weight_sums(project_gaussians(primary, camera, near=near), camera)
-    hits = pane_hits(panes_in_camera(scene.planes, camera), camera.intrinsics, camera.width, camera.height)
+    hits = nearest_hits(scene.planes, camera)
     if not hits.tiles.any():
         return most
-    planes, hits = those_seen(scene.planes, hits)
-    mirrored = project_mirrored(primary, camera, planes, hits, near=near)
-    return torch.maximum(most, _weight_sums(mirrored, camera, hits.tiles))
+    seen = seen_panes(scene.planes, camera, hits)
+    mirrored = project_mirrored(primary, camera, seen, near=near)
+    return torch.maximum(most, _weight_sums(mirrored, camera, seen.tiles))
 
 
 def _weight_sums(projected: Projected, camera: Camera, tiles: Tensor | None = None) -> Tensor:

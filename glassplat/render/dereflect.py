@@ -27,14 +27,15 @@ DARKEST = 1e-3
 def dereflected_photo(frame: Frame, photo: Tensor, blend: Blend) -> Tensor:
     """The photograph [H, W, 3] uint8 with the reflection taken off where the frame shows a pane.
 
-    Solves Eq. 1, C = (1 - R) C_t + R C_r, for C_t from the photographed C and the rendered R and C_r, so
-    that detail the scene does not hold survives. The rendered C_t takes over smoothly where most of the
+    Solves Eq. 1, C = (1 - R) C_t + R C_r, for C_t from the photographed C and the rendered R and R C_r, so
+    that detail the scene does not hold survives. Of panes seen through one another it takes off all: C_t is the image
+    without panes, and R and R C_r are what they add together. The rendered C_t takes over smoothly where most of the
     light is reflected, and where the photograph is clipped and the reflection can be seen; there, the
     difference would show the errors of the rendered reflection instead. Pixels without a pane are the
     photograph's, bit for bit.
 
     Args:
-        frame: a view rendered by `planar`, with `transmission`, `reflection` and `strength`; on the CPU.
+        frame: a view rendered by `planar`, with `without_panes` and `share`; on the CPU.
         photo: [H, W, 3] uint8, of that view.
         blend: the space in which the run holds Eq. 1.
 
@@ -44,14 +45,13 @@ def dereflected_photo(frame: Frame, photo: Tensor, blend: Blend) -> Tensor:
     if photo.shape != frame.rgb.shape:
         raise ValueError(f"the photograph is {list(photo.shape)}, the frame {list(frame.rgb.shape)}; expected one size")
     decode, encode = _curves(blend)
-    strength = frame.layers["strength"]
-    share = strength[..., None]
+    without_panes, share = frame.layers["without_panes"], frame.layers["share"][..., None]
     photographed = photo.to(torch.float32) / 255
-    light, reflected = decode(photographed), share * decode(frame.layers["reflection"])
+    light, reflected = decode(photographed), decode(frame.rgb) - (1 - share) * decode(without_panes)
     # The trust is almost zero before this division would blow up noise.
     solved = (light - reflected) / (1 - share).clamp(min=1 - DISTRUSTED_STRENGTH)
-    rendered = decode(frame.layers["transmission"].clamp(0, 1))
-    trust = _trust(photographed, light, reflected, strength)
+    rendered = decode(without_panes.clamp(0, 1))
+    trust = _trust(photographed, light, reflected, share[..., 0])
     behind = rendered + trust[..., None] * (solved - rendered)
     pixels = torch.round(encode(behind.clamp(0, 1)).clamp(0, 1) * 255).to(torch.uint8)
     return torch.where(share > 0, pixels, photo)

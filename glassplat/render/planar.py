@@ -11,9 +11,8 @@ from torch import Tensor
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.blend_panes import blend_panes
 from glassplat.kernels.composite import composite
-from glassplat.kernels.pane_hits import pane_hits
-from glassplat.kernels.panes import Fresnel, PaneHits, Panes
-from glassplat.kernels.splats import Deviation, Projected
+from glassplat.kernels.panes import BlendedPanes, Fresnel
+from glassplat.kernels.splats import Deviation, Projected, Splats
 from glassplat.render.frame import Frame, ScreenPass
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
@@ -23,6 +22,14 @@ from glassplat.render.rasterize import (
     over_background,
     project_gaussians,
     screen_pass,
+)
+from glassplat.render.seen_panes import (
+    SeenPanes,
+    glass_owners,
+    nearest_hits,
+    own_masks,
+    seen_panes,
+    visibilities,
 )
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
@@ -36,11 +43,13 @@ Blend = Literal["srgb", "linear"]
 class FirstPass(NamedTuple):
     """Everything seen straight through the camera."""
 
-    transmission: Tensor
+    image: Tensor
     alpha: Tensor
     depth: Tensor
     mask: Tensor
     deviation: Tensor | None
+    splats: Splats
+    marks: Tensor
     screen: tuple[ScreenPass, ...]
 
 
@@ -49,6 +58,14 @@ class SecondPass(NamedTuple):
 
     reflections: Tensor
     screen: tuple[ScreenPass, ...]
+
+
+class Glazed(NamedTuple):
+    """An image behind its panes: what comes through the nearest, what that one adds, and what all of them add."""
+
+    transmission: Tensor
+    nearest: BlendedPanes
+    share: Tensor
 
 
 @dataclass(frozen=True)
@@ -64,8 +81,12 @@ class Planar:
     cameras mirrored about each plane, which is the same as mirroring the Gaussians (Eqs. 8-12), and
     only in tiles where that pane is seen.
 
+    Where panes are seen through one another, Eq. 1 holds for one after the other, from the farthest on: the C_t of a
+    pane is the C of the pane behind it (the paper shows the nearest only). R, C_r and C_t are layers of the nearest.
+
     Layers: `transmission`, `reflection` [H, W, 3]; `strength`, `mask`, `depth`, `alpha`, `hit`
-    [H, W]; `deviation` [H, W] (Eq. 14) if asked for.
+    [H, W]; `without_panes` [H, W, 3], the image were there no panes, and `share` [H, W], how much of what is seen the
+    panes add, all of them together; `deviation` [H, W] (Eq. 14) if asked for.
 
     Attributes:
         background: colour behind everything, sRGB.
@@ -89,38 +110,30 @@ class Planar:
     def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are."""
         camera = camera.to(scene.primary.means.device)
-        panes = panes_in_camera(scene.planes, camera)
-        first = self._first_pass(scene, camera, panes, probed)
-        layers = {"transmission": first.transmission, "depth": first.depth, "alpha": first.alpha, "mask": first.mask}
-        hits = pane_hits(panes, camera.intrinsics, camera.width, camera.height, first.mask)
+        first = self._first_pass(scene, camera, probed)
+        layers = {"without_panes": first.image, "depth": first.depth, "alpha": first.alpha, "mask": first.mask}
+        hits = nearest_hits(scene.planes, camera, first.mask)
         hit = (hits.pane >= 0).to(first.mask.dtype)
         layers["hit"] = hit
         if first.deviation is not None:
             layers["deviation"] = first.deviation
         if not hits.tiles.any():
-            layers |= {"reflection": torch.zeros_like(first.transmission), "strength": torch.zeros_like(hit)}
-            return Frame(first.transmission, layers, first.screen)
-        planes, hits = those_seen(scene.planes, hits)
-        second = self._second_pass(scene, camera, planes, hits, probed)
-        result = blend_panes(
-            first.transmission,
-            first.mask,
-            second.reflections,
-            hits.pane,
-            planes.normals @ camera.cam_from_world[:3, :3].T,
-            planes.base_reflectances,
-            camera.intrinsics,
-            fresnel=self.fresnel,
-            intensity=self.intensity,
-            linear=self.blend == "linear",
-        )
-        layers |= {"reflection": result.reflection, "strength": result.strength}
-        mirrored = (
-            replace(record, weight=float(result.strength.detach().sum() / hit.sum())) for record in second.screen
-        )
-        return Frame(result.rgb, layers, (*first.screen, *mirrored))
+            nothing = torch.zeros_like(hit)
+            layers |= {"transmission": first.image, "reflection": torch.zeros_like(first.image)}
+            return Frame(first.image, layers | {"strength": nothing, "share": nothing}, first.screen)
+        seen = seen_panes(scene.planes, camera, hits, first.mask)
+        second = self._second_pass(scene, camera, seen, probed)
+        glazed = self._glazed(scene, camera, seen, first, second)
+        layers |= {
+            "transmission": glazed.transmission,
+            "reflection": glazed.nearest.reflection,
+            "strength": glazed.nearest.strength,
+            "share": glazed.share,
+        }
+        mirrored = (replace(record, weight=float(glazed.share.detach().sum() / hit.sum())) for record in second.screen)
+        return Frame(glazed.nearest.rgb, layers, (*first.screen, *mirrored))
 
-    def _first_pass(self, scene: Scene, camera: Camera, panes: Panes, probed: bool) -> FirstPass:
+    def _first_pass(self, scene: Scene, camera: Camera, probed: bool) -> FirstPass:
         near = NEAR_PER_EXTENT * scene.extent
         primary = project_gaussians(scene.primary, camera, near=near)
         glass = project_gaussians(scene.glass, camera, near=near)
@@ -131,8 +144,8 @@ class Planar:
         marks = torch.sigmoid(scene.glass.channels["logit_mark"])[None]
         deviation = None
         if self.deviation:
-            index = pane_hits(panes, camera.intrinsics, camera.width, camera.height).pane
-            deviation = Deviation(3, (index >= 0).to(colors.dtype)[None], self.deviation_depth_gradient)
+            hit = nearest_hits(scene.planes, camera).pane >= 0
+            deviation = Deviation(3, hit.to(colors.dtype)[None], self.deviation_depth_gradient)
         screen = (screen_pass("primary", primary), screen_pass("glass", glass)) if probed else ()
         result = composite(
             splats,
@@ -145,20 +158,22 @@ class Planar:
         )
         alpha = result.alpha[0]
         return FirstPass(
-            transmission=over_background(result.image[0, ..., :3], alpha, self.background),
+            image=over_background(result.image[0, ..., :3], alpha, self.background),
             alpha=alpha,
             depth=mean_depth(result.image[0, ..., 3], alpha),
             mask=result.mask[0],
             deviation=result.deviation[0] if deviation else None,
+            splats=splats,
+            marks=marks,
             screen=screen,
         )
 
-    def _second_pass(self, scene: Scene, camera: Camera, planes: Planes, hits: PaneHits, probed: bool) -> SecondPass:
+    def _second_pass(self, scene: Scene, camera: Camera, seen: SeenPanes, probed: bool) -> SecondPass:
         primary = scene.primary if self.reflection_gradient == "all" else detached(scene.primary)
-        projected = project_mirrored(primary, camera, planes, hits, near=NEAR_PER_EXTENT * scene.extent)
+        projected = project_mirrored(primary, camera, seen, near=NEAR_PER_EXTENT * scene.extent)
         splats = joined_splats(projected)
-        bins = bin_tiles(splats, camera.width, camera.height, hits.tiles)
-        intensity = torch.exp(primary.channels["log_intensity"]).expand(len(planes), -1)
+        bins = bin_tiles(splats, camera.width, camera.height, seen.tiles)
+        intensity = torch.exp(primary.channels["log_intensity"]).expand(len(seen.planes), -1)
         channels = torch.cat([projected.colors, intensity[..., None]], dim=-1)
         screen = (screen_pass("primary", projected, direct=False),) if probed else ()
         result = composite(splats, channels, bins, probe=joined_probe(screen))
@@ -168,28 +183,30 @@ class Planar:
             reflections = torch.cat([colors, reflections[..., 3:]], dim=-1)
         return SecondPass(reflections, screen)
 
-
-def panes_in_camera(planes: Planes, camera: Camera) -> Panes:
-    """The rectangles in the camera frame; no gradient."""
-    with torch.no_grad():
-        rotation, translation = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
-        centers, normals, axes, half_sizes = (
-            tensor.to(rotation)
-            for tensor in (planes.centers, planes.normals, torch.stack(planes.axes(), 1), planes.half_sizes)
-        )
-        return Panes(centers @ rotation.T + translation, normals @ rotation.T, axes @ rotation.T, half_sizes)
-
-
-def those_seen(planes: Planes, hits: PaneHits) -> tuple[Planes, PaneHits]:
-    """The planes that some tile shows, and the hits with indices into those."""
-    seen = hits.tiles.flatten(1).any(dim=1)
-    if bool(seen.all()):
-        return planes, hits
-    # The last entry is for index -1, pixels without a pane.
-    position = torch.where(torch.cat([seen, seen.new_zeros(1)]), torch.cat([seen.cumsum(0) - 1, seen.new_ones(1)]), -1)
-    index = position[hits.pane.long()].to(torch.int32)
-    rows = seen.nonzero().flatten().tolist()
-    return planes.select(rows), PaneHits(index, hits.tiles[seen], hits.windows[seen])
+    def _glazed(self, scene: Scene, camera: Camera, seen: SeenPanes, first: FirstPass, second: SecondPass) -> Glazed:
+        """Lays one pane after the other before the image, from the farthest on each ray to the nearest."""
+        masks = [first.mask]
+        if len(seen.order) > 1:
+            owners = glass_owners(scene.glass, scene.planes)
+            own = own_masks(seen, first.splats, first.marks, owners, (camera.height, camera.width))
+            masks = visibilities(seen, first.mask, own)
+        image, share = first.image, torch.zeros_like(first.mask)
+        for mask, pane in zip(reversed(masks), reversed(seen.order), strict=True):
+            behind = image
+            nearest = blend_panes(
+                behind,
+                mask,
+                second.reflections,
+                pane,
+                seen.planes.normals @ camera.cam_from_world[:3, :3].T,
+                seen.planes.base_reflectances,
+                camera.intrinsics,
+                fresnel=self.fresnel,
+                intensity=self.intensity,
+                linear=self.blend == "linear",
+            )
+            image, share = nearest.rgb, nearest.strength + (1 - nearest.strength) * share
+        return Glazed(behind, nearest, share)
 
 
 def detached(gaussians: Gaussians) -> Gaussians:
@@ -197,23 +214,22 @@ def detached(gaussians: Gaussians) -> Gaussians:
     return gaussians.with_tensors({name: tensor.detach() for name, tensor in gaussians.tensors().items()})
 
 
-def project_mirrored(gaussians: Gaussians, camera: Camera, planes: Planes, hits: PaneHits, *, near: float) -> Projected:
+def project_mirrored(gaussians: Gaussians, camera: Camera, seen: SeenPanes, *, near: float) -> Projected:
     """Projects the Gaussians of the camera's side into the camera mirrored about each plane (Eqs. 8-12).
 
     Args:
         gaussians: the set to project.
         camera: whose mirror images are wanted.
-        planes: K planes that the camera sees.
-        hits: where it sees them; what lies outside of a plane's window is culled.
+        seen: the planes that it sees, and where; what lies outside of a plane's window is culled.
         near: depth below which a Gaussian is culled, world units.
     """
     return project_gaussians(
         gaussians,
         camera,
         near=near,
-        poses=camera.cam_from_world @ mirror_matrices(planes.centers, planes.normals),
-        clip_planes=half_spaces_of(planes, camera),
-        windows=hits.windows,
+        poses=camera.cam_from_world @ mirror_matrices(seen.planes.centers, seen.planes.normals),
+        clip_planes=half_spaces_of(seen.planes, camera),
+        windows=seen.windows,
     )
 
 

@@ -44,7 +44,9 @@ def test_train_eval_render(method: str, tmp_path: Path) -> None:
     assert len(list((run / "sheets").glob("*.png"))) == results["num_test_views"]
     assert (run / "index.html").is_file()
     layers = (
-        ["rgb", "depth"] if method == "splat" else ["rgb", "transmission", "reflection", "strength", "mask", "depth"]
+        ["rgb", "depth"]
+        if method == "splat"
+        else ["rgb", "transmission", "without_panes", "reflection", "strength", "mask", "depth"]
     )
     assert main(["render", str(run), "--layers", *layers, "--split", "test", "--output", str(tmp_path / "out")]) == 0
     assert all(len(list((tmp_path / "out" / name).glob("*.png"))) == results["num_test_views"] for name in layers)

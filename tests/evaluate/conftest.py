@@ -92,8 +92,10 @@ def perfect_frame(folder: Path, index: int, name: str) -> Frame:
     pane = torch.from_numpy(pane_labels(index) > 0).float()
     layers = {
         "transmission": images["trans"],
+        "without_panes": images["trans"],
         "reflection": 0.5 * images["refl"],
         "strength": 0.1 * pane,
+        "share": 0.1 * pane,
         "mask": pane,
         "depth": torch.linspace(1, 3, WIDTH).expand(HEIGHT, WIDTH),
         "alpha": torch.ones(HEIGHT, WIDTH),

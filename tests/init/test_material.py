@@ -12,7 +12,7 @@ from glassplat.init.glass import glass_gaussians
 from glassplat.init.material import about_local_mean, likeness, mirror_labels
 from glassplat.render.planar import Planar
 from glassplat.scene.scene import Scene
-from tests.render.tiny_scene import camera_at, in_single_precision, nearest_hits, pane, showcase
+from tests.render.tiny_scene import camera_at, in_single_precision, pane, showcase, shown_panes
 
 
 def scene_with(base_reflectance: float) -> Scene:
@@ -33,7 +33,7 @@ def photographs(scene: Scene) -> list[View]:
         camera = replace(camera, cam_from_world=camera.cam_from_world.float())
         with torch.no_grad():
             photo = (255 * Planar()(scene, camera).rgb.clamp(0, 1)).to(torch.uint8)
-        labels = nearest_hits(scene.planes, camera)[0].to(torch.uint8)
+        labels = shown_panes(scene.planes, camera)[0].to(torch.uint8)
         views.append(View.in_memory(f"{x}", camera, photo=photo, pane_labels=labels))
     return views
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from glassplat.kernels.blend_panes import blend_panes
 from glassplat.kernels.maths_pane import LAWS
 from glassplat.kernels.pane_hits import pane_hits
-from glassplat.kernels.panes import BlendedPanes, Fresnel, Panes
+from glassplat.kernels.panes import BlendedPanes, Fresnel, PaneHits, Panes
 from glassplat.kernels.reference.blend_panes import blend_panes as blend_twin
 from glassplat.kernels.reference.pane_hits import pane_hits as hits_twin
 
@@ -44,11 +44,40 @@ def test_hits_match_their_twin(dtype: torch.dtype, count: int, masked: bool) -> 
     panes, intrinsics = random_panes(count, dtype)
     generator = torch.Generator().manual_seed(1)
     mask = (torch.rand(HEIGHT, WIDTH, generator=generator) > 0.9).to(dtype) if masked else None
-    found = pane_hits(panes, intrinsics, WIDTH, HEIGHT, mask)
-    expected = hits_twin(panes, intrinsics, WIDTH, HEIGHT, mask)
+    found, expected = (hits(panes, intrinsics, WIDTH, HEIGHT, mask) for hits in (pane_hits, hits_twin))
     assert count == 0 or len(expected.pane.unique()) > min(count, 2)
+    agree(found, expected)
+    # All panes on the rays, one behind another, until none is left.
+    met = []
+    while bool((expected.pane >= 0).any()):
+        met.append(expected.pane)
+        found = pane_hits(panes, intrinsics, WIDTH, HEIGHT, mask, beyond=found)
+        expected = hits_twin(panes, intrinsics, WIDTH, HEIGHT, mask, beyond=expected)
+        agree(found, expected)
+    assert len(met) == {0: 0, 1: 1, 3: 1, 8: 3}[count]
+
+
+def agree(found: PaneHits, expected: PaneHits) -> None:
+    torch.testing.assert_close(found.depth, expected.depth)
     for tensor, twin in zip(found, expected, strict=True):
-        assert torch.equal(tensor, twin)
+        assert tensor is found.depth or torch.equal(tensor, twin)
+
+
+def test_panes_on_a_ray_come_nearest_first_and_each_once() -> None:
+    panes, intrinsics = random_panes(8, torch.float32)
+    before = pane_hits(panes, intrinsics, WIDTH, HEIGHT)
+    after = pane_hits(panes, intrinsics, WIDTH, HEIGHT, beyond=before)
+    there = after.pane >= 0
+    assert 0.1 < float(there.float().mean()) < 0.9
+    assert bool((after.depth > before.depth)[there].all() and (after.pane != before.pane)[there].all())
+    assert bool((after.depth[~there] == torch.inf).all())
+
+
+def test_of_coincident_panes_one_is_met() -> None:
+    panes, intrinsics = random_panes(1, torch.float32)
+    twice = Panes(*(tensor.repeat(2, *[1] * (tensor.ndim - 1)) for tensor in panes))
+    first = pane_hits(twice, intrinsics, WIDTH, HEIGHT)
+    assert not bool((pane_hits(twice, intrinsics, WIDTH, HEIGHT, beyond=first).pane >= 0).any())
 
 
 def test_a_plane_through_the_camera_is_not_hit() -> None:

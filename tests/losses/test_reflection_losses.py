@@ -23,7 +23,7 @@ def test_gradient_conflict_counts_shared_edges_inside_the_hit_mask_only() -> Non
 
     def value(transmission: torch.Tensor, reflection: torch.Tensor, mask: torch.Tensor) -> float:
         return float(
-            gradient_conflict(frame_with(transmission=transmission, reflection=reflection, hit=mask), view, scene)
+            gradient_conflict(frame_with(without_panes=transmission, reflection=reflection, hit=mask), view, scene)
         )
 
     assert value(step, step, hit) > 0
@@ -34,7 +34,7 @@ def test_gradient_conflict_counts_shared_edges_inside_the_hit_mask_only() -> Non
 def test_gradient_conflict_leaves_the_reflection_alone() -> None:
     transmission = torch.rand(8, 9, 3, requires_grad=True)
     reflection = torch.rand(8, 9, 3, requires_grad=True)
-    frame = frame_with(transmission=transmission, reflection=reflection, hit=torch.ones(8, 9))
+    frame = frame_with(without_panes=transmission, reflection=reflection, hit=torch.ones(8, 9))
     loss = gradient_conflict(frame, SimpleNamespace(), SimpleNamespace())
     to_transmission, to_reflection = torch.autograd.grad(loss, [transmission, reflection], allow_unused=True)
     assert float(to_transmission.abs().sum()) > 0 and to_reflection is None

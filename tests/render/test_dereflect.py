@@ -28,17 +28,18 @@ def mixed(behind: torch.Tensor, mirrored: torch.Tensor, share: torch.Tensor, ble
     return srgb_from_linear((1 - share) * linear_from_srgb(behind) + share * linear_from_srgb(mirrored))
 
 
+def model(behind: torch.Tensor, mirrored: torch.Tensor, share: torch.Tensor, blend: Blend) -> Frame:
+    """A rendered view [H, W, 3] of something behind panes that add a share [H, W] of light."""
+    layers = {"without_panes": behind, "share": share}
+    return Frame(mixed(behind, mirrored, share[..., None], blend), layers)
+
+
 def case(strength: float, blend: Blend, reflection: float = 0.3) -> tuple[Frame, torch.Tensor, torch.Tensor]:
     """A blurred model of a pane in the left half, a photograph, and what is really behind the pane."""
-    truth = 0.3 + 0.4 * torch.rand(*SIZE, 3)
-    layers = {
-        "transmission": truth.mean(dim=(0, 1), keepdim=True).expand(*SIZE, 3),
-        "reflection": torch.full((*SIZE, 3), reflection),
-        "strength": torch.where(torch.arange(SIZE[1]) < 16, strength, 0.0).expand(*SIZE),
-    }
-    share = layers["strength"][..., None]
-    frame = Frame(mixed(layers["transmission"], layers["reflection"], share, blend), layers)
-    return frame, uint8(mixed(truth, layers["reflection"], share, blend)), truth
+    truth, mirrored = 0.3 + 0.4 * torch.rand(*SIZE, 3), torch.full((*SIZE, 3), reflection)
+    share = torch.where(torch.arange(SIZE[1]) < 16, strength, 0.0).expand(*SIZE)
+    frame = model(truth.mean(dim=(0, 1), keepdim=True).expand(*SIZE, 3), mirrored, share, blend)
+    return frame, uint8(mixed(truth, mirrored, share[..., None], blend)), truth
 
 
 @pytest.mark.parametrize("blend", BLENDS)
@@ -60,14 +61,14 @@ def test_without_a_pane_the_photograph_stays_bit_for_bit() -> None:
 def test_where_most_light_is_reflected_the_render_takes_over() -> None:
     frame, photo, _ = case(0.95, "linear")
     result = dereflected_photo(frame, photo, "linear")
-    assert torch.equal(result[:, :12], uint8(frame.layers["transmission"])[:, :12])
+    assert torch.equal(result[:, :12], uint8(frame.layers["without_panes"])[:, :12])
 
 
 def test_where_the_photograph_is_clipped_under_a_reflection_the_render_takes_over() -> None:
     frame, photo, _ = case(0.1, "linear", reflection=1.0)
     white = torch.full_like(photo, 255)
     result = dereflected_photo(frame, white, "linear")
-    assert torch.equal(result[:, :12], uint8(frame.layers["transmission"])[:, :12])
+    assert torch.equal(result[:, :12], uint8(frame.layers["without_panes"])[:, :12])
     assert torch.equal(result[:, 16:], white[:, 16:])
 
 
@@ -79,10 +80,10 @@ def test_a_clipped_pixel_without_visible_reflection_is_kept() -> None:
 
 def test_too_bright_a_model_of_the_reflection_leaves_no_black_holes() -> None:
     frame, photo, _ = case(0.3, "linear", reflection=0.3)
-    glaring = replace(frame, layers={**frame.layers, "reflection": torch.ones(*SIZE, 3)})
+    glaring = model(frame.layers["without_panes"], torch.ones(*SIZE, 3), frame.layers["share"], "linear")
     result = dereflected_photo(glaring, photo // 2, "linear")
     torch.testing.assert_close(
-        result[:, :12].float(), uint8(frame.layers["transmission"])[:, :12].float(), rtol=0, atol=12
+        result[:, :12].float(), uint8(frame.layers["without_panes"])[:, :12].float(), rtol=0, atol=12
     )
 
 
@@ -90,7 +91,8 @@ def test_the_way_from_trust_to_distrust_has_no_steps() -> None:
     frame, photo, _ = case(0.1, "linear")
     rising = torch.linspace(0.01, 0.99, SIZE[1]).expand(*SIZE)
     flat = torch.full_like(photo, 120)
-    result = dereflected_photo(replace(frame, layers={**frame.layers, "strength": rising}), flat, "linear")
+    frame = model(frame.layers["without_panes"], torch.full((*SIZE, 3), 0.3), rising, "linear")
+    result = dereflected_photo(frame, flat, "linear")
     assert int(result.int().diff(dim=1).abs().max()) < 16
 
 

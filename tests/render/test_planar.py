@@ -17,7 +17,7 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.plane import Planes
 from glassplat.scene.pose import mirror_matrices, rotation_from_quat
 from glassplat.scene.scene import Scene
-from tests.render.tiny_scene import camera_at, in_single_precision, joined, nearest_hits, pane, quat_product, showcase
+from tests.render.tiny_scene import camera_at, in_single_precision, joined, pane, quat_product, showcase, shown_panes
 
 CAMERA = camera_at(0.0, 0.0, -0.2)
 
@@ -134,16 +134,16 @@ def test_a_pane_reflects_for_cameras_on_either_side() -> None:
 
 def test_the_nearest_pane_wins() -> None:
     planes = joined(pane(4.0, label=1), pane(2.0, half=0.5, label=2))
-    hits = nearest_hits(planes, CAMERA)
+    hits = shown_panes(planes, CAMERA)
     assert bool(hits[0].any()) and bool(hits[1].any())
     assert not bool((hits[0] & hits[1]).any())
-    alone = nearest_hits(pane(2.0, half=0.5, label=2), CAMERA)
+    alone = shown_panes(pane(2.0, half=0.5, label=2), CAMERA)
     assert torch.equal(hits[1], alone[0])
     assert bool((hits[0] | hits[1]).all())
 
 
 def test_a_pane_behind_the_camera_is_not_hit() -> None:
-    assert not bool(nearest_hits(pane(-3.0), CAMERA).any())
+    assert not bool(shown_panes(pane(-3.0), CAMERA).any())
 
 
 @pytest.mark.parametrize("fresnel", LAWS)
@@ -159,7 +159,7 @@ def test_the_strength_of_each_pixel_is_that_of_its_angle(fresnel: Fresnel) -> No
 def test_two_panes_keep_their_own_reflections() -> None:
     left, right = pane(2.0, half=0.5, label=1), pane(4.0, label=2)
     both = Planar()(showcase(joined(left, right)), CAMERA).layers["reflection"]
-    hits = nearest_hits(joined(left, right), CAMERA)
+    hits = shown_panes(joined(left, right), CAMERA)
     for k, planes in enumerate((left, right)):
         alone = Planar()(showcase(planes), CAMERA).layers["reflection"]
         torch.testing.assert_close(both[hits[k]], alone[hits[k]])

@@ -8,8 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from glassplat.kernels.pane_hits import pane_hits
-from glassplat.render.planar import panes_in_camera
+from glassplat.render.seen_panes import nearest_hits
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
@@ -78,9 +77,9 @@ def in_single_precision(scene: Scene) -> Scene:
     return replace(scene, **parts, planes=planes)
 
 
-def nearest_hits(planes: Planes, camera: Camera) -> Tensor:
+def shown_panes(planes: Planes, camera: Camera) -> Tensor:
     """[K, H, W] bool: the pixels that show each pane, the nearest where panes overlap."""
-    index = pane_hits(panes_in_camera(planes, camera), camera.intrinsics, camera.width, camera.height).pane
+    index = nearest_hits(planes, camera).pane
     return index == torch.arange(len(planes), dtype=torch.int32)[:, None, None]
 
 

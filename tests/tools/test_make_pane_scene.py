@@ -81,6 +81,21 @@ def test_a_pane_behind_a_pane_returns_light_through_the_first() -> None:
     np.testing.assert_allclose(radiance, swapped)
 
 
+def test_what_a_pane_behind_a_pane_returns_is_part_of_the_transmission() -> None:
+    second = replace(WINDOW, label=2, center=np.array([0.0, 0.5, 0.0]))
+    origins, directions = towards_window()
+    both = Place((ROOM,), (WINDOW, second)).seen(origins, directions)
+    alone = Place((ROOM,), (second,)).seen(origins, directions, reflections=1)
+    through = (both.label == 1) & (alone.label == 2)
+    share = both.strength[:, None]
+    assert through.mean() > 0.2
+    np.testing.assert_allclose(both.radiance, (1 - share) * both.transmission + share * both.reflection)
+    # But for light thrown to and fro between the panes.
+    np.testing.assert_allclose(both.transmission[through], alone.radiance[through], atol=0.02)
+    behind, _ = Place((ROOM,), ()).without_panes(origins, directions)
+    assert float(np.abs(both.transmission - behind)[through].mean()) > 0.02
+
+
 def test_the_capture_fits_its_truth(tmp_path: Path) -> None:
     main(Arguments(tmp_path / "scene", width=40, views=16, masks=2, points=200))
     dataset = load_dataset(tmp_path / "scene")

@@ -15,7 +15,7 @@ from glassplat.files.ply_table import write_table
 from glassplat.render.planar import Planar
 from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
-from tests.render.tiny_scene import camera_at, in_single_precision, nearest_hits, pane, showcase
+from tests.render.tiny_scene import camera_at, in_single_precision, pane, showcase, shown_panes
 
 
 def true_scene() -> Scene:
@@ -31,7 +31,7 @@ def tiny_capture() -> Dataset:
         camera = replace(camera, cam_from_world=camera.cam_from_world.float())
         with torch.no_grad():
             photo = (255 * Planar()(scene, camera).rgb.clamp(0, 1)).to(torch.uint8)
-            labels = nearest_hits(scene.planes, camera)[0].to(torch.uint8)
+            labels = shown_panes(scene.planes, camera)[0].to(torch.uint8)
         views.append(
             View.in_memory(f"{index}.png", camera, photo=photo, pane_labels=labels if index % 3 == 0 else None)
         )
@@ -59,7 +59,7 @@ def write_tiny_capture(root: Path) -> Path:
     for view in dataset.train:
         camera = view.camera
         Image.fromarray(view.photo.numpy()).save(root / "images" / view.name)
-        labels = nearest_hits(true_scene().planes, camera)[0].to(torch.uint8)
+        labels = shown_panes(true_scene().planes, camera)[0].to(torch.uint8)
         Image.fromarray(labels.numpy()).save(root / "masks" / view.name)
         world_from_opengl = camera.cam_from_world.inverse() * torch.tensor([1, -1, -1, 1])
         frames.append({"file_path": f"images/{view.name}", "transform_matrix": world_from_opengl.tolist()})

@@ -18,35 +18,45 @@ from glassplat.kernels.panes import PaneHits
 from glassplat.kernels.tensor_checks import REAL_OF
 
 
-def pane_hits(inputs: Sequence[Tensor], width: int, height: int, mask: Tensor | None) -> PaneHits:
+def pane_hits(
+    inputs: Sequence[Tensor], width: int, height: int, mask: Tensor | None, beyond: PaneHits | None
+) -> PaneHits:
     """Nearest panes, from the fields of `Panes` and the intrinsics."""
     centers = inputs[0]
     count, real = centers.shape[0], REAL_OF[centers.dtype]
     index = torch.empty(height, width, dtype=torch.int32)
+    depth = centers.new_empty(height, width)
     tiles = torch.zeros(count, -(-height // TILE), -(-width // TILE), dtype=torch.bool)
     windows = centers.new_zeros(count, 4)
     visible = centers.new_empty(0, 0) if mask is None else mask
-    tensors = (*inputs, visible, index, tiles, windows)
+    before = (index.new_empty(0, 0), centers.new_empty(0, 0)) if beyond is None else (beyond.pane, beyond.depth)
+    tensors = (*inputs, visible, *before, index, depth, tiles, windows)
     pane_hits_forward(real)(*(tensor.numpy() for tensor in tensors))
-    return PaneHits(index, tiles, windows)
+    return PaneHits(index, depth, tiles, windows)
 
 
 @cache
 def pane_hits_forward(real: type) -> Kernel:
-    """Fills the index, the tiles and the windows of the panes."""
+    """Fills the index, the depth, the tiles and the windows of the panes."""
     half, one, zero, far = real(0.5), real(1.0), real(0.0), real(np.inf)
 
     @kernel("pane_hits", real)
-    def forward(centers, normals, axes, half_sizes, intrinsics, mask, index, tiles, windows):
+    def forward(
+        centers, normals, axes, half_sizes, intrinsics, mask, before, depth_before, index, depth_of, tiles, windows
+    ):  # fmt: skip
         height, width = index.shape
         count = centers.shape[0]
         spans: NDArray[Any] = np.empty((height, count, 2), np.int32)
         for tile_row in prange((height + TILE - 1) // TILE):
-            nearest: NDArray[Any] = np.empty(width, real)
+            least: NDArray[Any] = np.zeros(width, real)
+            own: NDArray[Any] = np.full(width, -1, np.int32)
             for row in range(tile_row * TILE, min(height, tile_row * TILE + TILE)):
                 y = (real(np.int32(row)) + half - intrinsics[3]) / intrinsics[1]
+                nearest = depth_of[row]
                 nearest[:] = far
                 index[row, :] = -1
+                if before.size:
+                    least[:], own[:] = depth_before[row], before[row]
                 for k in range(count):
                     n, u, v, c = normals[k], axes[k, 0], axes[k, 1], centers[k]
                     distance = c[0] * n[0] + c[1] * n[1] + c[2] * n[2]
@@ -59,7 +69,7 @@ def pane_hits_forward(real: type) -> Kernel:
                     for column in range(width):
                         x = (real(np.int32(column)) + half - c_x) * inverse_f
                         depth = distance / (n_x * x + n_row)
-                        inside = (depth > zero) & (depth < nearest[column])
+                        inside = (depth > least[column]) & (depth < nearest[column]) & (own[column] != k)
                         inside &= abs(depth * (u_x * x + u_row) - along_u) <= most_u
                         inside &= abs(depth * (v_x * x + v_row) - along_v) <= most_v
                         nearest[column] = depth if inside else nearest[column]

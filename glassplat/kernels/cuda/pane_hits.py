@@ -18,19 +18,24 @@ from glassplat.kernels.tensor_checks import REAL_OF
 PIXELS = TILE * TILE
 
 
-def pane_hits(inputs: Sequence[Tensor], width: int, height: int, mask: Tensor | None) -> PaneHits:
+def pane_hits(
+    inputs: Sequence[Tensor], width: int, height: int, mask: Tensor | None, beyond: PaneHits | None
+) -> PaneHits:
     """As `glassplat.kernels.cpu.pane_hits.pane_hits`."""
     centers = inputs[0]
     count, real = centers.shape[0], REAL_OF[centers.dtype]
     rows, columns = -(-height // TILE), -(-width // TILE)
     index = torch.empty(height, width, dtype=torch.int32, device=centers.device)
+    depth = centers.new_empty(height, width)
     tiles = torch.zeros(count, rows, columns, dtype=torch.bool, device=centers.device)
     shown_columns, shown_rows = (tiles.new_zeros(count, size) for size in (width, height))
     visible = centers.new_empty(0, 0) if mask is None else mask
-    pane_hits_forward(real)(rows * columns, PIXELS, *inputs, visible, index, tiles, shown_columns, shown_rows)
+    before = (index.new_empty(0, 0), centers.new_empty(0, 0)) if beyond is None else (beyond.pane, beyond.depth)
+    outputs = (index, depth, tiles, shown_columns, shown_rows)
+    pane_hits_forward(real)(rows * columns, PIXELS, *inputs, visible, *before, *outputs)
     left, right = _edges(shown_columns)
     top, bottom = _edges(shown_rows)
-    return PaneHits(index, tiles, torch.stack([left, top, right, bottom], dim=1).to(centers.dtype))
+    return PaneHits(index, depth, tiles, torch.stack([left, top, right, bottom], dim=1).to(centers.dtype))
 
 
 def _edges(shown: Tensor) -> tuple[Tensor, Tensor]:
@@ -42,12 +47,13 @@ def _edges(shown: Tensor) -> tuple[Tensor, Tensor]:
 
 @cache
 def pane_hits_forward(real: type) -> Kernel:
-    """Fills the index, and marks tiles, columns and rows in which a pane is shown."""
+    """Fills the index and the depth, and marks tiles, columns and rows in which a pane is shown."""
     half, one, zero, far = real(0.5), real(1.0), real(0.0), real(np.inf)
 
-    @kernel("pane_hits", real, "real2 real2 real3 real2 real1 real2 int2 bool3 bool2 bool2")
+    @kernel("pane_hits", real, "real2 real2 real3 real2 real1 real2 int2 real2 int2 real2 bool3 bool2 bool2")
     def forward(
-        centers, normals, axes, half_sizes, intrinsics, mask, index, tiles, shown_columns, shown_rows
+        centers, normals, axes, half_sizes, intrinsics, mask, before, depth_before,
+        index, depth_of, tiles, shown_columns, shown_rows,
     ):  # fmt: skip
         height, width = index.shape
         tile_columns = (width + TILE - 1) // TILE
@@ -58,6 +64,9 @@ def pane_hits_forward(real: type) -> Kernel:
             return
         x = (real(np.int32(column)) + half - intrinsics[2]) * (one / intrinsics[0])
         y = (real(np.int32(row)) + half - intrinsics[3]) / intrinsics[1]
+        least, own = zero, -1
+        if before.size:
+            least, own = depth_before[row, column], before[row, column]
         nearest, hit = far, -1
         for k in range(centers.shape[0]):
             c_x, c_y, c_z = centers[k, 0], centers[k, 1], centers[k, 2]
@@ -68,9 +77,10 @@ def pane_hits_forward(real: type) -> Kernel:
             along_u = depth * (u_x * x + (u_y * y + u_z)) - (c_x * u_x + c_y * u_y + c_z * u_z)
             along_v = depth * (v_x * x + (v_y * y + v_z)) - (c_x * v_x + c_y * v_y + c_z * v_z)
             within = abs(along_u) <= half_sizes[k, 0] and abs(along_v) <= half_sizes[k, 1]
-            if within and zero < depth < nearest:
+            if within and k != own and least < depth < nearest:
                 nearest, hit = depth, k
         index[row, column] = hit
+        depth_of[row, column] = nearest
         if hit >= 0 and (mask.size == 0 or mask[row, column] > zero):
             # Many threads may write here, all of them the same.
             tiles[hit, tile_row, tile_column] = True

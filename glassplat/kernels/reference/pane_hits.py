@@ -9,7 +9,15 @@ from glassplat.kernels.cpu.tile import TILE
 from glassplat.kernels.panes import PaneHits, Panes
 
 
-def pane_hits(panes: Panes, intrinsics: Tensor, width: int, height: int, mask: Tensor | None = None) -> PaneHits:
+def pane_hits(
+    panes: Panes,
+    intrinsics: Tensor,
+    width: int,
+    height: int,
+    mask: Tensor | None = None,
+    *,
+    beyond: PaneHits | None = None,
+) -> PaneHits:
     """See `glassplat.kernels.pane_hits.pane_hits`."""
     rays = ray_grid(intrinsics, width, height)
     count = panes.centers.shape[0]
@@ -20,6 +28,10 @@ def pane_hits(panes: Panes, intrinsics: Tensor, width: int, height: int, mask: T
         along = torch.einsum("hwi,ki->khw", rays, panes.axes[:, axis]) * depth
         offset = along - (panes.centers * panes.axes[:, axis]).sum(-1)[:, None, None]
         inside &= offset.abs() <= panes.half_sizes[:, axis, None, None]
+    if beyond is not None:
+        # A pane is not behind itself, however its depth is rounded.
+        own = beyond.pane == torch.arange(count, device=beyond.pane.device)[:, None, None]
+        inside &= (depth > beyond.depth) & ~own
     far = torch.full((1, height, width), torch.inf, dtype=rays.dtype)
     nearest, index = torch.cat([far, torch.where(inside, depth, torch.inf)]).min(dim=0)
     index = torch.where(nearest < torch.inf, index, 0) - 1
@@ -32,7 +44,7 @@ def pane_hits(panes: Panes, intrinsics: Tensor, width: int, height: int, mask: T
         rows, columns = shown[k].nonzero().unbind(-1)
         if len(rows):
             windows[k] = torch.stack([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1])
-    return PaneHits(index.to(torch.int32), tiles, windows)
+    return PaneHits(index.to(torch.int32), nearest, tiles, windows)
 
 
 def ray_grid(intrinsics: Tensor, width: int, height: int) -> Tensor:

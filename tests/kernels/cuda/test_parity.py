@@ -299,6 +299,11 @@ def test_pane_hits(masked: bool, dtype: torch.dtype) -> None:
     assert set(expected.pane.flatten().tolist()) == {-1, 0, 1}
     for value, want in zip(found, expected, strict=True):
         close(value, want)
+    further = hits_operation.pane_hits(on_device(panes), intrinsics.to(DEVICE), WIDTH, HEIGHT, own_mask, beyond=found)
+    expected = hits_twin.pane_hits(panes, intrinsics, WIDTH, HEIGHT, mask, beyond=expected)
+    assert bool((expected.pane >= 0).any())
+    for value, want in zip(further, expected, strict=True):
+        close(value, want)
 
 
 def test_no_pane_is_hit_where_there_is_none() -> None:

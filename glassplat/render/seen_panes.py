@@ -1,0 +1,135 @@
+"""Which panes a view shows, one behind another, and how much of each can be seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from glassplat.kernels.bin_tiles import TILE, bin_tiles
+from glassplat.kernels.composite import composite
+from glassplat.kernels.pane_hits import pane_hits
+from glassplat.kernels.panes import PaneHits, Panes
+from glassplat.kernels.splats import Splats
+from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.plane import Planes
+
+
+@dataclass(frozen=True)
+class SeenPanes:
+    """The panes that a view shows; only the nearest on each ray, or several that are seen through one another.
+
+    Attributes:
+        planes: the K panes that some tile shows.
+        rows: [K] their positions among the scene's planes.
+        order: L tensors [H, W] int32, L >= 1: the panes that each pixel's ray meets, nearest first, as positions in
+            `planes`; -1 where there is none left.
+        tiles: [K, rows, columns] bool, tiles in which a pixel shows the pane, in front or through others.
+        windows: [K, 4] left, top, right and bottom edge, in pixels, of the pixels that show it.
+    """
+
+    planes: Planes
+    rows: Tensor
+    order: tuple[Tensor, ...]
+    tiles: Tensor
+    windows: Tensor
+
+
+def panes_in_camera(planes: Planes, camera: Camera) -> Panes:
+    """The rectangles in the camera frame; no gradient."""
+    with torch.no_grad():
+        rotation, translation = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
+        centers, normals, axes, half_sizes = (
+            tensor.to(rotation)
+            for tensor in (planes.centers, planes.normals, torch.stack(planes.axes(), 1), planes.half_sizes)
+        )
+        return Panes(centers @ rotation.T + translation, normals @ rotation.T, axes @ rotation.T, half_sizes)
+
+
+def nearest_hits(
+    planes: Planes, camera: Camera, mask: Tensor | None = None, beyond: PaneHits | None = None
+) -> PaneHits:
+    """The nearest pane of each pixel, or the next one; see `pane_hits`."""
+    rectangles = panes_in_camera(planes, camera)
+    return pane_hits(rectangles, camera.intrinsics, camera.width, camera.height, mask, beyond=beyond)
+
+
+def seen_panes(planes: Planes, camera: Camera, first: PaneHits, mask: Tensor | None = None) -> SeenPanes:
+    """All panes on the ray of each pixel; the planes keep their gradient.
+
+    Args:
+        planes: the scene's.
+        camera: of the view.
+        first: `nearest_hits` of these, of which some tile shows a pane.
+        mask: [H, W] as given to `nearest_hits`.
+    """
+    hits = [first]
+    while len(hits) < len(planes):
+        further = nearest_hits(planes, camera, mask, beyond=hits[-1])
+        if not further.tiles.any():
+            break
+        hits.append(further)
+    tiles = torch.stack([h.tiles for h in hits]).any(dim=0)
+    seen = tiles.flatten(1).any(dim=1)
+    # The last entry is for index -1, pixels without a pane.
+    position = torch.where(torch.cat([seen, seen.new_zeros(1)]), torch.cat([seen.cumsum(0) - 1, seen.new_ones(1)]), -1)
+    order = tuple(position[h.pane.long()].to(torch.int32) for h in hits)
+    rows = seen.nonzero().flatten()
+    return SeenPanes(planes.select(rows.tolist()), rows, order, tiles[seen], _joined_windows(hits)[seen])
+
+
+def _joined_windows(hits: list[PaneHits]) -> Tensor:
+    """[K, 4] the smallest windows around those of all hits; an empty window is all 0."""
+    windows = torch.stack([h.windows for h in hits])
+    empty = (windows[..., 2] == 0)[..., None]
+    first = torch.where(empty, torch.inf, windows[..., :2]).amin(dim=0)
+    joined = torch.cat([first, windows[..., 2:].amax(dim=0)], dim=1)
+    return torch.where(empty.all(dim=0), 0, joined)
+
+
+def visibilities(seen: SeenPanes, joint: Tensor, own: Tensor) -> list[Tensor]:
+    """[H, W] for each of `seen.order`: how much of that pane is visible.
+
+    Args:
+        seen: panes seen through one another.
+        joint: [H, W] mask of all panes together, which holds where a ray meets one pane.
+        own: [K, H, W] mask of each, from `own_masks`.
+    """
+    nearest, *_ = masks = [own.gather(0, pane.clamp(min=0).long()[None])[0] for pane in seen.order]
+    return [torch.where(seen.order[1] >= 0, nearest, joint), *masks[1:]]
+
+
+def own_masks(seen: SeenPanes, splats: Splats, marks: Tensor, owners: Tensor, size: tuple[int, int]) -> Tensor:
+    """[K, H, W] mask of each pane as if it were the only one, in tiles where it is one of several.
+
+    As M of TR-Gaussians, Eq. 7, but other panes, through which it is seen, do not hide it.
+
+    Args:
+        seen: panes seen through one another.
+        splats: [1, G] primary ones, then glass.
+        marks: [1, M] of the glass ones.
+        owners: [M] the pane that each glass one is part of, position among the scene's planes.
+        size: height and width of the image.
+    """
+    count, (height, width), num_primary = len(seen.planes), size, splats.radii.shape[1] - len(owners)
+    means2d, conics, opacities, depths, radii = (field.expand(count, *field.shape[1:]) for field in splats)
+    foreign = owners != seen.rows[:, None]
+    kept = torch.cat([foreign.new_zeros(count, num_primary), foreign], dim=1).logical_not()
+    splats = Splats(means2d, conics, opacities, depths, radii * kept[..., None])
+    several = (seen.order[1] >= 0).to(torch.float32)[None]
+    active = torch.nn.functional.max_pool2d(several, TILE, ceil_mode=True) > 0
+    bins = bin_tiles(splats, width, height, seen.tiles & active)
+    nothing = marks.new_zeros(count, splats.radii.shape[1], 1)
+    return composite(splats, nothing, bins, marks=marks.expand(count, -1), num_primary=num_primary).mask
+
+
+@torch.no_grad()
+def glass_owners(glass: Gaussians, planes: Planes) -> Tensor:
+    """[M] the plane whose rectangle is nearest to each glass Gaussian, position in `planes`."""
+    offsets = glass.means[:, None] - planes.centers
+    along = torch.stack([(offsets * axis).sum(-1) for axis in planes.axes()], dim=-1)
+    outside = (along.abs() - planes.half_sizes).clamp(min=0)
+    across = (offsets * planes.normals).sum(-1, keepdim=True)
+    return torch.cat([outside, across], dim=-1).square().sum(-1).argmin(dim=1)

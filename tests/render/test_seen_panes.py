@@ -1,0 +1,176 @@
+"""Panes seen through one another: the optics of several panes on a ray, tested by their properties."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import Tensor
+
+from glassplat.kernels.reference.color_space import linear_from_srgb
+from glassplat.losses.reflection import gradient_conflict
+from glassplat.render.contribution import contributions
+from glassplat.render.planar import Planar
+from glassplat.render.seen_panes import glass_owners, nearest_hits, seen_panes
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Scene
+from tests.render.tiny_scene import camera_at, concatenated, joined, pane, random_gaussians, showcase
+
+CAMERA = camera_at(0.0, 0.0, -0.2)
+FRONT, BACK = pane(2.0, label=1), pane(4.0, label=2, base_reflectance=0.4)
+
+
+def glass_at(z: float, seed: int) -> Gaussians:
+    """A dozen glass Gaussians close to z."""
+    glass = random_gaussians(12, (0.0, 0.0, z), seed=seed, glass=True)
+    return glass.with_tensors({"means": glass.means * torch.tensor([1.0, 1.0, 0.2]) + torch.tensor([0, 0, 0.8 * z])})
+
+
+def vitrine(*labels: int) -> Scene:
+    """`showcase` with things in the last of its two panes' mirror images, and those of the panes that are named."""
+    between = random_gaussians(10, (0.1, -0.1, 3.0), seed=7)
+    planes = {1: FRONT, 2: BACK}
+    glass = {1: glass_at(2.0, 3), 2: glass_at(4.0, 4)}
+    scene = showcase(joined(*(planes[label] for label in labels)))
+    return replace(
+        scene,
+        primary=concatenated(scene.primary, between),
+        glass=concatenated(*(glass[label] for label in labels)),
+    )
+
+
+def light(image: Tensor) -> Tensor:
+    return linear_from_srgb(image)
+
+
+def test_each_pane_lays_its_reflection_over_what_is_behind_it() -> None:
+    both, front, back = (Planar()(vitrine(*labels), CAMERA) for labels in ((1, 2), (1,), (2,)))
+    near, far = (frame.layers["strength"][..., None] for frame in (front, back))
+    expected = (1 - far) * light(back.layers["transmission"]) + far * light(back.layers["reflection"])
+    expected = (1 - near) * expected + near * light(front.layers["reflection"])
+    assert float((near * far).max()) > 0.03
+    torch.testing.assert_close(light(both.rgb), expected, rtol=1e-4, atol=2e-5)
+
+
+def test_the_layers_are_those_of_the_nearest_pane() -> None:
+    both, front, back = (Planar()(vitrine(*labels), CAMERA) for labels in ((1, 2), (1,), (2,)))
+    torch.testing.assert_close(both.layers["strength"], front.layers["strength"])
+    torch.testing.assert_close(both.layers["reflection"], front.layers["reflection"])
+    # What the farther pane reflects comes through the nearer one.
+    torch.testing.assert_close(both.layers["transmission"], back.rgb)
+
+
+def test_all_panes_together_recombine_with_the_image_without_panes() -> None:
+    both, front, back = (Planar()(vitrine(*labels), CAMERA).layers for labels in ((1, 2), (1,), (2,)))
+    torch.testing.assert_close(both["without_panes"], back["transmission"])
+    torch.testing.assert_close(1 - both["share"], (1 - front["strength"]) * (1 - back["strength"]))
+    torch.testing.assert_close(front["share"], front["strength"])
+
+
+def test_the_order_in_which_panes_are_listed_does_not_matter() -> None:
+    frames = [Planar()(vitrine(*labels), CAMERA) for labels in ((1, 2), (2, 1))]
+    torch.testing.assert_close(frames[0].rgb, frames[1].rgb)
+    for name, layer in frames[0].layers.items():
+        torch.testing.assert_close(frames[1].layers[name], layer)
+
+
+def test_panes_change_places_for_a_camera_on_the_other_side() -> None:
+    half_turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
+    half_turn[2, 3] = 6.0
+    other = replace(CAMERA, cam_from_world=half_turn)
+    both, front, back = (Planar()(vitrine(*labels), other).layers for labels in ((1, 2), (1,), (2,)))
+    assert float((front["strength"] * back["strength"]).max()) > 0.02
+    torch.testing.assert_close(both["strength"], back["strength"])
+    torch.testing.assert_close(both["reflection"], back["reflection"])
+
+
+def test_a_mirror_behind_glass_shows_the_room() -> None:
+    mirror = pane(4.0, label=2, base_reflectance=1 - 1e-9)
+    scene = replace(vitrine(1, 2), planes=joined(FRONT, mirror))
+    room = scene.primary.select(scene.primary.means[:, 2] < 1.0)
+    frames = [Planar()(replace(scene, primary=primary), CAMERA) for primary in (scene.primary, room)]
+    through_glass = frames[1].layers["transmission"] - frames[1].layers["without_panes"]
+    assert float(through_glass.abs().max()) > 0.05
+    assert float(frames[0].layers["share"].max()) > 0.5
+
+
+@pytest.mark.parametrize("count", [3, 5])
+def test_any_number_of_panes_may_stand_one_behind_another(count: int) -> None:
+    depths = [1.5 + 0.5 * k for k in range(count)]
+    planes = joined(*(pane(depth, label=k + 1) for k, depth in enumerate(depths)))
+    glass = concatenated(*(glass_at(depth, 20 + k) for k, depth in enumerate(depths)))
+    scene = replace(vitrine(1, 2), planes=planes, glass=glass)
+    share = Planar()(scene, CAMERA).layers["share"]
+    passed = torch.ones_like(share)
+    for k in range(count):
+        own = glass.select(glass_owners(glass, planes) == k)
+        alone = replace(scene, planes=planes.select([k]), glass=own)
+        passed = passed * (1 - Planar()(alone, CAMERA).layers["strength"])
+    torch.testing.assert_close(1 - share, passed)
+
+
+def test_panes_beside_each_other_are_rendered_as_ever() -> None:
+    left, right = (replace(pane(2.0, half=0.4, label=label)) for label in (1, 2))
+    right = right.with_tensors({"centers": right.centers + torch.tensor([1.2, 0.0, 0.0])})
+    seen = seen_panes(planes := joined(left, right), CAMERA, nearest_hits(planes, CAMERA))
+    assert len(seen.order) == 1
+
+
+def test_the_panes_on_a_ray_come_in_the_order_of_their_depths() -> None:
+    planes = joined(*(pane(z, half=half, label=k + 1) for k, (z, half) in enumerate([(4, 3), (2, 0.6), (3, 1)])))
+    seen = seen_panes(planes, CAMERA, nearest_hits(planes, CAMERA))
+    nearness = torch.tensor([1.0, 3.0, 2.0, 0.0])
+    assert len(seen.order) == 3 and bool((seen.order[2] >= 0).any())
+    for before, after in pairwise(seen.order):
+        there = after >= 0
+        assert bool((nearness[before.long()] > nearness[after.long()])[there].all())
+        assert bool((before[there] >= 0).all())
+
+
+def test_panes_that_no_pixel_shows_are_left_out() -> None:
+    planes = joined(pane(-3.0, label=1), pane(2.0, label=2), pane(4.0, label=3))
+    seen = seen_panes(planes, CAMERA, nearest_hits(planes, CAMERA))
+    assert seen.planes.labels == (2, 3) and seen.rows.tolist() == [1, 2]
+    assert [int(pane.max()) for pane in seen.order] == [0, 1]
+    assert seen.windows.tolist() == [[0.0, 0.0, 40.0, 28.0]] * 2
+
+
+def test_glass_belongs_to_the_pane_it_lies_on() -> None:
+    beside = FRONT.with_tensors({"centers": torch.tensor([[5.0, 0.0, 2.0]]), "half_sizes": torch.tensor([[1.0, 1.0]])})
+    glass = concatenated(glass_at(2.0, 3), glass_at(4.0, 4))
+    planes = joined(BACK, pane(2.0, half=3.0), replace(beside.to("cpu"), labels=(3,)))
+    assert glass_owners(glass, planes).tolist() == [1] * 12 + [0] * 12
+
+
+@pytest.mark.parametrize("name", ["planes.centers", "planes.logit_reflectances", "glass.logit_mark", "glass.means"])
+def test_gradients_match_finite_differences(name: str) -> None:
+    scene = vitrine(1, 2)
+    weights = torch.randn(28, 40, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+
+    def objective(values: Tensor) -> Tensor:
+        return (Planar()(scene.with_parameters({name: values}), CAMERA).rgb * weights).sum()
+
+    values = scene.parameters()[name].clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(objective(values), values)
+    direction = torch.randn(values.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    with torch.no_grad():
+        slope = (objective(values + 1e-6 * direction) - objective(values - 1e-6 * direction)) / 2e-6
+    assert float(gradient.flatten(1 if gradient.ndim > 1 else 0).abs().sum()) > 0
+    torch.testing.assert_close((gradient * direction).sum(), slope, rtol=1e-4, atol=1e-5)
+
+
+def test_what_a_pane_mirrors_only_through_another_counts_as_seen() -> None:
+    scene = vitrine(1, 2)
+    both, front = (contributions(scene_of, CAMERA) for scene_of in (scene, replace(scene, planes=FRONT)))
+    between = slice(30, None)
+    assert float((both - front)[between].max()) > 0.5
+
+
+def test_the_conflict_of_edges_does_not_ask_the_farther_reflection() -> None:
+    scene = vitrine(1, 2)
+    frame = Planar()(scene, CAMERA)
+    alone = Planar()(vitrine(1), CAMERA)
+    losses = [gradient_conflict(f, None, scene) for f in (frame, alone)]  # type: ignore[arg-type]
+    torch.testing.assert_close(*losses)
