@@ -56,7 +56,7 @@ class Dereflect:
     def _image(self, stored: StoredRun, renderer: Planar, view: View) -> Tensor:
         frame, _ = timed_render(renderer, stored.scene, view)
         if self.source == "render":
-            return quantized(frame.layers["transmission"])
+            return quantized(frame.layers["without_panes"])
         # Not `view.photo`, which stays in memory: a capture may be larger than that.
         return dereflected_photo(frame, view.read_photo(), renderer.blend)
 

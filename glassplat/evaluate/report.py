@@ -14,7 +14,7 @@ from glassplat.evaluate.sheet import comparison_sheet
 from glassplat.evaluate.uses import Uses
 from glassplat.files.atomic import atomic_write
 from glassplat.files.images import write_image
-from glassplat.render.planar import Blend
+from glassplat.render.glazing import Blend
 
 METRICS = {
     "psnr": ("PSNR", "{:.2f} dB"),

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
-from glassplat.kernels.reference.color_space import linear_from_srgb, srgb_from_linear
 from glassplat.render.frame import Frame
-from glassplat.render.planar import Blend
+from glassplat.render.glazing import Blend, curves
 
 TRUSTED_STRENGTH, DISTRUSTED_STRENGTH = 0.35, 0.65
 """Between these shares of reflected light, the photograph gives way to the rendered transmission."""
@@ -44,7 +41,7 @@ def dereflected_photo(frame: Frame, photo: Tensor, blend: Blend) -> Tensor:
     """
     if photo.shape != frame.rgb.shape:
         raise ValueError(f"the photograph is {list(photo.shape)}, the frame {list(frame.rgb.shape)}; expected one size")
-    decode, encode = _curves(blend)
+    decode, encode = curves(blend)
     without_panes, share = frame.layers["without_panes"], frame.layers["share"][..., None]
     photographed = photo.to(torch.float32) / 255
     light, reflected = decode(photographed), decode(frame.rgb) - (1 - share) * decode(without_panes)
@@ -66,7 +63,7 @@ def as_mirror_image(frame: Frame, blend: Blend) -> Tensor:
         frame: a view rendered by `planar`, with all its layers.
         blend: the space in which the run holds Eq. 1.
     """
-    decode, encode = _curves(blend)
+    decode, encode = curves(blend)
     layers = frame.layers
     share = (layers["mask"] * (layers["strength"] > 0))[..., None]
     behind, mirrored = decode(layers["transmission"]), decode(layers["reflection"])
@@ -90,12 +87,3 @@ def _smooth_step(values: Tensor, low: float, high: float) -> Tensor:
     """0 up to `low`, 1 from `high` on, and a curve without kinks between."""
     share = ((values - low) / (high - low)).clamp(0, 1)
     return share * share * (3 - 2 * share)
-
-
-def _curves(blend: Blend) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
-    """Into the space in which light is blended, and back to sRGB."""
-    return (linear_from_srgb, srgb_from_linear) if blend == "linear" else (_unchanged, _unchanged)
-
-
-def _unchanged(color: Tensor) -> Tensor:
-    return color

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.bin_tiles import bin_tiles
-from glassplat.kernels.blend_panes import blend_panes
 from glassplat.kernels.composite import composite
-from glassplat.kernels.panes import BlendedPanes, Fresnel
+from glassplat.kernels.panes import Fresnel
 from glassplat.kernels.splats import Deviation, Projected, Splats
 from glassplat.render.frame import Frame, ScreenPass
+from glassplat.render.glazing import Blend, glazed, own_masks, visibilities
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
     joined_probe,
@@ -23,21 +23,12 @@ from glassplat.render.rasterize import (
     project_gaussians,
     screen_pass,
 )
-from glassplat.render.seen_panes import (
-    SeenPanes,
-    glass_owners,
-    nearest_hits,
-    own_masks,
-    seen_panes,
-    visibilities,
-)
+from glassplat.render.seen_panes import SeenPanes, glass_owners, nearest_hits, seen_panes
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
 from glassplat.scene.pose import mirror_matrices
 from glassplat.scene.scene import Scene
-
-Blend = Literal["srgb", "linear"]
 
 
 class FirstPass(NamedTuple):
@@ -60,14 +51,6 @@ class SecondPass(NamedTuple):
     screen: tuple[ScreenPass, ...]
 
 
-class Glazed(NamedTuple):
-    """An image behind its panes: what comes through the nearest, what that one adds, and what all of them add."""
-
-    transmission: Tensor
-    nearest: BlendedPanes
-    share: Tensor
-
-
 @dataclass(frozen=True)
 class Planar:
     """Renders transmission, reflection and their blend (TR-Gaussians, Section III-A).
@@ -82,7 +65,8 @@ class Planar:
     only in tiles where that pane is seen.
 
     Where panes are seen through one another, Eq. 1 holds for one after the other, from the farthest on: the C_t of a
-    pane is the C of the pane behind it (the paper shows the nearest only). R, C_r and C_t are layers of the nearest.
+    pane is the C of the pane behind it (the paper shows the nearest only). The layers R, C_r and C_t are those of the
+    nearest one that is more than `FAINT`ly visible; see `glazing`.
 
     Layers: `transmission`, `reflection` [H, W, 3]; `strength`, `mask`, `depth`, `alpha`, `hit`
     [H, W]; `without_panes` [H, W, 3], the image were there no panes, and `share` [H, W], how much of what is seen the
@@ -123,15 +107,20 @@ class Planar:
             return Frame(first.image, layers | {"strength": nothing, "share": nothing}, first.screen)
         seen = seen_panes(scene.planes, camera, hits, first.mask)
         second = self._second_pass(scene, camera, seen, probed)
-        glazed = self._glazed(scene, camera, seen, first, second)
-        layers |= {
-            "transmission": glazed.transmission,
-            "reflection": glazed.nearest.reflection,
-            "strength": glazed.nearest.strength,
-            "share": glazed.share,
-        }
-        mirrored = (replace(record, weight=float(glazed.share.detach().sum() / hit.sum())) for record in second.screen)
-        return Frame(glazed.nearest.rgb, layers, (*first.screen, *mirrored))
+        masks = self._visibilities(scene, camera, seen, first)
+        result = glazed(
+            first.image,
+            seen,
+            masks,
+            second.reflections,
+            camera,
+            fresnel=self.fresnel,
+            intensity=self.intensity,
+            blend=self.blend,
+        )
+        layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
+        mirrored = (replace(record, weight=float(result.share.detach().sum() / hit.sum())) for record in second.screen)
+        return Frame(result.rgb, layers, (*first.screen, *mirrored))
 
     def _first_pass(self, scene: Scene, camera: Camera, probed: bool) -> FirstPass:
         near = NEAR_PER_EXTENT * scene.extent
@@ -183,30 +172,13 @@ class Planar:
             reflections = torch.cat([colors, reflections[..., 3:]], dim=-1)
         return SecondPass(reflections, screen)
 
-    def _glazed(self, scene: Scene, camera: Camera, seen: SeenPanes, first: FirstPass, second: SecondPass) -> Glazed:
-        """Lays one pane after the other before the image, from the farthest on each ray to the nearest."""
-        masks = [first.mask]
-        if len(seen.order) > 1:
-            owners = glass_owners(scene.glass, scene.planes)
-            own = own_masks(seen, first.splats, first.marks, owners, (camera.height, camera.width))
-            masks = visibilities(seen, first.mask, own)
-        image, share = first.image, torch.zeros_like(first.mask)
-        for mask, pane in zip(reversed(masks), reversed(seen.order), strict=True):
-            behind = image
-            nearest = blend_panes(
-                behind,
-                mask,
-                second.reflections,
-                pane,
-                seen.planes.normals @ camera.cam_from_world[:3, :3].T,
-                seen.planes.base_reflectances,
-                camera.intrinsics,
-                fresnel=self.fresnel,
-                intensity=self.intensity,
-                linear=self.blend == "linear",
-            )
-            image, share = nearest.rgb, nearest.strength + (1 - nearest.strength) * share
-        return Glazed(behind, nearest, share)
+    def _visibilities(self, scene: Scene, camera: Camera, seen: SeenPanes, first: FirstPass) -> list[Tensor]:
+        """[H, W] for each of `seen.order`: how much of that pane is visible."""
+        if len(seen.order) == 1:
+            return [first.mask]
+        owners = glass_owners(scene.glass, scene.planes)
+        own = own_masks(seen, first.splats, first.marks, owners, (camera.height, camera.width))
+        return visibilities(seen, first.mask, own)
 
 
 def detached(gaussians: Gaussians) -> Gaussians:

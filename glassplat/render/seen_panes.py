@@ -1,4 +1,4 @@
-"""Which panes a view shows, one behind another, and how much of each can be seen."""
+"""Which panes a view shows, one behind another."""
 
 from __future__ import annotations
 
@@ -7,11 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from glassplat.kernels.bin_tiles import TILE, bin_tiles
-from glassplat.kernels.composite import composite
 from glassplat.kernels.pane_hits import pane_hits
 from glassplat.kernels.panes import PaneHits, Panes
-from glassplat.kernels.splats import Splats
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
@@ -87,42 +84,6 @@ def _joined_windows(hits: list[PaneHits]) -> Tensor:
     first = torch.where(empty, torch.inf, windows[..., :2]).amin(dim=0)
     joined = torch.cat([first, windows[..., 2:].amax(dim=0)], dim=1)
     return torch.where(empty.all(dim=0), 0, joined)
-
-
-def visibilities(seen: SeenPanes, joint: Tensor, own: Tensor) -> list[Tensor]:
-    """[H, W] for each of `seen.order`: how much of that pane is visible.
-
-    Args:
-        seen: panes seen through one another.
-        joint: [H, W] mask of all panes together, which holds where a ray meets one pane.
-        own: [K, H, W] mask of each, from `own_masks`.
-    """
-    nearest, *_ = masks = [own.gather(0, pane.clamp(min=0).long()[None])[0] for pane in seen.order]
-    return [torch.where(seen.order[1] >= 0, nearest, joint), *masks[1:]]
-
-
-def own_masks(seen: SeenPanes, splats: Splats, marks: Tensor, owners: Tensor, size: tuple[int, int]) -> Tensor:
-    """[K, H, W] mask of each pane as if it were the only one, in tiles where it is one of several.
-
-    As M of TR-Gaussians, Eq. 7, but other panes, through which it is seen, do not hide it.
-
-    Args:
-        seen: panes seen through one another.
-        splats: [1, G] primary ones, then glass.
-        marks: [1, M] of the glass ones.
-        owners: [M] the pane that each glass one is part of, position among the scene's planes.
-        size: height and width of the image.
-    """
-    count, (height, width), num_primary = len(seen.planes), size, splats.radii.shape[1] - len(owners)
-    means2d, conics, opacities, depths, radii = (field.expand(count, *field.shape[1:]) for field in splats)
-    foreign = owners != seen.rows[:, None]
-    kept = torch.cat([foreign.new_zeros(count, num_primary), foreign], dim=1).logical_not()
-    splats = Splats(means2d, conics, opacities, depths, radii * kept[..., None])
-    several = (seen.order[1] >= 0).to(torch.float32)[None]
-    active = torch.nn.functional.max_pool2d(several, TILE, ceil_mode=True) > 0
-    bins = bin_tiles(splats, width, height, seen.tiles & active)
-    nothing = marks.new_zeros(count, splats.radii.shape[1], 1)
-    return composite(splats, nothing, bins, marks=marks.expand(count, -1), num_primary=num_primary).mask
 
 
 @torch.no_grad()

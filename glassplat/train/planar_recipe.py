@@ -13,7 +13,8 @@ from glassplat.kernels.panes import Fresnel
 from glassplat.losses.geometry import depth_deviation_loss
 from glassplat.losses.reflection import gradient_conflict, intensity_departure, mask_loss
 from glassplat.losses.term import LossTerm, weighted
-from glassplat.render.planar import Blend, Planar
+from glassplat.render.glazing import Blend
+from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, GrowSh, PerturbOpacity

@@ -12,7 +12,7 @@ from glassplat.evaluate.sheet import BACKGROUND, CAPTION_HEIGHT, MARGIN, TITLE_H
 from glassplat.evaluate.surface_truth import TrueSurface
 from glassplat.files.images import read_image
 from glassplat.render.dereflect import dereflected_photo
-from glassplat.render.planar import Blend
+from glassplat.render.glazing import Blend
 from glassplat.scene.plane import Planes
 
 

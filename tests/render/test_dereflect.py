@@ -10,7 +10,8 @@ import torch
 from glassplat.kernels.reference.color_space import linear_from_srgb, srgb_from_linear
 from glassplat.render.dereflect import as_mirror_image, dereflected_photo
 from glassplat.render.frame import Frame
-from glassplat.render.planar import Blend, Planar
+from glassplat.render.glazing import Blend
+from glassplat.render.planar import Planar
 from glassplat.scene.plane_edits import as_mirrors
 from tests.render.tiny_scene import camera_at, in_single_precision, showcase
 

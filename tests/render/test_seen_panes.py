@@ -12,6 +12,7 @@ from torch import Tensor
 from glassplat.kernels.reference.color_space import linear_from_srgb
 from glassplat.losses.reflection import gradient_conflict
 from glassplat.render.contribution import contributions
+from glassplat.render.glazing import FAINT, Blend, curves
 from glassplat.render.planar import Planar
 from glassplat.render.seen_panes import glass_owners, nearest_hits, seen_panes
 from glassplat.scene.gaussians import Gaussians
@@ -56,10 +57,34 @@ def test_each_pane_lays_its_reflection_over_what_is_behind_it() -> None:
 
 def test_the_layers_are_those_of_the_nearest_pane() -> None:
     both, front, back = (Planar()(vitrine(*labels), CAMERA) for labels in ((1, 2), (1,), (2,)))
-    torch.testing.assert_close(both.layers["strength"], front.layers["strength"])
-    torch.testing.assert_close(both.layers["reflection"], front.layers["reflection"])
+    seen = front.layers["mask"] >= FAINT
+    assert bool(seen.any()) and not bool(seen.all())
+    for name in ("strength", "reflection"):
+        torch.testing.assert_close(both.layers[name][seen], front.layers[name][seen])
     # What the farther pane reflects comes through the nearer one.
-    torch.testing.assert_close(both.layers["transmission"], back.rgb)
+    torch.testing.assert_close(both.layers["transmission"][seen], back.rgb[seen])
+
+
+def test_where_the_nearest_pane_cannot_be_seen_the_layers_are_those_of_the_next() -> None:
+    scene = vitrine(1, 2)
+    unmarked = scene.glass.channels["logit_mark"].clone()
+    unmarked[:12] = -80
+    invisible = replace(scene, glass=scene.glass.with_tensors({"logit_mark": unmarked}))
+    both, back = (Planar()(of, CAMERA) for of in (invisible, vitrine(2)))
+    torch.testing.assert_close(both.rgb, back.rgb)
+    where = back.layers["strength"] > 0
+    assert bool(where.any())
+    for name in ("transmission", "strength", "reflection"):
+        torch.testing.assert_close(both.layers[name][where], back.layers[name][where], rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("blend", ["linear", "srgb"])
+def test_the_layers_recombine_to_the_image(blend: Blend) -> None:
+    frame = Planar(blend=blend)(vitrine(1, 2), CAMERA)
+    decode, _ = curves(blend)
+    share = frame.layers["strength"][..., None]
+    expected = (1 - share) * decode(frame.layers["transmission"]) + share * decode(frame.layers["reflection"])
+    torch.testing.assert_close(decode(frame.rgb), expected, rtol=1e-4, atol=2e-5)
 
 
 def test_all_panes_together_recombine_with_the_image_without_panes() -> None:
@@ -82,11 +107,14 @@ def test_panes_change_places_for_a_camera_on_the_other_side() -> None:
     other = replace(CAMERA, cam_from_world=half_turn)
     both, front, back = (Planar()(vitrine(*labels), other).layers for labels in ((1, 2), (1,), (2,)))
     assert float((front["strength"] * back["strength"]).max()) > 0.02
-    torch.testing.assert_close(both["strength"], back["strength"])
-    torch.testing.assert_close(both["reflection"], back["reflection"])
+    seen = back["mask"] >= FAINT
+    assert bool(seen.any())
+    for name in ("strength", "reflection"):
+        torch.testing.assert_close(both[name][seen], back[name][seen])
 
 
-def test_a_mirror_behind_glass_shows_the_room() -> None:
+def test_a_mirror_behind_glass_shows_the_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("glassplat.render.glazing.FAINT", 0.0)
     mirror = pane(4.0, label=2, base_reflectance=1 - 1e-9)
     scene = replace(vitrine(1, 2), planes=joined(FRONT, mirror))
     room = scene.primary.select(scene.primary.means[:, 2] < 1.0)
@@ -168,7 +196,8 @@ def test_what_a_pane_mirrors_only_through_another_counts_as_seen() -> None:
     assert float((both - front)[between].max()) > 0.5
 
 
-def test_the_conflict_of_edges_does_not_ask_the_farther_reflection() -> None:
+def test_the_conflict_of_edges_does_not_ask_the_farther_reflection(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("glassplat.render.glazing.FAINT", 0.0)
     scene = vitrine(1, 2)
     frame = Planar()(scene, CAMERA)
     alone = Planar()(vitrine(1), CAMERA)

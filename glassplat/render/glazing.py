@@ -1,0 +1,143 @@
+"""Laying panes before an image: one after the other, from the farthest on each ray to the nearest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from glassplat.kernels.bin_tiles import TILE, bin_tiles
+from glassplat.kernels.blend_panes import blend_panes
+from glassplat.kernels.composite import composite
+from glassplat.kernels.panes import BlendedPanes, Fresnel
+from glassplat.kernels.reference.color_space import linear_from_srgb, srgb_from_linear
+from glassplat.kernels.splats import Splats
+from glassplat.render.seen_panes import SeenPanes
+from glassplat.scene.camera import Camera
+
+Blend = Literal["srgb", "linear"]
+FAINT = 0.5
+"""A pane that is less visible in a pixel, as at its rim, leaves the layers to the pane behind it."""
+
+
+class Glazed(NamedTuple):
+    """An image behind panes.
+
+    rgb [H, W, 3]; the layers of each pixel's nearest pane: transmission and reflection [H, W, 3], strength [H, W]; and
+    share [H, W], how much of what is seen all panes add.
+    """
+
+    rgb: Tensor
+    transmission: Tensor
+    reflection: Tensor
+    strength: Tensor
+    share: Tensor
+
+
+def glazed(
+    image: Tensor, seen: SeenPanes, masks: Sequence[Tensor], reflections: Tensor, camera: Camera,
+    *, fresnel: Fresnel, intensity: bool, blend: Blend,
+) -> Glazed:  # fmt: skip
+    """Applies Eq. 1 of TR-Gaussians for each pane on a ray, C_t being what all panes behind it make of the image.
+
+    Args:
+        image: [H, W, 3] without panes.
+        seen: the K panes, and their order.
+        masks: [H, W] for each of `seen.order`, visibility of that pane.
+        reflections: [K, H, W, 4] what each pane mirrors, and its intensity.
+        camera: of the view.
+        fresnel: as for `blend_panes`.
+        intensity: as for `blend_panes`.
+        blend: the space in which light adds up.
+    """
+    normals = seen.planes.normals @ camera.cam_from_world[:3, :3].T
+    share, laid = torch.zeros_like(masks[0]), []
+    for mask, pane in zip(reversed(masks), reversed(seen.order), strict=True):
+        result = blend_panes(
+            image,
+            mask,
+            reflections,
+            pane,
+            normals,
+            seen.planes.base_reflectances,
+            camera.intrinsics,
+            fresnel=fresnel,
+            intensity=intensity,
+            linear=blend == "linear",
+        )
+        laid.append((image, result))
+        image, share = result.rgb, result.strength + (1 - result.strength) * share
+    behind, nearest = laid.pop()
+    layers = (behind, nearest.reflection, nearest.strength)
+    faint = masks[0] < FAINT
+    for mask, (behind, farther) in zip(masks[1:], reversed(laid), strict=True):
+        layers = _joined_layers(layers, behind, farther, faint & (mask > 0), blend)
+        faint = faint & (mask < FAINT)
+    return Glazed(image, *layers, share)
+
+
+def _joined_layers(
+    layers: tuple[Tensor, Tensor, Tensor], behind: Tensor, farther: BlendedPanes, where: Tensor, blend: Blend
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Transmission, reflection and strength of a pane and the one behind it as if they were one, in some pixels.
+
+    They make the same image: R = R_1 + (1 - R_1) R_2 and R C_r = R_1 C_1 + (1 - R_1) R_2 C_2.
+    """
+    decode, encode = curves(blend)
+    transmission, reflection, strength = layers
+    first = strength[where]
+    second = (1 - first) * farther.strength[where]
+    both = first + second
+    light = first[:, None] * decode(reflection[where]) + second[:, None] * decode(farther.reflection[where])
+    return (
+        torch.where(where[..., None], behind, transmission),
+        reflection.index_put((where,), encode(light / both.clamp(min=1e-9)[:, None])),
+        strength.index_put((where,), both),
+    )
+
+
+def curves(blend: Blend) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
+    """Into the space in which light is blended, and back to sRGB."""
+    return (linear_from_srgb, srgb_from_linear) if blend == "linear" else (_unchanged, _unchanged)
+
+
+def _unchanged(color: Tensor) -> Tensor:
+    return color
+
+
+def visibilities(seen: SeenPanes, joint: Tensor, own: Tensor) -> list[Tensor]:
+    """[H, W] for each of `seen.order`: how much of that pane is visible.
+
+    Args:
+        seen: panes seen through one another.
+        joint: [H, W] mask of all panes together, which holds where a ray meets one pane.
+        own: [K, H, W] mask of each, from `own_masks`.
+    """
+    nearest, *_ = masks = [own.gather(0, pane.clamp(min=0).long()[None])[0] for pane in seen.order]
+    return [torch.where(seen.order[1] >= 0, nearest, joint), *masks[1:]]
+
+
+def own_masks(seen: SeenPanes, splats: Splats, marks: Tensor, owners: Tensor, size: tuple[int, int]) -> Tensor:
+    """[K, H, W] mask of each pane as if it were the only one, in tiles where it is one of several.
+
+    As M of TR-Gaussians, Eq. 7, but other panes, through which it is seen, do not hide it.
+
+    Args:
+        seen: panes seen through one another.
+        splats: [1, G] primary ones, then glass.
+        marks: [1, M] of the glass ones.
+        owners: [M] the pane that each glass one is part of, position among the scene's planes.
+        size: height and width of the image.
+    """
+    count, (height, width), num_primary = len(seen.planes), size, splats.radii.shape[1] - len(owners)
+    means2d, conics, opacities, depths, radii = (field.expand(count, *field.shape[1:]) for field in splats)
+    foreign = owners != seen.rows[:, None]
+    kept = torch.cat([foreign.new_zeros(count, num_primary), foreign], dim=1).logical_not()
+    splats = Splats(means2d, conics, opacities, depths, radii * kept[..., None])
+    several = (seen.order[1] >= 0).to(torch.float32)[None]
+    active = torch.nn.functional.max_pool2d(several, TILE, ceil_mode=True) > 0
+    bins = bin_tiles(splats, width, height, seen.tiles & active)
+    nothing = marks.new_zeros(count, splats.radii.shape[1], 1)
+    return composite(splats, nothing, bins, marks=marks.expand(count, -1), num_primary=num_primary).mask
