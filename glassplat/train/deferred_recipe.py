@@ -22,7 +22,13 @@ from glassplat.scene.environment import Environment
 from glassplat.scene.scene import Scene
 from glassplat.train.background import BLACK
 from glassplat.train.optimizer import Rate
-from glassplat.train.propagation import GrowShAfterPropagation, Propagate, PropagationSchedule, RefineEnvironment
+from glassplat.train.propagation import (
+    GrowShAfterPropagation,
+    Propagate,
+    PropagationSchedule,
+    RefineEnvironment,
+    ResetAfterPropagation,
+)
 from glassplat.train.splat_recipe import GaussianRates, image_terms
 from glassplat.train.stage import Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
@@ -147,6 +153,7 @@ class DeferredRecipe:
                 *population.edits,
                 GrowShAfterPropagation(Every(self.rhythm.sh)),
                 *population.resets,
+                *(ResetAfterPropagation.following(reset) for reset in population.resets),
                 Propagate(beat, self.propagation, self.schedule),
                 RefineEnvironment(self.refinements, self.texels),
             ),

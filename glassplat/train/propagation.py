@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
@@ -11,7 +11,7 @@ import torch
 from glassplat.data.dataset import Dataset
 from glassplat.densify.propagate import NormalPropagation
 from glassplat.render.environment import resized
-from glassplat.train.actions import GrowSh
+from glassplat.train.actions import GrowSh, ResetOpacity
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
 
@@ -102,6 +102,36 @@ class GrowShAfterPropagation(GrowSh):
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state`, once propagation has ended."""
         return has_ended(state) and super().apply(state, dataset, clock)
+
+
+@dataclass(frozen=True)
+class ResetAfterPropagation(ResetOpacity):
+    """Resets opacities once more, if propagation has gone on after the last regular reset.
+
+    Propagation raises every opacity, also of what only stands in the way, as in the hole of a ring. Most of that is
+    never lowered again without a reset.
+
+    Attributes:
+        when: its moments, of which it takes the first after the end of propagation; they begin after the regular ones.
+        regular: moments of the regular resets.
+    """
+
+    regular: Every = field(kw_only=True)
+
+    @staticmethod
+    def following(reset: ResetOpacity) -> ResetAfterPropagation:
+        """The one that comes after regular resets, at the moments at which they would go on."""
+        when = replace(reset.when, start=reset.when.stop, stop=1.0)
+        return ResetAfterPropagation(when, reset.ceiling, regular=reset.when)
+
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`, once, and only if no reset has come since propagation ended."""
+        if not has_ended(state):
+            return False
+        since = range(int(state.records[ENDED]) + 1, clock.step)
+        if any(when.due(replace(clock, step=step)) for step in since for when in (self.regular, self.when)):
+            return False
+        return super().apply(state, dataset, clock)
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ class Population:
     opacity: float = 0.1
     spread: float = 1.0
     edits: tuple[Action, ...] = ()
-    resets: tuple[Action, ...] = ()
+    resets: tuple[ResetOpacity, ...] = ()
     motions: tuple[Motion, ...] = ()
     terms: tuple[LossTerm, ...] = ()
     densify_until: float = 0.0

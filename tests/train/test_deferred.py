@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from glassplat.densify.propagate import NormalPropagation
+from glassplat.train.actions import ResetOpacity
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.messages import ActionDone, Message, StepDone
-from glassplat.train.propagation import ENDED, Propagate, PropagationSchedule
+from glassplat.train.propagation import ENDED, Propagate, PropagationSchedule, ResetAfterPropagation
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
@@ -77,6 +78,24 @@ def test_propagation_and_resets_never_meet() -> None:
     raised = {m.step for m in done if m.action == "propagate normals"}
     lowered = {m.step for m in done if m.action == "reset opacity"}
     assert raised and lowered and not raised & lowered
+
+
+@pytest.mark.parametrize(
+    ("ended", "resets"),
+    [(None, []), (10, []), (41, [60]), (70, [90]), (91, [])],
+    ids=["never", "before a regular reset", "after the last one", "late", "too late"],
+)
+def test_opacities_are_reset_once_after_propagation(ended: int | None, resets: list[int]) -> None:
+    regular = ResetOpacity(Every(0.1, stop=0.4, only_multiples_of=3))
+    state, action, done = fresh_state(), ResetAfterPropagation.following(regular), []
+    for step in range(1, 101):
+        clock = Clock(step, 100, 5)
+        if step == ended:
+            state.records[ENDED] = step
+        if action.due(clock) and action.apply(state, tiny_capture(), clock):
+            done.append(step)
+    assert done == resets
+    assert (float(state.scene.primary.logit_opacities.max()) < -4) == bool(resets)
 
 
 @pytest.mark.parametrize("pause", [3, 9, 15])
