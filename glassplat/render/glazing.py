@@ -25,8 +25,8 @@ FAINT = 0.5
 class Glazed(NamedTuple):
     """An image behind panes.
 
-    rgb [H, W, 3]; the layers of each pixel's nearest pane: transmission and reflection [H, W, 3], strength [H, W]; and
-    share [H, W], how much of what is seen all panes add.
+    rgb [H, W, 3]; transmission and reflection [H, W, 3] and strength [H, W] of the nearest pane that is not `FAINT`
+    in a pixel, joined with those before it; and share [H, W], how much of what is seen all panes add.
     """
 
     rgb: Tensor
@@ -73,7 +73,7 @@ def glazed(
     layers = (behind, nearest.reflection, nearest.strength)
     faint = masks[0] < FAINT
     for mask, (behind, farther) in zip(masks[1:], reversed(laid), strict=True):
-        layers = _joined_layers(layers, behind, farther, faint & (mask > 0), blend)
+        layers = _joined_layers(layers, behind, farther, faint & (farther.strength > 0), blend)
         faint = faint & (mask < FAINT)
     return Glazed(image, *layers, share)
 
@@ -93,7 +93,7 @@ def _joined_layers(
     light = first[:, None] * decode(reflection[where]) + second[:, None] * decode(farther.reflection[where])
     return (
         torch.where(where[..., None], behind, transmission),
-        reflection.index_put((where,), encode(light / both.clamp(min=1e-9)[:, None])),
+        reflection.index_put((where,), encode(light / both[:, None])),
         strength.index_put((where,), both),
     )
 
