@@ -87,14 +87,15 @@ def _joined_layers(
     """
     decode, encode = curves(blend)
     transmission, reflection, strength = layers
-    first = strength[where]
-    second = (1 - first) * farther.strength[where]
+    pixels = where.nonzero(as_tuple=True)
+    first = strength[pixels]
+    second = (1 - first) * farther.strength[pixels]
     both = first + second
-    light = first[:, None] * decode(reflection[where]) + second[:, None] * decode(farther.reflection[where])
+    light = first[:, None] * decode(reflection[pixels]) + second[:, None] * decode(farther.reflection[pixels])
     return (
-        torch.where(where[..., None], behind, transmission),
-        reflection.index_put((where,), encode(light / both[:, None])),
-        strength.index_put((where,), both),
+        transmission.index_put(pixels, behind[pixels]),
+        reflection.index_put(pixels, encode(light / both[:, None])),
+        strength.index_put(pixels, both),
     )
 
 
@@ -131,13 +132,30 @@ def own_masks(seen: SeenPanes, splats: Splats, marks: Tensor, owners: Tensor, si
         owners: [M] the pane that each glass one is part of, position among the scene's planes.
         size: height and width of the image.
     """
-    count, (height, width), num_primary = len(seen.planes), size, splats.radii.shape[1] - len(owners)
-    means2d, conics, opacities, depths, radii = (field.expand(count, *field.shape[1:]) for field in splats)
-    foreign = owners != seen.rows[:, None]
+    count, (height, width), several = len(seen.planes), size, seen.order[1] >= 0
+    near = _splats_near(splats, several)
+    is_glass = near >= splats.radii.shape[1] - len(owners)
+    num_primary = int((~is_glass).sum())
+    glass = near[is_glass] - (splats.radii.shape[1] - len(owners))
+    means2d, conics, opacities, depths, radii = (
+        field[:, near].expand(count, len(near), *field.shape[2:]) for field in splats
+    )
+    foreign = owners[glass] != seen.rows[:, None]
     kept = torch.cat([foreign.new_zeros(count, num_primary), foreign], dim=1).logical_not()
     splats = Splats(means2d, conics, opacities, depths, radii * kept[..., None])
-    several = (seen.order[1] >= 0).to(torch.float32)[None]
-    active = torch.nn.functional.max_pool2d(several, TILE, ceil_mode=True) > 0
+    active = torch.nn.functional.max_pool2d(several.to(torch.float32)[None], TILE, ceil_mode=True) > 0
     bins = bin_tiles(splats, width, height, seen.tiles & active)
-    nothing = marks.new_zeros(count, splats.radii.shape[1], 1)
-    return composite(splats, nothing, bins, marks=marks.expand(count, -1), num_primary=num_primary).mask
+    nothing = marks.new_zeros(count, len(near), 1)
+    return composite(splats, nothing, bins, marks=marks[:, glass].expand(count, -1), num_primary=num_primary).mask
+
+
+@torch.no_grad()
+def _splats_near(splats: Splats, pixels: Tensor) -> Tensor:
+    """Positions, in order, of the splats [1, G] that may reach the smallest window around the pixels [H, W] bool."""
+    rows, columns = (pixels.any(dim=axis).nonzero() for axis in (1, 0))
+    edges = torch.stack([columns.aminmax().min, rows.aminmax().min, columns.aminmax().max, rows.aminmax().max])
+    # Whole tiles, all of which are traversed.
+    low, high = edges[:2] // TILE * TILE, (edges[2:] // TILE + 1) * TILE
+    means, radii = splats.means2d[0], splats.radii[0]
+    reaches = (means + radii >= low) & (means - radii <= high) & (radii > 0)
+    return reaches.all(dim=1).nonzero().flatten()
