@@ -116,8 +116,8 @@ def visibilities(seen: SeenPanes, joint: Tensor, own: Tensor) -> list[Tensor]:
         joint: [H, W] mask of all panes together, which holds where a ray meets one pane.
         own: [K, H, W] mask of each, from `own_masks`.
     """
-    nearest, *_ = masks = [own.gather(0, pane.clamp(min=0).long()[None])[0] for pane in seen.order]
-    return [torch.where(seen.order[1] >= 0, nearest, joint), *masks[1:]]
+    nearest, *farther = (own.gather(0, pane.clamp(min=0).long()[None])[0] for pane in seen.order)
+    return [torch.where(seen.order[1] >= 0, nearest, joint), *farther]
 
 
 def own_masks(seen: SeenPanes, splats: Splats, marks: Tensor, owners: Tensor, size: tuple[int, int]) -> Tensor:
@@ -133,10 +133,9 @@ def own_masks(seen: SeenPanes, splats: Splats, marks: Tensor, owners: Tensor, si
         size: height and width of the image.
     """
     count, (height, width), several = len(seen.planes), size, seen.order[1] >= 0
-    near = _splats_near(splats, several)
-    is_glass = near >= splats.radii.shape[1] - len(owners)
-    num_primary = int((~is_glass).sum())
-    glass = near[is_glass] - (splats.radii.shape[1] - len(owners))
+    near, first_glass = _splats_near(splats, several), splats.radii.shape[1] - len(owners)
+    glass = near[near >= first_glass] - first_glass
+    num_primary = len(near) - len(glass)
     means2d, conics, opacities, depths, radii = (
         field[:, near].expand(count, len(near), *field.shape[2:]) for field in splats
     )

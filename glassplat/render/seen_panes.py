@@ -69,12 +69,15 @@ def seen_panes(planes: Planes, camera: Camera, first: PaneHits, mask: Tensor | N
             break
         hits.append(further)
     tiles = torch.stack([h.tiles for h in hits]).any(dim=0)
+    windows = first.windows if len(hits) == 1 else _joined_windows(hits)
     seen = tiles.flatten(1).any(dim=1)
+    rows = seen.nonzero().flatten()
+    if len(rows) == len(planes):
+        return SeenPanes(planes, rows, tuple(h.pane for h in hits), tiles, windows)
     # The last entry is for index -1, pixels without a pane.
     position = torch.where(torch.cat([seen, seen.new_zeros(1)]), torch.cat([seen.cumsum(0) - 1, seen.new_ones(1)]), -1)
     order = tuple(position[h.pane.long()].to(torch.int32) for h in hits)
-    rows = seen.nonzero().flatten()
-    return SeenPanes(planes.select(rows.tolist()), rows, order, tiles[seen], _joined_windows(hits)[seen])
+    return SeenPanes(planes.select(rows.tolist()), rows, order, tiles[seen], windows[seen])
 
 
 def _joined_windows(hits: list[PaneHits]) -> Tensor:
