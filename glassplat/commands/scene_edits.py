@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from glassplat.data.errors import InputError
+from glassplat.data.errors import InputError, input_checked
 from glassplat.files.environment_image import read_equirect
 from glassplat.render.environment import environment_from_equirect
 from glassplat.scene.plane_edits import as_mirrors, shifted, tilted, with_reflectance, without_glass
@@ -45,7 +45,7 @@ class SceneEdits:
         if replace(self, surroundings=None) == SceneEdits():
             return scene
         self._check(scene)
-        try:
+        with input_checked():
             for label, reflectance in self.reflectance.items():
                 scene = with_reflectance(scene, label, reflectance)
             for label, angles in self.tilt.items():
@@ -53,8 +53,6 @@ class SceneEdits:
             for label, distance in self.shift.items():
                 scene = shifted(scene, label, distance)
             scene = as_mirrors(scene, self.as_mirror)
-        except ValueError as error:
-            raise InputError(str(error)) from error
         return without_glass(scene) if self.remove_glass else scene
 
     def _check(self, scene: Scene) -> None:

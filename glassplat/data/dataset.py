@@ -12,7 +12,7 @@ import torch
 from glassplat.data import colmap, mirror_nerf, transforms
 from glassplat.data.axes import axes_evidence
 from glassplat.data.capture import Capture, Loader, PointCloud, Shot
-from glassplat.data.errors import InputError, first_names
+from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.data.masks import MaskSet, Polarity, find_masks, known_masks
 from glassplat.data.random_points import points_in_view
 from glassplat.data.view import WHITE, PreparedView, Rgb, View, ViewOptions, prepare_view
@@ -152,10 +152,8 @@ def _check_axes(train: tuple[View, ...], points: PointCloud | None, format_name:
 
 def _any_transparent(shots: list[Shot]) -> bool:
     """Whether a photograph has transparent pixels."""
-    try:
+    with input_checked():
         return any(is_transparent(shot.image_path) for shot in shots)
-    except ValueError as error:
-        raise InputError(str(error)) from error
 
 
 def _check_names(shots: list[Shot]) -> None:

@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class InputError(ValueError):
     """The data set cannot be used as it is; the message says what was expected, what came and what to do."""
+
+
+@contextmanager
+def input_checked() -> Iterator[None]:
+    """Turns the ValueError of a reader or an edit, whose message already says what is wrong, into an InputError."""
+    try:
+        yield
+    except ValueError as error:
+        raise InputError(str(error)) from error
 
 
 def first_names(names: list[str], limit: int = 5) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from glassplat.data.errors import InputError, first_names
+from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.files.images import open_image
 
 HIGHEST_LABEL = 64
@@ -45,10 +45,8 @@ def read_mask_values(path: Path) -> MaskValues:
     Raises:
         InputError: the file is no image, or its values are neither labels nor black and white.
     """
-    try:
+    with input_checked():
         image = open_image(path)
-    except ValueError as error:
-        raise InputError(str(error)) from error
     shades = _shades(image, path)
     counts = np.bincount(shades.ravel(), minlength=WHITE + 1)
     lossy = path.suffix.lower() in LOSSY_SUFFIXES
@@ -65,10 +63,8 @@ def read_mask_at_threshold(path: Path) -> MaskValues:
     Raises:
         InputError: the file is no image.
     """
-    try:
+    with input_checked():
         image = open_image(path)
-    except ValueError as error:
-        raise InputError(str(error)) from error
     shades = _shades(image, path)
     if path.suffix.lower() not in LOSSY_SUFFIXES and not (shades > HIGHEST_LABEL).any():
         return MaskValues("labels" if shades.any() else "empty", shades)

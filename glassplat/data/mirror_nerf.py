@@ -26,7 +26,7 @@ import numpy as np
 
 from glassplat.data.axes import AxesEvidence, axes_evidence
 from glassplat.data.capture import Capture, PointCloud, Shot
-from glassplat.data.errors import InputError, first_names
+from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.data.mask_values import read_mask_at_threshold
 from glassplat.data.masks import MASK_FOLDER, PaneMask
 from glassplat.data.transforms_file import (
@@ -136,10 +136,8 @@ def _in_pixels_of(path: Path, intrinsics: tuple[float, float, float, float]) -> 
     Raises:
         InputError: the photograph cannot be read, or is of another shape than what was calibrated.
     """
-    try:
+    with input_checked():
         width, height = image_size(path)
-    except ValueError as error:
-        raise InputError(str(error)) from error
     fx, fy, cx, cy = intrinsics
     across, down = 2 * cx / width, 2 * cy / height
     if not (across > 0 and abs(down / across - 1) < SAME_SIZE):

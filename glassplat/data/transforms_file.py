@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from glassplat.data.capture import PointCloud, Shot
-from glassplat.data.errors import InputError, first_names
+from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.data.poses import rigid_pose
 from glassplat.data.random_points import GREY
 from glassplat.data.transforms_lens import lens_from_settings
@@ -103,10 +103,8 @@ def read_points(root: Path, settings: Settings) -> PointCloud | None:
     if not candidates:
         return None
     path = root / str(candidates[0])
-    try:
+    with input_checked():
         columns = read_table(path).columns
-    except ValueError as error:
-        raise InputError(str(error)) from error
     lacking = [axis for axis in "xyz" if axis not in columns]
     if lacking:
         raise InputError(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.data.capture import Shot
-from glassplat.data.errors import InputError
+from glassplat.data.errors import InputError, input_checked
 from glassplat.data.lens import PixelMap, lens_for_image, nearest_resize, pinhole_of
 from glassplat.data.masks import PaneMask
 from glassplat.data.poses import rigid_pose
@@ -77,10 +77,8 @@ class PhotoFile:
 
     def __call__(self) -> Tensor:
         """[H, W, 3] uint8 in the pixel grid of the view's camera."""
-        try:
+        with input_checked():
             pixels = read_image(self.path)
-        except ValueError as error:
-            raise InputError(str(error)) from error
         return torch.from_numpy(self.pixel_map.photo(_opaque(pixels, self.background)))
 
 
@@ -124,10 +122,8 @@ def prepare_view(shot: Shot, mask: PaneMask | None, options: ViewOptions) -> Pre
     Raises:
         InputError: unreadable file, sizes that disagree, a pose that is not rigid, a lens that cannot be undistorted.
     """
-    try:
+    with input_checked():
         width, height = image_size(shot.image_path)
-    except ValueError as error:
-        raise InputError(str(error)) from error
     lens = lens_for_image(shot.lens, (width, height), shot.name)
     pinhole, distorted = pinhole_of(lens)
     small = max(1, round(pinhole.width / options.downscale)), max(1, round(pinhole.height / options.downscale))
@@ -146,10 +142,8 @@ def prepare_view(shot: Shot, mask: PaneMask | None, options: ViewOptions) -> Pre
 
 def _mask_file(mask: PaneMask, size: tuple[int, int], pixel_map: PixelMap) -> MaskFile:
     """The mask at the photograph's size, which it must have up to an integer factor."""
-    try:
+    with input_checked():
         mask_size = image_size(mask.path)
-    except ValueError as error:
-        raise InputError(str(error)) from error
     if not (_is_multiple(mask_size, size) or _is_multiple(size, mask_size)):
         raise InputError(
             f"mask {mask.path} is {mask_size[0]}x{mask_size[1]} pixels large, its photograph {size[0]}x{size[1]}; "

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from glassplat.data.errors import InputError
+from glassplat.data.errors import input_checked
 from glassplat.evaluate.lpips import Lpips
 from glassplat.evaluate.metrics import quantized
 from glassplat.evaluate.outcome import NO_WEIGHTS, Outcome
@@ -45,10 +45,8 @@ def true_environment(capture: Path) -> Tensor | None:
     """
     for path in (capture / f"environment{suffix}" for suffix in (".exr", ".png")):
         if path.is_file():
-            try:
+            with input_checked():
                 return read_equirect(path)
-            except ValueError as error:
-                raise InputError(str(error)) from error
     return None
 
 

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.data.errors import InputError
+from glassplat.data.errors import InputError, input_checked
 from glassplat.data.view import View
 from glassplat.evaluate.truth import resized_float
 from glassplat.files.images import image_size, read_image_float
@@ -87,10 +87,8 @@ def _read_beside(view: View, mark: str) -> NDArray[np.float32] | None:
 
 
 def _read(path: Path) -> NDArray[np.float32]:
-    try:
+    with input_checked():
         return read_image_float(path)
-    except ValueError as error:
-        raise InputError(str(error)) from error
 
 
 def _coverage(view: View, vectors: NDArray[np.float32] | None) -> NDArray[np.float32]:
