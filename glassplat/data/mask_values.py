@@ -45,9 +45,7 @@ def read_mask_values(path: Path) -> MaskValues:
     Raises:
         InputError: the file is no image, or its values are neither labels nor black and white.
     """
-    with input_checked():
-        image = open_image(path)
-    shades = _shades(image, path)
+    shades = _read_shades(path)
     counts = np.bincount(shades.ravel(), minlength=WHITE + 1)
     lossy = path.suffix.lower() in LOSSY_SUFFIXES
     if not lossy and not counts[HIGHEST_LABEL + 1 :].any():
@@ -63,17 +61,17 @@ def read_mask_at_threshold(path: Path) -> MaskValues:
     Raises:
         InputError: the file is no image.
     """
-    with input_checked():
-        image = open_image(path)
-    shades = _shades(image, path)
+    shades = _read_shades(path)
     if path.suffix.lower() not in LOSSY_SUFFIXES and not (shades > HIGHEST_LABEL).any():
         return MaskValues("labels" if shades.any() else "empty", shades)
     pixels = (shades >= THRESHOLD).astype(np.uint8)
     return MaskValues("binary" if pixels.any() else "empty", pixels)
 
 
-def _shades(image: Image.Image, path: Path) -> NDArray[np.uint8]:
+def _read_shades(path: Path) -> NDArray[np.uint8]:
     """[H, W] grey values, or the indices of a palette."""
+    with input_checked():
+        image = open_image(path)
     if image.mode == "1" or (image.mode == "P" and not _is_black_and_white(image)):
         return np.array(image).astype(np.uint8)
     if image.mode.startswith("I"):

@@ -151,10 +151,10 @@ def own_masks(seen: SeenPanes, splats: Splats, marks: Tensor, owners: Tensor, si
 @torch.no_grad()
 def _splats_near(splats: Splats, pixels: Tensor) -> Tensor:
     """Positions, in order, of the splats [1, G] that may reach the smallest window around the pixels [H, W] bool."""
-    rows, columns = (pixels.any(dim=axis).nonzero() for axis in (1, 0))
-    edges = torch.stack([columns.aminmax().min, rows.aminmax().min, columns.aminmax().max, rows.aminmax().max])
+    columns, rows = (pixels.any(dim=axis).nonzero().aminmax() for axis in (0, 1))
     # Whole tiles, all of which are traversed.
-    low, high = edges[:2] // TILE * TILE, (edges[2:] // TILE + 1) * TILE
+    low = torch.stack([columns.min, rows.min]) // TILE * TILE
+    high = (torch.stack([columns.max, rows.max]) // TILE + 1) * TILE
     means, radii = splats.means2d[0], splats.radii[0]
     reaches = (means + radii >= low) & (means - radii <= high) & (radii > 0)
     return reaches.all(dim=1).nonzero().flatten()

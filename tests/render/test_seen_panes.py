@@ -48,15 +48,17 @@ def light(image: Tensor) -> Tensor:
     return linear_from_srgb(image)
 
 
-@pytest.mark.parametrize(("half", "shift"), [(50.0, 0.0), (0.25, 0.4)], ids=["everywhere", "on a few tiles"])
-def test_each_pane_lays_its_reflection_over_what_is_behind_it(half: float, shift: float) -> None:
+@pytest.mark.parametrize(
+    ("half", "shift", "least"), [(50.0, 0.0, 0.03), (0.25, 0.4, 0.015)], ids=["everywhere", "on a few tiles"]
+)
+def test_each_pane_lays_its_reflection_over_what_is_behind_it(half: float, shift: float, least: float) -> None:
     front_pane = pane(2.0, half=half, label=1)
     front_pane = front_pane.with_tensors({"centers": front_pane.centers + torch.tensor([shift, 0.0, 0.0])})
     both, front, back = (Planar()(vitrine(*labels, front=front_pane), WIDE) for labels in ((1, 2), (1,), (2,)))
     near, far = (frame.layers["strength"][..., None] for frame in (front, back))
     expected = (1 - far) * light(back.layers["transmission"]) + far * light(back.layers["reflection"])
     expected = (1 - near) * expected + near * light(front.layers["reflection"])
-    assert float((near * far).max()) > 1e-3
+    assert float((near * far).max()) > least
     two = nearest_hits(front_pane, WIDE).pane >= 0
     torch.testing.assert_close(light(both.rgb)[two], expected[two], rtol=1e-4, atol=2e-5)
 
