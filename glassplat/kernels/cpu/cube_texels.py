@@ -61,17 +61,23 @@ def pad_faces(real: type) -> Kernel:
     @kernel("cube_pad_faces", real)
     def pad(texels, padded):
         size, depth = texels.shape[1], texels.shape[3]
+        rows = texels.reshape(6, size, size * depth)
+        padded_rows = padded.reshape(6, size + 2, (size + 2) * depth)
         for task in prange(6 * (size + 2)):
             face, row = task // (size + 2), task % (size + 2) - 1
             low, outside = 1 if row < 0 else 0, row < 0 or row == size
             inner = min(max(row, 0), size - 1)
             target = padded[face, row + 1]
-            for column in range(size):
-                from_face, from_row, from_column = face, inner, column
-                if outside:
-                    from_face, from_row, from_column = over_row(face, low, column, size)
-                for d in range(depth):
-                    target[column + 1, d] = texels[from_face, from_row, from_column, d]
+            if outside:
+                for column in range(size):
+                    f, r, c = over_row(face, low, column, size)
+                    for d in range(depth):
+                        target[column + 1, d] = texels[f, r, c, d]
+            else:
+                # All but the ring is copied, in long runs.
+                copied, to = rows[face, row], padded_rows[face, row + 1, depth : (size + 1) * depth]
+                for i in range(to.size):
+                    to[i] = copied[i]
             for side in range(2):
                 column, cell = (size - 1, size + 1) if side == 0 else (0, 0)
                 f, r, c = over_column(face, side, inner, size)
