@@ -36,7 +36,8 @@ class McmcDensify:
         interval: steps between relocations.
         start: share of the run after which relocation begins.
         stop: share of the run after which relocation and growth end; the noise goes on.
-        growth: factor by which the number grows at every relocation, until the cap.
+        growth: factor by which the number grows in every three hundredth of the run, until the cap: with the published
+            30,000 iterations at every relocation. A single relocation at most doubles it.
         dead_opacity: Gaussians at most this opaque are relocated.
         noise_rate: noise on the positions, as a multiple of their learning rate; 0 switches it off.
         noise_sharpness: how fast the noise fades above `dead_opacity`.

@@ -23,6 +23,10 @@ from glassplat.train.state import TrainState
 MEGAPIXEL = 1e6
 GAUSSIANS_PER_PIXEL = 0.5
 """Where `McmcDensify` stops to grow unless told otherwise; default densification ends near it (docs/experiments.md)."""
+GROWTH_SHARE = 1 / 300
+"""Share of the run in which `McmcDensify` grows by its factor: 100 of the published 30,000 iterations."""
+MOST_GROWTH = 2.0
+"""Largest factor of one relocation, however short the run."""
 
 
 @dataclass(frozen=True)
@@ -142,6 +146,12 @@ def cap_of(densifier: McmcDensify, dataset: Dataset) -> int:
     return round(GAUSSIANS_PER_PIXEL * camera.width * camera.height)
 
 
+def growth_of(densifier: McmcDensify, iterations: int) -> float:
+    """The factor by which the set grows at one relocation, so that it reaches its cap at the same share of any run."""
+    factor: float = densifier.growth ** (densifier.interval / (GROWTH_SHARE * iterations))
+    return min(factor, MOST_GROWTH)
+
+
 @dataclass(frozen=True)
 class Relocate:
     """Moves dead primary Gaussians onto live ones and adds new ones (3DGS-MCMC)."""
@@ -155,7 +165,8 @@ class Relocate:
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state`, if there is anything to edit."""
-        edited, moments = self.densifier.densify(
+        densifier = replace(self.densifier, growth=growth_of(self.densifier, clock.iterations))
+        edited, moments = densifier.densify(
             state.scene.primary,
             state.optimizer.moments,
             cap=cap_of(self.densifier, dataset),

@@ -11,7 +11,7 @@ import torch
 
 from glassplat.densify.mcmc import McmcDensify
 from glassplat.losses.photometric import PhotometricLoss
-from glassplat.train.actions import Densify, Explore, Relocate, ResetOpacity, cap_of
+from glassplat.train.actions import Densify, Explore, Relocate, ResetOpacity, cap_of, growth_of
 from glassplat.train.averaging import AverageLast
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.messages import ActionDone, Message, StepDone
@@ -132,6 +132,23 @@ def test_the_default_cap_follows_the_photographs() -> None:
     camera = tiny_capture().train[0].camera
     assert cap_of(McmcDensify(), tiny_capture()) == round(camera.width * camera.height / 2)
     assert cap_of(McmcDensify(cap=7), tiny_capture()) == 7
+
+
+@pytest.mark.parametrize("iterations", [3_000, 7_000, 30_000, 60_000])
+def test_the_cap_is_reached_at_the_same_share_of_any_run(iterations: int) -> None:
+    count, options = 6000.0, McmcDensify()
+    action = Relocate(options)
+    for step in range(1, iterations + 1):
+        if action.due(Clock(step, iterations, views=10)):
+            count *= growth_of(options, iterations)
+        if count >= 60_000:
+            break
+    assert step / iterations == pytest.approx(0.17, abs=0.02)
+
+
+def test_one_relocation_at_most_doubles_the_set() -> None:
+    assert growth_of(McmcDensify(), 30_000) == pytest.approx(1.05)
+    assert growth_of(McmcDensify(), 500) == 2.0
 
 
 def test_relocation_keeps_its_share_of_the_run() -> None:
