@@ -7,6 +7,9 @@ import os
 # Numba reads this once, when it is imported. Two threads are enough to find a result that depends on their number.
 os.environ.setdefault("NUMBA_NUM_THREADS", "2")
 
+# Before PyTorch, as the package asks: it says how threads wait.
+import glassplat  # noqa: F401, I001
+
 import random
 from collections.abc import Iterator
 
