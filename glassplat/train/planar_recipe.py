@@ -17,7 +17,7 @@ from glassplat.render.glazing import Blend
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
-from glassplat.train.actions import Densify, GrowSh, PerturbOpacity
+from glassplat.train.actions import Densify, GrowSh, PerturbOpacity, ResetOpacity
 from glassplat.train.background import BLACK
 from glassplat.train.optimizer import Rate
 from glassplat.train.plane_entry import PlaneEntry, annotations_of
@@ -121,8 +121,10 @@ class PlanarRecipe:
         plane_fit: how planes are found from masks.
         rhythm: when opacities are reset and the SH degree grows.
         strategy: what decides how many primary Gaussians there are and where. With `mcmc` its relocation takes the
-            place of densification and its regularisers join the loss (Eq. 20), from the first stage on; the
-            perturbation keeps its beats. The glass is densified by `densify` either way.
+            place of densification and its regularisers join the loss (Eq. 20). The set grows in the joint stage only,
+            before which opacities are reset once: many Gaussians would build the reflected room behind the panes in
+            the first stage, and no pruning removes it later. The perturbation keeps its beats. The glass is densified
+            by `densify` either way.
         densify: when and how Gaussians are added and pruned under `default`.
         mcmc: when and how Gaussians are relocated and added under `mcmc`.
     """
@@ -195,7 +197,12 @@ class PlanarRecipe:
             renderer=self._training_renderer("planes"),
             losses=self._joint_terms(population),
             rates=self.rates.of("primary") | self.rates.of("glass") | self.plane_rates.of(1.0),
-            actions=(*population.edits, GrowSh(Every(self.rhythm.sh)), Densify(self.densify, part="glass")),
+            actions=(
+                *population.edits,
+                GrowSh(Every(self.rhythm.sh)),
+                Densify(self.densify, part="glass"),
+                *self._clearing(),
+            ),
             motions=population.motions,
             entry=entry,
             densify_until=self.densify.stop,
@@ -219,6 +226,7 @@ class PlanarRecipe:
                 GrowSh(Every(self.rhythm.sh)),
                 Densify(self.densify, part="glass"),
                 *population.resets,
+                *self._clearing(),
                 PerturbOpacity(beat, self.perturbation.amplitude),
             ),
             motions=population.motions,
@@ -231,9 +239,20 @@ class PlanarRecipe:
 
     def _population(self) -> Population:
         means_rate = self.rates.of("primary")["primary.means"]
-        return population_of(
-            self.strategy, default=self.densify, mcmc=self.mcmc, rhythm=self.rhythm, means_rate=means_rate
-        )
+        late = replace(self.mcmc, start=max(self.mcmc.start, self._joint_start))
+        return population_of(self.strategy, default=self.densify, mcmc=late, rhythm=self.rhythm, means_rate=means_rate)
+
+    def _clearing(self) -> tuple[ResetOpacity, ...]:
+        """The one reset under `mcmc`, where joint optimisation begins; `default` has its own."""
+        # A second one would come after the stop.
+        once = Every(self._joint_start, stop=1.5 * self._joint_start)
+        return (ResetOpacity(once),) if self.strategy == "mcmc" else ()
+
+    @property
+    def _joint_start(self) -> float:
+        """Share of the run after which all three parts learn together."""
+        first, second, third = self.stage_shares
+        return (first + second) / (first + second + third)
 
     def _training_renderer(self, gradient: str) -> Planar:
         return Planar(

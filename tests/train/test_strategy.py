@@ -18,7 +18,7 @@ from glassplat.train.messages import ActionDone, Message, StepDone
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
 from glassplat.train.splat_recipe import SplatRecipe
-from glassplat.train.stage import Clock, Stage
+from glassplat.train.stage import Clock, Stage, stage_starts
 from glassplat.train.state import TrainState
 from glassplat.train.strategy import Rhythm
 from glassplat.train.trainer import differentiate, train
@@ -62,8 +62,9 @@ def test_a_short_run_relocates_grows_and_regularises(recipe: Any) -> None:
     state = fresh_state(recipe)
     before = len(state.scene.primary)
     messages = run(state, recipe)
-    actions = {m.action for m in messages if isinstance(m, ActionDone)}
-    assert "densify primary" in actions and "reset opacity" not in actions
+    actions = [m.action for m in messages if isinstance(m, ActionDone)]
+    assert "densify primary" in actions
+    assert actions.count("reset opacity") == (1 if recipe.method == "planar" else 0)
     assert before < len(state.scene.primary) <= OFTEN.cap
     steps = [m for m in messages if isinstance(m, StepDone)]
     assert all({"opacity", "scale"} <= set(m.losses) for m in steps)
@@ -87,13 +88,29 @@ def test_resuming_continues_to_the_same_result(recipe: Any, pause: int, tmp_path
 def test_the_strategy_decides_what_happens_to_the_primary_gaussians(recipe: Any) -> None:
     for stage in recipe.stages(seed=0):
         kinds = [type(action) for action in stage.actions]
-        assert kinds.count(Relocate) == 1 and ResetOpacity not in kinds
+        assert kinds.count(Relocate) == 1 and (ResetOpacity not in kinds or recipe.method == "planar")
         assert [type(motion) for motion in stage.motions] == [Explore, AverageLast]
         assert all(action.part == "glass" for action in stage.actions if isinstance(action, Densify))
     for stage in replace(recipe, strategy="default").stages(seed=0):
         assert [type(motion) for motion in stage.motions] == [AverageLast]
         assert not any(isinstance(action, Relocate) for action in stage.actions)
         assert not {"opacity", "scale"} & {term.name for term in stage.losses}
+
+
+@pytest.mark.parametrize("iterations", [251, 1234, 7_000])
+@pytest.mark.parametrize("multi_stage", [True, False])
+def test_planar_grows_after_one_reset_when_joint_optimisation_begins(multi_stage: bool, iterations: int) -> None:
+    stages = PlanarRecipe(strategy="mcmc", multi_stage=multi_stage).stages(seed=0)
+    starts = stage_starts(stages, iterations)
+    due: dict[type, list[int]] = {ResetOpacity: [], Relocate: []}
+    for stage, start, end in zip(stages, starts, starts[1:], strict=False):
+        for step in range(start + 1, end + 1):
+            for action in stage.actions:
+                if type(action) in due and action.due(Clock(step, iterations, views=10)):
+                    due[type(action)].append(step)
+    joint = round(0.2 * iterations)
+    assert due[ResetOpacity] == [joint]
+    assert joint < due[Relocate][0] <= joint + 100
 
 
 def test_the_planar_objective_is_that_of_equation_20_but_for_two_terms() -> None:
