@@ -24,7 +24,7 @@ class ScreenStatistics:
     Attributes:
         gradient_sum: [2, N] sum over views of the norm of the loss gradient with respect to the centre on screen.
         pull_sum: [2, N] the same of what single pixels contribute to that gradient, added up without signs.
-        view_count: [2, N] number of views that saw the Gaussian; a view in a mirror counts by its strength.
+        view_count: [2, N] number of views that saw the Gaussian; one in or through a pane counts by its `weight`.
         max_radius: [N] largest radius on screen, as a share of the longer image side.
     """
 
@@ -62,7 +62,7 @@ def accumulate(
     *,
     width: int,
     height: int,
-    weight: float = 1.0,
+    weight: float | Tensor = 1.0,
     direct: bool = True,
 ) -> ScreenStatistics:
     """The statistics with the views of one training step added.
@@ -77,8 +77,8 @@ def accumulate(
         radii: [C, N, 2] bounds on screen in pixels; 0 where a view does not see the Gaussian.
         width: image width in pixels.
         height: image height in pixels.
-        weight: share of the image that this pass contributes. A reflection of strength 0.1 has gradients a tenth
-            as large; counted as a full view it would dilute the mean of what is also seen directly.
+        weight: how much of what is drawn is left in the image, of all or [C, N] of each. A reflection of strength 0.1
+            has smaller gradients; counted as a full view it would dilute the mean of what is also seen directly.
         direct: whether the views see the Gaussians themselves, and not their mirror images.
     """
     visible = (radii > 0).all(dim=-1)
@@ -92,7 +92,7 @@ def accumulate(
     return ScreenStatistics(
         gradient_sum=statistics.gradient_sum + rows * norms(means2d_gradient),
         pull_sum=statistics.pull_sum + rows * norms(probe_gradient),
-        view_count=statistics.view_count + rows * weight * visible.sum(dim=0),
+        view_count=statistics.view_count + rows * (weight * visible).sum(dim=0),
         max_radius=torch.maximum(statistics.max_radius, shares.amax(dim=0).to(statistics.max_radius.dtype)),
     )
 

@@ -24,7 +24,8 @@ class ScreenPass:
         means2d: [C, N, 2] projected centres, pixels; part of the autograd graph.
         probe: [C, N, 2] that `composite` got; its gradient is how strongly single pixels pull at the centres.
         radii: [C, N, 2] half extents in pixels; 0 where not visible.
-        weight: share of the image that the pass contributes where it is seen.
+        weight: how much of what is drawn there is left in the image, of the whole pass or [C, N] of each Gaussian: 1
+            but for what is seen in or through a pane.
         direct: whether it shows the Gaussians themselves, and not their mirror images.
     """
 
@@ -32,7 +33,7 @@ class ScreenPass:
     means2d: Tensor
     probe: Tensor
     radii: Tensor
-    weight: float = 1.0
+    weight: float | Tensor = 1.0
     direct: bool = True
 
 

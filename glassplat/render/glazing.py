@@ -99,6 +99,24 @@ def _joined_layers(
     )
 
 
+def layer_slopes(result: Glazed, where: Tensor, blend: Blend) -> tuple[Tensor, Tensor]:
+    """[H, W] how much the image changes with its transmission, and with its reflection: the derivatives of Eq. 1.
+
+    Where `where` [H, W] is False, 1 and 0. In linear radiance they are not 1 - R and R: a weak reflection stands out
+    from a dark transmission, and takes contrast from it. Of grey that is as bright as the mean of the channels.
+    """
+    decode, encode = curves(blend)
+    strength = result.strength[where].detach()
+    layers = [layer[where].detach().mean(dim=-1) for layer in (result.transmission, result.reflection)]
+    with torch.enable_grad():
+        transmission, reflection = (layer.requires_grad_() for layer in layers)
+        image = encode((1 - strength) * decode(transmission) + strength * decode(reflection))
+        slopes = torch.autograd.grad(image.sum(), (transmission, reflection))
+    full = torch.ones_like(result.strength), torch.zeros_like(result.strength)
+    through, mirrored = (image.masked_scatter(where, slope) for image, slope in zip(full, slopes, strict=True))
+    return through, mirrored
+
+
 def curves(blend: Blend) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
     """Into the space in which light is blended, and back to sRGB."""
     return (linear_from_srgb, srgb_from_linear) if blend == "linear" else (_unchanged, _unchanged)

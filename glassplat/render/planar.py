@@ -10,10 +10,10 @@ from torch import Tensor
 
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
-from glassplat.kernels.panes import Fresnel
+from glassplat.kernels.panes import Fresnel, PaneHits
 from glassplat.kernels.splats import Deviation, Projected, Splats
 from glassplat.render.frame import Frame, ScreenPass
-from glassplat.render.glazing import Blend, glazed, own_masks, visibilities
+from glassplat.render.glazing import Blend, Glazed, glazed, layer_slopes, own_masks, visibilities
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
     joined_probe,
@@ -119,8 +119,8 @@ class Planar:
             blend=self.blend,
         )
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
-        mirrored = (replace(record, weight=float(result.share.detach().sum() / hit.sum())) for record in second.screen)
-        return Frame(result.rgb, layers, (*first.screen, *mirrored))
+        screen = weighted_screen(first, second, hits, result, self.blend) if probed else ()
+        return Frame(result.rgb, layers, screen)
 
     def _first_pass(self, scene: Scene, camera: Camera, probed: bool) -> FirstPass:
         near = NEAR_PER_EXTENT * scene.extent
@@ -179,6 +179,27 @@ class Planar:
         owners = glass_owners(scene.glass, scene.planes)
         own = own_masks(seen, first.splats, first.marks, owners, (camera.height, camera.width))
         return visibilities(seen, first.mask, own)
+
+
+@torch.no_grad()
+def weighted_screen(
+    first: FirstPass, second: SecondPass, hits: PaneHits, result: Glazed, blend: Blend
+) -> tuple[ScreenPass, ...]:
+    """The records of both passes, weighted by how much of each layer is left in the image (see `layer_slopes`).
+
+    What is behind a pane counts by what the pane lets through at its centre, mirror images by the mean over the pixels
+    that show a pane.
+    """
+    hit = hits.pane >= 0
+    through, mirrored = layer_slopes(result, hit, blend)
+    primary, glass = first.screen
+    height, width = hit.shape
+    columns, rows = primary.means2d.nan_to_num().floor().long().unbind(-1)
+    pixels = rows.clamp(0, height - 1), columns.clamp(0, width - 1)
+    behind = first.splats.depths[:, : primary.means2d.shape[1]] > hits.depth[pixels]
+    primary = replace(primary, weight=torch.where(behind, through[pixels], 1.0))
+    weight = float(mirrored[hit].mean())
+    return (primary, glass, *(replace(record, weight=weight) for record in second.screen))
 
 
 def detached(gaussians: Gaussians) -> Gaussians:
