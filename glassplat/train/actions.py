@@ -193,7 +193,7 @@ class Explore:
     def __call__(self, state: TrainState, clock: Clock) -> None:
         """Edits `state`."""
         primary, extent = state.scene.primary, state.scene.extent
-        rate = self.rate.at(clock.progress, 1.0)
+        rate = self.rate.at(clock.progress, 1.0, clock.iterations)
         offsets = self.densifier.noise(primary, rate=rate, extent=extent, generator=state.generator("explore"))
         state.scene = replace(state.scene, primary=primary.with_tensors({"means": primary.means + offsets}))
 

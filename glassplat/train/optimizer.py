@@ -10,6 +10,9 @@ from torch import Tensor
 
 from glassplat.kernels.adam import adam
 
+PUBLISHED_ITERATIONS = 30_000
+"""Length of the runs for which 3DGS, and TR-Gaussians after it, chose their learning rates."""
+
 Moments = dict[str, tuple[Tensor, Tensor]]
 
 
@@ -22,16 +25,21 @@ class Rate:
         end: rate at the last one, reached exponentially; None keeps `start`.
         per_extent: multiply by the scene extent (for positions).
         rest: factor for every SH coefficient but the constant one; only for `sh`.
+        short_run_power: a run of fewer iterations than the published 30,000 multiplies the rate by their ratio to this
+            power, because Adam moves a parameter by about its rate at every step, however small the gradient.
     """
 
     start: float
     end: float | None = None
     per_extent: bool = False
     rest: float | None = None
+    short_run_power: float = 0.0
 
-    def at(self, progress: float, extent: float) -> float:
-        """The rate at a progress in [0, 1]."""
-        scale = extent if self.per_extent else 1.0
+    def at(self, progress: float, extent: float, iterations: int = PUBLISHED_ITERATIONS) -> float:
+        """The rate at a progress in [0, 1] of a run of so many iterations."""
+        scale = max(1.0, PUBLISHED_ITERATIONS / iterations) ** self.short_run_power
+        if self.per_extent:
+            scale *= extent
         if self.end is None:
             return self.start * scale
         return float(self.start ** (1 - progress) * self.end**progress * scale)
@@ -80,9 +88,9 @@ class Optimizer:
         return known
 
 
-def rate_tensor(rate: Rate, parameter: Tensor, progress: float, extent: float) -> float | Tensor:
+def rate_tensor(rate: Rate, parameter: Tensor, progress: float, extent: float, iterations: int) -> float | Tensor:
     """The rate as `adam` takes it: one number, or one per column where SH bands differ."""
-    value = rate.at(progress, extent)
+    value = rate.at(progress, extent, iterations)
     if rate.rest is None:
         return value
     columns = torch.full(parameter.shape[1:], value * rate.rest, dtype=parameter.dtype, device=parameter.device)

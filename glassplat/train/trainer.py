@@ -126,7 +126,8 @@ def update(stage: Stage, state: TrainState, gradients: Mapping[str, Tensor], ite
     """Steps the optimiser at the stage's learning rates."""
     parameters = state.scene.parameters()
     progress = state.step / iterations
-    rates = {name: rate_tensor(stage.rates[name], parameters[name], progress, state.scene.extent) for name in gradients}
+    extent = state.scene.extent
+    rates = {n: rate_tensor(stage.rates[n], parameters[n], progress, extent, iterations) for n in gradients}
     state.optimizer.step(parameters, gradients, rates)
 
 
