@@ -25,6 +25,7 @@ Switch = Literal[
     "bright-reflections",
     "calm-colors",
     "averaging",
+    "short-run-rates",
     "propagation",
     "sabotage",
     "deferred-shading",
@@ -63,6 +64,10 @@ def _without_averaging(recipe: PlanarRecipe) -> PlanarRecipe:
     return replace(recipe, rhythm=replace(recipe.rhythm, averaged_passes=0.0))
 
 
+def _with_published_rates(recipe: Any) -> Any:
+    return replace(recipe, rates=replace(recipe.rates, short_run_power=0.0))
+
+
 def _without_propagation(recipe: DeferredRecipe) -> DeferredRecipe:
     return replace(recipe, propagation=replace(recipe.propagation, propagates=False))
 
@@ -87,6 +92,7 @@ PLANAR: dict[Switch, Ablation] = {
     "bright-reflections": Ablation("a(u) left free (the paper's)", _without("intensity")),
     "calm-colors": Ablation("harmonics left free (the paper's)", lambda r: replace(r, view_dependence_weight=0.0)),
     "averaging": Ablation("last step, not the mean of a pass", _without_averaging),
+    "short-run-rates": Ablation("learning rates as published, however short the run", _with_published_rates),
 }
 """The first seven are the rows of TR-Gaussians' Table IV, the others are parts that the paper does not ablate."""
 
@@ -96,6 +102,7 @@ DEFERRED: dict[Switch, Ablation] = {
     "deferred-shading": Ablation("forward shading", lambda r: replace(r, shading="forward"), -6.02),
     "coarse-to-fine": Ablation("w/o coarse-to-fine environment", lambda r: replace(r, first_texels=r.texels)),
     "strength-price": Ablation("strength without a price (the paper's)", lambda r: replace(r, strength_weight=0.0)),
+    "short-run-rates": Ablation("learning rates as published, however short the run", _with_published_rates),
 }
 """The rows of 3DGS-DR's Table 5 and its forward variant (Table 1, `ball`), and what the paper does not have."""
 
