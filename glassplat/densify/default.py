@@ -18,8 +18,8 @@ class ScreenStatistics:
     """What the views since the last densification saw of each Gaussian.
 
     Gradients are in normalised device coordinates: the image spans [-1, 1] both ways. Sums and counts have two rows,
-    over all views and over those that see the Gaussian directly. In a mirror it is small and has small gradients,
-    which must not hide that it is too coarse where it is close.
+    over all views and over those that see the Gaussian directly. In a mirror it is farther away: whether it is too
+    coarse is seen where it is close, and in mirrors only where no view shows it directly.
 
     Attributes:
         gradient_sum: [2, N] sum over views of the norm of the loss gradient with respect to the centre on screen.
@@ -41,7 +41,7 @@ class ScreenStatistics:
 
     @property
     def mean_gradient(self) -> Tensor:
-        """[N] mean gradient norm over the views that saw the Gaussian, all or direct, the larger; 0 where none did."""
+        """[N] mean gradient norm over the views that saw the Gaussian, direct ones if there are any; 0 if none did."""
         return self._mean(self.gradient_sum)
 
     @property
@@ -50,7 +50,8 @@ class ScreenStatistics:
         return self._mean(self.pull_sum)
 
     def _mean(self, total: Tensor) -> Tensor:
-        return (total / self.view_count.clamp(min=1)).amax(dim=0)
+        over_all, over_direct = total / self.view_count.clamp(min=1)
+        return torch.where(self.view_count[1] > 0, over_direct, over_all)
 
 
 @torch.no_grad()

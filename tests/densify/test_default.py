@@ -47,9 +47,9 @@ def test_accumulate_counts_visible_views_in_device_coordinates() -> None:
     assert statistics.mean_pull.tolist() == [700, 200, 0]
 
 
-def test_mirror_images_do_not_dilute_what_is_seen_directly() -> None:
+def test_mirror_images_count_only_for_what_is_not_seen_directly() -> None:
     statistics, radii = ScreenStatistics.zeros(2), torch.full((1, 2, 2), 6)
-    for weight, gradients in ((1.0, [8.0, 0.0]), (1.0, [4.0, 0.0]), (0.5, [0.0, 3.0])):
+    for weight, gradients in ((1.0, [8.0, 0.0]), (1.0, [4.0, 0.0]), (0.5, [90.0, 3.0])):
         gradient = torch.tensor(gradients)[None, :, None] * torch.tensor([0.01, 0.0])
         seen_here = radii * (gradient != 0).any(dim=-1, keepdim=True) if weight == 1 else radii
         statistics = accumulate(
