@@ -64,7 +64,7 @@ def _without_averaging(recipe: PlanarRecipe) -> PlanarRecipe:
     return replace(recipe, rhythm=replace(recipe.rhythm, averaged_passes=0.0))
 
 
-def _with_published_rates(recipe: Any) -> Any:
+def _with_published_rates(recipe: PlanarRecipe) -> PlanarRecipe:
     return replace(recipe, rates=replace(recipe.rates, short_run_power=0.0))
 
 
@@ -102,7 +102,6 @@ DEFERRED: dict[Switch, Ablation] = {
     "deferred-shading": Ablation("forward shading", lambda r: replace(r, shading="forward"), -6.02),
     "coarse-to-fine": Ablation("w/o coarse-to-fine environment", lambda r: replace(r, first_texels=r.texels)),
     "strength-price": Ablation("strength without a price (the paper's)", lambda r: replace(r, strength_weight=0.0)),
-    "short-run-rates": Ablation("learning rates as published, however short the run", _with_published_rates),
 }
 """The rows of 3DGS-DR's Table 5 and its forward variant (Table 1, `ball`), and what the paper does not have."""
 

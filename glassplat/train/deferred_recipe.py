@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -74,7 +75,8 @@ class DeferredRecipe:
         consistency_weight: weight of the difference between normals and the slope of the depths, while normals spread.
         propagation: how normals spread and colours are sabotaged.
         schedule: when they do.
-        rates: learning rates of the Gaussians.
+        rates: learning rates of the Gaussians; they do not rise in short runs, which costs a mirror ball its normals
+            (docs/experiments.md).
         reflection_rates: learning rates of strength and environment.
         rhythm: when opacities are reset and the SH degree grows.
         strategy: what decides how many Gaussians there are and where; `densify` or `mcmc` holds its options.
@@ -100,7 +102,7 @@ class DeferredRecipe:
     consistency_weight: float = 0.3
     propagation: NormalPropagation = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
-    rates: GaussianRates = field(default_factory=GaussianRates)
+    rates: GaussianRates = field(default_factory=partial(GaussianRates, short_run_power=0.0))
     reflection_rates: ReflectionRates = field(default_factory=ReflectionRates)
     rhythm: Rhythm = field(default_factory=lambda: Rhythm(beat=0.0214, least=150))
     strategy: Strategy = "default"

@@ -12,6 +12,8 @@ from glassplat.kernels.adam import adam
 
 PUBLISHED_ITERATIONS = 30_000
 """Length of the runs for which 3DGS, and TR-Gaussians after it, chose their learning rates."""
+FASTEST_ITERATIONS = 3_000
+"""Shorter runs learn no faster than one of this length, the shortest for which higher rates were measured."""
 
 Moments = dict[str, tuple[Tensor, Tensor]]
 
@@ -26,7 +28,8 @@ class Rate:
         per_extent: multiply by the scene extent (for positions).
         rest: factor for every SH coefficient but the constant one; only for `sh`.
         short_run_power: a run of fewer iterations than the published 30,000 multiplies the rate by their ratio to this
-            power, because Adam moves a parameter by about its rate at every step, however small the gradient.
+            power (`FASTEST_ITERATIONS` at the least), because Adam moves a parameter by about its rate at every step,
+            however small the gradient.
     """
 
     start: float
@@ -37,7 +40,8 @@ class Rate:
 
     def at(self, progress: float, extent: float, iterations: int = PUBLISHED_ITERATIONS) -> float:
         """The rate at a progress in [0, 1] of a run of so many iterations."""
-        scale = max(1.0, PUBLISHED_ITERATIONS / iterations) ** self.short_run_power
+        length = min(max(iterations, FASTEST_ITERATIONS), PUBLISHED_ITERATIONS)
+        scale = (PUBLISHED_ITERATIONS / length) ** self.short_run_power
         if self.per_extent:
             scale *= extent
         if self.end is None:

@@ -30,7 +30,8 @@ class GaussianRates:
         opacity, scale, rotation: of the raw values.
         intensity: of the reflection intensity's logarithm.
         short_run_power: in a run of n < 30,000 iterations the rates of position, colour, scale and rotation are
-            (30,000 / n) to this power times as large; 0 keeps the published ones (docs/experiments.md).
+            (30,000 / n) to this power times as large, n being 3,000 at the least; 0 keeps the published ones
+            (docs/experiments.md).
     """
 
     means: float = 1.6e-4

@@ -48,5 +48,6 @@ def test_a_rate_decays_exponentially_and_scales_with_the_extent() -> None:
 def test_short_runs_raise_the_rates_that_say_so() -> None:
     rate = Rate(1e-2, 1e-4, short_run_power=0.5)
     for progress in (0.0, 0.4, 1.0):
-        assert rate.at(progress, 1.0, 300) == pytest.approx(10 * rate.at(progress, 1.0, 30_000))
+        assert rate.at(progress, 1.0, 7500) == pytest.approx(2 * rate.at(progress, 1.0, 30_000))
     assert rate.at(0.4, 1.0, 30_000) == rate.at(0.4, 1.0, 90_000) == Rate(1e-2, 1e-4).at(0.4, 1.0, 300)
+    assert rate.at(0.4, 1.0, 300) == rate.at(0.4, 1.0, 3000)
