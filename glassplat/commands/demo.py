@@ -30,7 +30,7 @@ class Demo:
     """
 
     output: Path = Path("runs/demo")
-    iterations: int = 1500
+    iterations: int = 3000
     seed: int = 0
     device: DeviceName = "auto"
 
