@@ -78,8 +78,8 @@ def accumulate(
         radii: [C, N, 2] bounds on screen in pixels; 0 where a view does not see the Gaussian.
         width: image width in pixels.
         height: image height in pixels.
-        weight: how much of what is drawn is left in the image, of all or [C, N] of each. A reflection of strength 0.1
-            has smaller gradients; counted as a full view it would dilute the mean of what is also seen directly.
+        weight: how much of what is drawn is left in the image, of all or [C, N] of each. Gradients are smaller by as
+            much; counted as a full view, a weak reflection would look as if it needed no more detail.
         direct: whether the views see the Gaussians themselves, and not their mirror images.
     """
     visible = (radii > 0).all(dim=-1)

@@ -111,10 +111,9 @@ def layer_slopes(result: Glazed, where: Tensor, blend: Blend) -> tuple[Tensor, T
     with torch.enable_grad():
         transmission, reflection = (layer.requires_grad_() for layer in layers)
         image = encode((1 - strength) * decode(transmission) + strength * decode(reflection))
-        slopes = torch.autograd.grad(image.sum(), (transmission, reflection))
-    full = torch.ones_like(result.strength), torch.zeros_like(result.strength)
-    through, mirrored = (image.masked_scatter(where, slope) for image, slope in zip(full, slopes, strict=True))
-    return through, mirrored
+        through, mirrored = torch.autograd.grad(image.sum(), (transmission, reflection))
+    clear, nothing = torch.ones_like(result.strength), torch.zeros_like(result.strength)
+    return clear.masked_scatter(where, through), nothing.masked_scatter(where, mirrored)
 
 
 def curves(blend: Blend) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
