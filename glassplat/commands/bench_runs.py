@@ -61,10 +61,9 @@ class PlannedRun:
         directory = self.directory
         if not self.begun():
             return
-        recorded = directory.recipe()
         # What the photographs decide is recorded, and not part of what was asked for.
-        wanted = with_background(self.train.recipe, recorded.background)
-        if (directory.settings(), recorded) != (self.train.settings(), wanted):
+        wanted = with_background(self.train.recipe, directory.recipe().background)
+        if directory.settings() != self.train.settings() or not directory.was_begun_with(wanted):
             raise InputError(
                 f"{directory.path} holds a run with {directory.settings()} or with another recipe; expected "
                 f"{self.train.settings()} and the recipe of this version. Choose another --output, or move the run away"

@@ -60,10 +60,11 @@ def prepare(recipe: Any, settings: RunSettings, directory: RunDirectory, dataset
     if resume:
         # A run may go on on another device.
         recorded = replace(directory.settings(), device=settings.device)
-        if recorded != settings or directory.recipe() != recipe:
+        if recorded != settings or not directory.was_begun_with(recipe):
             raise InputError(
                 f"{directory.path} was started with {directory.settings()} and its own recipe; expected the same to "
-                f"resume it, got {settings}. Repeat the original options, or choose another --output"
+                f"resume it, got {settings}. Repeat the original options, with the version of glassplat that began "
+                "it, or choose another --output"
             )
         return load_checkpoint(directory.checkpoint).to(settings.device)
     if directory.checkpoint.exists() or directory.results.exists():

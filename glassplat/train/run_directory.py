@@ -84,6 +84,15 @@ class RunDirectory:
         """The recorded recipe."""
         return recipe_from_json(self._read("recipe.json"))
 
+    def was_begun_with(self, recipe: Any) -> bool:
+        """Whether `begin` recorded just this recipe.
+
+        Compared as written: `recipe()` gives options that an earlier version did not have their present defaults,
+        with which the run was not made.
+        """
+        written = self._read("recipe.json")
+        return recipe_from_json(written) == recipe and json.loads(written) == json.loads(recipe_to_json(recipe))
+
     def settings(self) -> RunSettings:
         """The recorded settings."""
         try:

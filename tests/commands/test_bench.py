@@ -109,6 +109,18 @@ def test_another_run_in_the_way_is_not_overwritten(capture: Path, capsys: pytest
     assert written(capture.parent / "bench") == before
 
 
+def test_a_run_of_a_version_with_fewer_options_is_not_taken_for_one_of_this(
+    capture: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert bench_scenes(capture, "--methods", "splat") == 0
+    recipe = next((capture.parent / "bench").glob("runs/*/*/recipe.json"))
+    recorded = json.loads(recipe.read_text())
+    del recorded["rates"]["short_run_power"]
+    recipe.write_text(json.dumps(recorded))
+    assert bench_scenes(capture, "--methods", "splat") == 2
+    assert "with another recipe" in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_scene_that_fails_does_not_stop_the_others(
     capture: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
