@@ -39,10 +39,11 @@ class McmcDensify:
         growth: factor by which the number grows in every three hundredth of the run, until the cap: with the published
             30,000 iterations at every relocation. A single relocation at most doubles it.
         dead_opacity: Gaussians at most this opaque are relocated.
-        noise_rate: noise on the positions, as a multiple of their learning rate; 0 switches it off.
+        noise_rate: noise on the positions of what a view shows, as a multiple of their learning rate; 0 switches it
+            off.
         noise_sharpness: how fast the noise fades above `dead_opacity`.
-        opacity_weight: lambda_o, weight of the mean opacity in the objective.
-        scale_weight: lambda_Sigma, weight of the mean standard deviation in the objective.
+        opacity_weight: lambda_o, weight of the mean opacity in the objective, over what a view shows.
+        scale_weight: lambda_Sigma, weight of the mean standard deviation in the objective, likewise.
         initial_opacity: opacity of the first Gaussians.
         initial_spread: standard deviation of the first Gaussians, as a share of the distance to their neighbours. The
             published 0.1 takes a thousand steps or more to grow over the gaps (docs/experiments.md).

@@ -14,11 +14,12 @@ from glassplat.scene.scene import Scene
 
 
 def mean_opacity(frame: Frame, view: View, scene: Scene) -> Tensor:
-    """Opacity regularisation L_o (TR-Gaussians, Eq. 20): the L1 norm of the opacities, per Gaussian.
+    """Opacity regularisation L_o (TR-Gaussians, Eq. 20): the L1 norm of the opacities, per Gaussian in view.
 
-    Differentiable in the raw opacities. What no photograph holds up fades until it is relocated.
+    Differentiable in the raw opacities. What no photograph holds up fades until it is relocated. Those that the view
+    does not show are left out, unlike in the papers: what few views show would fade in all the others.
     """
-    opacities = scene.primary.logit_opacities.sigmoid()
+    opacities = _shown(scene.primary.logit_opacities, frame).sigmoid()
     return opacities.sum() / max(opacities.numel(), 1)
 
 
@@ -26,9 +27,9 @@ def mean_scale(frame: Frame, view: View, scene: Scene) -> Tensor:
     """Covariance regularisation L_Sigma (TR-Gaussians, Eq. 20): the L1 norm of its eigenvalues' roots, per axis.
 
     Those roots are the standard deviations. Divided by the scene extent, so that the weight does not depend on the
-    capture's units. Differentiable in the raw scales.
+    capture's units. Differentiable in the raw scales. Of the Gaussians that the view shows, as `mean_opacity`.
     """
-    scales = scene.primary.log_scales.exp()
+    scales = _shown(scene.primary.log_scales, frame).exp()
     return scales.sum() / max(scales.numel(), 1) / scene.extent
 
 
@@ -40,6 +41,11 @@ def view_dependence(frame: Frame, view: View, scene: Scene) -> Tensor:
     """
     sh = scene.primary.sh
     return _SquaresBeyondFirst.apply(sh) / max(sh.shape[0], 1)
+
+
+def _shown(values: Tensor, frame: Frame) -> Tensor:
+    """The rows of `values` [N, ...] of the Gaussians that the frame shows; all if it does not say."""
+    return values if frame.visible is None else values[frame.visible]
 
 
 class _SquaresBeyondFirst(torch.autograd.Function):

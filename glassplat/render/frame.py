@@ -44,11 +44,14 @@ class Frame:
     Attributes:
         rgb: [H, W, 3] the image, sRGB, not clamped.
         layers: further images by name, [H, W] or [H, W, 3]; a renderer's docstring lists its own.
+        visible: [N] bool, which primary Gaussians the camera itself shows, not only as mirror images; None says that
+            nobody asked.
         screen: one record per rasterised part and pass of a probed frame.
     """
 
     rgb: Tensor
     layers: Mapping[str, Tensor] = field(default_factory=dict)
+    visible: Tensor | None = None
     screen: tuple[ScreenPass, ...] = ()
 
 

@@ -22,6 +22,7 @@ from glassplat.render.rasterize import (
     over_background,
     project_gaussians,
     screen_pass,
+    shown,
 )
 from glassplat.render.seen_panes import SeenPanes, glass_owners, nearest_hits, seen_panes
 from glassplat.scene.camera import Camera
@@ -41,6 +42,7 @@ class FirstPass(NamedTuple):
     deviation: Tensor | None
     splats: Splats
     marks: Tensor
+    visible: Tensor
     screen: tuple[ScreenPass, ...]
 
 
@@ -104,7 +106,8 @@ class Planar:
         if not hits.tiles.any():
             nothing = torch.zeros_like(hit)
             layers |= {"transmission": first.image, "reflection": torch.zeros_like(first.image)}
-            return Frame(first.image, layers | {"strength": nothing, "share": nothing}, first.screen)
+            layers |= {"strength": nothing, "share": nothing}
+            return Frame(first.image, layers, first.visible, first.screen)
         seen = seen_panes(scene.planes, camera, hits, first.mask)
         second = self._second_pass(scene, camera, seen, probed)
         masks = self._visibilities(scene, camera, seen, first)
@@ -120,7 +123,7 @@ class Planar:
         )
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
         screen = weighted_screen(first, second, hits, result, self.blend) if probed else ()
-        return Frame(result.rgb, layers, screen)
+        return Frame(result.rgb, layers, first.visible, screen)
 
     def _first_pass(self, scene: Scene, camera: Camera, probed: bool) -> FirstPass:
         near = NEAR_PER_EXTENT * scene.extent
@@ -154,6 +157,7 @@ class Planar:
             deviation=result.deviation[0] if deviation else None,
             splats=splats,
             marks=marks,
+            visible=shown(primary),
             screen=screen,
         )
 

@@ -58,6 +58,11 @@ def joined_splats(*parts: Projected) -> Splats:
     return Splats(*(torch.cat([getattr(part, name) for part in parts], dim=1) for name in names))
 
 
+def shown(projected: Projected) -> Tensor:
+    """[N] bool: which Gaussians reach a pixel of the first camera."""
+    return projected.radii[0, :, 0] > 0
+
+
 def screen_pass(part: str, projected: Projected, *, direct: bool = True) -> ScreenPass:
     """The record of a projected scene part, with a probe that asks for a gradient."""
     probe = torch.zeros_like(projected.means2d).requires_grad_()

@@ -17,6 +17,7 @@ from glassplat.render.rasterize import (
     over_background,
     project_gaussians,
     screen_pass,
+    shown,
 )
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
@@ -54,4 +55,4 @@ class Splat:
         if self.depth:
             layers["depth"] = mean_depth(image[..., 3], alpha)
         rgb = over_background(image[..., :3], alpha, self.background)
-        return Frame(rgb, layers, screen)
+        return Frame(rgb, layers, shown(projected), screen)

@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify, reset_opacity
@@ -180,7 +181,10 @@ class Relocate:
 
 @dataclass(frozen=True)
 class Explore:
-    """Moves the primary Gaussians at random, the transparent ones most (3DGS-MCMC).
+    """Moves the primary Gaussians that a step's view shows at random, the transparent ones most (3DGS-MCMC).
+
+    The paper moves all of them in every step. Those that the view does not show have nothing to pull them back, and
+    what few views show would wander off.
 
     Attributes:
         densifier: holds how strong the noise is.
@@ -190,11 +194,13 @@ class Explore:
     densifier: McmcDensify
     rate: Rate
 
-    def __call__(self, state: TrainState, clock: Clock) -> None:
+    def __call__(self, state: TrainState, clock: Clock, visible: Tensor | None) -> None:
         """Edits `state`."""
         primary, extent = state.scene.primary, state.scene.extent
         rate = self.rate.at(clock.progress, 1.0, clock.iterations)
         offsets = self.densifier.noise(primary, rate=rate, extent=extent, generator=state.generator("explore"))
+        if visible is not None:
+            offsets *= visible[:, None]
         state.scene = replace(state.scene, primary=primary.with_tensors({"means": primary.means + offsets}))
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from torch import Tensor
+
 from glassplat.train.stage import Clock
 from glassplat.train.state import TrainState
 
@@ -25,7 +27,7 @@ class AverageLast:
 
     passes: float
 
-    def __call__(self, state: TrainState, clock: Clock) -> None:
+    def __call__(self, state: TrainState, clock: Clock, visible: Tensor | None) -> None:
         """Edits `state`; should the set of Gaussians change meanwhile, the mean begins anew."""
         length = min(round(self.passes * clock.views), int(LONGEST_SHARE * clock.iterations))
         if clock.step <= clock.iterations - length:

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
+from torch import Tensor
+
 from glassplat.data.dataset import Dataset
 from glassplat.losses.term import LossTerm
 from glassplat.render.frame import Renderer
@@ -87,8 +89,14 @@ class Action(Protocol):
 class Motion(Protocol):
     """A change of values that belongs to every step, like the noise of Langevin dynamics; no message reports it."""
 
-    def __call__(self, state: TrainState, clock: Clock) -> None:
-        """Edits `state`."""
+    def __call__(self, state: TrainState, clock: Clock, visible: Tensor | None) -> None:
+        """Edits `state`.
+
+        Args:
+            state: after the optimiser's step.
+            clock: where the run stands.
+            visible: [N] bool, which primary Gaussians the step's view showed; see `Frame.visible`.
+        """
         ...
 
 

@@ -24,11 +24,15 @@ class TrainingDivergedError(FloatingPointError):
 
 
 class Differentiated(NamedTuple):
-    """One view's losses and their gradients; of each pass on screen those of its centres and of its probe."""
+    """One view's losses and their gradients; of each pass on screen those of its centres and of its probe.
+
+    `visible` is the frame's.
+    """
 
     losses: dict[str, float]
     gradients: dict[str, Tensor]
     screen: list[tuple[ScreenPass, Tensor, Tensor]]
+    visible: Tensor | None
 
 
 def train(stages: tuple[Stage, ...], dataset: Dataset, state: TrainState, iterations: int) -> Iterator[Message]:
@@ -76,7 +80,7 @@ def advance(stage: Stage, dataset: Dataset, state: TrainState, iterations: int) 
     state.step += 1
     clock = Clock(state.step, iterations, len(dataset.train))
     for motion in stage.motions:
-        motion(state, clock)
+        motion(state, clock, result.visible)
     done = [action for action in stage.actions if action.due(clock) and action.apply(state, dataset, clock)]
     yield StepDone(state.step, view.name, sum(result.losses.values()), result.losses, counts_of(state.scene))
     for action in done:
@@ -112,7 +116,8 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Di
     on_screen = found[len(leaves) :]
     pulls = zip(tracked, on_screen[: len(tracked)], on_screen[len(tracked) :], strict=True)
     screen = [(s, v_means, v_probe) for s, v_means, v_probe in pulls if v_means is not None and v_probe is not None]
-    return Differentiated({name: float(value.detach()) for name, value in terms.items()}, gradients, screen)
+    losses = {name: float(value.detach()) for name, value in terms.items()}
+    return Differentiated(losses, gradients, screen, frame.visible)
 
 
 def weighted_terms(stage: Stage, frame: Frame, view: View, scene: Scene) -> dict[str, Tensor]:

@@ -9,10 +9,13 @@ import pytest
 import torch
 
 from glassplat.losses.parsimony import mean_opacity, mean_scale, view_dependence
+from glassplat.render.frame import Frame
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
 UNUSED: Any = None
+UNTOLD = Frame(torch.zeros(1, 1, 3))
+"""A frame that does not say what it shows."""
 
 
 def scene_of(opacities: list[float], scale: float, extent: float = 1.0) -> Scene:
@@ -29,27 +32,40 @@ def scene_of(opacities: list[float], scale: float, extent: float = 1.0) -> Scene
 
 def test_the_terms_are_means_of_activated_values() -> None:
     scene = scene_of([0.2, 0.6], scale=0.3)
-    assert mean_opacity(UNUSED, UNUSED, scene).item() == pytest.approx(0.4)
-    assert mean_scale(UNUSED, UNUSED, scene).item() == pytest.approx(0.3)
+    assert mean_opacity(UNTOLD, UNUSED, scene).item() == pytest.approx(0.4)
+    assert mean_scale(UNTOLD, UNUSED, scene).item() == pytest.approx(0.3)
 
 
 def test_the_scale_term_does_not_depend_on_the_units_of_the_capture() -> None:
     metres, millimetres = scene_of([0.5], 0.3, extent=2.0), scene_of([0.5], 300.0, extent=2000.0)
-    assert mean_scale(UNUSED, UNUSED, metres).item() == pytest.approx(mean_scale(UNUSED, UNUSED, millimetres).item())
+    assert mean_scale(UNTOLD, UNUSED, metres).item() == pytest.approx(mean_scale(UNTOLD, UNUSED, millimetres).item())
 
 
 def test_gradients_reach_the_raw_values() -> None:
     scene = scene_of([0.2, 0.6], scale=0.3)
-    (mean_opacity(UNUSED, UNUSED, scene) + mean_scale(UNUSED, UNUSED, scene)).backward()
+    (mean_opacity(UNTOLD, UNUSED, scene) + mean_scale(UNTOLD, UNUSED, scene)).backward()
     assert scene.primary.logit_opacities.grad is not None and scene.primary.log_scales.grad is not None
     assert scene.primary.logit_opacities.grad.tolist() == pytest.approx([0.2 * 0.8 / 2, 0.6 * 0.4 / 2])
     assert scene.primary.log_scales.grad.flatten().tolist() == pytest.approx([0.3 / 6] * 6)
 
 
+def test_what_a_view_does_not_show_is_left_alone() -> None:
+    scene = scene_of([0.2, 0.6, 0.7], scale=0.3)
+    frame = replace(UNTOLD, visible=torch.tensor([True, False, True]))
+    (opacity, scale) = mean_opacity(frame, UNUSED, scene), mean_scale(frame, UNUSED, scene)
+    assert opacity.item() == pytest.approx(0.45) and scale.item() == pytest.approx(0.3)
+    (opacity + scale).backward()
+    assert scene.primary.logit_opacities.grad is not None and scene.primary.log_scales.grad is not None
+    assert scene.primary.logit_opacities.grad.tolist() == pytest.approx([0.2 * 0.8 / 2, 0.0, 0.7 * 0.3 / 2])
+    assert scene.primary.log_scales.grad[:, 0].tolist() == pytest.approx([0.3 / 6, 0.0, 0.3 / 6])
+    nothing = replace(UNTOLD, visible=torch.zeros(3, dtype=torch.bool))
+    assert mean_opacity(nothing, UNUSED, scene).item() == mean_scale(nothing, UNUSED, scene).item() == 0
+
+
 def test_no_gaussians_cost_nothing() -> None:
     scene = scene_of([], scale=0.3)
-    assert mean_opacity(UNUSED, UNUSED, scene).item() == 0
-    assert mean_scale(UNUSED, UNUSED, scene).item() == 0
+    assert mean_opacity(UNTOLD, UNUSED, scene).item() == 0
+    assert mean_scale(UNTOLD, UNUSED, scene).item() == 0
 
 
 def test_only_colours_that_turn_with_the_view_are_held() -> None:

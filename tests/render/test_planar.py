@@ -118,6 +118,16 @@ def test_the_sign_of_the_normal_does_not_matter() -> None:
     torch.testing.assert_close(Planar()(flipped, CAMERA).rgb, Planar()(scene, CAMERA).rgb)
 
 
+def test_what_is_seen_as_a_mirror_image_only_does_not_count_as_visible() -> None:
+    scene = showcase()
+    depths = CAMERA.project(scene.primary.means)[1]
+    room = replace(scene, primary=scene.primary.select(depths < 0))
+    for shown in (scene, room):
+        frame = Planar()(shown, CAMERA)
+        assert frame.visible is not None and float(frame.layers["reflection"].abs().max()) > 0.1
+        assert torch.equal(frame.visible, CAMERA.project(shown.primary.means)[1] > 0)
+
+
 def test_a_pane_reflects_for_cameras_on_either_side() -> None:
     scene = showcase()
     half_turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))

@@ -73,9 +73,9 @@ def test_a_resumed_run_ends_with_the_same_mean(pause: int, tmp_path: Path) -> No
 
 def test_the_mean_begins_anew_when_the_set_of_gaussians_changes() -> None:
     state, average = fresh_state(), AverageLast(passes=1)
-    average(state, Clock(97, 100, views=10))
+    average(state, Clock(97, 100, views=10), None)
     fewer = state.scene.primary.select(torch.arange(len(state.scene.primary)) > 2)
     state.scene = replace(state.scene, primary=fewer)
     for step in (98, 99, 100):
-        average(state, Clock(step, 100, views=10))
+        average(state, Clock(step, 100, views=10), None)
     assert torch.equal(state.scene.primary.means, fewer.means)

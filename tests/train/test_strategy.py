@@ -8,9 +8,12 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
+from glassplat.data.view import View
 from glassplat.densify.mcmc import McmcDensify
 from glassplat.losses.photometric import PhotometricLoss
+from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, Explore, Relocate, ResetOpacity, cap_of, growth_of
 from glassplat.train.averaging import AverageLast
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
@@ -55,6 +58,11 @@ def run(state: TrainState, recipe: Any, iterations: int = 20, until: int | None 
         if isinstance(message, StepDone) and message.step == until:
             break
     return messages
+
+
+def in_front(scene: Scene, view: View) -> Tensor:
+    """[N] bool: what the tiny capture's camera shows of the primary Gaussians."""
+    return view.camera.project(scene.primary.means)[1] > 0
 
 
 @BOTH
@@ -130,12 +138,35 @@ def test_the_regularisers_reach_the_gaussians() -> None:
     plain = replace(stage, losses=tuple(term for term in stage.losses if term.name not in ("opacity", "scale")))
     gradients = [differentiate(s, scene, view, probed=False).gradients for s in (stage, plain)]
     opacities, scales = torch.sigmoid(scene.primary.logit_opacities), scene.primary.log_scales.exp()
+    shown = in_front(scene, view)
     expected = {
-        "primary.logit_opacities": 0.01 * opacities * (1 - opacities) / len(opacities),
-        "primary.log_scales": 0.01 * scales / scales.numel() / scene.extent,
+        "primary.logit_opacities": shown * 0.01 * opacities * (1 - opacities) / shown.sum(),
+        "primary.log_scales": shown[:, None] * 0.01 * scales / (3 * shown.sum()) / scene.extent,
     }
     for name, gradient in expected.items():
         assert torch.allclose(gradients[0][name] - gradients[1][name], gradient, rtol=1e-3, atol=1e-8), name
+
+
+@pytest.mark.parametrize("visible", [None, [True, False, True, False]])
+def test_the_noise_moves_what_the_view_shows(visible: list[bool] | None) -> None:
+    recipe = RECIPES[0]
+    state = fresh_state(recipe)
+    faint = state.scene.primary.select(torch.arange(4))
+    faint = faint.with_tensors({"logit_opacities": torch.full((4,), -9.0)})
+    state.scene = replace(state.scene, primary=faint)
+    (stage,) = recipe.stages(seed=0)
+    explore = stage.motions[0]
+    explore(state, Clock(1, 100, views=10), None if visible is None else torch.tensor(visible))
+    moved = (state.scene.primary.means != faint.means).any(dim=1).tolist()
+    assert moved == (visible or [True] * 4)
+
+
+def test_a_step_hands_on_what_its_view_shows() -> None:
+    (stage,) = RECIPES[0].stages(seed=0)
+    scene, view = fresh_state(RECIPES[0]).scene, tiny_capture().train[0]
+    visible = differentiate(stage, scene, view, probed=False).visible
+    assert visible is not None and torch.equal(visible, in_front(scene, view))
+    assert visible.any() and not visible.all()
 
 
 def test_the_strategy_decides_how_the_first_gaussians_look() -> None:
