@@ -44,8 +44,8 @@ class Frame:
     Attributes:
         rgb: [H, W, 3] the image, sRGB, not clamped.
         layers: further images by name, [H, W] or [H, W, 3]; a renderer's docstring lists its own.
-        visible: [N] bool, which primary Gaussians the camera itself shows, not only as mirror images; None says that
-            nobody asked.
+        visible: [N] bool, which primary Gaussians reach a pixel, themselves or as mirror images; None where the
+            renderer does not say.
         screen: one record per rasterised part and pass of a probed frame.
     """
 

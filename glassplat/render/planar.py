@@ -50,6 +50,7 @@ class SecondPass(NamedTuple):
     """What the panes mirror: colours and intensity [K, H, W, 4] of each."""
 
     reflections: Tensor
+    visible: Tensor
     screen: tuple[ScreenPass, ...]
 
 
@@ -123,7 +124,7 @@ class Planar:
         )
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
         screen = weighted_screen(first, second, hits, result, self.blend) if probed else ()
-        return Frame(result.rgb, layers, first.visible, screen)
+        return Frame(result.rgb, layers, first.visible | second.visible, screen)
 
     def _first_pass(self, scene: Scene, camera: Camera, probed: bool) -> FirstPass:
         near = NEAR_PER_EXTENT * scene.extent
@@ -174,7 +175,7 @@ class Planar:
         if any(self.background):
             colors = over_background(reflections[..., :3], result.alpha, self.background)
             reflections = torch.cat([colors, reflections[..., 3:]], dim=-1)
-        return SecondPass(reflections, screen)
+        return SecondPass(reflections, shown(projected), screen)
 
     def _visibilities(self, scene: Scene, camera: Camera, seen: SeenPanes, first: FirstPass) -> list[Tensor]:
         """[H, W] for each of `seen.order`: how much of that pane is visible."""

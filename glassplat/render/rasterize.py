@@ -59,8 +59,8 @@ def joined_splats(*parts: Projected) -> Splats:
 
 
 def shown(projected: Projected) -> Tensor:
-    """[N] bool: which Gaussians reach a pixel of the first camera."""
-    return projected.radii[0, :, 0] > 0
+    """[N] bool: which Gaussians reach a pixel of some of the cameras."""
+    return (projected.radii[..., 0] > 0).any(dim=0)
 
 
 def screen_pass(part: str, projected: Projected, *, direct: bool = True) -> ScreenPass:

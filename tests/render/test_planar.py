@@ -118,14 +118,19 @@ def test_the_sign_of_the_normal_does_not_matter() -> None:
     torch.testing.assert_close(Planar()(flipped, CAMERA).rgb, Planar()(scene, CAMERA).rgb)
 
 
-def test_what_is_seen_as_a_mirror_image_only_does_not_count_as_visible() -> None:
-    scene = showcase()
+def test_what_is_seen_directly_or_as_a_mirror_image_is_visible() -> None:
+    scene, away = showcase(), camera_at(0.0, 0.0, 10.0)
     depths = CAMERA.project(scene.primary.means)[1]
-    room = replace(scene, primary=scene.primary.select(depths < 0))
-    for shown in (scene, room):
-        frame = Planar()(shown, CAMERA)
-        assert frame.visible is not None and float(frame.layers["reflection"].abs().max()) > 0.1
-        assert torch.equal(frame.visible, CAMERA.project(shown.primary.means)[1] > 0)
+    frame, without_panes, nothing = (
+        Planar()(scene, CAMERA),
+        Planar()(replace(scene, planes=Planes.empty()), CAMERA),
+        Planar()(scene, away),
+    )
+    assert frame.visible is not None and without_panes.visible is not None and nothing.visible is not None
+    assert torch.equal(without_panes.visible, depths > 0)
+    assert frame.visible[depths > 0].all()
+    assert 0 < frame.visible[depths < 0].sum() <= (depths < 0).sum()
+    assert not nothing.visible.any()
 
 
 def test_a_pane_reflects_for_cameras_on_either_side() -> None:
