@@ -217,13 +217,11 @@ class DefaultDensify:
 
 @torch.no_grad()
 def reset_opacity(
-    gaussians: Gaussians, moments: Moments, *, ceiling: float = 0.01, rows: Tensor | None = None
+    gaussians: Gaussians, moments: Moments, *, ceiling: float = 0.01
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
-    """Lowers opacities to at most `ceiling` and forgets their moments (3DGS, Section 5.2).
+    """Lowers every opacity to at most `ceiling` and forgets the opacities' moments (3DGS, Section 5.2).
 
-    What the photographs need grows back; what does not is pruned. Of the `rows` [N] bool only, if they are given.
+    What the photographs need grows back; what does not is pruned.
     """
     lowered = gaussians.logit_opacities.clamp(max=logit(ceiling))
-    if rows is not None:
-        lowered = torch.where(rows, lowered, gaussians.logit_opacities)
-    return gaussians.with_tensors({"logit_opacities": lowered}), forget(moments, ("primary.logit_opacities",), rows)
+    return gaussians.with_tensors({"logit_opacities": lowered}), forget(moments, ("primary.logit_opacities",))

@@ -17,7 +17,6 @@ from glassplat.densify.order import in_morton_order
 from glassplat.densify.perturb import perturb_opacities
 from glassplat.render.contribution import contributions
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.sight import behind_panes
 from glassplat.train.optimizer import Rate
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
@@ -224,32 +223,6 @@ class ResetOpacity:
         )
         state.scene = replace(state.scene, primary=lowered)
         return True
-
-
-@dataclass(frozen=True)
-class ResetBehindPanes:
-    """Lowers the opacity of what is seen through a pane to a ceiling, and of nothing else.
-
-    What stands there for a reflection has to compete with the mirrored image, which keeps its opacity.
-    """
-
-    when: Every
-    ceiling: float = 0.01
-    name: str = "reset opacity behind panes"
-
-    def due(self, clock: Clock) -> bool:
-        """Whether to act after this step."""
-        return self.when.due(clock)
-
-    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Edits `state`, if there is anything to edit."""
-        primary = state.scene.primary
-        selected = behind_panes(primary.means, state.scene.planes, [view.camera for view in dataset.train])
-        lowered, state.optimizer.moments = reset_opacity(
-            primary, state.optimizer.moments, ceiling=self.ceiling, rows=selected
-        )
-        state.scene = replace(state.scene, primary=lowered)
-        return bool(selected.any())
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from glassplat.render.glazing import Blend
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
-from glassplat.train.actions import Densify, GrowSh, PerturbOpacity, ResetBehindPanes
+from glassplat.train.actions import Densify, GrowSh, PerturbOpacity, ResetOpacity
 from glassplat.train.background import BLACK
 from glassplat.train.optimizer import Rate
 from glassplat.train.plane_entry import PlaneEntry, annotations_of
@@ -121,9 +121,10 @@ class PlanarRecipe:
         plane_fit: how planes are found from masks.
         rhythm: when opacities are reset and the SH degree grows.
         strategy: what decides how many primary Gaussians there are and where. With `mcmc` its relocation takes the
-            place of densification and its regularisers join the loss (Eq. 20). It has no resets of its own, and what
-            the first stage builds behind the panes for their reflections would stay: the beats of `rhythm` reset what
-            is behind panes. The perturbation keeps its beats. The glass is densified by `densify` either way.
+            place of densification and its regularisers join the loss (Eq. 20). The set grows in the joint stage only,
+            before which opacities are reset once: many Gaussians would build the reflected room behind the panes in
+            the first stage, and no pruning removes it later. The perturbation keeps its beats. The glass is densified
+            by `densify` either way.
         densify: when and how Gaussians are added and pruned under `default`.
         mcmc: when and how Gaussians are relocated and added under `mcmc`.
     """
@@ -200,6 +201,7 @@ class PlanarRecipe:
                 *population.edits,
                 GrowSh(Every(self.rhythm.sh)),
                 Densify(self.densify, part="glass"),
+                *self._clearing(),
             ),
             motions=population.motions,
             entry=entry,
@@ -223,7 +225,8 @@ class PlanarRecipe:
                 *population.edits,
                 GrowSh(Every(self.rhythm.sh)),
                 Densify(self.densify, part="glass"),
-                *(population.resets if self.strategy == "default" else (ResetBehindPanes(self.rhythm.resets),)),
+                *population.resets,
+                *self._clearing(),
                 PerturbOpacity(beat, self.perturbation.amplitude),
             ),
             motions=population.motions,
@@ -236,9 +239,20 @@ class PlanarRecipe:
 
     def _population(self) -> Population:
         means_rate = self.rates.of("primary")["primary.means"]
-        return population_of(
-            self.strategy, default=self.densify, mcmc=self.mcmc, rhythm=self.rhythm, means_rate=means_rate
-        )
+        late = replace(self.mcmc, start=max(self.mcmc.start, self._joint_start))
+        return population_of(self.strategy, default=self.densify, mcmc=late, rhythm=self.rhythm, means_rate=means_rate)
+
+    def _clearing(self) -> tuple[ResetOpacity, ...]:
+        """The one reset under `mcmc`, where joint optimisation begins; `default` has its own."""
+        # A second one would come after the stop.
+        once = Every(self._joint_start, stop=1.5 * self._joint_start)
+        return (ResetOpacity(once),) if self.strategy == "mcmc" else ()
+
+    @property
+    def _joint_start(self) -> float:
+        """Share of the run after which all three parts learn together."""
+        first, second, third = self.stage_shares
+        return (first + second) / (first + second + third)
 
     def _training_renderer(self, gradient: str) -> Planar:
         return Planar(

@@ -32,7 +32,7 @@ class Rhythm:
     Attributes:
         beat: distance between beats, as a share of the run.
         least: fewest iterations between beats; what a beat disturbs needs as many to recover.
-        reset_stop: share of the run after which no reset happens.
+        reset_stop: share of the run after which no reset happens; the `mcmc` strategy has none.
         sh: distance between rises of the SH degree, as a share of the run.
         averaged_passes: passes over the views at the end of the run of which the scene becomes the mean; 0 keeps the
             last step.
@@ -43,11 +43,6 @@ class Rhythm:
     reset_stop: float = 0.45
     sh: float = 1 / 30
     averaged_passes: float = 1.0
-
-    @property
-    def resets(self) -> Every:
-        """The beats that reset opacities."""
-        return Every(self.beat, 0.0, self.reset_stop, self.least, only_multiples_of=3)
 
 
 @dataclass(frozen=True)
@@ -97,8 +92,9 @@ def population_of(
 
 def default_population(densifier: DefaultDensify, rhythm: Rhythm) -> Population:
     """3DGS: clone, split, prune, and reset the opacities; and what adds to no view is removed in the end."""
+    reset = ResetOpacity(Every(rhythm.beat, 0.0, rhythm.reset_stop, rhythm.least, only_multiples_of=3))
     edits = (Densify(densifier), PruneIdle(densifier))
-    return Population(edits=edits, resets=(ResetOpacity(rhythm.resets),), densify_until=densifier.stop)
+    return Population(edits=edits, resets=(reset,), densify_until=densifier.stop)
 
 
 def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:

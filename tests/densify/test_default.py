@@ -128,11 +128,3 @@ def test_reset_lowers_high_opacities_and_forgets_their_moments() -> None:
     assert not moments["primary.logit_opacities"][0].any()
     assert moments["primary.sh"][0].all()
     assert after.logit_opacities.max() <= math.log(0.01 / 0.99) + 1e-6
-
-
-def test_a_reset_of_some_leaves_the_others_and_their_moments() -> None:
-    gaussians, ones = make_gaussians([0.1] * 3, [0.9, 0.9, 0.002]), torch.ones(3)
-    rows = torch.tensor([True, False, True])
-    after, moments = reset_opacity(gaussians, {"primary.logit_opacities": (ones, ones)}, rows=rows)
-    assert torch.sigmoid(after.logit_opacities).tolist() == pytest.approx([0.01, 0.9, 0.002])
-    assert moments["primary.logit_opacities"][0].tolist() == [0.0, 1.0, 0.0]

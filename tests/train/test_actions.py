@@ -7,14 +7,12 @@ from dataclasses import replace
 import torch
 
 from glassplat.densify.default import DefaultDensify
-from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
-from glassplat.scene.sight import behind_panes
-from glassplat.train.actions import PruneIdle, ResetBehindPanes
+from glassplat.train.actions import PruneIdle
 from glassplat.train.splat_recipe import SplatRecipe
-from glassplat.train.stage import Clock, Every
+from glassplat.train.stage import Clock
 from glassplat.train.state import TrainState
-from tests.train.tiny_capture import tiny_capture, true_scene
+from tests.train.tiny_capture import tiny_capture
 
 
 def state_with_one_out_of_sight() -> TrainState:
@@ -43,18 +41,3 @@ def test_idle_gaussians_are_looked_for_at_the_moments_that_were_asked_for() -> N
 
     assert due(DefaultDensify(contribution_moments=(0.5, 0.8))) == [50, 80]
     assert due(DefaultDensify(least_contribution=0)) == []
-
-
-def test_what_is_behind_panes_is_reset_and_nothing_else() -> None:
-    scene = true_scene()
-    opaque = scene.primary.with_tensors({"logit_opacities": torch.full((len(scene.primary),), 2.0)})
-    state = TrainState(replace(scene, primary=opaque), seed=0)
-    action, dataset = ResetBehindPanes(Every(0.1)), tiny_capture()
-    behind = behind_panes(opaque.means, scene.planes, [view.camera for view in dataset.train])
-    assert behind.any() and not behind.all()
-    assert action.apply(state, dataset, Clock(10, 100, 5))
-    lowered = torch.sigmoid(state.scene.primary.logit_opacities) < 0.011
-    assert torch.equal(lowered, behind)
-    assert torch.equal(state.scene.primary.logit_opacities[~behind], opaque.logit_opacities[~behind])
-    state.scene = replace(state.scene, planes=Planes.empty())
-    assert not action.apply(state, dataset, Clock(20, 100, 5))
