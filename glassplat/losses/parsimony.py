@@ -17,9 +17,10 @@ def mean_opacity(frame: Frame, view: View, scene: Scene) -> Tensor:
     """Opacity regularisation L_o (TR-Gaussians, Eq. 20): the L1 norm of the opacities, per Gaussian in view.
 
     Differentiable in the raw opacities. What no photograph holds up fades until it is relocated. Those that the view
-    does not show are left out, unlike in the papers: what few views show would fade in all the others.
+    does not show are left out, unlike in the papers: what few views show would fade in all the others. Mirror images
+    do not count: what a pane shows at a tenth of its strength would fade as fast as what is seen directly.
     """
-    opacities = _shown(scene.primary.logit_opacities, frame).sigmoid()
+    opacities = _direct(scene.primary.logit_opacities, frame).sigmoid()
     return opacities.sum() / max(opacities.numel(), 1)
 
 
@@ -29,7 +30,7 @@ def mean_scale(frame: Frame, view: View, scene: Scene) -> Tensor:
     Those roots are the standard deviations. Divided by the scene extent, so that the weight does not depend on the
     capture's units. Differentiable in the raw scales. Of the Gaussians that the view shows, as `mean_opacity`.
     """
-    scales = _shown(scene.primary.log_scales, frame).exp()
+    scales = _direct(scene.primary.log_scales, frame).exp()
     return scales.sum() / max(scales.numel(), 1) / scene.extent
 
 
@@ -43,9 +44,9 @@ def view_dependence(frame: Frame, view: View, scene: Scene) -> Tensor:
     return _SquaresBeyondFirst.apply(sh) / max(sh.shape[0], 1)
 
 
-def _shown(values: Tensor, frame: Frame) -> Tensor:
-    """The rows of `values` [N, ...] of the Gaussians that the frame shows; all if it does not say."""
-    return values if frame.visible is None else values[frame.visible]
+def _direct(values: Tensor, frame: Frame) -> Tensor:
+    """The rows of `values` [N, ...] of the Gaussians that the frame shows directly; all if it does not say."""
+    return values if frame.direct is None else values[frame.direct]
 
 
 class _SquaresBeyondFirst(torch.autograd.Function):

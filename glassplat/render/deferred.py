@@ -80,7 +80,7 @@ class Deferred:
         rgb, layers = shade(scene, camera, projected, channels, joined_probe(screen))
         if self.environment:
             layers["environment"] = torch.sigmoid(cube_lookup(scene.environment.raw, view_directions(camera)))
-        return Frame(rgb, layers, shown(projected), screen)
+        return Frame(rgb, layers, direct=shown(projected), screen=screen)
 
     def _channels_of(self, gaussians: Gaussians, camera: Camera, projected: Projected) -> Tensor:
         """[N, D] what each Gaussian adds to the image: as `shade_environment` reads it, then depth, if asked for."""

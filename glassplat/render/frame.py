@@ -44,15 +44,21 @@ class Frame:
     Attributes:
         rgb: [H, W, 3] the image, sRGB, not clamped.
         layers: further images by name, [H, W] or [H, W, 3]; a renderer's docstring lists its own.
-        visible: [N] bool, which primary Gaussians reach a pixel, themselves or as mirror images; None where the
-            renderer does not say.
+        direct: [N] bool, which primary Gaussians reach a pixel themselves; None where the renderer does not say.
+        mirrored: [N] bool, which ones reach a pixel as mirror images; None where nothing is mirrored.
         screen: one record per rasterised part and pass of a probed frame.
     """
 
     rgb: Tensor
     layers: Mapping[str, Tensor] = field(default_factory=dict)
-    visible: Tensor | None = None
+    direct: Tensor | None = None
+    mirrored: Tensor | None = None
     screen: tuple[ScreenPass, ...] = ()
+
+    @property
+    def visible(self) -> Tensor | None:
+        """[N] bool, which primary Gaussians reach a pixel in either way; None where the renderer does not say."""
+        return self.direct if self.direct is None or self.mirrored is None else self.direct | self.mirrored
 
 
 class Renderer(Protocol):

@@ -42,7 +42,7 @@ class FirstPass(NamedTuple):
     deviation: Tensor | None
     splats: Splats
     marks: Tensor
-    visible: Tensor
+    direct: Tensor
     screen: tuple[ScreenPass, ...]
 
 
@@ -50,7 +50,7 @@ class SecondPass(NamedTuple):
     """What the panes mirror: colours and intensity [K, H, W, 4] of each."""
 
     reflections: Tensor
-    visible: Tensor
+    mirrored: Tensor
     screen: tuple[ScreenPass, ...]
 
 
@@ -108,7 +108,7 @@ class Planar:
             nothing = torch.zeros_like(hit)
             layers |= {"transmission": first.image, "reflection": torch.zeros_like(first.image)}
             layers |= {"strength": nothing, "share": nothing}
-            return Frame(first.image, layers, first.visible, first.screen)
+            return Frame(first.image, layers, direct=first.direct, screen=first.screen)
         seen = seen_panes(scene.planes, camera, hits, first.mask)
         second = self._second_pass(scene, camera, seen, probed)
         masks = self._visibilities(scene, camera, seen, first)
@@ -124,7 +124,7 @@ class Planar:
         )
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
         screen = weighted_screen(first, second, hits, result, self.blend) if probed else ()
-        return Frame(result.rgb, layers, first.visible | second.visible, screen)
+        return Frame(result.rgb, layers, first.direct, second.mirrored, screen)
 
     def _first_pass(self, scene: Scene, camera: Camera, probed: bool) -> FirstPass:
         near = NEAR_PER_EXTENT * scene.extent
@@ -158,7 +158,7 @@ class Planar:
             deviation=result.deviation[0] if deviation else None,
             splats=splats,
             marks=marks,
-            visible=shown(primary),
+            direct=shown(primary),
             screen=screen,
         )
 

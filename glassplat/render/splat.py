@@ -55,4 +55,4 @@ class Splat:
         if self.depth:
             layers["depth"] = mean_depth(image[..., 3], alpha)
         rgb = over_background(image[..., :3], alpha, self.background)
-        return Frame(rgb, layers, shown(projected), screen)
+        return Frame(rgb, layers, direct=shown(projected), screen=screen)

@@ -95,7 +95,7 @@ class Motion(Protocol):
         Args:
             state: after the optimiser's step.
             clock: where the run stands.
-            visible: [N] bool, which primary Gaussians the step's view showed; see `Frame.visible`.
+            visible: [N] bool, which primary Gaussians the step's view showed, also as mirror images; all if None.
         """
         ...
 

@@ -49,16 +49,16 @@ def test_gradients_reach_the_raw_values() -> None:
     assert scene.primary.log_scales.grad.flatten().tolist() == pytest.approx([0.3 / 6] * 6)
 
 
-def test_what_a_view_does_not_show_is_left_alone() -> None:
+def test_what_a_view_does_not_show_directly_is_left_alone() -> None:
     scene = scene_of([0.2, 0.6, 0.7], scale=0.3)
-    frame = replace(UNTOLD, visible=torch.tensor([True, False, True]))
+    frame = replace(UNTOLD, direct=torch.tensor([True, False, True]), mirrored=torch.tensor([False, True, True]))
     (opacity, scale) = mean_opacity(frame, UNUSED, scene), mean_scale(frame, UNUSED, scene)
     assert opacity.item() == pytest.approx(0.45) and scale.item() == pytest.approx(0.3)
     (opacity + scale).backward()
     assert scene.primary.logit_opacities.grad is not None and scene.primary.log_scales.grad is not None
     assert scene.primary.logit_opacities.grad.tolist() == pytest.approx([0.2 * 0.8 / 2, 0.0, 0.7 * 0.3 / 2])
     assert scene.primary.log_scales.grad[:, 0].tolist() == pytest.approx([0.3 / 6, 0.0, 0.3 / 6])
-    nothing = replace(UNTOLD, visible=torch.zeros(3, dtype=torch.bool))
+    nothing = replace(UNTOLD, direct=torch.zeros(3, dtype=torch.bool))
     assert mean_opacity(nothing, UNUSED, scene).item() == mean_scale(nothing, UNUSED, scene).item() == 0
 
 
