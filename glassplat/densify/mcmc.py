@@ -42,7 +42,7 @@ class McmcDensify:
         noise_rate: noise on the positions of what a view shows, as a multiple of their learning rate; 0 switches it
             off.
         noise_sharpness: how fast the noise fades above `dead_opacity`.
-        opacity_weight: lambda_o, weight of the mean opacity in the objective, over what a view shows.
+        opacity_weight: lambda_o, weight of the mean opacity in the objective, over what a view shows directly.
         scale_weight: lambda_Sigma, weight of the mean standard deviation in the objective, likewise.
         initial_opacity: opacity of the first Gaussians.
         initial_spread: standard deviation of the first Gaussians, as a share of the distance to their neighbours. The

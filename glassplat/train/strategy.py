@@ -101,8 +101,9 @@ def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
     """3DGS-MCMC: relocate, add, explore, and regularise opacities and scales; opacities are never reset.
 
     The regularisers are those of TR-Gaussians, Eq. 20, which adds them to whatever the objective is otherwise. They
-    and the noise act on what a step's view shows. The papers' act on everything, which hardly differs where every view
-    shows most of the scene; what a few of many views show, such as a room photographed all around, fades and wanders.
+    act on what a step's view shows directly, and the noise on what it shows, also as mirror images. The papers' act on
+    everything, which hardly differs where every view shows most of the scene; what a few of many views show, such as a
+    room photographed all around, fades and wanders.
     """
     terms = weighted(
         LossTerm("opacity", densifier.opacity_weight, mean_opacity),
