@@ -28,7 +28,7 @@ def mean_scale(frame: Frame, view: View, scene: Scene) -> Tensor:
     """Covariance regularisation L_Sigma (TR-Gaussians, Eq. 20): the L1 norm of its eigenvalues' roots, per axis.
 
     Those roots are the standard deviations. Divided by the scene extent, so that the weight does not depend on the
-    capture's units. Differentiable in the raw scales. Of the Gaussians that the view shows, as `mean_opacity`.
+    capture's units. Differentiable in the raw scales. Of what the view shows directly, as `mean_opacity`.
     """
     scales = _direct(scene.primary.log_scales, frame).exp()
     return scales.sum() / max(scales.numel(), 1) / scene.extent

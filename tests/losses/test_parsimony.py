@@ -52,7 +52,7 @@ def test_gradients_reach_the_raw_values() -> None:
 def test_what_a_view_does_not_show_directly_is_left_alone() -> None:
     scene = scene_of([0.2, 0.6, 0.7], scale=0.3)
     frame = replace(UNTOLD, direct=torch.tensor([True, False, True]), mirrored=torch.tensor([False, True, True]))
-    (opacity, scale) = mean_opacity(frame, UNUSED, scene), mean_scale(frame, UNUSED, scene)
+    opacity, scale = mean_opacity(frame, UNUSED, scene), mean_scale(frame, UNUSED, scene)
     assert opacity.item() == pytest.approx(0.45) and scale.item() == pytest.approx(0.3)
     (opacity + scale).backward()
     assert scene.primary.logit_opacities.grad is not None and scene.primary.log_scales.grad is not None
