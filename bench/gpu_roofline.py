@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from bench.kernels import MULTIPLY_ADDS
-from glassplat.kernels.cuda.tile import BUCKET, PIXELS
+from glassplat.kernels.composite.cuda_tile import BUCKET, PIXELS
 
 GEOMETRY_BYTES = 28
 """Of one pair: the splat's index, mean, conic and opacity."""
@@ -62,7 +62,7 @@ def counts_of(saved: Any, visited: int, pairs: int, channels: int) -> Counts:
     """Counts from what the forward pass saved.
 
     Args:
-        saved: `glassplat.kernels.cuda.composite.Saved`.
+        saved: `glassplat.kernels.composite.cuda.Saved`.
         visited: evaluations of a traversal in which no pixel stops early.
         pairs: all (tile, splat) pairs.
         channels: of a splat.

@@ -15,11 +15,11 @@ from glassplat.files.markdown_table import Table
 from glassplat.kernels import bin_tiles as bin_tiles_module
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
+from glassplat.kernels.composite import reference as composite_twin
 from glassplat.kernels.photometric import photometric
+from glassplat.kernels.photometric import reference as photometric_twin
 from glassplat.kernels.project import project
-from glassplat.kernels.reference import composite as composite_twin
-from glassplat.kernels.reference import photometric as photometric_twin
-from glassplat.kernels.reference import project as project_twin
+from glassplat.kernels.project import reference as project_twin
 from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians, Splats, TileBins
 from glassplat.render.rasterize import joined_splats
 from glassplat.scene.camera import Camera

@@ -180,9 +180,9 @@ SMALL_ROWS = {"cli": 0, "train": 1, "render": 2, "files": 2, "kernels": 3, "scen
         ("glassplat/render/splat.py", "from glassplat.train.trainer import train", "train"),
         ("glassplat/render/splat.py", "import glassplat.cli", "cli"),
         ("glassplat/render/splat.py", "from glassplat.files.ply import read_ply", "files"),
-        ("glassplat/kernels/project.py", "from glassplat.scene.camera import Camera", "scene"),
-        ("glassplat/kernels/project.py", "from glassplat import scene", "scene"),
-        ("glassplat/kernels/cpu/project.py", "from ...scene import camera", "scene"),
+        ("glassplat/kernels/project/operation.py", "from glassplat.scene.camera import Camera", "scene"),
+        ("glassplat/kernels/project/operation.py", "from glassplat import scene", "scene"),
+        ("glassplat/kernels/project/cpu.py", "from ...scene import camera", "scene"),
         ("glassplat/scene/camera.py", "def late():\n    import glassplat.render.splat", "render"),
     ],
 )
@@ -225,7 +225,7 @@ def test_a_function_is_measured_without_its_docstring() -> None:
 
 def test_kernels_may_be_longer_and_take_more() -> None:
     source = long_function(MOST_KERNEL_LINES) + "def many(a, b, c, d, e, f, g, h, i): ...\n"
-    assert violations(Path("glassplat/kernels/cpu/x.py"), source, SMALL_ROWS) == []
+    assert violations(Path("glassplat/kernels/x/cpu.py"), source, SMALL_ROWS) == []
     assert len(violations(Path("glassplat/render/x.py"), source, SMALL_ROWS)) == 2
 
 

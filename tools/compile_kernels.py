@@ -22,7 +22,7 @@ import numpy as np
 
 CAPABILITIES = ((8, 0), (9, 0), (12, 0))
 SUPPORTED = ((7, 5), (8, 0), (8, 6), (8, 9), (9, 0), (10, 0), (12, 0))
-PACKAGE = "glassplat.kernels.cuda"
+PACKAGE = "glassplat.kernels"
 
 
 class Resources(NamedTuple):
@@ -36,7 +36,8 @@ class Resources(NamedTuple):
 def all_kernels(real: type = np.float32) -> list[Any]:
     """Every kernel of the package, built for one floating-point type, in the order of their names."""
     package = importlib.import_module(PACKAGE)
-    modules = [importlib.import_module(f"{PACKAGE}.{entry.name}") for entry in pkgutil.iter_modules(package.__path__)]
+    names = [entry.name for entry in pkgutil.walk_packages(package.__path__, f"{PACKAGE}.")]
+    modules = [importlib.import_module(name) for name in names if name.rpartition(".")[2].startswith("cuda")]
     factories: set[Callable[..., Any]] = {
         value
         for module in modules

@@ -28,7 +28,7 @@ def kernels_for(operation: str, device: torch.device) -> Any:
     """The module that holds the kernels of an operation for tensors on a device.
 
     Args:
-        operation: name of the file in `kernels/cpu/` and `kernels/cuda/`.
+        operation: name of the operation's folder in `kernels/`, which holds `cpu.py` and `cuda.py`.
         device: where the operation's tensors are, the CPU or an NVIDIA GPU.
 
     Raises:
@@ -41,7 +41,7 @@ def kernels_for(operation: str, device: torch.device) -> Any:
 def _module(operation: str, folder: str) -> Any:
     if folder == "cuda" and not _has_numba_cuda():
         raise CudaUnavailableError(_install())
-    return importlib.import_module(f"glassplat.kernels.{folder}.{operation}")
+    return importlib.import_module(f"glassplat.kernels.{operation}.{folder}")
 
 
 def chosen_device(name: DeviceName) -> torch.device:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from glassplat.data.dataset import View
-from glassplat.kernels.reference.pane_hits import ray_grid
+from glassplat.kernels.pane_hits.reference import ray_grid
 from glassplat.render.frame import Frame
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene

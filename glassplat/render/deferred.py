@@ -11,9 +11,9 @@ from torch import Tensor
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
 from glassplat.kernels.cube_lookup import cube_lookup
-from glassplat.kernels.reference.pane_hits import ray_grid
+from glassplat.kernels.pane_hits.reference import ray_grid
 from glassplat.kernels.shade_environment import shade_environment
-from glassplat.kernels.shaded import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
+from glassplat.kernels.shade_environment.shaded import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
 from glassplat.kernels.splats import Projected
 from glassplat.kernels.surface_channels import surface_channels
 from glassplat.render.frame import Frame

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from glassplat.kernels.bin_tiles import TILE, bin_tiles
 from glassplat.kernels.blend_panes import blend_panes
+from glassplat.kernels.color_space import linear_from_srgb, srgb_from_linear
 from glassplat.kernels.composite import composite
 from glassplat.kernels.panes import BlendedPanes, Fresnel
-from glassplat.kernels.reference.color_space import linear_from_srgb, srgb_from_linear
 from glassplat.kernels.splats import Splats
 from glassplat.render.seen_panes import SeenPanes
 from glassplat.scene.camera import Camera

@@ -11,7 +11,7 @@ import torch
 
 from glassplat.cli import main
 from glassplat.commands.demo import SCENE
-from glassplat.kernels.maths_pane import LAWS
+from glassplat.kernels.maths.pane import LAWS
 
 PROMISED = {
     "method", "iterations", "resolution", "split", "seed", "num_gaussians", "train_seconds", "seconds_per_frame",

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from glassplat.kernels.adam import adam
-from glassplat.kernels.reference.adam import adam as reference_adam
+from glassplat.kernels.adam.reference import adam as reference_adam
 
 BETAS = (0.8, 0.99)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import Composite, composite
-from glassplat.kernels.reference.composite import composite as composite_twin
+from glassplat.kernels.composite.reference import composite as composite_twin
 from glassplat.kernels.splats import Deviation, Splats, TileBins
 
 MakeSplats = Callable[..., Splats]

@@ -80,7 +80,7 @@ def test_tensors_on_a_gpu_without_its_kernels_are_refused(monkeypatch: pytest.Mo
     devices._module.cache_clear()
     with pytest.raises(CudaUnavailableError, match="pip install"):
         kernels_for("adam", torch.device("cuda"))
-    assert kernels_for("adam", torch.device("cpu")).__name__ == "glassplat.kernels.cpu.adam"
+    assert kernels_for("adam", torch.device("cpu")).__name__ == "glassplat.kernels.adam.cpu"
 
 
 @pytest.mark.skipif(importlib.util.find_spec("numba_cuda") is None, reason="numba-cuda is not installed")

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.gradient_conflict import gradient_conflict
-from glassplat.kernels.reference.gradient_conflict import gradient_conflict as twin
-from glassplat.kernels.reference.gradient_conflict import sobel
+from glassplat.kernels.gradient_conflict.reference import gradient_conflict as twin
+from glassplat.kernels.gradient_conflict.reference import sobel
 
 
 def pictures(height: int, width: int, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from glassplat.kernels.maths_blend import ALPHA_MIN, blend_maths
+from glassplat.kernels.maths.blending import ALPHA_MIN, blend_maths
 
 
 @pytest.mark.parametrize(("real", "tolerance"), [(np.float32, 4e-7), (np.float64, 1e-15)])

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.project import project
-from glassplat.kernels.reference.project import sh_basis
+from glassplat.kernels.project.reference import sh_basis
 from glassplat.kernels.splats import CameraBatch, RawGaussians
 from tests.kernels.gaussians_and_cameras import draw, random_cameras, random_gaussians
 

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.blend_panes import blend_panes
-from glassplat.kernels.maths_pane import LAWS
+from glassplat.kernels.blend_panes.reference import blend_panes as blend_twin
+from glassplat.kernels.maths.pane import LAWS
 from glassplat.kernels.pane_hits import pane_hits
+from glassplat.kernels.pane_hits.reference import pane_hits as hits_twin
 from glassplat.kernels.panes import BlendedPanes, Fresnel, PaneHits, Panes
-from glassplat.kernels.reference.blend_panes import blend_panes as blend_twin
-from glassplat.kernels.reference.pane_hits import pane_hits as hits_twin
 
 WIDTH, HEIGHT = 53, 37
 INPUTS = ("transmission", "mask", "reflections", "normals", "base_reflectances")

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.cpu.photometric import COLUMNS, ROWS
 from glassplat.kernels.photometric import Photometric, photometric
-from glassplat.kernels.reference.photometric import photometric as photometric_twin
+from glassplat.kernels.photometric.cpu import COLUMNS, ROWS
+from glassplat.kernels.photometric.reference import photometric as photometric_twin
 
 
 def pictures(height: int, width: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:

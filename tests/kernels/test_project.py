@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.project import project
-from glassplat.kernels.reference.project import project as reference_project
+from glassplat.kernels.project.reference import project as reference_project
 from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians
 from tests.kernels.gaussians_and_cameras import HEIGHT, WIDTH, draw, random_cameras, random_gaussians
 

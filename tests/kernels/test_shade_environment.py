@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.cube_lookup import cube_lookup
-from glassplat.kernels.reference.shade_environment import shade_environment as twin
 from glassplat.kernels.shade_environment import shade_environment
-from glassplat.kernels.shaded import NORMAL_MIN, Shaded
+from glassplat.kernels.shade_environment.reference import shade_environment as twin
+from glassplat.kernels.shade_environment.shaded import NORMAL_MIN, Shaded
 
 INPUTS = ("blended", "alpha", "texels")
 WIDTH, HEIGHT = 29, 23

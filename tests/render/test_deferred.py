@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from glassplat.kernels.reference.cube_lookup import cube_lookup
+from glassplat.kernels.cube_lookup.reference import cube_lookup
 from glassplat.render.deferred import Deferred, Shading, view_directions
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from glassplat.kernels.reference.color_space import linear_from_srgb, srgb_from_linear
+from glassplat.kernels.color_space import linear_from_srgb, srgb_from_linear
 from glassplat.render.dereflect import as_mirror_image, dereflected_photo
 from glassplat.render.frame import Frame
 from glassplat.render.glazing import Blend

@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from glassplat.kernels.maths_pane import LAWS
+from glassplat.kernels.blend_panes.reference import REFLECTANCE
+from glassplat.kernels.color_space import linear_from_srgb
+from glassplat.kernels.maths.pane import LAWS
 from glassplat.kernels.panes import Fresnel
-from glassplat.kernels.reference.blend_panes import REFLECTANCE
-from glassplat.kernels.reference.color_space import linear_from_srgb
 from glassplat.render.planar import Planar, detached
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera

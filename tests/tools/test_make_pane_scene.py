@@ -11,9 +11,9 @@ import torch
 
 from glassplat.data.dataset import load_dataset
 from glassplat.evaluate.truth import load_truth
+from glassplat.kernels.blend_panes.reference import two_surfaces
+from glassplat.kernels.pane_hits.reference import pane_hits
 from glassplat.kernels.panes import Panes
-from glassplat.kernels.reference.blend_panes import two_surfaces
-from glassplat.kernels.reference.pane_hits import pane_hits
 from tools.make_pane_scene import Arguments, main
 from tools.pane_tracer import Ball, Box, Pane, Place
 

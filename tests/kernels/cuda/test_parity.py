@@ -25,19 +25,19 @@ from glassplat.kernels import photometric as photometric_operation
 from glassplat.kernels import project as project_operation
 from glassplat.kernels import shade_environment as shade_operation
 from glassplat.kernels import surface_channels as surface_operation
+from glassplat.kernels.adam import reference as adam_twin
+from glassplat.kernels.bin_tiles import reference as bin_twin
+from glassplat.kernels.blend_panes import reference as blend_twin
+from glassplat.kernels.composite import reference as composite_twin
+from glassplat.kernels.cube_lookup import reference as lookup_twin
 from glassplat.kernels.devices import SIMULATED, cuda_problem, kernels_for
+from glassplat.kernels.pane_hits import reference as hits_twin
 from glassplat.kernels.panes import Fresnel, Panes
-from glassplat.kernels.reference import adam as adam_twin
-from glassplat.kernels.reference import bin_tiles as bin_twin
-from glassplat.kernels.reference import blend_panes as blend_twin
-from glassplat.kernels.reference import composite as composite_twin
-from glassplat.kernels.reference import cube_lookup as lookup_twin
-from glassplat.kernels.reference import pane_hits as hits_twin
-from glassplat.kernels.reference import photometric as photometric_twin
-from glassplat.kernels.reference import project as project_twin
-from glassplat.kernels.reference import shade_environment as shade_twin
-from glassplat.kernels.reference import surface_channels as surface_twin
+from glassplat.kernels.photometric import reference as photometric_twin
+from glassplat.kernels.project import reference as project_twin
+from glassplat.kernels.shade_environment import reference as shade_twin
 from glassplat.kernels.splats import CameraBatch, Deviation, RawGaussians, Splats
+from glassplat.kernels.surface_channels import reference as surface_twin
 from tests.kernels.gaussians_and_cameras import draw, random_cameras, random_gaussians
 
 if SIMULATED and hasattr(os, "sched_setaffinity"):

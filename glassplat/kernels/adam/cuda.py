@@ -1,0 +1,54 @@
+"""Adam on the GPU: one thread for each element."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+
+import torch
+from numba import cuda
+from torch import Tensor
+
+from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
+from glassplat.kernels.tensor_checks import REAL_OF
+
+THREADS = 256
+
+
+def adam(
+    flat: Sequence[Tensor], lr: float | Tensor, betas: tuple[float, float], eps: float,
+    *, corrections: tuple[float, float],
+) -> None:  # fmt: skip
+    """As `glassplat.kernels.adam.cpu.adam`."""
+    parameter = flat[0]
+    rates, rate = parameter.new_empty(0), 0.0
+    if isinstance(lr, Tensor):
+        rates = (lr.detach().to(parameter.device, torch.float64) * corrections[0]).to(parameter.dtype).contiguous()
+    else:
+        rate = lr * corrections[0]
+    adam_step(REAL_OF[parameter.dtype])(
+        blocks_for(parameter.numel(), THREADS), THREADS, *flat, rates, rate,
+        betas[0], betas[1], 1 - betas[0], 1 - betas[1], corrections[1], eps,
+    )  # fmt: skip
+
+
+@cache
+def adam_step(real: type) -> Kernel:
+    """Updates flat arrays in place; `rates` holds one step size for each column, or `rate` is that of all."""
+
+    @kernel("adam", real, "real1 real1 real1 real1 real1 real real real real real real real")
+    def step(
+        parameter, gradient, first, second, rates, rate, beta_1, beta_2, gain_1, gain_2, second_scale, eps
+    ):  # fmt: skip
+        i = cuda.grid(1)
+        if i >= parameter.size:
+            return
+        g = gradient[i]
+        mean = beta_1 * first[i] + gain_1 * g
+        square = beta_2 * second[i] + gain_2 * g * g
+        first[i], second[i] = mean, square
+        step_size = rates[i % rates.size] if rates.size > 0 else rate
+        parameter[i] -= step_size * mean / (math.sqrt(square) * second_scale + eps)
+
+    return step

@@ -1,0 +1,186 @@
+"""Binning on the GPU: one pass over the splats to count their tiles, one over the pairs; torch scans and sorts.
+
+Splats are sorted by depth first. Their pairs are written in that order, so that one stable sort of the pairs by tile,
+an integer of 16 bits for all but very large images, leaves each tile's splats nearest first. Each pair has a thread,
+which searches the sums of the counts for its splat: no thread waits for one that covers the whole image.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import torch
+from numba import cuda
+from torch import Tensor
+
+from glassplat.kernels.bin_tiles.cpu import pixel_ranges
+from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
+from glassplat.kernels.maths.blending import Scalar
+from glassplat.kernels.maths.projection import ellipse_maths
+from glassplat.kernels.splats import TILE, Splats, TileBins, check_pair_count
+from glassplat.kernels.tensor_checks import REAL_OF
+
+THREADS = 128
+
+
+def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | None) -> TileBins:
+    """As `glassplat.kernels.bin_tiles.cpu.bin_tiles`; waits for the GPU once, to learn the number of pairs."""
+    num_cameras, per_camera = splats.depths.shape
+    count, device, real = num_cameras * per_camera, splats.depths.device, REAL_OF[splats.depths.dtype]
+    num_tiles = num_cameras * -(-height // TILE) * -(-width // TILE)
+    shapes = (splats.means2d.view(count, 2), splats.conics.view(count, 3), splats.opacities.view(count))
+    radii = splats.radii.view(count, 2)
+    mask = radii.new_zeros(0, 0, 0, dtype=torch.bool) if active_tiles is None else active_tiles
+    counts = torch.empty(count, dtype=torch.int32, device=device)
+    count_tiles(real)(blocks_for(count, THREADS), THREADS, *shapes, radii, mask, per_camera, width, height, counts)
+    splat_offsets = torch.zeros(count + 1, dtype=torch.int64, device=device)
+    torch.cumsum(counts, 0, out=splat_offsets[1:])
+    num_pairs = int(splat_offsets[-1])
+    check_pair_count(num_pairs)
+    narrow = num_tiles < np.iinfo(np.int16).max
+    tiles = torch.empty(num_pairs, dtype=torch.int16 if narrow else torch.int32, device=device)
+    members, slots = torch.empty(2, num_pairs, dtype=torch.int32, device=device)
+    emit_tiles(real, np.int16 if narrow else np.int32)(
+        blocks_for(num_pairs, THREADS), THREADS, *shapes, radii, mask, per_camera, width, height, num_tiles,
+        *_sequence(splats.depths, counts), splat_offsets, tiles, members, slots,
+    )  # fmt: skip
+    by_tile, order = torch.sort(tiles, stable=True)
+    edges = torch.arange(num_tiles + 1, dtype=tiles.dtype, device=device)
+    pair_slots = torch.empty_like(slots)
+    pair_slots[slots[order].long()] = torch.arange(num_pairs, dtype=torch.int32, device=device)
+    if active_tiles is None:
+        active = torch.arange(num_tiles, dtype=torch.int32, device=device)
+    else:
+        active = active_tiles.flatten().nonzero()[:, 0].to(torch.int32)
+    tile_offsets = torch.searchsorted(by_tile, edges)
+    return TileBins(members[order], tile_offsets, pair_slots, splat_offsets, active, width, height, num_cameras)
+
+
+def _sequence(depths: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+    """The splats [S] in the order of their depths, camera by camera, and how many pairs those before each have."""
+    num_cameras, per_camera = depths.shape
+    first = torch.arange(num_cameras, device=depths.device)[:, None] * per_camera
+    order = (torch.argsort(depths, dim=1, stable=True) + first).flatten()
+    in_order = counts[order].long()
+    return order, in_order.cumsum(0) - in_order
+
+
+def _spans(real: type) -> tuple[Scalar, Scalar]:
+    half_height, outline, band = ellipse_maths()
+    pixel_range = pixel_ranges()
+    zero, endless = real(0.0), real(np.inf)
+
+    @inlined
+    def rows_of(means2d, conics, opacities, radii, s, height):
+        """First and last row of pixels that a splat reaches (last < first: none), and its half height."""
+        if not (radii[s, 0] > zero and abs(means2d[s, 0]) + abs(means2d[s, 1]) < endless):
+            return 0, -1, -1.0
+        y = np.float64(means2d[s, 1])
+        reach = half_height(conics[s, 0], conics[s, 1], conics[s, 2], opacities[s])
+        if not reach >= 0.0:
+            return 0, -1, -1.0
+        first, last = pixel_range(y - reach, y + reach, height)
+        return first, last, reach
+
+    @inlined
+    def columns_of(means2d, conics, s, row, rows, width):
+        """First and last tile that a splat touches in a row of tiles, last < first where it touches none."""
+        x, y = np.float64(means2d[s, 0]), np.float64(means2d[s, 1])
+        first, last, reach = rows
+        shape = outline(conics[s, 0], conics[s, 1], conics[s, 2], reach)
+        low, high = max(first, row * TILE) + 0.5 - y, min(last, row * TILE + TILE - 1) + 0.5 - y
+        left, right = band(shape, low, high)
+        first_pixel, last_pixel = pixel_range(x + left, x + right, width)
+        if first_pixel > last_pixel:
+            return 0, -1
+        return first_pixel // TILE, last_pixel // TILE
+
+    return rows_of, columns_of
+
+
+@cache
+def count_tiles(real: type) -> Kernel:
+    """Counts the active tiles that each splat touches."""
+    rows_of, columns_of = _spans(real)
+
+    @kernel("count_tiles", real, "real2 real2 real1 real2 bool3 int int int int1")
+    def count(means2d, conics, opacities, radii, active_tiles, per_camera, width, height, counts):
+        s = cuda.grid(1)
+        if s >= counts.size:
+            return
+        found, masked, camera = 0, active_tiles.size > 0, s // per_camera
+        rows = rows_of(means2d, conics, opacities, radii, s, height)
+        if rows[0] <= rows[1]:
+            for row in range(rows[0] // TILE, rows[1] // TILE + 1):
+                left, right = columns_of(means2d, conics, s, row, rows, width)
+                found += right - left + 1
+                if masked:
+                    for column in range(left, right + 1):
+                        if not active_tiles[camera, row, column]:
+                            found -= 1
+        counts[s] = found
+
+    return count
+
+
+def _search() -> Scalar:
+    @inlined
+    def search(values, x):
+        """The last of ascending values that is at most x; the first is."""
+        low, high = 0, values.size
+        while high - low > 1:
+            middle = (low + high) // 2
+            if values[middle] <= x:
+                low = middle
+            else:
+                high = middle
+        return low
+
+    return search
+
+
+@cache
+def emit_tiles(real: type, key: type = np.int16) -> Kernel:
+    """Writes the tile, the splat and the slot of every pair."""
+    rows_of, columns_of = _spans(real)
+    search = _search()
+    keys = "short1" if key is np.int16 else "int1"
+
+    @kernel(
+        f"emit_tiles_{np.dtype(key).name}",
+        real,
+        f"real2 real2 real1 real2 bool3 int int int int long1 long1 long1 {keys} int1 int1",
+    )
+    def emit(
+        means2d, conics, opacities, radii, active_tiles, per_camera, width, height, num_tiles,
+        order, starts, splat_offsets, tiles, members, slots,
+    ):  # fmt: skip
+        pair = cuda.grid(1)
+        if pair >= tiles.size:
+            return
+        place = search(starts, pair)
+        s, left_over = order[place], pair - starts[place]
+        members[pair], slots[pair] = s, splat_offsets[s] + left_over
+        masked, camera = active_tiles.size > 0, s // per_camera
+        grid_rows, grid_columns = (height + TILE - 1) // TILE, (width + TILE - 1) // TILE
+        rows = rows_of(means2d, conics, opacities, radii, s, height)
+        for row in range(rows[0] // TILE, rows[1] // TILE + 1):
+            left, right = columns_of(means2d, conics, s, row, rows, width)
+            if masked:
+                for column in range(left, right + 1):
+                    if active_tiles[camera, row, column]:
+                        if left_over == 0:
+                            tiles[pair] = key((camera * grid_rows + row) * grid_columns + column)
+                            return
+                        left_over -= 1
+            elif left_over <= right - left:
+                tiles[pair] = key((camera * grid_rows + row) * grid_columns + left + left_over)
+                return
+            else:
+                left_over -= right - left + 1
+        # Should the two passes ever round differently, what is left over goes behind the last tile, where none looks.
+        tiles[pair] = key(num_tiles)
+
+    return emit

@@ -1,0 +1,281 @@
+"""Blending of panes on the CPU: runs of pixels of one row and one pane.
+
+A run is first copied into *planes* of one flat buffer, one plane per quantity, at offsets known to the compiler; that
+is what lets it turn the curves of the colour space into vector instructions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+from numba import prange
+from numpy.typing import NDArray
+from torch import Tensor
+
+from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
+from glassplat.kernels.cpu.schedule import even_stride
+from glassplat.kernels.maths.blending import Scalar
+from glassplat.kernels.maths.color_space import color_space_maths
+from glassplat.kernels.maths.pane import pane_maths
+from glassplat.kernels.tensor_checks import REAL_OF
+
+RUN = 64
+"""Pixels of a run."""
+
+# Planes of a run. MASK is 0 where the run's pane is not shown; GAIN is the intensity.
+MASK, GAIN, RAW, SHARE, ALONG, LENGTH = (plane * RUN for plane in range(6))
+BEHIND, MIRRORED, RGB, BRIGHT = (plane * RUN for plane in (6, 9, 12, 15))
+FORWARD_PLANES = 18
+V_RGB, V_BRIGHT, V_SHARE, V_GAIN = (plane * RUN for plane in (18, 21, 24, 25))
+BACKWARD_PLANES = 26
+
+
+def blend_panes(inputs: Sequence[Tensor], switches: tuple[int, bool, bool]) -> tuple[Tensor, ...]:
+    """The fields of `BlendedPanes`; inputs in the order of the kernel, switches (law, intensity, linear)."""
+    transmission, mask = inputs[:2]
+    outputs = tuple(torch.empty_like(like) for like in (transmission, transmission, mask))
+    blend_panes_forward(REAL_OF[mask.dtype])(*_arrays(inputs), *switches, *_arrays(outputs))
+    return outputs
+
+
+def blend_panes_gradients(
+    inputs: Sequence[Tensor], switches: tuple[int, bool, bool], cotangents: Sequence[Tensor]
+) -> tuple[Tensor, ...]:
+    """Gradients of the first five inputs."""
+    found = tuple(torch.zeros_like(tensor) for tensor in inputs[:5])
+    blend_panes_backward(REAL_OF[found[0].dtype])(*_arrays(inputs), *switches, *_arrays(cotangents), *_arrays(found))
+    return found
+
+
+def _arrays(tensors: Sequence[Tensor]) -> list[Any]:
+    return [tensor.numpy() for tensor in tensors]
+
+
+@inlined
+def _span(pane, row, k):
+    """First and one-past-last column of a row that shows pane k."""
+    first, last = pane.shape[1], 0
+    for column in range(pane.shape[1]):
+        if pane[row, column] == k:
+            first = min(first, column)
+            last = column + 1
+    return first, last
+
+
+def _load(real: type) -> Scalar:
+    zero, one = real(0.0), real(1.0)
+
+    @inlined
+    def load(run, transmission, mask, reflections, pane, intensity, row, k, first, count):
+        """Copies the pixels of a run; what lies beyond its end is not shown."""
+        for i in range(RUN):
+            column = first + min(i, count - 1)
+            shown = (pane[row, column] == k) & (i < count)
+            run[MASK + i] = mask[row, column] if shown else zero
+            run[GAIN + i] = reflections[k, row, column, 3] if intensity else one
+            for d in range(3):
+                run[BEHIND + d * RUN + i] = transmission[row, column, d]
+                run[MIRRORED + d * RUN + i] = reflections[k, row, column, d]
+
+    return load
+
+
+def _shine(real: type) -> Scalar:
+    strength, _, ray_length = pane_maths(real)
+    zero, one, half = real(0.0), real(1.0), real(0.5)
+
+    @inlined
+    def shine(run, normals, bases, k, row, first, intrinsics, law):
+        """Strength of every pixel of a run, before the mask in RAW and after it in SHARE; returns the rays' y."""
+        inverse_f, c_x = one / intrinsics[0], intrinsics[2]
+        y = (real(np.int32(row)) + half - intrinsics[3]) / intrinsics[1]
+        n_x, n_row, base = normals[k, 0], normals[k, 1] * y + normals[k, 2], bases[k]
+        start = real(np.int32(first)) + half - c_x
+        for i in range(RUN):
+            x = (start + real(np.int32(i))) * inverse_f
+            along, length = n_x * x + n_row, ray_length(x, y)
+            raw = strength(law, base, abs(along) / length)
+            marked = run[MASK + i]
+            run[ALONG + i], run[LENGTH + i], run[RAW + i] = along, length, raw
+            run[SHARE + i] = raw * marked if marked > zero else zero
+        return y
+
+    return shine
+
+
+def _mix(real: type) -> Scalar:
+    linear_of, _, encoded, _ = color_space_maths(real)
+
+    @inlined
+    def mix(run, d, linear):
+        """Blends channel d of a run into RGB and BRIGHT."""
+        at = d * RUN
+        for i in range(RUN):
+            behind, mirrored = run[BEHIND + at + i], run[MIRRORED + at + i]
+            gain, share = run[GAIN + i], run[SHARE + i]
+            if linear:
+                lit = linear_of(behind)
+                bright = linear_of(mirrored) * gain
+                run[RGB + at + i] = encoded(lit + share * (bright - lit))
+                run[BRIGHT + at + i] = encoded(bright)
+            else:
+                bright = mirrored * gain
+                run[RGB + at + i] = behind + share * (bright - behind)
+                run[BRIGHT + at + i] = bright
+
+    return mix
+
+
+@cache
+def blend_panes_forward(real: type) -> Kernel:
+    """Fills rgb, reflection and strength."""
+    load, shine, mix = _load(real), _shine(real), _mix(real)
+    zero = real(0.0)
+
+    @kernel("blend_panes_forward", real)
+    def forward(
+        transmission, mask, reflections, normals, bases, pane, intrinsics, law, intensity, linear,
+        rgb, reflection, strength,
+    ):  # fmt: skip
+        height = mask.shape[0]
+        stride = even_stride(height)
+        for task in prange(height):
+            row = task * stride % height
+            run: NDArray[Any] = np.empty(FORWARD_PLANES * RUN, real)
+            rgb[row], reflection[row], strength[row] = transmission[row], zero, zero
+            for k in range(normals.shape[0]):
+                begin, end = _span(pane, row, k)
+                for first in range(begin, end, RUN):
+                    count = min(RUN, end - first)
+                    load(run, transmission, mask, reflections, pane, intensity, row, k, first, count)
+                    shine(run, normals, bases, k, row, first, intrinsics, law)
+                    for d in range(3):
+                        mix(run, d, linear)
+                    for i in range(count):
+                        column = first + i
+                        if run[MASK + i] > zero:
+                            strength[row, column] = run[SHARE + i]
+                            for d in range(3):
+                                reflection[row, column, d] = run[BRIGHT + d * RUN + i]
+                        if run[SHARE + i] > zero:
+                            for d in range(3):
+                                rgb[row, column, d] = run[RGB + d * RUN + i]
+
+    return forward
+
+
+def _unmix(real: type) -> Scalar:
+    linear_of, linear_slope, encoded, encoded_slope = color_space_maths(real)
+    zero, one = real(0.0), real(1.0)
+
+    @inlined
+    def unmix(run, d, linear):
+        """Gradients of channel d; those of BEHIND and MIRRORED replace V_RGB and V_BRIGHT, the others add up."""
+        at = d * RUN
+        for i in range(RUN):
+            behind, mirrored = run[BEHIND + at + i], run[MIRRORED + at + i]
+            gain, share = run[GAIN + i], run[SHARE + i]
+            v_mixed = run[V_RGB + at + i] if share > zero else zero
+            v_bright = run[V_BRIGHT + at + i]
+            if linear:
+                lit, shone = linear_of(behind), linear_of(mirrored)
+                bright = shone * gain
+                mixed = lit + share * (bright - lit)
+                v_mixed *= encoded_slope(mixed, encoded(mixed))
+                v_bright = v_mixed * share + v_bright * encoded_slope(bright, encoded(bright))
+                run[V_SHARE + i] += v_mixed * (bright - lit)
+                run[V_GAIN + i] += v_bright * shone
+                run[V_RGB + at + i] = v_mixed * (one - share) * linear_slope(behind, lit)
+                run[V_BRIGHT + at + i] = v_bright * gain * linear_slope(mirrored, shone)
+            else:
+                v_bright += v_mixed * share
+                run[V_SHARE + i] += v_mixed * (mirrored * gain - behind)
+                run[V_GAIN + i] += v_bright * mirrored
+                run[V_RGB + at + i] = v_mixed * (one - share)
+                run[V_BRIGHT + at + i] = v_bright * gain
+
+    return unmix
+
+
+def _dim(real: type) -> Scalar:
+    strength_slopes = pane_maths(real).strength_slopes
+    zero, one, half = real(0.0), real(1.0), real(0.5)
+
+    @inlined
+    def dim(run, base, first, intrinsics, law):
+        """From the gradient of SHARE to sums over the run for the normal (x, 1) and the base reflectance."""
+        inverse_f = one / intrinsics[0]
+        start = real(np.int32(first)) + half - intrinsics[2]
+        sum_x, sum_1, sum_base = zero, zero, zero
+        for i in range(RUN):
+            marked, along, length = run[MASK + i], run[ALONG + i], run[LENGTH + i]
+            v_raw = run[V_SHARE + i] * marked if marked > zero else zero
+            by_base, by_cosine = strength_slopes(law, base, abs(along) / length)
+            slope = v_raw * by_cosine / length
+            slope = slope if along > zero else -slope
+            sum_x += slope * (start + real(np.int32(i))) * inverse_f
+            sum_1 += slope
+            sum_base += v_raw * by_base
+        return sum_x, sum_1, sum_base
+
+    return dim
+
+
+@cache
+def blend_panes_backward(real: type) -> Kernel:
+    """Fills the gradients of transmission, mask, reflections, normals and base reflectances; all start at zero."""
+    load, shine, unmix, dim = _load(real), _shine(real), _unmix(real), _dim(real)
+    zero = real(0.0)
+
+    @kernel("blend_panes_backward", real)
+    def backward(
+        transmission, mask, reflections, normals, bases, pane, intrinsics, law, intensity, linear,
+        v_rgb, v_reflection, v_strength, v_transmission, v_mask, v_reflections, v_normals, v_bases,
+    ):  # fmt: skip
+        height, panes = mask.shape[0], normals.shape[0]
+        sums: NDArray[Any] = np.zeros((height, panes, 4), real)
+        stride = even_stride(height)
+        for task in prange(height):
+            row = task * stride % height
+            run: NDArray[Any] = np.empty(BACKWARD_PLANES * RUN, real)
+            v_transmission[row] = v_rgb[row]
+            for k in range(panes):
+                begin, end = _span(pane, row, k)
+                for first in range(begin, end, RUN):
+                    count = min(RUN, end - first)
+                    load(run, transmission, mask, reflections, pane, intensity, row, k, first, count)
+                    y = shine(run, normals, bases, k, row, first, intrinsics, law)
+                    for i in range(RUN):
+                        column = first + min(i, count - 1)
+                        run[V_SHARE + i], run[V_GAIN + i] = v_strength[row, column], zero
+                        for d in range(3):
+                            run[V_RGB + d * RUN + i] = v_rgb[row, column, d]
+                            run[V_BRIGHT + d * RUN + i] = v_reflection[row, column, d]
+                    for d in range(3):
+                        unmix(run, d, linear)
+                    sum_x, sum_1, sum_base = dim(run, bases[k], first, intrinsics, law)
+                    sums[row, k, 0] += sum_x
+                    sums[row, k, 1] += sum_1 * y
+                    sums[row, k, 2] += sum_1
+                    sums[row, k, 3] += sum_base
+                    for i in range(count):
+                        column = first + i
+                        if not run[MASK + i] > zero:
+                            continue
+                        v_mask[row, column] = run[V_SHARE + i] * run[RAW + i]
+                        v_reflections[k, row, column, 3] = run[V_GAIN + i] if intensity else zero
+                        for d in range(3):
+                            v_reflections[k, row, column, d] = run[V_BRIGHT + d * RUN + i]
+                            if run[SHARE + i] > zero:
+                                v_transmission[row, column, d] = run[V_RGB + d * RUN + i]
+        for k in range(panes):
+            for row in range(height):
+                for axis in range(3):
+                    v_normals[k, axis] += sums[row, k, axis]
+                v_bases[k] += sums[row, k, 3]
+
+    return backward

@@ -1,0 +1,163 @@
+"""Blending of panes on the GPU: one thread for each pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+import torch
+from numba import cuda
+from torch import Tensor
+
+from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
+from glassplat.kernels.maths.blending import Scalar
+from glassplat.kernels.maths.color_space import color_space_maths
+from glassplat.kernels.maths.pane import pane_maths
+from glassplat.kernels.tensor_checks import REAL_OF
+
+THREADS = 128
+INPUTS = "real3 real2 real4 real2 real1 int2 real1 int bool bool"
+
+
+def blend_panes(inputs: Sequence[Tensor], switches: tuple[int, bool, bool]) -> tuple[Tensor, ...]:
+    """As `glassplat.kernels.blend_panes.cpu.blend_panes`."""
+    transmission, mask = inputs[:2]
+    outputs = tuple(torch.empty_like(like) for like in (transmission, transmission, mask))
+    kernel_of = blend_panes_forward(REAL_OF[mask.dtype])
+    kernel_of(blocks_for(mask.numel(), THREADS), THREADS, *inputs, *switches, *outputs)
+    return outputs
+
+
+def blend_panes_gradients(
+    inputs: Sequence[Tensor], switches: tuple[int, bool, bool], cotangents: Sequence[Tensor]
+) -> tuple[Tensor, ...]:
+    """As `glassplat.kernels.blend_panes.cpu.blend_panes_gradients`."""
+    mask, normals, pane = inputs[1], inputs[3], inputs[5]
+    found = tuple(torch.zeros_like(tensor) for tensor in inputs[:3])
+    shares = mask.new_zeros(*mask.shape, 4)
+    kernel_of = blend_panes_backward(REAL_OF[mask.dtype])
+    kernel_of(blocks_for(mask.numel(), THREADS), THREADS, *inputs, *switches, *cotangents, *found, shares)
+    # A sum of its own for each pane, in an order that does not change from run to run.
+    panes = torch.arange(normals.shape[0], device=mask.device)[:, None]
+    sums = (pane.flatten() == panes).to(mask.dtype) @ shares.view(-1, 4)
+    return (*found, sums[:, :3].contiguous(), sums[:, 3].contiguous())
+
+
+def _shine(real: type) -> Scalar:
+    strength, _, ray_length = pane_maths(real)
+    one, half = real(1.0), real(0.5)
+
+    @inlined
+    def shine(row, column, k, normals, bases, intrinsics, law):
+        """Strength before the mask, the ray's x and y, its product with the normal and its length."""
+        x = (real(np.int32(column)) + half - intrinsics[2]) * (one / intrinsics[0])
+        y = (real(np.int32(row)) + half - intrinsics[3]) / intrinsics[1]
+        along, length = normals[k, 0] * x + (normals[k, 1] * y + normals[k, 2]), ray_length(x, y)
+        raw = strength(law, bases[k], abs(along) / length)
+        return raw, x, y, along, length
+
+    return shine
+
+
+@cache
+def blend_panes_forward(real: type) -> Kernel:
+    """Fills rgb, reflection and strength."""
+    shine = _shine(real)
+    linear_of, _, encoded, _ = color_space_maths(real)
+    zero, one = real(0.0), real(1.0)
+
+    @kernel("blend_panes_forward", real, f"{INPUTS} real3 real3 real2")
+    def forward(
+        transmission, mask, reflections, normals, bases, pane, intrinsics, law, intensity, linear,
+        rgb, reflection, strength,
+    ):  # fmt: skip
+        i = cuda.grid(1)
+        if i >= mask.size:
+            return
+        row, column = i // mask.shape[1], i % mask.shape[1]
+        k, marked = pane[row, column], mask[row, column]
+        shown = k >= 0 and marked > zero
+        share, gain = zero, one
+        if shown:
+            raw, _, _, _, _ = shine(row, column, k, normals, bases, intrinsics, law)
+            share = raw * marked
+            gain = reflections[k, row, column, 3] if intensity else one
+        strength[row, column] = share
+        for d in range(3):
+            behind, bright, mixed = transmission[row, column, d], zero, transmission[row, column, d]
+            if shown:
+                mirrored = reflections[k, row, column, d]
+                if linear:
+                    lit, shone = linear_of(behind), linear_of(mirrored) * gain
+                    bright = encoded(shone)
+                    mixed = encoded(lit + share * (shone - lit))
+                else:
+                    bright = mirrored * gain
+                    mixed = behind + share * (bright - behind)
+            rgb[row, column, d] = mixed if share > zero else behind
+            reflection[row, column, d] = bright
+
+    return forward
+
+
+@cache
+def blend_panes_backward(real: type) -> Kernel:
+    """Fills the gradients of transmission, mask and reflections, and each pixel's share [H, W, 4] of those of its
+    pane's normal and base reflectance; all but the first start at zero.
+    """
+    shine, strength_slopes = _shine(real), pane_maths(real).strength_slopes
+    linear_of, linear_slope, encoded, encoded_slope = color_space_maths(real)
+    zero, one = real(0.0), real(1.0)
+
+    @kernel("blend_panes_backward", real, f"{INPUTS} real3 real3 real2 real3 real2 real4 real3")
+    def backward(
+        transmission, mask, reflections, normals, bases, pane, intrinsics, law, intensity, linear,
+        v_rgb, v_reflection, v_strength, v_transmission, v_mask, v_reflections, shares,
+    ):  # fmt: skip
+        i = cuda.grid(1)
+        if i >= mask.size:
+            return
+        row, column = i // mask.shape[1], i % mask.shape[1]
+        k, marked = pane[row, column], mask[row, column]
+        if not (k >= 0 and marked > zero):
+            for d in range(3):
+                v_transmission[row, column, d] = v_rgb[row, column, d]
+            return
+        raw, x, y, along, length = shine(row, column, k, normals, bases, intrinsics, law)
+        share, v_share, v_gain = raw * marked, v_strength[row, column], zero
+        gain = reflections[k, row, column, 3] if intensity else one
+        for d in range(3):
+            behind, mirrored = transmission[row, column, d], reflections[k, row, column, d]
+            v_behind, v_bright = v_rgb[row, column, d], v_reflection[row, column, d]
+            v_mixed = v_behind if share > zero else zero
+            if linear:
+                lit, shone = linear_of(behind), linear_of(mirrored)
+                bright = shone * gain
+                mixed = lit + share * (bright - lit)
+                v_mixed *= encoded_slope(mixed, encoded(mixed))
+                v_bright = v_mixed * share + v_bright * encoded_slope(bright, encoded(bright))
+                v_share += v_mixed * (bright - lit)
+                v_gain += v_bright * shone
+                mixed_behind = v_mixed * (one - share) * linear_slope(behind, lit)
+                v_reflections[k, row, column, d] = v_bright * gain * linear_slope(mirrored, shone)
+            else:
+                v_bright += v_mixed * share
+                v_share += v_mixed * (mirrored * gain - behind)
+                v_gain += v_bright * mirrored
+                mixed_behind = v_mixed * (one - share)
+                v_reflections[k, row, column, d] = v_bright * gain
+            v_transmission[row, column, d] = mixed_behind if share > zero else v_behind
+        v_reflections[k, row, column, 3] = v_gain if intensity else zero
+        v_mask[row, column] = v_share * raw
+        v_raw = v_share * marked
+        by_base, by_cosine = strength_slopes(law, bases[k], abs(along) / length)
+        slope = v_raw * by_cosine / length
+        slope = slope if along > zero else -slope
+        shares[row, column, 0] = slope * x
+        shares[row, column, 1] = slope * y
+        shares[row, column, 2] = slope
+        shares[row, column, 3] = v_raw * by_base
+
+    return backward

@@ -1,0 +1,288 @@
+"""Blending of sorted splats on the GPU: one block for each active tile, one thread for each pixel, front to back.
+
+The number of channels is part of a kernel, so that a pixel's sums stay in registers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numba import cuda
+from torch import Tensor
+
+from glassplat.kernels.composite.cuda_backward import PULLS, THREADS, WARPS, composite_backward, composite_pulls
+from glassplat.kernels.composite.cuda_pair_rows import new_pair_rows, sum_pair_rows
+from glassplat.kernels.composite.cuda_tile import BUCKET, GEOMETRY, MEMBER, MEMBERSHIP, PIXELS, tile_steps
+from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
+from glassplat.kernels.maths.blending import TRANSMITTANCE_MIN, blend_maths
+from glassplat.kernels.splats import LEAST_ALPHA, TILE, Deviation, Splats, TileBins
+from glassplat.kernels.tensor_checks import REAL_OF
+
+
+class Saved(NamedTuple):
+    """What the backward pass needs from the forward pass.
+
+    final [A, 2, 256]: both transmittances of each pixel of the active tiles.
+    last [A, 2, 256] int32: the last pair, counted from the tile's first, that each pixel blended, -1 for none.
+    looked_at [A] int32: how many pairs of each tile any pixel blended, those in between included.
+    bucket_tiles [B] int32: the active tile that each bucket belongs to, -1 for buckets that none has.
+    kept [B, D + 1, 256], with glass [B, D + 3, 256]: of each pixel that had not stopped, its transmittance before the
+        first pair of a bucket, what its channels had gathered, its second transmittance, and what its mask had.
+    kept_spread [B, 256]: what the deviation had gathered there, where it was asked for.
+    center, lean [C, H, W]: of the channel whose deviation was asked for, as on the CPU.
+    outputs: image, alpha, mask and deviation.
+
+    B is 0 where no gradients are needed.
+    """
+
+    final: Tensor
+    last: Tensor
+    looked_at: Tensor
+    bucket_tiles: Tensor
+    kept: Tensor
+    kept_spread: Tensor
+    center: Tensor
+    lean: Tensor
+    outputs: tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+def composite(
+    splats: Splats, channels: Tensor, bins: TileBins,
+    *, marks: Tensor, num_primary: int, deviation: Deviation | None, needs_gradients: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Saved]:  # fmt: skip
+    """As `glassplat.kernels.composite.cpu.composite`."""
+    real, (_, count, num_channels) = REAL_OF[channels.dtype], channels.shape
+    shape, tiles = (bins.num_cameras, bins.height, bins.width), len(bins.active)
+    image, alpha, mask = (channels.new_zeros(s) for s in ((*shape, num_channels), shape, shape))
+    deviated, center, lean = (channels.new_zeros(shape if deviation else (0, 0, 0)) for _ in range(3))
+    buckets = len(bins.pair_splats) // BUCKET + tiles if needs_gradients else 0
+    planes = num_channels + (1 if num_primary == count else 3)
+    saved = Saved(
+        channels.new_empty(tiles, 2, PIXELS),
+        torch.empty(tiles, 2, PIXELS, dtype=torch.int32, device=channels.device),
+        torch.empty(tiles, dtype=torch.int32, device=channels.device),
+        torch.full((buckets,), -1, dtype=torch.int32, device=channels.device),
+        channels.new_empty(buckets, planes, PIXELS),
+        channels.new_empty(buckets if deviation else 0, PIXELS),
+        center,
+        lean,
+        # Without their history: it holds this record, and would keep itself alive.
+        (image.detach(), alpha.detach(), mask.detach(), deviated.detach()),
+    )
+    lists = (bins.pair_splats, bins.tile_offsets, bins.active)
+    geometry = flat_geometry(splats)
+    values = channels.view(-1, num_channels)
+    composite_forward(real, num_channels)(
+        tiles, PIXELS, *geometry, values, marks, count, num_primary, *lists, *saved[:5], image, alpha, mask
+    )
+    if deviation:
+        where = deviation.where.detach().contiguous()
+        composite_deviation(real)(
+            tiles, PIXELS, *geometry, values, count, num_primary, deviation.channel, where, *lists, *saved[1:3],
+            saved.kept_spread, image, alpha, center, lean, deviated,
+        )  # fmt: skip
+    return image, alpha, mask, deviated, saved
+
+
+def composite_gradients(
+    splats: Splats, channels: Tensor, bins: TileBins, saved: Saved, v_outputs: Sequence[Tensor],
+    *, marks: Tensor, num_primary: int, deviation: Deviation | None, probed: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]:  # fmt: skip
+    """As `glassplat.kernels.composite.cpu.composite_gradients`."""
+    real, (_, count, num_channels), tiles = REAL_OF[channels.dtype], channels.shape, len(bins.active)
+    v_image, v_alpha, v_mask, v_deviation = v_outputs
+    image, _, mask, deviated = saved.outputs
+    channel, v_spread = -1, v_deviation
+    if deviation:
+        channel, v_spread = deviation.channel, v_deviation * deviation.where
+        if deviation.through_mean:
+            v_image, v_alpha = through_mean(v_image, v_alpha, v_spread, saved, channel)
+    pulls = channels.new_empty(tiles, num_channels + PULLS, PIXELS)
+    composite_pulls(real, num_channels)(
+        tiles, PIXELS, channel, bins.active, saved.final, saved.center, image, mask, deviated,
+        *(v.contiguous() for v in (v_image, v_alpha, v_mask, v_deviation, v_spread)), pulls,
+    )  # fmt: skip
+    rows = new_pair_rows(bins, channels, probed)
+    composite_backward(real, num_channels, probed)(
+        blocks_for(len(saved.bucket_tiles), WARPS), THREADS, *flat_geometry(splats), channels.view(-1, num_channels),
+        marks, count, num_primary, channel, bins.width, bins.height, bins.pair_splats, bins.tile_offsets, bins.active,
+        saved.last.view(-1), saved.looked_at, saved.bucket_tiles, saved.kept.view(-1), saved.kept_spread.view(-1),
+        pulls.view(-1), rows,
+    )  # fmt: skip
+    v_means, v_conics, v_opacities, v_values, v_probe = sum_pair_rows(rows, bins, splats, num_channels)
+    v_marks = torch.zeros_like(marks)
+    if num_primary < count:
+        v_marks.copy_(v_values[:, num_primary:, 0])
+        v_values[:, num_primary:] = 0
+    return v_means, v_conics, v_opacities, v_values, v_marks, v_probe if probed else None
+
+
+def through_mean(
+    v_image: Tensor, v_alpha: Tensor, v_deviation: Tensor, saved: Saved, channel: int
+) -> tuple[Tensor, Tensor]:
+    """Adds what the deviation's gradient does through the mean, which is the channel's sum over the coverage."""
+    alpha = saved.outputs[1]
+    covered = alpha > LEAST_ALPHA
+    v_sum = torch.where(covered, -v_deviation * saved.lean / torch.where(covered, alpha, 1), 0)
+    v_image = v_image.clone()
+    v_image[..., channel] += v_sum
+    return v_image, v_alpha - v_sum * saved.center
+
+
+def flat_geometry(splats: Splats) -> tuple[Tensor, Tensor, Tensor]:
+    """means2d [S, 2], conics [S, 3] and opacities [S] of the splats of all cameras."""
+    return splats.means2d.view(-1, 2), splats.conics.view(-1, 3), splats.opacities.view(-1)
+
+
+@cache
+def composite_forward(real: type, num_channels: int = 4) -> Kernel:
+    """Fills image, alpha and mask of the active tiles, and what the backward pass needs."""
+    place, load, coverage = tile_steps(real)
+    clipped_alpha = blend_maths(real).clipped_alpha
+    zero, one, t_min = real(0.0), real(1.0), real(TRANSMITTANCE_MIN)
+
+    @kernel(
+        f"composite_forward_{num_channels}",
+        real,
+        "real2 real2 real1 real2 real2 int int int1 long1 int1 real3 int3 int1 int1 real3 real4 real3 real3",
+    )
+    def forward(
+        means, conics, opacities, channels, marks, splats_per_camera, num_primary, pair_splats, tile_offsets, active,
+        final, last, looked_at, bucket_tiles, kept, image, alpha, mask,
+    ):  # fmt: skip
+        geometry = cuda.shared.array((GEOMETRY, PIXELS), real)
+        membership = cuda.shared.array((MEMBERSHIP, PIXELS), np.int32)
+        most = cuda.shared.array(1, np.int32)
+        sums = cuda.local.array(num_channels, real)
+        n, pixel = cuda.blockIdx.x, cuda.threadIdx.x
+        camera, x0, y0, columns, num_rows = place(active[n], image.shape[2], image.shape[1])
+        column, row = pixel % TILE, pixel // TILE
+        inside = column < columns and row < num_rows
+        running, glass_running = inside, inside
+        t, t_glass, shown, last_order, last_glass = one, one, zero, -1, -1
+        for d in range(num_channels):
+            sums[d] = zero
+        if pixel == 0:
+            most[0] = 0
+        start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
+        keeps, keeps_glass = bucket_tiles.size > 0, num_primary < splats_per_camera
+        for first in range(start, stop, PIXELS):
+            if not cuda.syncthreads_or(1 if running else 0):
+                break
+            if first + pixel < stop:
+                if keeps and pixel % BUCKET == 0:
+                    bucket_tiles[start // BUCKET + n + (first + pixel - start) // BUCKET] = n
+                load(
+                    geometry, membership, pixel, pair_splats[first + pixel], means, conics, opacities, x0, y0, num_rows
+                )
+            cuda.syncthreads()
+            for i in range(min(PIXELS, stop - first)):
+                if not running:
+                    break
+                if keeps and i % BUCKET == 0:
+                    bucket = start // BUCKET + n + (first + i - start) // BUCKET
+                    kept[bucket, 0, pixel] = t
+                    for d in range(num_channels):
+                        kept[bucket, 1 + d, pixel] = sums[d]
+                    if keeps_glass:
+                        kept[bucket, num_channels + 1, pixel], kept[bucket, num_channels + 2, pixel] = t_glass, shown
+                a = clipped_alpha(coverage(geometry, membership, i, column, row))
+                if not a > zero:
+                    continue
+                s, order = membership[MEMBER, i], first + i - start
+                glass = s - camera * splats_per_camera - num_primary
+                if glass < 0:
+                    weight = a * t
+                    if t - weight >= t_min:
+                        t -= weight
+                        last_order = order
+                        for d in range(num_channels):
+                            sums[d] += weight * channels[s, d]
+                    else:
+                        running = False
+                elif glass_running:
+                    weight = a * t_glass
+                    if t_glass - weight >= t_min:
+                        t_glass -= weight
+                        last_glass = order
+                        shown += weight * t * marks[camera, glass]
+                    else:
+                        glass_running = False
+        cuda.syncthreads()
+        cuda.atomic.max(most, 0, np.int32(max(last_order, last_glass) + 1))
+        cuda.syncthreads()
+        if pixel == 0:
+            looked_at[n] = most[0]
+        final[n, 0, pixel], final[n, 1, pixel] = t, t_glass
+        last[n, 0, pixel], last[n, 1, pixel] = last_order, last_glass
+        if inside:
+            alpha[camera, y0 + row, x0 + column] = one - t
+            mask[camera, y0 + row, x0 + column] = shown
+            for d in range(num_channels):
+                image[camera, y0 + row, x0 + column, d] = sums[d]
+
+    return forward
+
+
+@cache
+def composite_deviation(real: type) -> Kernel:
+    """The second traversal: fills the mean of a channel, and the deviation and lean from it, of the active tiles."""
+    place, load, coverage = tile_steps(real)
+    clipped_alpha = blend_maths(real).clipped_alpha
+    zero, one, least_alpha = real(0.0), real(1.0), real(LEAST_ALPHA)
+
+    @kernel(
+        "composite_deviation",
+        real,
+        "real2 real2 real1 real2 int int int real3 int1 long1 int1 int3 int1 real2 real4 real3 real3 real3 real3",
+    )
+    def deviate(
+        means, conics, opacities, channels, splats_per_camera, num_primary, channel, where,
+        pair_splats, tile_offsets, active, last, looked_at, kept_spread, image, alpha, center, lean, deviation,
+    ):  # fmt: skip
+        geometry = cuda.shared.array((GEOMETRY, PIXELS), real)
+        membership = cuda.shared.array((MEMBERSHIP, PIXELS), np.int32)
+        n, pixel = cuda.blockIdx.x, cuda.threadIdx.x
+        camera, x0, y0, columns, num_rows = place(active[n], image.shape[2], image.shape[1])
+        column, row = pixel % TILE, pixel // TILE
+        inside = column < columns and row < num_rows
+        factor, middle = zero, zero
+        if inside:
+            factor = where[camera, y0 + row, x0 + column]
+            covered = alpha[camera, y0 + row, x0 + column]
+            if covered > least_alpha:
+                middle = image[camera, y0 + row, x0 + column, channel] / covered
+        if not cuda.syncthreads_or(1 if factor != zero else 0):
+            return
+        t, spread, leaning = one, zero, zero
+        start = tile_offsets[active[n]]
+        stop, last_order = start + looked_at[n], last[n, 0, pixel]
+        for first in range(start, stop, PIXELS):
+            cuda.syncthreads()
+            if first + pixel < stop:
+                load(
+                    geometry, membership, pixel, pair_splats[first + pixel], means, conics, opacities, x0, y0, num_rows
+                )
+            cuda.syncthreads()
+            for i in range(min(PIXELS, stop - first)):
+                if kept_spread.shape[0] > 0 and i % BUCKET == 0:
+                    kept_spread[start // BUCKET + n + (first + i - start) // BUCKET, pixel] = spread
+                s = membership[MEMBER, i]
+                if first + i - start > last_order or s - camera * splats_per_camera >= num_primary:
+                    continue
+                weight = clipped_alpha(coverage(geometry, membership, i, column, row)) * t
+                t -= weight
+                difference = channels[s, channel] - middle
+                spread += weight * abs(difference)
+                if difference != zero:
+                    leaning += weight if difference > zero else -weight
+        if inside:
+            center[camera, y0 + row, x0 + column] = middle
+            lean[camera, y0 + row, x0 + column] = leaning
+            deviation[camera, y0 + row, x0 + column] = spread * factor
+
+    return deviate

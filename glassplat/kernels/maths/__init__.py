@@ -1,0 +1,1 @@
+"""Scalar maths, with adjoints, that CPU and CUDA kernels share: one formula, one function."""

@@ -1,0 +1,153 @@
+"""Scalar maths of a cube map: which face a direction meets, where on it, which texels meet at an edge, and mirroring.
+
+Every function is pure and typed by its factory, so that one source compiles for the CPU and for CUDA. Face 2 a + s is
+the one of axis a, on the negative side for s = 1; its columns run along axis a + 1 and its rows along a + 2 (mod 3).
+Cells are texels of faces that are padded by a ring of their neighbours' texels: texel i is cell i + 1.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.maths.blending import Scalar, blend_maths
+from glassplat.kernels.maths.projection import vector_maths
+
+
+class CubeMaths(NamedTuple):
+    """Scalar functions of directions for one floating-point type.
+
+    Attributes:
+        on_face: (axis, face, u, v, 1 / |largest coordinate|) of a direction x, y, z; u and v in [-1, 1].
+        from_face: gradient of x, y, z from those of u and v, given what `on_face` returned.
+        cell: first of the two cells that u or v lies between, and its fraction of the way to the second one. The cell
+            exists whatever the value; the fraction is NaN where the value is.
+        logistic: 1 / (1 + exp(-x)).
+    """
+
+    on_face: Scalar
+    from_face: Scalar
+    cell: Scalar
+    logistic: Scalar
+
+
+def cube_maths(real: type) -> CubeMaths:
+    """Builds the functions for `real`, np.float32 or np.float64."""
+    return CubeMaths(*_faces(real), _cell(real), _logistic(real))
+
+
+def _faces(real: type) -> tuple[Scalar, Scalar]:
+    zero, one = real(0.0), real(1.0)
+
+    @inlined
+    def on_face(x, y, z):  # type: ignore[no-untyped-def]
+        size_x, size_y, size_z = abs(x), abs(y), abs(z)
+        if size_x >= size_y and size_x >= size_z:
+            axis, major, along, down = 0, x, y, z
+        elif size_y >= size_z:
+            axis, major, along, down = 1, y, z, x
+        else:
+            axis, major, along, down = 2, z, x, y
+        inverse = one / abs(major)
+        return axis, 2 * axis + (1 if major < zero else 0), along * inverse, down * inverse, inverse
+
+    @inlined
+    def from_face(place, g_u, g_v):  # type: ignore[no-untyped-def]
+        axis, face, u, v, inverse = place
+        along, down = g_u * inverse, g_v * inverse
+        outwards = -(along * u + down * v)
+        outwards = -outwards if face > 2 * axis else outwards
+        if axis == 0:
+            return outwards, along, down
+        if axis == 1:
+            return down, outwards, along
+        return along, down, outwards
+
+    return on_face, from_face
+
+
+def _cell(real: type) -> Scalar:
+    half = real(0.5)
+
+    @inlined
+    def cell(u, size):  # type: ignore[no-untyped-def]
+        extent = real(size)
+        position = half * (u * extent + extent) + half
+        held = position if position > half else half
+        held = held if held < extent + half else extent + half
+        first = np.int32(held)
+        return first, position - real(first)
+
+    return cell
+
+
+def _logistic(real: type) -> Scalar:
+    exp2 = blend_maths(real).exp2
+    zero, one, bits = real(0.0), real(1.0), real(1.0 / np.log(2.0))
+
+    @inlined
+    def logistic(x):  # type: ignore[no-untyped-def]
+        small = exp2(-abs(x) * bits)
+        value = (one if x >= zero else small) / (one + small)
+        # `exp2` takes NaN for a very small number.
+        return value if x == x else x
+
+    return logistic
+
+
+class MirrorMaths(NamedTuple):
+    """Scalar functions of a mirrored ray for one floating-point type.
+
+    Attributes:
+        mirrored: a ray mirrored by a normal of any length, times the square of that length.
+        gradient: gradient of the normal from that of the mirrored ray.
+    """
+
+    mirrored: Scalar
+    gradient: Scalar
+
+
+def mirror_maths(real: type) -> MirrorMaths:
+    """Builds the functions for `real`, np.float32 or np.float64."""
+    dot, blend, two = vector_maths().dot, vector_maths().blend, real(2.0)
+
+    @inlined
+    def mirrored(ray, normal):  # type: ignore[no-untyped-def]
+        return blend(dot(normal, normal), ray, -two * dot(ray, normal), normal)
+
+    @inlined
+    def gradient(ray, normal, g):  # type: ignore[no-untyped-def]
+        by_square = blend(two * dot(ray, g), normal, -two * dot(normal, g), ray)
+        across = -two * dot(ray, normal)
+        return by_square[0] + across * g[0], by_square[1] + across * g[1], by_square[2] + across * g[2]
+
+    return MirrorMaths(mirrored, gradient)
+
+
+class EdgeMaths(NamedTuple):
+    """Neighbours across the edges of a cube map with S texels a side.
+
+    Attributes:
+        over_column: (face, row, column) of the texel beside `row`, beyond the face's last column for side = 0, or
+            before its first for side = 1.
+        over_row: the same beside `column`, beyond the last or before the first row.
+    """
+
+    over_column: Scalar
+    over_row: Scalar
+
+
+def edge_maths() -> EdgeMaths:
+    """Builds the functions, of whole numbers."""
+
+    @inlined
+    def over_column(face, side, row, size):  # type: ignore[no-untyped-def]
+        return 2 * ((face // 2 + 1) % 3) + side, (1 - face % 2) * (size - 1), row
+
+    @inlined
+    def over_row(face, side, column, size):  # type: ignore[no-untyped-def]
+        return 2 * ((face // 2 + 2) % 3) + side, column, (1 - face % 2) * (size - 1)
+
+    return EdgeMaths(over_column, over_row)

@@ -1,0 +1,130 @@
+"""Scalar maths of a flat pane: where rays meet it, and how strongly it reflects.
+
+Rays are (x, y, 1) in the camera frame. Every function is pure and typed by its factory, so that one source compiles for
+the CPU and for CUDA.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, get_args
+
+from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.maths.blending import Scalar
+from glassplat.kernels.panes import Fresnel
+
+LAWS: tuple[Fresnel, ...] = get_args(Fresnel)
+"""Kernels are given a law as its position here."""
+PANE, SCHLICK = LAWS.index("pane"), LAWS.index("schlick")
+
+LEAST_COSINE = 1e-6
+"""Two surfaces are not asked for more grazing rays: a pane that reflects nothing would divide 0 by 0."""
+
+
+class PaneMaths(NamedTuple):
+    """Scalar functions of panes for one floating-point type.
+
+    Attributes:
+        strength: reflectance by a law, given the reflectance R0 at normal incidence and the cosine of the angle.
+        strength_slopes: derivatives of `strength` by R0 and by the cosine.
+        ray_length: length of the ray (x, y, 1).
+    """
+
+    strength: Scalar
+    strength_slopes: Scalar
+    ray_length: Scalar
+
+
+def pane_maths(real: type) -> PaneMaths:
+    """Builds the functions for `real`, np.float32 or np.float64."""
+    schlick, schlick_slopes = _schlick(real)
+    two_surfaces, two_surfaces_slopes = _two_surfaces(real)
+    zero, one = real(0.0), real(1.0)
+
+    @inlined
+    def strength(law, base, cosine):  # type: ignore[no-untyped-def]
+        if law == PANE:
+            return two_surfaces(base, cosine)
+        if law == SCHLICK:
+            return schlick(base, cosine)
+        return base
+
+    @inlined
+    def strength_slopes(law, base, cosine):  # type: ignore[no-untyped-def]
+        if law == PANE:
+            return two_surfaces_slopes(base, cosine)
+        if law == SCHLICK:
+            return schlick_slopes(base, cosine)
+        return one, zero
+
+    @inlined
+    def ray_length(x, y):  # type: ignore[no-untyped-def]
+        return real(math.sqrt(x * x + y * y + one))
+
+    return PaneMaths(strength, strength_slopes, ray_length)
+
+
+def _schlick(real: type) -> tuple[Scalar, Scalar]:
+    """R0 + (1 - R0) (1 - c)^5 (TR-Gaussians, Eq. 6), and its slopes."""
+    zero, one, five = real(0.0), real(1.0), real(5.0)
+
+    @inlined
+    def schlick(base, cosine):  # type: ignore[no-untyped-def]
+        grazing = one - (cosine if cosine < one else one)
+        squared = grazing * grazing
+        return base + (one - base) * squared * squared * grazing
+
+    @inlined
+    def schlick_slopes(base, cosine):  # type: ignore[no-untyped-def]
+        grazing = one - (cosine if cosine < one else one)
+        squared = grazing * grazing
+        fourth = squared * squared
+        return one - fourth * grazing, -five * (one - base) * fourth if cosine < one else zero
+
+    return schlick, schlick_slopes
+
+
+def _two_surfaces(real: type) -> tuple[Scalar, Scalar]:
+    """Fresnel's laws at both surfaces of a pane, with all that goes to and fro between them; and the slopes.
+
+    A surface of relative index n takes the cosine c to c_t inside. With q = 1 / n^2, one polarisation's Fresnel
+    coefficient is (a - b) / (a + b) for (a, b) = (c_t, c / n), the other's for (c, c_t / n), and two surfaces reflect
+    2 r / (1 + r) = (a - b)^2 / (a^2 + b^2). With t = 1 - R0 and w = sqrt(1 - t^2) = (1 - q) / (1 + q), everything
+    below is rational in t, w, c and c_t. a - b is (a^2 - b^2) / (a + b), whose numerator has no difference of nearly
+    equal numbers left: values and slopes keep their digits from glass that reflects nothing to a perfect mirror.
+    """
+    zero, half, one, least = real(0.0), real(0.5), real(1.0), real(LEAST_COSINE)
+
+    @inlined
+    def terms(base, cosine):  # type: ignore[no-untyped-def]
+        """What the a^2 + b^2 of both polarisations are proportional to; then w, 1 - w, c_t, and the clamped cosine."""
+        cosine = cosine if cosine > least else least
+        cosine = cosine if cosine < one else one
+        through = one - base
+        w = real(math.sqrt(base * (one + through)))
+        rest = through * through / (one + w)
+        squared = cosine * cosine
+        inside = real(math.sqrt((w + w + rest * squared) / (one + w)))
+        across, along = w + rest * squared, (one + w * w) * squared + w * rest
+        return across, along, w, rest, inside, cosine
+
+    @inlined
+    def two_surfaces(base, cosine):  # type: ignore[no-untyped-def]
+        across, along, w, rest, inside, c = terms(base, cosine)
+        # In the same proportion: 2 a b, and the second a^2 - b^2, which is 0 at Brewster's angle; the first is w.
+        product, difference = (one - base) * c * inside, w * (c * c + c * c - rest)
+        first = w * w / (across * (across + product))
+        return half * (first + difference * difference / (along * (along + product * (one + w))))
+
+    @inlined
+    def two_surfaces_slopes(base, cosine):  # type: ignore[no-untyped-def]
+        across, along, w, rest, inside, c = terms(base, cosine)
+        inverse_across, inverse_along, inverse_inside = one / across, one / along, one / inside
+        first, second = inverse_across * inverse_across, inverse_along * inverse_along
+        doubled = c * c + c * c
+        second *= doubled - rest
+        by_base = half * c * inverse_inside * (first + second * (w + w + rest * (doubled - one)))
+        by_cosine = (one - base) * w * w * inverse_inside * (second - first / (one + w))
+        return by_base, by_cosine if (cosine > least) & (cosine < one) else zero
+
+    return two_surfaces, two_surfaces_slopes

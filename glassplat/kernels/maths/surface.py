@@ -1,0 +1,114 @@
+"""Scalar maths of surfaces: one Gaussian's colour, normal and strength, and their adjoint.
+
+The functions read and write rows of arrays, so that one source compiles for the CPU and for CUDA.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.maths.blending import Scalar
+from glassplat.kernels.maths.projection import shape_maths, vector_maths
+from glassplat.kernels.shade_environment.shaded import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
+
+
+class SurfaceMaths(NamedTuple):
+    """Steps for Gaussian `i`, which is seen.
+
+    Attributes:
+        describe: writes its channels, with a normal of zeros where its quaternion has no direction.
+        describe_gradient: writes the gradients, given the channels that `describe` has written.
+    """
+
+    describe: Scalar
+    describe_gradient: Scalar
+
+
+@inlined
+def shortest_axis(x, y, z):  # type: ignore[no-untyped-def]
+    """Position of the smallest of three values, the first among equals."""
+    if y < x:
+        return 2 if z < y else 1
+    return 2 if z < x else 0
+
+
+def _facing(real: type) -> tuple[Scalar, Scalar]:
+    """The normal of a Gaussian, and its adjoint."""
+    maths, dot = shape_maths(real), vector_maths().dot
+    unit_quat, rotation, is_finite = maths.unit_quat, maths.rotation, maths.is_finite
+    unit_quat_gradient = maths.unit_quat_gradient
+    zero, one = real(0.0), real(1.0)
+
+    @inlined
+    def chosen(which, a, b, c):  # type: ignore[no-untyped-def]
+        # Sums, because a processor cannot foresee which one it is.
+        first, second = real(which == 0), real(which == 1)
+        third = one - first - second
+        return (
+            first * a[0] + second * b[0] + third * c[0],
+            first * a[1] + second * b[1] + third * c[1],
+            first * a[2] + second * b[2] + third * c[2],
+        )
+
+    @inlined
+    def normal_of(i, quats, log_scales, means, eye):  # type: ignore[no-untyped-def]
+        quat, inverse_norm = unit_quat(quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3])
+        if not (is_finite(inverse_norm) and inverse_norm > zero):
+            return zero, zero, zero
+        first, second, third = rotation(quat)
+        shortest = shortest_axis(log_scales[i, 0], log_scales[i, 1], log_scales[i, 2])
+        axis = chosen(shortest, first, second, third)
+        towards = eye[0] - means[i, 0], eye[1] - means[i, 1], eye[2] - means[i, 2]
+        side = -one if dot(towards, axis) < zero else one
+        return side * axis[0], side * axis[1], side * axis[2]
+
+    @inlined
+    def quat_gradient(i, quats, log_scales, normal, v_normal):  # type: ignore[no-untyped-def]
+        none = (zero, zero, zero)
+        if dot(normal, normal) == zero:
+            return zero, zero, zero, zero
+        quat, inverse_norm = unit_quat(quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3])
+        first, second, third = rotation(quat)
+        shortest = shortest_axis(log_scales[i, 0], log_scales[i, 1], log_scales[i, 2])
+        axis = chosen(shortest, first, second, third)
+        side = -one if dot(normal, axis) < zero else one
+        v = side * v_normal[0], side * v_normal[1], side * v_normal[2]
+        g0 = v if shortest == 0 else none
+        g1 = v if shortest == 1 else none
+        g2 = v if shortest == 2 else none
+        return unit_quat_gradient(quat, inverse_norm, g0, g1, g2)
+
+    return normal_of, quat_gradient
+
+
+def surface_maths(real: type) -> SurfaceMaths:
+    """Builds the functions for `real`, np.float32 or np.float64."""
+    normal_of, quat_gradient = _facing(real)
+    sigmoid, one = shape_maths(real).sigmoid, real(1.0)
+
+    @inlined
+    def describe(i, colors, quats, log_scales, means, logit_strengths, eye, extra, channels):  # type: ignore[no-untyped-def]
+        normal = normal_of(i, quats, log_scales, means, eye)
+        for d in range(3):
+            channels[i, d], channels[i, NORMAL_AT + d] = colors[i, d], normal[d]
+        channels[i, STRENGTH_AT] = sigmoid(logit_strengths[i])
+        for e in range(extra.shape[1]):
+            channels[i, SURFACE_CHANNELS + e] = extra[i, e]
+
+    @inlined
+    def describe_gradient(  # type: ignore[no-untyped-def]
+        i, quats, log_scales, channels, v_channels, v_colors, v_quats, v_logit_strengths, v_extra
+    ):  # fmt: skip
+        normal = channels[i, NORMAL_AT], channels[i, NORMAL_AT + 1], channels[i, NORMAL_AT + 2]
+        v_normal = v_channels[i, NORMAL_AT], v_channels[i, NORMAL_AT + 1], v_channels[i, NORMAL_AT + 2]
+        g = quat_gradient(i, quats, log_scales, normal, v_normal)
+        v_quats[i, 0], v_quats[i, 1], v_quats[i, 2], v_quats[i, 3] = g
+        for d in range(3):
+            v_colors[i, d] = v_channels[i, d]
+        strength = channels[i, STRENGTH_AT]
+        v_logit_strengths[i] = v_channels[i, STRENGTH_AT] * strength * (one - strength)
+        for e in range(v_extra.shape[1]):
+            v_extra[i, e] = v_channels[i, SURFACE_CHANNELS + e]
+
+    return SurfaceMaths(describe, describe_gradient)

@@ -1,0 +1,274 @@
+"""L1 and structural similarity on the CPU in one traversal, with the gradient of the similarity where it is asked for.
+
+A tile is a run of columns of a strip of rows. Rows enter it from above in groups: they are blurred along the row, then
+down the columns, compared, and the slopes of the similarity are blurred in the same two steps, so that all that lies
+between photograph and gradient stays in the cache. An image row is taken as one run of interleaved channels: a
+horizontal tap is three floats away and every loop runs over contiguous memory. Squares need no blur of their own per
+image: similarity depends on their sum only.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+import torch
+from numba import prange
+from numpy.typing import NDArray
+from torch import Tensor
+
+from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
+from glassplat.kernels.maths.blending import Scalar
+from glassplat.kernels.maths.ssim import RADIUS, ssim_maths
+from glassplat.kernels.tensor_checks import REAL_OF
+
+CHANNELS = 3
+MARGIN = RADIUS * CHANNELS
+
+ROWS = 76
+"""Rows of a tile; with two margins above and below they fill six groups."""
+COLUMNS = 256
+"""Columns of a tile; like all columns here, floats and not pixels."""
+WIDE = COLUMNS + 2 * 16
+"""Columns with one margin on either side, rounded up to whole vectors."""
+STRIDE = WIDE + 2 * 16
+GROUP = 16
+"""Rows that enter a tile at once; ten rows before them are still needed."""
+TOGETHER = 4
+"""Rows that are blurred vertically at once, because they share most of what they read."""
+
+# One flat buffer with offsets known to the compiler lets it see that its parts never overlap, so that loops become
+# vector code. A plane holds the rows that are needed at a time; it has 32, so that a mask can bound their number.
+PLANE = 32 * STRIDE
+ENTERED = 0  # One row of image, photograph, sum of squares and product,
+BLURRED = ENTERED + 4 * STRIDE  # a plane of each after the blur along the row,
+RESULTS = BLURRED + 4 * PLANE  # four rows of each after the blur down the columns,
+SLOPES = RESULTS + 4 * TOGETHER * STRIDE  # one row of similarity and three slopes,
+PULLS = SLOPES + 4 * STRIDE  # and a plane of each slope after the blur along the row.
+SCRATCH = PULLS + 3 * PLANE
+
+
+def photometric(image: Tensor, target: Tensor, *, with_gradient: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean L1, mean similarity, and the gradient [H, W, 3] of the similarity's sum (empty unless asked for)."""
+    height, width, _ = image.shape
+    pull = image.new_empty(image.shape if with_gradient else (0, 0, CHANNELS))
+    sums = np.zeros((-(-height // ROWS) * -(-width * CHANNELS // COLUMNS), 2), np.float64)
+    _forward(REAL_OF[image.dtype])(_rows(image), _rows(target), _rows(pull), sums)
+    l1, ssim = sums.sum(axis=0) / image.numel()
+    return image.new_tensor(l1), image.new_tensor(ssim), pull
+
+
+def photometric_gradient(image: Tensor, target: Tensor, pull: Tensor, v_l1: Tensor, v_ssim: Tensor) -> Tensor:
+    """Gradient of the image, given what the forward pass found."""
+    real, v_image = REAL_OF[image.dtype], torch.empty_like(image)
+    weights = (real(v.item() / image.numel()) for v in (v_l1, v_ssim))
+    _backward(real)(_rows(image), _rows(target), _rows(pull), *weights, _rows(v_image))
+    return v_image
+
+
+def _rows(image: Tensor) -> NDArray[Any]:
+    return image.numpy().reshape(image.shape[0], image.shape[1] * CHANNELS)
+
+
+def _brightness(real: type) -> Scalar:
+    per_step = 1.0 / 255.0
+
+    @inlined
+    def brightness(byte):
+        """A byte in [0, 1]; in double precision, so that it is the number nearest to the quotient."""
+        return real(np.float64(byte) * per_step)
+
+    return brightness
+
+
+def _enter(real: type) -> Scalar:
+    blur, brightness, zero = ssim_maths(real).blur, _brightness(real), real(0.0)
+
+    @inlined
+    def enter(scratch, image, target, y, left, row):
+        """Blurs an image row of a tile, with its margins, into row `row` of the planes; beyond the image it is zero."""
+        begin, end = max(0, left - 2 * MARGIN), min(image.shape[1], left + COLUMNS + 2 * MARGIN)
+        inside, skipped = 0 <= y < image.shape[0], (begin - left + 2 * MARGIN) & 31
+        for j in range(0 if inside and end - begin == COLUMNS + 4 * MARGIN else 4 * STRIDE):
+            scratch[ENTERED + j] = zero
+        if inside:
+            a, b = image[y, begin:end], target[y, begin:end]
+            for j in range(a.size):
+                own, wanted = a[j], brightness(b[j])
+                scratch[ENTERED + skipped + j] = own
+                scratch[ENTERED + STRIDE + skipped + j] = wanted
+                scratch[ENTERED + 2 * STRIDE + skipped + j] = own * own + wanted * wanted
+                scratch[ENTERED + 3 * STRIDE + skipped + j] = own * wanted
+        for plane in range(4):
+            source, to = ENTERED + (plane & 3) * STRIDE, BLURRED + (plane & 3) * PLANE + (row & 31) * STRIDE
+            for j in range(WIDE):
+                scratch[to + j] = blur(scratch, source + j, CHANNELS)
+
+    return enter
+
+
+def _blur_down(real: type) -> Scalar:
+    blur = ssim_maths(real).blur
+
+    @inlined
+    def blur_down(scratch, first, row, planes, count):
+        """Blurs four rows of each plane vertically, into the rows at `RESULTS`."""
+        for plane in range(planes):
+            source, to = first + (plane & 3) * PLANE + (row & 15) * STRIDE, RESULTS + (plane & 3) * TOGETHER * STRIDE
+            for j in range(count):
+                one = blur(scratch, source + j, STRIDE)
+                two = blur(scratch, source + STRIDE + j, STRIDE)
+                three = blur(scratch, source + 2 * STRIDE + j, STRIDE)
+                four = blur(scratch, source + 3 * STRIDE + j, STRIDE)
+                scratch[to + j], scratch[to + STRIDE + j] = one, two
+                scratch[to + 2 * STRIDE + j], scratch[to + 3 * STRIDE + j] = three, four
+
+    return blur_down
+
+
+def _compare_row(real: type) -> Scalar:
+    compare = ssim_maths(real).compare
+
+    @inlined
+    def compare_row(scratch, row):
+        """Similarity of one of the four rows at `RESULTS`, and its slopes."""
+        at = RESULTS + (row & 3) * STRIDE
+        for j in range(WIDE):
+            value, by_mean, by_squares, by_product = compare(
+                scratch[at + j],
+                scratch[at + TOGETHER * STRIDE + j],
+                scratch[at + 2 * TOGETHER * STRIDE + j],
+                scratch[at + 3 * TOGETHER * STRIDE + j],
+            )
+            scratch[SLOPES + j] = by_mean
+            scratch[SLOPES + STRIDE + j] = by_squares
+            scratch[SLOPES + 2 * STRIDE + j] = by_product
+            scratch[SLOPES + 3 * STRIDE + j] = value
+
+    return compare_row
+
+
+def _spread_slopes(real: type) -> Scalar:
+    blur, zero = ssim_maths(real).blur, real(0.0)
+
+    @inlined
+    def spread_slopes(scratch, inside, left, rest, row):
+        """Blurs the row of slopes into row `row` of the planes; beyond the image, `rest` columns on, there are none."""
+        for plane in range(3):
+            at, to = SLOPES + (plane & 3) * STRIDE, PULLS + (plane & 3) * PLANE + (row & 31) * STRIDE
+            if inside:
+                for j in range(MARGIN if left == 0 else 0):
+                    scratch[at + j] = zero
+                for j in range(min(rest + MARGIN, WIDE) & 511, WIDE):
+                    scratch[at + j] = zero
+                for j in range(COLUMNS):
+                    scratch[to + j] = blur(scratch, at + j, CHANNELS)
+            else:
+                for j in range(COLUMNS):
+                    scratch[to + j] = zero
+
+    return spread_slopes
+
+
+def _pull_row(real: type) -> Scalar:
+    brightness, two = _brightness(real), real(2.0)
+
+    @inlined
+    def pull_row(scratch, row, image, target, out):
+        """The gradient of one row, from one of the four rows at `RESULTS`."""
+        at = RESULTS + (row & 3) * STRIDE
+        for j in range(out.size):
+            by_squares = scratch[at + TOGETHER * STRIDE + j]
+            by_product = scratch[at + 2 * TOGETHER * STRIDE + j]
+            out[j] = scratch[at + j] + two * image[j] * by_squares + brightness(target[j]) * by_product
+
+    return pull_row
+
+
+@inlined
+def _scroll(scratch, first, planes, count):
+    """Moves the last ten rows of each plane to its top."""
+    for plane in range(planes):
+        for row in range(2 * RADIUS):
+            to = first + (plane & 7) * PLANE + (row & 15) * STRIDE
+            for j in range(count):
+                scratch[to + j] = scratch[to + GROUP * STRIDE + j]
+
+
+@functools.cache
+def _forward(real: type) -> Kernel:
+    enter, blur_down, compare_row = _enter(real), _blur_down(real), _compare_row(real)
+    spread_slopes, pull_row, scroll = _spread_slopes(real), _pull_row(real), _scroll
+    zero = real(0.0)
+
+    @inlined
+    def differences(scratch, count):
+        """Sum of the absolute differences of the row that entered last."""
+        total = zero
+        for j in range(count):
+            total += abs(scratch[ENTERED + 2 * MARGIN + j] - scratch[ENTERED + STRIDE + 2 * MARGIN + j])
+        return total
+
+    @inlined
+    def similarity(scratch, count):
+        """Sum of the similarities of the row that was compared last."""
+        total = zero
+        for j in range(count):
+            total += scratch[SLOPES + 3 * STRIDE + MARGIN + j]
+        return total
+
+    @kernel("photometric_forward", real)
+    def forward(image, target, pull, sums):
+        height, width = image.shape
+        columns = (width + COLUMNS - 1) // COLUMNS
+        reach = RADIUS if pull.size > 0 else 0
+        for tile in prange(sums.shape[0]):
+            scratch: NDArray[Any] = np.empty(SCRATCH, real)
+            top, left = tile // columns * ROWS, tile % columns * COLUMNS
+            bottom, right = min(height, top + ROWS), min(width, left + COLUMNS)
+            l1, ssim = 0.0, 0.0
+            for begin in range(top - reach - RADIUS, bottom + reach + RADIUS, GROUP):
+                for i in range(GROUP):
+                    enter(scratch, image, target, begin + i, left, 2 * RADIUS + i)
+                    if top <= begin + i < bottom:
+                        l1 += differences(scratch, right - left)
+                for i in range(GROUP):
+                    y = begin + i - RADIUS
+                    if i % TOGETHER == 0 and top - reach - TOGETHER < y < bottom + reach:
+                        blur_down(scratch, BLURRED, i, 4, WIDE)
+                    inside = max(0, top - reach) <= y < min(height, bottom + reach)
+                    if inside:
+                        compare_row(scratch, i)
+                    if top <= y < bottom:
+                        ssim += similarity(scratch, right - left)
+                    if reach > 0:
+                        spread_slopes(scratch, inside, left, width - left, 2 * RADIUS + i)
+                scroll(scratch, BLURRED, 4, WIDE)
+                if reach == 0:
+                    continue
+                for i in range(GROUP):
+                    y = begin + i - 2 * RADIUS
+                    if i % TOGETHER == 0 and top - TOGETHER < y < bottom:
+                        blur_down(scratch, PULLS, i, 3, COLUMNS)
+                    if top <= y < bottom:
+                        pull_row(scratch, i, image[y, left:right], target[y, left:right], pull[y, left:right])
+                scroll(scratch, PULLS, 3, COLUMNS)
+            sums[tile, 0], sums[tile, 1] = l1, ssim
+
+    return forward
+
+
+@functools.cache
+def _backward(real: type) -> Kernel:
+    brightness, zero = _brightness(real), real(0.0)
+
+    @kernel("photometric_backward", real)
+    def backward(image, target, pull, v_l1, v_ssim, v_image):
+        for y in prange(image.shape[0]):
+            for j in range(image.shape[1]):
+                difference = image[y, j] - brightness(target[y, j])
+                sign = v_l1 if difference > zero else (-v_l1 if difference < zero else zero)
+                v_image[y, j] = sign + v_ssim * pull[y, j]
+
+    return backward
