@@ -34,6 +34,7 @@ class PaneView:
             the mask leaves the image there is no edge, because the pane goes on.
         edge: [E, 2] points (x, y) half-way between a pixel on the pane and a neighbour off it.
         outward: [E, 2] unit vectors across the edge, off the pane.
+        name: of the photograph, for messages.
     """
 
     cam_from_world: Array
@@ -43,6 +44,7 @@ class PaneView:
     distance: Array
     edge: Array
     outward: Array
+    name: str = ""
 
     @property
     def center(self) -> Array:
@@ -112,13 +114,14 @@ class PaneView:
         return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
-def pane_view(camera: Camera, labels: Tensor, label: int) -> PaneView:
+def pane_view(camera: Camera, labels: Tensor, label: int, *, name: str = "") -> PaneView:
     """One pane of one annotated view.
 
     Args:
         camera: the view's camera.
         labels: [H, W] integer label image, of the camera's size.
         label: which pane.
+        name: of the photograph, for messages.
 
     Raises:
         ValueError: the label image and the camera differ in size.
@@ -139,6 +142,7 @@ def pane_view(camera: Camera, labels: Tensor, label: int) -> PaneView:
         distance=_signed_distance(mask),
         edge=edge,
         outward=_outward(mask, edge),
+        name=name,
     )
 
 
@@ -188,7 +192,9 @@ def _outward(mask: Mask, edge: Array) -> Array:
     return outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), np.finfo(np.float64).tiny)
 
 
-def pane_views(annotations: Sequence[tuple[Camera, Tensor]], label: int, *, most: int = 12) -> list[PaneView]:
+def pane_views(
+    annotations: Sequence[tuple[Camera, Tensor]], label: int, *, most: int = 12, names: Sequence[str] | None = None
+) -> list[PaneView]:
     """Annotated views that show a pane, ignoring parts of it that are only a few pixels wide.
 
     Args:
@@ -196,11 +202,13 @@ def pane_views(annotations: Sequence[tuple[Camera, Tensor]], label: int, *, most
         label: which pane.
         most: largest number of views; where a capture has a mask for every photograph, those that
             show much of the pane and were taken far from one another tell enough.
+        names: of the photographs; they are numbered from 1 if None.
     """
     centers = np.array([_array(camera.center) for camera, _ in annotations])
     shares = np.array([float((labels == label).double().mean()) for _, labels in annotations])
     chosen = _far_apart(centers, shares, most)
-    views = (pane_view(*annotations[index], label) for index in sorted(chosen))
+    names = names or [f"annotation {number}" for number in range(1, len(annotations) + 1)]
+    views = (pane_view(*annotations[index], label, name=names[index]) for index in sorted(chosen))
     return [view for view in views if view.mask.any()]
 
 

@@ -46,20 +46,35 @@ def mask_agreement(planes: PlaneEquations, views: Sequence[PaneView], *, pixels_
         views: annotated views of one pane, at least two.
         pixels_per_view: number of rays that are followed from each view.
     """
-    both, either, unknown = np.zeros(len(planes)), np.zeros(len(planes)), np.zeros(len(planes))
-    for source in views:
+    both, either = _overlaps(planes, views, pixels_per_view)
+    agreement: Array = both.sum(axis=(0, 1)) / np.maximum(either.sum(axis=(0, 1)), 1)
+    return agreement
+
+
+def agreement_of_each(plane: PlaneEquations, views: Sequence[PaneView], *, pixels_per_view: int = 400) -> Array:
+    """[V] how well the mask of each view agrees with those of all others on one plane; as `mask_agreement`."""
+    both, either = (pairs[..., 0] + pairs[..., 0].T for pairs in _overlaps(plane, views, pixels_per_view))
+    agreement: Array = both.sum(axis=1) / np.maximum(either.sum(axis=1), 1)
+    return agreement
+
+
+def _overlaps(planes: PlaneEquations, views: Sequence[PaneView], pixels_per_view: int) -> tuple[Array, Array]:
+    """Pixels of each view on the pane in another one as well, and on it in either; [V, V, H], from and to."""
+    count = len(views)
+    both, either = np.zeros((2, count, count, len(planes)))
+    for number, source in enumerate(views):
         pixels = source.grid(pixels_per_view)
         pixels = pixels[source.tells(pixels, np.ones(len(pixels), dtype=bool))]
         on_pane = source.covers(pixels, np.ones(len(pixels), dtype=bool))
         points, hit = meet(planes, source.center, source.directions(pixels))
-        # A plane behind the camera cannot hold a pane that the camera sees.
-        either += (on_pane & ~hit).sum(axis=1) * (len(views) - 1)
-        for target in views:
+        for other, target in enumerate(views):
             if target is not source:
                 landed, held = target.project(points)
                 held = target.tells(landed, held & hit)
                 covered = target.covers(landed, held)
-                both += (covered & on_pane).sum(axis=1)
-                either += (held & (covered | on_pane)).sum(axis=1)
-                unknown += (hit & on_pane & ~held).sum(axis=1)
-    return both / np.maximum(either + UNKNOWN_WEIGHT * unknown, 1)
+                both[number, other] = (covered & on_pane).sum(axis=1)
+                unknown = (hit & on_pane & ~held).sum(axis=1)
+                # A plane behind the camera cannot hold a pane that the camera sees.
+                missed = (on_pane & ~hit).sum(axis=1)
+                either[number, other] = (held & (covered | on_pane)).sum(axis=1) + missed + UNKNOWN_WEIGHT * unknown
+    return both, either

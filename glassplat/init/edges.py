@@ -42,12 +42,14 @@ class EdgeMatches:
             view. The distance is 0 where there is not.
         turns: [H, P] by how much the edge at point p is turned against the pane's sides, if it is a rectangle:
             the sine of twice the angle.
+        sources: [P] the view whose mask's edge point p lies on.
     """
 
     distances: Array
     shifts: Array
     compared: Mask
     turns: Array
+    sources: NDArray[np.int64]
 
     def residuals(self, frames: Array, tolerance: float) -> Array:
         """[V, H, P] distances that frames [H] of some height leave unexplained, in units of the tolerance."""
@@ -79,7 +81,7 @@ def edge_matches(planes: PlaneEquations, views: Sequence[PaneView], *, edges_per
     doubt = np.sqrt((1 + (own_size / sizes) ** 2) / 2)
     diagonals = np.array([view.diagonal for view in views])[:, None, None]
     shifts = np.where(compared, (own_hidden - hidden) / (sizes * diagonals * doubt), 0)
-    return EdgeMatches(distances / doubt, shifts, compared, _turns(planes, outward))
+    return EdgeMatches(distances / doubt, shifts, compared, _turns(planes, outward), source_of)
 
 
 def _turns(planes: PlaneEquations, outward: Array) -> Array:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from glassplat.init.consistency import mask_agreement
 from glassplat.init.plane_moves import planes_nearby, planes_through_masks
-from glassplat.init.plane_objective import COARSE, FINE, MIDDLE, USUAL_FRAME, Objective
+from glassplat.init.plane_objective import COARSE, EDGES, FINE, MIDDLE, USUAL_FRAME, Objective
 from glassplat.init.plane_refinement import refined
 from glassplat.init.ransac import FramedPlanes, joined, random_planes
 
@@ -15,8 +15,12 @@ Array = NDArray[np.float64]
 
 AGREEMENT_WEIGHT = 0.1
 """Weight of the agreement of the masks against that of their edges, which know of frames."""
-BEAM, CHILDREN = 12, 30
-"""Number of hypotheses that are followed, and of the planes tried around each of them in each round."""
+POOL, LEAST_OF_BEST = 200, 0.75
+"""Number of the hypotheses on which the masks agree best whose edges are compared, and the share of the best agreement
+below which no edges are looked at."""
+BY_AREAS, BY_EDGES, CHILDREN = 12, 6, 30
+"""Number of hypotheses that are followed because masks agree on them, and because edges meet, and of the planes tried
+around each of them in each round."""
 ROUNDS = ((0.3, 0.1, 2 * COARSE), (0.1, 0.03, COARSE))
 """Spread of these (radians, distances of the cameras from the pane) and tolerance of the edges, for each round."""
 SHAKE = (0.03, 0.01, MIDDLE)
@@ -45,17 +49,34 @@ def best_plane(objective: Objective, *, hypotheses: int, refine: int, rng: np.ra
     beam = _hypotheses(objective, hypotheses, rng)
     for tilt, shift, tolerance in ROUNDS:
         beam = _followed(beam, objective, (tilt, shift), tolerance, rng)
-    beam = refined(beam, objective, (COARSE, MIDDLE))
+    beam = _agreed(refined(beam, objective, (COARSE, MIDDLE)), objective)
     tilt, shift, tolerance = SHAKE
     shaken = _followed(beam, objective, (tilt, shift), tolerance, rng)
-    best_first = np.argsort(_cost(beam, objective, (COARSE, MIDDLE)), kind="stable")
+    best_first = np.argsort(contradiction(beam, objective, (COARSE, MIDDLE)), kind="stable")
     leading = joined([beam.select(best_first[:refine]), shaken.select(np.arange(min(refine, len(shaken))))])
-    finished = refined(leading, objective, (MIDDLE, FINE))
-    return finished.select(np.array([np.argmin(_cost(finished, objective, (COARSE, MIDDLE, FINE)))]))
+    finished = _agreed(refined(leading, objective, (MIDDLE, FINE)), objective)
+    return finished.select(np.array([np.argmin(contradiction(finished, objective))]))
+
+
+def contradiction(
+    planes: FramedPlanes,
+    objective: Objective,
+    tolerances: tuple[float, ...] = (COARSE, MIDDLE, FINE),
+    *,
+    edges: int = EDGES,
+) -> Array:
+    """[H] what tells against planes, their masks included, at several tolerances; in no unit, near 0 on the pane."""
+    costs = [objective.terms(planes, tolerance, edges=edges).cost for tolerance in tolerances]
+    mean: Array = np.mean(costs, axis=0) - AGREEMENT_WEIGHT * _agreement(planes, objective)
+    return mean
 
 
 def _hypotheses(objective: Objective, count: int, rng: np.random.Generator) -> FramedPlanes:
-    """The planes, of those drawn through points and masks, on which the masks agree best."""
+    """The planes, of those drawn through points and masks, on which the masks agree best, or their edges.
+
+    Areas lead there from afar. But where a pane fills most of the photographs they agree by more than nine tenths on
+    planes that are off by a right angle, and only edges tell.
+    """
     drawn = [planes_through_masks(objective.views, count, rng)]
     if len(objective.points) >= 3:
         through = random_planes(objective.points, objective.weights, count, rng)
@@ -63,7 +84,11 @@ def _hypotheses(objective: Objective, count: int, rng: np.random.Generator) -> F
     usual = USUAL_FRAME * objective.extent
     planes = joined([FramedPlanes(part, np.full(len(part), usual)) for part in drawn])
     scores = _agreement(planes, objective) + AGREEMENT_WEIGHT * objective.support(planes.planes)
-    return planes.select(np.argsort(-scores, kind="stable")[:BEAM])
+    best_first = _agreed(planes.select(np.argsort(-scores, kind="stable")[:POOL]), objective, least=BY_AREAS)
+    costs = contradiction(best_first, objective, (ROUNDS[0][2],), edges=COARSE_EDGES)
+    by_edges = np.argsort(costs, kind="stable")
+    by_areas = np.arange(len(best_first))[:BY_AREAS]
+    return best_first.select(np.concatenate([by_areas, by_edges[by_edges >= BY_AREAS][:BY_EDGES]]))
 
 
 def _followed(
@@ -81,11 +106,14 @@ def _followed(
     return family.select(best[np.argsort(costs.min(axis=1), kind="stable")])
 
 
-def _cost(planes: FramedPlanes, objective: Objective, tolerances: tuple[float, ...]) -> Array:
-    """[H] what tells against planes, their masks included, at several tolerances."""
-    costs = [objective.terms(planes, tolerance).cost for tolerance in tolerances]
-    mean: Array = np.mean(costs, axis=0) - AGREEMENT_WEIGHT * _agreement(planes, objective)
-    return mean
+def _agreed(planes: FramedPlanes, objective: Objective, *, least: int = 0) -> FramedPlanes:
+    """The first so many planes, and all others that the masks do not rule out beside the best.
+
+    Where other panes or posts hide much of a pane, edges that meet by chance may outdo its own.
+    """
+    agreement = _agreement(planes, objective)
+    kept = (agreement >= LEAST_OF_BEST * agreement.max()) | (np.arange(len(planes)) < least)
+    return planes.select(np.flatnonzero(kept))
 
 
 def _agreement(planes: FramedPlanes, objective: Objective) -> Array:

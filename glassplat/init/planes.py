@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +14,8 @@ from torch import Tensor
 from glassplat.init.annotation import PaneView, pane_views, plane_candidates
 from glassplat.init.consistency import mask_agreement
 from glassplat.init.footprint import pane_rectangle
+from glassplat.init.mask_check import report_masks
+from glassplat.init.plane_evidence import Fit, best_supported
 from glassplat.init.plane_objective import MIDDLE, Objective
 from glassplat.init.plane_refinement import doubt
 from glassplat.init.plane_search import best_plane
@@ -82,7 +84,8 @@ def fit_planes(
     annotations: Sequence[tuple[Camera, Tensor]],
     *,
     extent: float,
-    weights: Tensor | None = None,
+    measured: Tensor | None = None,
+    names: Sequence[str] | None = None,
     labels: Sequence[int] | None = None,
     options: PlaneFit | None = None,
 ) -> Planes:
@@ -94,11 +97,15 @@ def fit_planes(
     the masks of all views coincide (`consistency`), and their edges do (`edges`). RANSAC alone often prefers a
     wall or the floor. No points are needed: further planes are drawn through the masks.
 
+    Gaussians may mislead, so that each pane is fitted to the measured points as well, and of both planes the one is
+    kept that masks and measured points support better (`plane_evidence`).
+
     Args:
         centers: [N, 3] centres of the primary Gaussians, or SfM points.
         annotations: cameras and their label images [H, W]; 0 is no pane.
         extent: radius of the capture in world units.
-        weights: [N] how much each centre counts, such as its opacity; all the same if None.
+        measured: [M, 3] SfM points, where `centers` are those of Gaussians; None where there are none.
+        names: of the annotated photographs, for messages.
         labels: the panes to fit; all that the masks name if None.
         options: how to fit; the defaults if None.
 
@@ -116,26 +123,67 @@ def fit_planes(
         raise PlaneFitError(
             f"none of the {len(annotations)} masks names a pane; expected pixels with labels 1, 2, ... in at least two"
         )
-    points = centers.detach().cpu().double().numpy()
-    shares = np.ones(len(points)) if weights is None else weights.detach().cpu().double().numpy()
-    usable = np.isfinite(points).all(axis=1) & (shares > 0)
-    panes = [
-        _fit_pane(label, points[usable], shares[usable], annotations, extent=extent, options=options)
-        for label in labels
-    ]
+    clouds = {"the points" if measured is None else "the Gaussians": _usable(centers)}
+    if measured is not None:
+        clouds = {"the measured points": _usable(measured)} | clouds
+    panes = []
+    for label in labels:
+        views = pane_views(annotations, label, most=options.most_views, names=names)
+        panes.append(_fit_pane(label, clouds, views, extent=extent, options=options))
     return _planes(panes, labels, options).to(centers.device)
 
 
+def _usable(positions: Tensor) -> Array:
+    points: Array = positions.detach().cpu().double().numpy()
+    return points[np.isfinite(points).all(axis=1)]
+
+
 def _fit_pane(
-    label: int,
-    points: Array,
-    weights: Array,
-    annotations: Sequence[tuple[Camera, Tensor]],
-    *,
-    extent: float,
-    options: PlaneFit,
+    label: int, clouds: Mapping[str, Array], views: Sequence[PaneView], *, extent: float, options: PlaneFit
 ) -> _Pane:
-    views = pane_views(annotations, label, most=options.most_views)
+    """The pane on the plane, of those fitted to each cloud, that masks and the first cloud support best."""
+    _check_views(label, views, extent)
+    objectives = {}
+    for source, points in clouds.items():
+        chosen = points[plane_candidates(points, views, band=options.band)]
+        distance = options.inlier_distance * extent
+        objectives[source] = Objective(views, chosen, np.ones(len(chosen)), extent, distance)
+    try:
+        fits = _fits(label, objectives, options)
+        found = best_supported(label, fits, next(iter(objectives.values())))
+        report_masks(label, found, views)
+        return _pane(found.planes, views, options.margin)
+    except ValueError as error:
+        raise PlaneFitError(
+            f"pane {label}, annotated in {len(views)} views: {error}. Check that label {label} means the same flat "
+            "pane in every mask, and annotate more views, from places well apart, that show its outline inside of the "
+            "image with nothing standing before it"
+        ) from error
+
+
+def _fits(label: int, objectives: Mapping[str, Objective], options: PlaneFit) -> list[Fit]:
+    """A plane for each objective that leads to one.
+
+    Raises:
+        ValueError: none does; the first one's reason.
+    """
+    fits, errors = [], []
+    for source, objective in objectives.items():
+        rng = np.random.default_rng((options.seed, label))
+        found = best_plane(objective, hypotheses=options.hypotheses, refine=options.refined, rng=rng)
+        try:
+            _check_agreement(found.planes, objective.views, options.least_agreement)
+            _check_certainty(found, objective)
+        except ValueError as error:
+            errors.append(error)
+        else:
+            fits.append(Fit(source, found))
+    if not fits:
+        raise errors[0]
+    return fits
+
+
+def _check_views(label: int, views: Sequence[PaneView], extent: float) -> None:
     if len(views) < 2:
         raise PlaneFitError(
             f"pane {label} is annotated in {len(views)} view(s), but its plane shows only between views: "
@@ -145,21 +193,6 @@ def _fit_pane(
         log.warning("pane %d is annotated in two views only; its plane may be off by degrees, a third helps", label)
     _check_places(label, views, extent)
     _check_outline(label, views)
-    chosen = plane_candidates(points, views, band=options.band)
-    objective = Objective(views, points[chosen], weights[chosen], extent, options.inlier_distance * extent)
-    rng = np.random.default_rng((options.seed, label))
-    try:
-        found = best_plane(objective, hypotheses=options.hypotheses, refine=options.refined, rng=rng)
-        _check_agreement(found.planes, views, options.least_agreement)
-        _check_certainty(found, objective)
-        log.info("pane %d: plane found from %d views and %d candidate points", label, len(views), chosen.sum())
-        return _pane(found.planes, views, options.margin)
-    except ValueError as error:
-        raise PlaneFitError(
-            f"pane {label}, annotated in {len(views)} views: {error}. Check that label {label} means the same flat "
-            "pane in every mask, and annotate more views, from places well apart, that show its outline inside of the "
-            "image with nothing standing before it"
-        ) from error
 
 
 def _check_places(label: int, views: Sequence[PaneView], extent: float) -> None:

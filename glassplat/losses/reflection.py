@@ -15,10 +15,11 @@ def gradient_conflict(frame: Frame, view: View, scene: Scene) -> Tensor:
 
     The image mean of H |grad C_t . sg(grad C_r)|, per colour channel: an edge of the reflection should
     not appear in the transmission. No gradient reaches the reflection. C_t is the image without any pane, also where
-    panes are seen through one another.
+    panes are seen through one another. H leaves out the pixels where the reflection ends or passes to another pane's:
+    that edge is the pane's own, and the frame behind it has every right to be there.
     """
     layers = frame.layers
-    return shared_edges(layers["without_panes"], layers["reflection"], layers["hit"])
+    return shared_edges(layers["without_panes"], layers["reflection"], layers["inner"])
 
 
 def mask_loss(frame: Frame, view: View, scene: Scene) -> Tensor | None:

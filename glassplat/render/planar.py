@@ -24,7 +24,7 @@ from glassplat.render.rasterize import (
     screen_pass,
     shown,
 )
-from glassplat.render.seen_panes import SeenPanes, glass_owners, nearest_hits, seen_panes
+from glassplat.render.seen_panes import SeenPanes, amid_one_pane, glass_owners, nearest_hits, seen_panes
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
@@ -71,9 +71,10 @@ class Planar:
     pane is the C of the pane behind it (the paper shows the nearest only). The layers R, C_r and C_t are those of the
     nearest one that is more than `FAINT`ly visible; see `glazing`.
 
-    Layers: `transmission`, `reflection` [H, W, 3]; `strength`, `mask`, `depth`, `alpha`, `hit`
-    [H, W]; `without_panes` [H, W, 3], the image were there no panes, and `share` [H, W], how much of what is seen the
-    panes add, all of them together; `deviation` [H, W] (Eq. 14) if asked for.
+    Layers: `transmission`, `reflection` [H, W, 3]; `strength`, `mask`, `depth`, `alpha` [H, W]; `hit` [H, W], 1 in
+    the panes' rectangles, and `inner` [H, W], without the rim of what reflects; `without_panes` [H, W, 3], the image
+    were there no panes, and `share` [H, W], how much of what is seen the panes add, all of them together;
+    `deviation` [H, W] (Eq. 14) if asked for.
 
     Attributes:
         background: colour behind everything, sRGB.
@@ -107,7 +108,7 @@ class Planar:
         if not hits.tiles.any():
             nothing = torch.zeros_like(hit)
             layers |= {"transmission": first.image, "reflection": torch.zeros_like(first.image)}
-            layers |= {"strength": nothing, "share": nothing}
+            layers |= {"strength": nothing, "share": nothing, "inner": nothing}
             return Frame(first.image, layers, direct=first.direct, screen=first.screen)
         seen = seen_panes(scene.planes, camera, hits, first.mask)
         second = self._second_pass(scene, camera, seen, probed)
@@ -123,6 +124,7 @@ class Planar:
             blend=self.blend,
         )
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
+        layers["inner"] = amid_one_pane(hits.pane, result.strength)
         screen = weighted_screen(first, second, hits, result, self.blend) if probed else ()
         return Frame(result.rgb, layers, first.direct, second.mirrored, screen)
 

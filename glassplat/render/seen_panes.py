@@ -90,6 +90,19 @@ def _joined_windows(hits: list[PaneHits]) -> Tensor:
 
 
 @torch.no_grad()
+def amid_one_pane(pane: Tensor, strength: Tensor) -> Tensor:
+    """[H, W] 1 where a pixel and its eight neighbours show the same pane, and it reflects; 0 elsewhere.
+
+    Args:
+        pane: [H, W] which pane is nearest, -1 for none.
+        strength: [H, W] of the reflection; 0 where a pane is hit and no glass is there.
+    """
+    shown = torch.where(strength > 0, pane, -1).to(strength.dtype)[None]
+    highest, negated_lowest = (torch.nn.functional.max_pool2d(image, 3, 1, 1)[0] for image in (shown, -shown))
+    return ((shown[0] >= 0) & (highest == -negated_lowest)).to(strength.dtype)
+
+
+@torch.no_grad()
 def glass_owners(glass: Gaussians, planes: Planes) -> Tensor:
     """[M] the plane whose rectangle is nearest to each glass Gaussian, position in `planes`."""
     offsets = glass.means[:, None] - planes.centers

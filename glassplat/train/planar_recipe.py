@@ -8,7 +8,7 @@ from typing import ClassVar
 from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
-from glassplat.init.planes import PlaneFit, fit_planes
+from glassplat.init.planes import PlaneFit
 from glassplat.kernels.panes import Fresnel
 from glassplat.losses.geometry import depth_deviation_loss
 from glassplat.losses.reflection import gradient_conflict, intensity_departure, mask_loss
@@ -20,7 +20,7 @@ from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, GrowSh, PerturbOpacity, ResetOpacity
 from glassplat.train.background import BLACK
 from glassplat.train.optimizer import Rate
-from glassplat.train.plane_entry import PlaneEntry, annotations_of
+from glassplat.train.plane_entry import PlaneEntry, fitted_planes
 from glassplat.train.splat_recipe import GaussianRates, image_terms
 from glassplat.train.stage import Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
@@ -161,8 +161,7 @@ class PlanarRecipe:
                 because a bad mask should end a run before the first iteration and not at the second stage.
         """
         if dataset.measured_points or not dataset.pane_labels:
-            positions, annotations = dataset.points.positions, annotations_of(dataset)
-            fit_planes(positions, annotations, extent=dataset.extent, options=self.plane_fit)
+            fitted_planes(dataset, None, self.plane_fit)
         return Scene(self._population().initial(dataset.points, self.sh_degree), dataset.extent)
 
     def renderer(self) -> Planar:

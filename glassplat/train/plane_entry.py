@@ -14,7 +14,6 @@ from glassplat.init.material import mirror_labels, mirrored_coverage
 from glassplat.init.planes import PlaneFit, fit_planes, with_mirrors
 from glassplat.init.points import gaussians_from_points
 from glassplat.init.virtual_scene import virtual_points
-from glassplat.scene.camera import Camera
 from glassplat.scene.mirrored import mirrored_gaussians
 from glassplat.scene.plane import Planes
 from glassplat.train.state import TrainState
@@ -45,8 +44,7 @@ class PlaneEntry:
 
     def __call__(self, state: TrainState, dataset: Dataset) -> None:
         """Edits `state`."""
-        means, extent = state.scene.primary.means, state.scene.extent
-        planes = fit_planes(means, annotations_of(dataset), extent=extent, options=self.fit)
+        planes = fitted_planes(dataset, state.scene.primary.means, self.fit)
         glass = glass_gaussians(planes, count=self.glass_count, seed=self.seed)
         scene = replace(state.scene, planes=planes, glass=glass)
         if self.detect_mirrors and not self.fit.mirror_labels:
@@ -62,9 +60,27 @@ class PlaneEntry:
                 seed_reflection(state, dataset, planes.select([row]))
 
 
-def annotations_of(dataset: Dataset) -> list[tuple[Camera, Tensor]]:
-    """Cameras and pane labels [H, W] of the annotated training views."""
-    return [(view.camera, view.pane_labels) for view in dataset.train if view.pane_labels is not None]
+def fitted_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Planes:
+    """The planes of the panes that a capture's masks name.
+
+    Args:
+        dataset: the capture.
+        centers: [N, 3] those of Gaussians; None fits to the capture's own points.
+        fit: how planes are found.
+
+    Raises:
+        PlaneFitError: the masks do not do.
+    """
+    shown = [(view.name, view.camera, view.pane_labels) for view in dataset.train if view.pane_labels is not None]
+    points = dataset.points.positions
+    return fit_planes(
+        points if centers is None else centers,
+        [(camera, labels) for _, camera, labels in shown],
+        extent=dataset.extent,
+        measured=points if dataset.measured_points and centers is not None else None,
+        names=[name for name, _, _ in shown],
+        options=fit,
+    )
 
 
 def turn_virtual_scene_round(state: TrainState, dataset: Dataset, mirror: Planes) -> None:

@@ -10,31 +10,48 @@ import torch
 from glassplat.losses.geometry import depth_deviation_loss
 from glassplat.losses.reflection import gradient_conflict, intensity_departure, mask_loss
 from glassplat.render.frame import Frame
+from glassplat.render.seen_panes import amid_one_pane
 
 
 def frame_with(**layers: torch.Tensor) -> Any:
     return Frame(rgb=torch.zeros(8, 9, 3), layers=layers)
 
 
-def test_gradient_conflict_counts_shared_edges_inside_the_hit_mask_only() -> None:
-    step = (torch.arange(9) >= 4).float()[None, :, None].expand(8, 9, 3)
-    flat, hit = torch.full((8, 9, 3), 0.5), torch.ones(8, 9)
-    view, scene = SimpleNamespace(), SimpleNamespace()
+def conflict(transmission: torch.Tensor, reflection: torch.Tensor, pane: torch.Tensor, strength: torch.Tensor) -> float:
+    layers = {"without_panes": transmission, "reflection": reflection, "inner": amid_one_pane(pane, strength)}
+    return float(gradient_conflict(frame_with(**layers), SimpleNamespace(), SimpleNamespace()))
 
-    def value(transmission: torch.Tensor, reflection: torch.Tensor, mask: torch.Tensor) -> float:
-        return float(
-            gradient_conflict(frame_with(without_panes=transmission, reflection=reflection, hit=mask), view, scene)
-        )
 
-    assert value(step, step, hit) > 0
-    assert value(step, flat, hit) == 0
-    assert value(step, step, torch.zeros(8, 9)) == 0
+STEP = (torch.arange(9) >= 4).float()[None, :, None].expand(8, 9, 3)
+FLAT = torch.full((8, 9, 3), 0.5)
+ALL = torch.zeros(8, 9, dtype=torch.int32)
+EVEN = torch.full((8, 9), 0.1)
+
+
+def test_gradient_conflict_counts_shared_edges_on_panes_only() -> None:
+    assert conflict(STEP, STEP, ALL, EVEN) > 0
+    assert conflict(STEP, FLAT, ALL, EVEN) == 0
+    assert conflict(STEP, STEP, ALL - 1, EVEN) == 0
+
+
+def test_where_a_reflection_ends_is_no_edge_of_it() -> None:
+    """At the rectangle's rim, where no glass is, and where the next pane begins, with a frame behind each."""
+    right = STEP[..., 0] > 0
+    rim = torch.where(right, ALL, -1)
+    assert conflict(STEP, FLAT * STEP, rim, EVEN * right) == 0
+    assert conflict(STEP, FLAT * STEP, ALL, EVEN * right) == 0
+    assert conflict(STEP, FLAT + 0.3 * STEP, right.to(torch.int32), EVEN) == 0
+
+
+def test_edges_beside_a_rim_still_count() -> None:
+    narrow = torch.where(torch.arange(9) >= 2, ALL, -1)
+    assert conflict(STEP, STEP, narrow, EVEN) == conflict(STEP, STEP, ALL, EVEN)
 
 
 def test_gradient_conflict_leaves_the_reflection_alone() -> None:
     transmission = torch.rand(8, 9, 3, requires_grad=True)
     reflection = torch.rand(8, 9, 3, requires_grad=True)
-    frame = frame_with(without_panes=transmission, reflection=reflection, hit=torch.ones(8, 9))
+    frame = frame_with(without_panes=transmission, reflection=reflection, inner=torch.ones(8, 9))
     loss = gradient_conflict(frame, SimpleNamespace(), SimpleNamespace())
     to_transmission, to_reflection = torch.autograd.grad(loss, [transmission, reflection], allow_unused=True)
     assert float(to_transmission.abs().sum()) > 0 and to_reflection is None

@@ -1,0 +1,98 @@
+"""Which plane is kept where Gaussians and measured points lead to different ones."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from glassplat.init.annotation import pane_views
+from glassplat.init.plane_evidence import Fit, best_supported, score
+from glassplat.init.plane_objective import Objective
+from glassplat.init.planes import PlaneFit, fit_planes
+from glassplat.init.ransac import FramedPlanes, PlaneEquations
+from tests.init.pane_scene import FRONT, Pane, frame_and_clutter, normal_error, scene_of
+
+QUICK = PlaneFit(hypotheses=300, refined=2)
+EXTENT = 3.0
+CLOSE = ((-0.15, 0.0, -1.0), (0.15, 0.05, -1.0), (0.0, -0.1, -0.9))
+"""Places so near one another that masks leave the plane open by some degrees."""
+
+
+def turned(pane: Pane, degrees: float) -> Pane:
+    """The pane turned about the upright axis through its middle."""
+    cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    rotation = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+    return replace(pane, normal=rotation @ pane.normal, tangent=rotation @ pane.tangent)
+
+
+MEASURED = frame_and_clutter([FRONT], frame=60, wall=200)
+MISLEADING = frame_and_clutter([turned(FRONT, 10)], frame=400, wall=200)
+
+
+def framed(pane: Pane) -> FramedPlanes:
+    return FramedPlanes(PlaneEquations(pane.normal[None], np.array([pane.normal @ pane.center])), np.zeros(1))
+
+
+def test_the_measured_points_win_where_gaussians_mislead(caplog: pytest.LogCaptureFixture) -> None:
+    annotations = scene_of([FRONT], CLOSE)
+    misled = fit_planes(MISLEADING, annotations, extent=EXTENT, options=QUICK)
+    assert normal_error(misled, 0, FRONT) > 3
+    caplog.clear()
+    with caplog.at_level(logging.INFO, "glassplat.init"):
+        planes = fit_planes(MISLEADING, annotations, extent=EXTENT, measured=MEASURED, options=QUICK)
+    assert normal_error(planes, 0, FRONT) < 1.5
+    assert "fitted to the measured points scores" in caplog.text
+    assert "fitted to the Gaussians scores" in caplog.text
+    assert caplog.text.count("; kept") == 1
+
+
+def test_gaussians_decide_where_measured_points_lead_to_no_plane(caplog: pytest.LogCaptureFixture) -> None:
+    annotations = scene_of([FRONT], CLOSE)
+    with caplog.at_level(logging.INFO, "glassplat.init"):
+        planes = fit_planes(MEASURED, annotations, extent=EXTENT, measured=torch.zeros(0, 3), options=QUICK)
+    assert normal_error(planes, 0, FRONT) < 3
+    assert "of 0 points along its edge" in caplog.text
+
+
+@pytest.mark.parametrize("degrees", [1.0, 5.0, 40.0])
+def test_the_better_plane_is_kept_in_either_order(degrees: float) -> None:
+    views = pane_views(scene_of([FRONT]), 1)
+    evidence = Objective(views, np.zeros((0, 3)), np.zeros(0), EXTENT, 0.01 * EXTENT)
+    fits = [Fit("one", framed(FRONT)), Fit("other", framed(turned(FRONT, degrees)))]
+    assert best_supported(1, fits, evidence) is fits[0].plane
+    assert best_supported(1, fits[::-1], evidence) is fits[0].plane
+
+
+def test_virtual_points_behind_a_mirror_do_not_speak_against_its_plane() -> None:
+    """Nothing lies on the mirror, and everything that was measured in it lies behind."""
+    views = pane_views(scene_of([FRONT]), 1)
+    virtual = np.random.default_rng(0).uniform([-2, -1, 2.5], [2, 1, 6], (5000, 3))
+    evidence = Objective(views, virtual, np.ones(len(virtual)), EXTENT, 0.01 * EXTENT)
+    wall = replace(FRONT, center=FRONT.center + np.array([0, 0, 0.6]))
+    assert score(framed(FRONT), evidence) > score(framed(wall), evidence) + 0.2
+
+
+def test_the_score_does_not_depend_on_the_unit_of_length() -> None:
+    def scaled(factor: float) -> float:
+        annotations = [
+            (replace(camera, cam_from_world=with_translation(camera.cam_from_world, factor)), labels)
+            for camera, labels in scene_of([FRONT])
+        ]
+        points = factor * frame_and_clutter([FRONT], wall=0).numpy()
+        evidence = Objective(
+            pane_views(annotations, 1), points, np.ones(len(points)), factor * EXTENT, 0.01 * factor * EXTENT
+        )
+        pane = replace(turned(FRONT, 2), center=factor * FRONT.center)
+        return score(framed(pane), evidence)
+
+    assert scaled(1000.0) == pytest.approx(scaled(1.0), rel=1e-9)
+
+
+def with_translation(matrix: torch.Tensor, factor: float) -> torch.Tensor:
+    scaled = matrix.clone()
+    scaled[:3, 3] *= factor
+    return scaled
