@@ -125,7 +125,9 @@ class KernelCache(FunctionCache):
         for file in self._files:
             try:
                 data = file.load(key)
-            except (OSError, *DAMAGE) as error:
+            except OSError:
+                continue  # A folder that is none, or that this user may not look into.
+            except DAMAGE as error:
                 log.warning("%s cannot be read (%s); compiling again", file._index_path, error)
                 continue
             if data is not None:

@@ -2,7 +2,7 @@
 
 Left alone, Numba takes TBB wherever it finds one. TBB's waiting threads take the cores from PyTorch's pool, which makes
 training about twice as long, and when the process ends they may wait for each other forever. So TBB comes last, behind
-the work queue that is always there; who sets NUMBA_THREADING_LAYER or NUMBA_THREADING_LAYER_PRIORITY gets what they ask.
+the work queue that is always there. Who sets NUMBA_THREADING_LAYER or NUMBA_THREADING_LAYER_PRIORITY has the choice.
 """
 
 from __future__ import annotations
