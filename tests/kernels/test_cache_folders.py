@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import logging
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -43,7 +44,7 @@ class Machine:
     def __post_init__(self) -> None:
         for folder in (self.package, self.home, self.temporary):
             folder.mkdir()
-        (self.package / "scale.py").write_text(KERNEL)
+        (self.package / "scale_in_package.py").write_text(KERNEL)
 
     @property
     def package(self) -> Path:
@@ -66,11 +67,8 @@ class Machine:
         """Runs the kernel as a new process would: how often it was compiled, and what was said beside."""
         cache_folders._warn_once.cache_clear()
         self.log.clear()
-        spec = importlib.util.spec_from_file_location("scale", self.package / "scale.py")
-        assert spec is not None and spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        scale = module.made(np.float32)
+        sys.modules.pop("scale_in_package", None)
+        scale = importlib.import_module("scale_in_package").made(np.float32)
         values = np.ones(2, np.float32)
         scale(values)
         assert values.tolist() == [4, 4]
@@ -81,6 +79,7 @@ class Machine:
 @pytest.fixture
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> Machine:
     """A machine on which the package cannot be written."""
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
@@ -88,6 +87,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogC
     caplog.set_level(logging.INFO, logger="glassplat.kernels")
     made = Machine(tmp_path, caplog)
     made.closed.append(made.package)
+    monkeypatch.syspath_prepend(made.package)
     refused(machine=made, monkeypatch=monkeypatch)
     return made
 
