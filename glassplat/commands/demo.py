@@ -45,3 +45,7 @@ class Demo:
             results.append(evaluate_run(open_run(folder, self.device)))
         console.print(results_table(*results))
         console.print(f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
+
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        return f"what is finished stays in {self.output}: repeat the command to go on"

@@ -55,6 +55,10 @@ class Evaluate:
         console.print(results_table(results))
         console.print(f"pictures: {stored.directory.path / 'index.html'}")
 
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        return f"{self.run_directory} itself is as it was: repeat the command to evaluate it"
+
 
 def evaluate_run(stored: StoredRun) -> dict:
     """Evaluates a run, writes `results.json`, `per_view.json`, sheets and overview; returns the results."""

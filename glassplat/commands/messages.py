@@ -6,7 +6,10 @@ as a picture, and break it at 80 columns where the output goes to a file; a cont
 
 from __future__ import annotations
 
+import io
+import logging
 import re
+import sys
 from typing import Literal
 
 from rich.console import Console
@@ -55,3 +58,25 @@ def complain(label: Literal["error", "stopped", "failed"], text: object) -> None
 def printable(text: str) -> str:
     r"""The text with what no terminal should get written out, such as `\x1b`."""
     return UNPRINTABLE.sub(lambda found: repr(found.group())[1:-1], text)
+
+
+def plain_streams() -> None:
+    """Lets output in an encoding that lacks a character show its number, where it would end with an error."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+class LogLines(logging.Handler):
+    """Shows what is logged among the other lines of a command, above its progress bar."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self._console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Prints one record."""
+        if record.levelno >= logging.WARNING:
+            warn(self._console, record.getMessage())
+        else:
+            say(self._console, record.getMessage())

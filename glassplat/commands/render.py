@@ -77,6 +77,10 @@ class Render:
                 write_image(self.output / layer / paths[view.name], image)
         console.print(f"{len(views)} views x {len(self.layers)} layers -> {self.output}")
 
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        return f"images already written to {self.output} are whole: repeat the command for all of them"
+
 
 def layer_image(frame: Frame, layer: str, method: str) -> Tensor:
     """A layer of a frame as an image in [0, 1]; depth is colour-mapped, near bright, normals are (n + 1) / 2.
