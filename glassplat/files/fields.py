@@ -3,36 +3,22 @@
 A table of fields checks a JSON object:
 
     SCENE = {"extent": Number(above=0), "active_sh_degree": Whole(0, 3), "files": Optional(Items(Text()), ())}
-    header = checked(read_json(path), SCENE, f"{path}")
-
-A dataclass that is written to JSON is its own table: the types of its fields say it, ranges are in their annotations:
-
-    @dataclass(frozen=True)
-    class Settings:
-        iterations: Annotated[int, Whole(1)]
-        downscale: Annotated[float, Number(1)] = 1.0
-
-    settings = checked_instance(Settings, read_json(path), f"{path}")
+    header = checked(read_json(path), SCENE, str(path))
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
-import types
-import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol
 
-Instance = TypeVar("Instance")
 LARGEST_SHOWN = 80
 LEAST_WHOLE, MOST_WHOLE = -(2**63), 2**63 - 1
 LARGEST_COORDINATE = 1e12
 """World units. The square of a greater one, and what is summed up of them, does not fit float32."""
 
 
-@runtime_checkable
 class Field(Protocol):
     """What one value has to be."""
 
@@ -205,22 +191,6 @@ class Optional:
         return self.field.read(value, where)
 
 
-@dataclass(frozen=True)
-class Record:
-    """An instance of a dataclass, from an object with its fields."""
-
-    kind: type
-
-    @property
-    def expected(self) -> str:
-        """For messages."""
-        return f"an object with the fields {', '.join(field.name for field in dataclasses.fields(self.kind))}"
-
-    def read(self, value: Any, where: str) -> Any:
-        """As `checked_instance`."""
-        return checked_instance(self.kind, value, where)
-
-
 def checked(value: Any, fields: Mapping[str, Field], where: str) -> dict[str, Any]:
     """The fields of an object, each as its entry of the table says; keys that the table does not know are left out.
 
@@ -245,50 +215,6 @@ def checked(value: Any, fields: Mapping[str, Field], where: str) -> dict[str, An
     return found
 
 
-def checked_instance(kind: type[Instance], value: Any, where: str) -> Instance:
-    """An instance of a dataclass from an object with its fields, checked as their annotations say.
-
-    A field with a default may be missing; a key that is no field is refused, because it was meant to do something.
-
-    Raises:
-        ValueError: as `checked`, or an unknown key.
-    """
-    hints = typing.get_type_hints(kind, include_extras=True)
-    known = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    given = value if isinstance(value, dict) else {}
-    unknown = sorted(set(given) - set(known))
-    if unknown:
-        raise ValueError(
-            f"{where} has {', '.join(map(shown, unknown))}; expected no other keys than {', '.join(known)}"
-        )
-    expected = [name for name, field in known.items() if name in given or not _has_default(field)]
-    return kind(**checked(value, {name: field_of(hints[name]) for name in expected}, where))
-
-
-def field_of(hint: Any) -> Field:
-    """The field that an annotation stands for.
-
-    Raises:
-        TypeError: a kind of annotation that no file holds.
-    """
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin is typing.Annotated:
-        declared = next((extra for extra in hint.__metadata__ if isinstance(extra, Field)), None)
-        return field_of(arguments[0]) if declared is None else declared
-    if origin in (typing.Union, types.UnionType):
-        inner = [argument for argument in arguments if argument is not type(None)]
-        return Nullable(field_of(inner[0])) if len(inner) == 1 else _refuse(hint)
-    if origin is typing.Literal:
-        return Choice(arguments)
-    if origin is tuple:
-        count = None if arguments[-1] is Ellipsis else len(arguments)
-        return Items(field_of(arguments[0]), count)
-    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        return Record(hint)
-    plain: dict[Any, Field] = {int: Whole(), float: Number(), bool: Flag(), str: Text()}
-    return plain[hint] if hint in plain else _refuse(hint)
-
-
 def mismatch(value: Any, where: str, field: Field) -> ValueError:
     """The error of a value that is not what was expected."""
     return ValueError(f"{where} is {shown(value)}; expected {field.expected}")
@@ -300,17 +226,9 @@ def shown(value: Any) -> str:
     return text if len(text) <= LARGEST_SHOWN else f"{text[:LARGEST_SHOWN]}..."
 
 
-def _refuse(hint: Any) -> Field:
-    raise TypeError(f"no field for the annotation {hint!r}; expected numbers, texts, choices, tuples or dataclasses")
-
-
 def _is_finite(value: float) -> bool:
     """Also for whole numbers beyond the range of floats, which `math.isfinite` cannot take."""
     return -1.7e308 < value < 1.7e308
-
-
-def _has_default(field: dataclasses.Field[Any]) -> bool:
-    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
 
 
 def _range_text(least: float, most: float, above: float = -math.inf) -> str:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import pytest
 
@@ -20,8 +19,6 @@ from glassplat.files.fields import (
     Text,
     Whole,
     checked,
-    checked_instance,
-    field_of,
 )
 
 NOT_NUMBERS = [None, True, "1", [1], {}, math.nan, math.inf, -math.inf, 10**400]
@@ -87,49 +84,3 @@ def test_an_object_is_checked_by_its_table() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             checked(value, TABLE, "it")
-
-
-@dataclass(frozen=True)
-class Inner:
-    share: Annotated[float, Number(0, 1)] = 0.5
-
-
-@dataclass(frozen=True)
-class Outer:
-    count: Annotated[int, Whole(1)]
-    kind: Literal["a", "b"] = "a"
-    inner: Inner = field(default_factory=Inner)
-    background: tuple[float, float, float] | None = None
-    parts: tuple[str, ...] = ()
-
-
-def test_a_dataclass_is_its_own_table() -> None:
-    assert checked_instance(Outer, {"count": 3}, "it") == Outer(3)
-    given = {"count": 3, "kind": "b", "inner": {"share": 1}, "background": [0, 1, 2], "parts": ["x"]}
-    assert checked_instance(Outer, given, "it") == Outer(3, "b", Inner(1.0), (0.0, 1.0, 2.0), ("x",))
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        (None, "it is None; expected an object with count"),
-        ([], r"it is \[\]; expected an object"),
-        ({}, "it has no count"),
-        ({"count": 0}, "count of it is 0; expected a whole number of at least 1"),
-        ({"count": 1, "kind": "c"}, "kind of it is 'c'; expected one of 'a', 'b'"),
-        ({"count": 1, "inner": {"share": 2}}, "share of inner of it is 2; expected a finite number from 0 to 1"),
-        ({"count": 1, "inner": 2}, "inner of it is 2; expected an object"),
-        ({"count": 1, "background": "red"}, "background of it is 'red'; expected a list of 3 values"),
-        ({"count": 1, "background": [1, 2]}, r"background of it is \[1, 2\]; expected a list of 3 values"),
-        ({"count": 1, "speed": 3}, "it has 'speed'; expected no other keys than count, kind"),
-    ],
-)
-def test_a_record_that_does_not_fit_the_dataclass_is_named(given: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        checked_instance(Outer, given, "it")
-
-
-@pytest.mark.parametrize("hint", [object, int | str, dict[str, int]])
-def test_an_annotation_that_no_file_holds_is_a_mistake_of_the_program(hint: Any) -> None:
-    with pytest.raises(TypeError, match="no field for the annotation"):
-        field_of(hint)
