@@ -130,8 +130,8 @@ class Items:
     @property
     def expected(self) -> str:
         """For messages."""
-        count = "" if self.count is None else f"{self.count} values, "
-        return f"a list of {count}each {self.item.expected}"
+        count = "" if self.count is None else f"{self.count} "
+        return f"a list of {count}values, each {self.item.expected}"
 
     def read(self, value: Any, where: str) -> tuple[Any, ...]:
         """Names the entry that is wrong, counted from 1."""

@@ -19,7 +19,7 @@ from glassplat.scene.scene import Scene
 PRIMARY, GLASS, PLANES, SCENE = "point_cloud.ply", "glass.ply", "planes.json", "scene.json"
 ENVIRONMENT = "environment.safetensors"
 HEADER: dict[str, Field] = {
-    "extent": Number(above=0, most=LARGEST_COORDINATE),
+    "extent": Number(above=0, most=4 * LARGEST_COORDINATE),
     "active_sh_degree": Whole(0, 3),
     "files": Optional(Items(Choice((PRIMARY, GLASS, PLANES, ENVIRONMENT)))),
 }
