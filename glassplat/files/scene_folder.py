@@ -18,9 +18,11 @@ from glassplat.scene.scene import Scene
 
 PRIMARY, GLASS, PLANES, SCENE = "point_cloud.ply", "glass.ply", "planes.json", "scene.json"
 ENVIRONMENT = "environment.safetensors"
+EXTENT = Number(above=0, most=4 * LARGEST_COORDINATE)
+SH_DEGREE = Whole(0, 3)
 HEADER: dict[str, Field] = {
-    "extent": Number(above=0, most=4 * LARGEST_COORDINATE),
-    "active_sh_degree": Whole(0, 3),
+    "extent": EXTENT,
+    "active_sh_degree": SH_DEGREE,
     "files": Optional(Items(Choice((PRIMARY, GLASS, PLANES, ENVIRONMENT)))),
 }
 """`files` is what the scene consists of, so that one that is lost is missed; folders of earlier versions lack it."""

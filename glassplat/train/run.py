@@ -66,13 +66,16 @@ def prepare(recipe: Any, settings: RunSettings, directory: RunDirectory, dataset
                 f"resume it, got {settings}. Repeat the original options, with the version of glassplat that began "
                 "it, or choose another --output"
             )
-        return load_checkpoint(directory.checkpoint).to(settings.device)
+        state = load_checkpoint(
+            directory.checkpoint, method=recipe.method, seed=settings.seed, iterations=settings.iterations
+        )
+        return state.to(settings.device)
     if directory.checkpoint.exists() or directory.results.exists():
         raise InputError(
             f"{directory.path} already holds a run; pass --resume to go on with it, or choose another --output"
         )
     directory.begin(recipe, settings, dataset)
-    return TrainState(recipe.initialise(dataset), settings.seed).to(settings.device)
+    return TrainState(recipe.initialise(dataset), settings.seed, method=recipe.method).to(settings.device)
 
 
 def run_training(
