@@ -100,6 +100,13 @@ class RunDirectory:
         except (ValueError, TypeError) as error:
             raise InputError(f"{self.path / 'settings.json'} cannot be read ({error}); train again") from error
 
+    def photographs(self) -> set[str] | None:
+        """Names of the photographs that the run was begun with; None where that is not recorded legibly."""
+        try:
+            return {entry["img_name"] for entry in json.loads((self.path / "cameras.json").read_text(encoding="utf-8"))}
+        except (OSError, ValueError, TypeError, KeyError, RecursionError):
+            return None
+
     def export(self, scene: Scene, step: int) -> Path:
         """Writes the scene in the formats that others read; returns its folder."""
         folder = self.path / "point_cloud" / f"iteration_{step}"
