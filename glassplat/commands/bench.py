@@ -25,6 +25,7 @@ from glassplat.commands.bench_tables import (
     plain_rows,
     values_of,
 )
+from glassplat.commands.messages import say
 from glassplat.commands.train import Train
 from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
@@ -82,7 +83,7 @@ class BenchScenes:
         ]
         runs = planned_runs(self, recipes)
         execute(runs, console, partial(write_scenes, self.output, pairs))
-        console.print(f"tables: {self.output / 'scenes.md'}, {self.output / 'scenes.json'}")
+        say(console, f"tables: {self.output / 'scenes.md'}, {self.output / 'scenes.json'}")
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,7 @@ class BenchAblation:
         recipes = {FULL: full} | {f"no-{switch}": ablation.off(full) for switch, ablation in ablations.items()}
         runs = planned_runs(self, recipes)
         execute(runs, console, partial(write_ablation, self.output, ablations))
-        console.print(f"tables: {self.output / 'ablation.md'}, {self.output / 'ablation.json'}")
+        say(console, f"tables: {self.output / 'ablation.md'}, {self.output / 'ablation.json'}")
 
     def chosen(self) -> dict[Switch, Ablation]:
         """The parts to switch off.

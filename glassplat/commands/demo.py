@@ -8,6 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from glassplat.commands.evaluate import evaluate_run, results_table
+from glassplat.commands.messages import say
 from glassplat.commands.stored_run import open_run
 from glassplat.commands.train import Train
 from glassplat.kernels.devices import DeviceName
@@ -44,4 +45,4 @@ class Demo:
             run.run(console)
             results.append(evaluate_run(open_run(folder, self.device)))
         console.print(results_table(*results))
-        console.print(f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
+        say(console, f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
+from glassplat.commands.messages import say, warn
 from glassplat.commands.output_folder import check_targets, claim_folder
 from glassplat.commands.stored_run import Split, StoredRun, chosen_views, open_run, photographs_of, pictures_of
 from glassplat.data.errors import InputError
@@ -52,12 +53,12 @@ class Dereflect:
         paths = pictures_of(stored.dataset)
         check_targets(self.output, [self.output / paths[view.name] for view in views], photographs_of(stored.dataset))
         if claim_folder(self.output, "dereflect", self.run_directory):
-            console.print(f"replacing the images of an earlier run of this command in {self.output}")
+            say(console, f"replacing the images of an earlier run of this command in {self.output}")
         for warning in mirror_warnings(stored):
-            console.print(f"[yellow]warning:[/yellow] {warning}")
+            warn(console, warning)
         for view in track(views, "taking reflections off", console=console):
             write_image(self.output / paths[view.name], self._image(stored, renderer, view))
-        console.print(f"{len(views)} images without reflections -> {self.output}")
+        say(console, f"{len(views)} images without reflections -> {self.output}")
 
     def _image(self, stored: StoredRun, renderer: Planar, view: View) -> Tensor:
         frame, _ = timed_render(renderer, stored.scene, view)

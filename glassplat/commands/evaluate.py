@@ -10,6 +10,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from glassplat.commands.messages import say
 from glassplat.commands.stored_run import StoredRun, open_run
 from glassplat.evaluate.evaluate import Evaluation, evaluate
 from glassplat.evaluate.report import SURFACE_METRICS, Report
@@ -55,7 +56,7 @@ class Evaluate:
         with console.status(f"rendering {len(stored.dataset.test)} test views"):
             results = evaluate_run(stored)
         console.print(results_table(results))
-        console.print(f"pictures: {stored.directory.path / 'index.html'}")
+        say(console, f"pictures: {stored.directory.path / 'index.html'}")
 
 
 def evaluate_run(stored: StoredRun) -> dict:

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
+from glassplat.commands.messages import say
 from glassplat.commands.output_folder import check_targets, claim_folder
 from glassplat.commands.scene_edits import SceneEdits
 from glassplat.commands.stored_run import Split, chosen_views, open_run, photographs_of, pictures_of
@@ -71,15 +72,16 @@ class Render:
         targets = [self.output / layer / paths[view.name] for layer in self.layers for view in views]
         check_targets(self.output, targets, photographs_of(stored.dataset))
         if claim_folder(self.output, "render", self.run_directory):
-            console.print(
-                f"adding to {self.output}, which `glassplat render` wrote earlier; images of one name are replaced"
+            say(
+                console,
+                f"adding to {self.output}, which `glassplat render` wrote earlier; images of one name are replaced",
             )
         for view in track(views, "rendering", console=console):
             frame, _ = timed_render(renderer, scene, view)
             for layer in self.layers:
                 image = layer_image(frame, layer, stored.recipe.method)
                 write_image(self.output / layer / paths[view.name], image)
-        console.print(f"{len(views)} views x {len(self.layers)} layers -> {self.output}")
+        say(console, f"{len(views)} views x {len(self.layers)} layers -> {self.output}")
 
 
 def layer_image(frame: Frame, layer: str, method: str) -> Tensor:

@@ -74,8 +74,11 @@ def _check_same(directory: RunDirectory, dataset: Dataset) -> None:
     trained, found = directory.photographs(), {view.name for view in (*dataset.train, *dataset.test)}
     if trained is None or trained == found:
         return
-    only = [f"{first_names(sorted(names))} only in {where}" for names, where in (
-        (trained - found, "the run"), (found - trained, "the capture")) if names]
+    only = [
+        f"{first_names(sorted(names))} only in {where}"
+        for names, where in ((trained - found, "the run"), (found - trained, "the capture"))
+        if names
+    ]
     raise InputError(
         f"{dataset.root} is not the capture that {directory.path} was trained on: {', '.join(only)}. Give the same "
         "photographs to --data"

@@ -21,7 +21,9 @@ def check_folder(path: Path) -> None:
     if not found.is_dir():
         kind = "a link that leads nowhere" if found.is_symlink() and not found.exists() else "a file"
         where = "" if found == whole else f", so there can be no folder {path}"
-        raise NotADirectoryError(f"{found} is {kind}{where}; expected a folder, or a name for a new one, for the output")
+        raise NotADirectoryError(
+            f"{found} is {kind}{where}; expected a folder, or a name for a new one, for the output"
+        )
     if not os.access(found, os.W_OK | os.X_OK):
         raise PermissionError(f"nothing may be written in {found}; choose another folder for the output, or allow it")
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import unicodedata
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import count
+from itertools import count, takewhile
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 Parts = tuple[str, ...]
@@ -49,7 +48,8 @@ def _inside(names: Sequence[str]) -> dict[str, Parts]:
     """Folders and file of each name, without what leads out; backslashes divide, as on Windows."""
     parts = {name: _normal(name) for name in names}
     outside = [name for name in names if _leads_out(name)]
-    shared = len(os.path.commonprefix([parts[name][:-1] for name in outside]))
+    columns = zip(*(parts[name][:-1] for name in outside), strict=False)
+    shared = sum(1 for _ in takewhile(lambda column: len(set(column)) == 1, columns))
     return parts | {name: parts[name][shared:] for name in outside}
 
 

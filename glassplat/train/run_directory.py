@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from glassplat.data.dataset import Dataset
-from glassplat.data.errors import InputError
+from glassplat.data.errors import InputError, first_names
 from glassplat.data.masks import Polarity
 from glassplat.files.atomic import atomic_write
 from glassplat.files.cameras_json import write_cameras
 from glassplat.files.environment_image import write_equirect
+from glassplat.files.folders import make_folder
 from glassplat.files.scene_folder import read_scene, write_scene
 from glassplat.render.environment import equirect_from_environment
 from glassplat.scene.scene import Scene
@@ -41,6 +43,19 @@ class RunSettings:
     mask_polarity: Polarity = "auto"
 
 
+FILES = (
+    "recipe.json",
+    "settings.json",
+    "log.jsonl",
+    "cameras.json",
+    "per_view.json",
+    "sheets",
+    "uses.png",
+    "index.html",
+)
+"""What a run writes beside its checkpoint, scene and metrics."""
+
+
 @dataclass(frozen=True)
 class RunDirectory:
     """Names of the files of a run.
@@ -48,6 +63,7 @@ class RunDirectory:
     ```
     recipe.json  settings.json         what was run
     log.jsonl                          one line per logged step
+    train.lock                         held while a training writes here
     checkpoint.safetensors             to resume from
     cameras.json                       all cameras
     point_cloud/iteration_N/           point_cloud.ply, glass.ply, environment.safetensors, scene.json
@@ -73,9 +89,57 @@ class RunDirectory:
         """Where the metrics are."""
         return self.path / "results.json"
 
+    @property
+    def is_saved(self) -> bool:
+        """Whether there is something in it that took training to make."""
+        return any((self.path / name).exists() for name in (self.checkpoint.name, self.results.name, "point_cloud"))
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether a run was begun here, whatever has become of it."""
+        try:
+            self.recipe()
+        except InputError:
+            return False
+        return True
+
+    def check_vacant(self) -> None:
+        """Refuse to begin a run where something would be lost by it.
+
+        Raises:
+            InputError: the directory holds a run, or files of somebody else that have the names of a run's.
+        """
+        if self.checkpoint.exists():
+            raise InputError(
+                f"{self.path} already holds a run; pass --resume to go on with it, or choose another --output"
+            )
+        if self.is_saved:
+            raise InputError(f"{self.path} already holds a trained scene; choose another --output, or move it away")
+        found = [name for name in FILES if os.path.lexists(self.path / name)]
+        if found and not self.is_begun:
+            raise InputError(
+                f"{self.path} holds {first_names(found)}, which is not from a run of this version and would be "
+                "overwritten; choose another --output"
+            )
+
+    def check_saved(self) -> None:
+        """Refuse to go on with a run of which there is no checkpoint.
+
+        Raises:
+            InputError: there is none.
+        """
+        if self.checkpoint.is_file():
+            return
+        if self.is_saved:
+            raise InputError(
+                f"{self.path} holds a trained scene, but no {self.checkpoint.name} to go on from; train it again with "
+                "another --output"
+            )
+        raise InputError(f"nothing was saved yet in {self.path}; begin again without --resume")
+
     def begin(self, recipe: Any, settings: RunSettings, dataset: Dataset) -> None:
         """Creates the directory and records what is about to run."""
-        self.path.mkdir(parents=True, exist_ok=True)
+        make_folder(self.path)
         write_text(self.path / "recipe.json", recipe_to_json(recipe))
         write_text(self.path / "settings.json", json.dumps(dataclasses.asdict(settings), indent=2))
         write_cameras(self.path / "cameras.json", [(v.name, v.camera) for v in (*dataset.train, *dataset.test)])
