@@ -29,6 +29,7 @@ from glassplat.commands.messages import say
 from glassplat.commands.train import Train
 from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
+from glassplat.files.folders import check_folder
 from glassplat.train.ablations import ABLATIONS, Ablated, Ablation, Switch
 from glassplat.train.recipe import RECIPES
 from glassplat.train.run_directory import write_text
@@ -185,6 +186,7 @@ def unique(choices: Sequence[Any], option: str) -> list[Any]:
 
 def planned_runs(bench: BenchScenes | BenchAblation, recipes: dict[str, Any]) -> list[PlannedRun]:
     """A run per capture, variant and seed; the paths are absolute, so that a bench goes on from any folder."""
+    check_folder(bench.output)
     captures = zip(scene_names(bench.data), bench.data, strict=True)
     seeds = unique(bench.seeds, "seeds")
     return [

@@ -47,7 +47,7 @@ def check_targets(folder: Path, targets: Sequence[Path], photographs: Sequence[P
         InputError: names the file and where it leads; nothing has been written.
     """
     inside, kept = _real(folder), {_real(path) for path in photographs}
-    for target in targets:
+    for target in (folder / RECORD, *targets):
         real = _real(target)
         if real in kept or not real.is_relative_to(inside):
             what = "is a photograph of the capture" if real in kept else f"leads out of {folder}, to {real}"

@@ -171,9 +171,8 @@ class StepLines:
         )
 
     def work(self, standing: Standing, work: Working) -> None:
-        """Shows the work where it begins, and then when it is time for a line."""
-        if work.done == 0:
-            self._shown_at = self._clock()
+        """Shows the work when it is time for a line, or where there will be no other moment for it."""
+        if work.total == 1:
             say(self._console, f"step {standing.step}: {work.what}")
         elif self._is_time():
             say(self._console, f"step {standing.step}: {work.what}, {work.done} of {work.total} done")

@@ -36,7 +36,8 @@ def _distinct(parts: Mapping[str, Parts]) -> dict[str, Path]:
     times = Counter(plain.values())
     taken: set[str] = set()
     paths: dict[str, Path] = {}
-    for name in sorted(parts, key=lambda name: times[plain[name]] > 1):
+    # The deepest first, so that no file can stand where one of them needs a folder.
+    for name in sorted(parts, key=lambda name: (-len(parts[name]), times[plain[name]] > 1)):
         wanted = _candidates(parts[name], clash=times[plain[name]] > 1)
         path = next(path for path in wanted if _is_free(path, taken))
         taken |= {_key(path), *(f"{_key(folder)}/" for folder in path.parents)}
@@ -83,9 +84,8 @@ def _candidates(parts: Parts, *, clash: bool) -> Iterator[PurePosixPath]:
 
 
 def _is_free(path: PurePosixPath, taken: set[str]) -> bool:
-    """Whether neither the file nor a folder above it is a file already, and the file is no folder."""
-    files = {_key(path), *(_key(folder) for folder in path.parents)}
-    return not files & taken and f"{_key(path)}/" not in taken
+    """Whether the path is neither a file yet nor a folder of one."""
+    return not {_key(path), f"{_key(path)}/"} & taken
 
 
 def _key(path: PurePosixPath) -> str:

@@ -63,7 +63,7 @@ def test_photographs_are_never_overwritten(tmp_path: Path, capsys: pytest.Captur
     images = tmp_path / "capture" / "images"
     before = {path.name: path.read_bytes() for path in images.iterdir()}
     assert main(["dereflect", str(run), "--output", str(images)]) == 2
-    assert "is not empty" in message(capsys)
+    assert "is a photograph of the capture; nothing was written" in message(capsys)
     assert {path.name: path.read_bytes() for path in images.iterdir()} == before
 
 
