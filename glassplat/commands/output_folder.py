@@ -9,6 +9,7 @@ from pathlib import Path
 
 from glassplat.data.errors import InputError, first_names
 from glassplat.files.folders import check_folder, make_folder
+from glassplat.files.json_text import read_json
 from glassplat.train.run_directory import write_text
 
 RECORD = "glassplat.json"
@@ -62,7 +63,7 @@ def _real(path: Path) -> Path:
 def _recorded_command(record: Path) -> str | None:
     """Who wrote the folder; None where nobody says."""
     try:
-        content = json.loads(record.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        content = read_json(record)
+    except (OSError, ValueError):
         return None
     return content.get("command") if isinstance(content, dict) else None

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from glassplat.data.dataset import Dataset, View, load_dataset
-from glassplat.data.errors import InputError, first_names
+from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.files.picture_paths import picture_paths
 from glassplat.kernels.devices import DeviceName, chosen_device
 from glassplat.render.frame import Renderer
@@ -44,6 +44,8 @@ def open_run(path: Path, device: DeviceName = "auto", data: Path | None = None) 
     directory = RunDirectory(path)
     recorded = directory.recipe()
     scene, iterations = directory.latest_scene()
+    with input_checked():
+        recorded.renderer().check(scene)
     scene = scene.to(chosen_device(device))
     dataset = _capture(directory, recorded, data)
     recipe = settled(recorded, dataset)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -32,7 +32,7 @@ class View:
         name: unique within the data set, with suffix; `/` between folders.
         camera: float32 pinhole camera of `photo`.
         image_path: the file.
-        read_photo: returns `photo`; called once.
+        read_photo: returns `photo`.
         read_pane_labels: returns `pane_labels`; None where the view is not annotated.
     """
 
@@ -41,15 +41,21 @@ class View:
     image_path: Path
     read_photo: Callable[[], Tensor]
     read_pane_labels: Callable[[], Tensor] | None = None
+    _read: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
-    @cached_property
+    @property
     def photo(self) -> Tensor:
         """[H, W, 3] uint8 sRGB, undistorted and reduced; stays in memory once read.
+
+        Threads may ask at once: without a lock, which `cached_property` has for all views together, none waits for the
+        photograph of another.
 
         Raises:
             InputError: the file cannot be read; names it.
         """
-        return self.read_photo()
+        if "photo" not in self._read:
+            self._read["photo"] = self.read_photo()
+        return self._read["photo"]
 
     @cached_property
     def pane_labels(self) -> Tensor | None:
@@ -166,6 +172,9 @@ def _opaque(pixels: NDArray[np.uint8], background: Rgb) -> NDArray[np.uint8]:
         return np.repeat(pixels, 3, axis=2)
     if pixels.shape[2] == 3:
         return np.ascontiguousarray(pixels)
-    alpha = pixels[:, :, 3:].astype(np.float32) / 255
+    alpha = pixels[:, :, 3].astype(np.float32) / 255
     behind = np.asarray(background, dtype=np.float32) * 255
-    return np.round(pixels[:, :, :3] * alpha + behind * (1 - alpha)).astype(np.uint8)
+    opaque = np.empty((*alpha.shape, 3), dtype=np.uint8)
+    for index in range(3):  # One after the other: as floats a channel takes more memory than the photograph.
+        opaque[:, :, index] = np.round(pixels[:, :, index] * alpha + behind[index] * (1 - alpha))
+    return opaque

@@ -13,6 +13,7 @@ from typing import Any
 
 from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError
+from glassplat.data.photographs_read import photographs_read
 from glassplat.files.folders import check_folder, make_folder
 from glassplat.train.background import settled
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
@@ -104,7 +105,7 @@ def run_training(
 
     Raises:
         InputError: the directory is not fit for it (`check_output`), the run was recorded with other settings, it is
-            too short for its stages, or as `settled` does.
+            too short for its stages, a photograph cannot be read, of the test views too, or as `settled` does.
         KeyboardInterrupt: the user stopped the run; the checkpoint is written.
         TrainingDivergedError: training cannot go on; the last checkpoint stays.
         OSError: the disk is full or fails; the last checkpoint stays.
@@ -133,7 +134,7 @@ def run_training(
 def first_state(recipe: Any, settings: RunSettings, dataset: Dataset, listen: Listener) -> TrainState:
     """The state from which a fresh run starts."""
     listen(Working("preparing the first scene", 0, 1))
-    return TrainState(recipe.initialise(dataset), settings.seed).to(settings.device)
+    return TrainState(recipe.initialise(dataset), settings.seed, method=recipe.method).to(settings.device)
 
 
 def resumed_state(recipe: Any, settings: RunSettings, directory: RunDirectory) -> TrainState:
@@ -151,7 +152,10 @@ def resumed_state(recipe: Any, settings: RunSettings, directory: RunDirectory) -
             f"resume it, got {settings}. Repeat the original options, with the version of glassplat that began "
             "it, or choose another --output"
         )
-    return load_checkpoint(directory.checkpoint).to(settings.device)
+    state = load_checkpoint(
+        directory.checkpoint, method=recipe.method, seed=settings.seed, iterations=settings.iterations
+    )
+    return state.to(settings.device)
 
 
 class Sitting:
@@ -174,8 +178,9 @@ class Sitting:
 
     def train(self, stages: tuple[Stage, ...], dataset: Dataset, iterations: int) -> None:
         """Trains to the end, or raises KeyboardInterrupt after the step in which the user asks for it."""
-        with stop_on_interrupt() as self._stop:
+        with stop_on_interrupt() as self._stop, photographs_read(dataset) as check_photographs:
             for message in train(stages, dataset, self._state, iterations):
+                check_photographs()
                 self.tell(message)
                 if not isinstance(message, StepDone):
                     continue
