@@ -25,9 +25,11 @@ from glassplat.commands.bench_tables import (
     plain_rows,
     values_of,
 )
+from glassplat.commands.messages import say
 from glassplat.commands.train import Train
 from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
+from glassplat.files.folders import check_folder
 from glassplat.train.ablations import ABLATIONS, Ablated, Ablation, Switch
 from glassplat.train.recipe import RECIPES
 from glassplat.train.run_directory import write_text
@@ -82,7 +84,7 @@ class BenchScenes:
         ]
         runs = planned_runs(self, recipes)
         execute(runs, console, partial(write_scenes, self.output, pairs))
-        console.print(f"tables: {self.output / 'scenes.md'}, {self.output / 'scenes.json'}")
+        say(console, f"tables: {self.output / 'scenes.md'}, {self.output / 'scenes.json'}")
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ class BenchAblation:
         recipes = {FULL: full} | {f"no-{switch}": ablation.off(full) for switch, ablation in ablations.items()}
         runs = planned_runs(self, recipes)
         execute(runs, console, partial(write_ablation, self.output, ablations))
-        console.print(f"tables: {self.output / 'ablation.md'}, {self.output / 'ablation.json'}")
+        say(console, f"tables: {self.output / 'ablation.md'}, {self.output / 'ablation.json'}")
 
     def chosen(self) -> dict[Switch, Ablation]:
         """The parts to switch off.
@@ -188,6 +190,7 @@ def unique(choices: Sequence[Any], option: str) -> list[Any]:
 
 def planned_runs(bench: BenchScenes | BenchAblation, recipes: dict[str, Any]) -> list[PlannedRun]:
     """A run per capture, variant and seed; the paths are absolute, so that a bench goes on from any folder."""
+    check_folder(bench.output)
     captures = zip(scene_names(bench.data), bench.data, strict=True)
     seeds = unique(bench.seeds, "seeds")
     return [
