@@ -26,7 +26,7 @@ RECIPE = DeferredRecipe(
     bootstrap=0.2,
     texels=4,
     first_texels=2,
-    refinements=(0.4, 0.6, 0.8),
+    refinements=(0.4, 0.6),
     region=(0.0, 0.0, 3.5, 1.0),
     rhythm=Rhythm(beat=0.1, least=2, sh=0.1),
     schedule=PropagationSchedule(end="fixed", stop=0.7, pause=2),
