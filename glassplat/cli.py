@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import tyro
@@ -18,19 +18,13 @@ from glassplat.commands.dereflect import Dereflect
 from glassplat.commands.evaluate import Evaluate
 from glassplat.commands.render import Render
 from glassplat.commands.train import Train
+from glassplat.commands.train_options import train_command
 from glassplat.data.errors import InputError
+from glassplat.data.options import check_options
 from glassplat.init.planes import PlaneFitError
 from glassplat.kernels.devices import CudaUnavailableError
 from glassplat.train.trainer import TrainingDivergedError
 
-Command = (
-    Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Evaluate, tyro.conf.subcommand("eval")]
-    | Annotated[Render, tyro.conf.subcommand("render")]
-    | Annotated[Dereflect, tyro.conf.subcommand("dereflect")]
-    | Annotated[Demo, tyro.conf.subcommand("demo")]
-    | Annotated[Bench, tyro.conf.subcommand("bench")]
-)
 INPUT_ERRORS = (
     InputError,
     PlaneFitError,
@@ -45,8 +39,17 @@ INPUT_ERROR_CODE, FAILURE_CODE, INTERRUPTED_CODE = 2, 1, 130
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code (0 done, 1 failed, 2 bad input, 130 interrupted)."""
+    train, arguments = train_command(sys.argv[1:] if arguments is None else arguments)
+    any_command: Any = (
+        Annotated[train, tyro.conf.subcommand("train")]
+        | Annotated[Evaluate, tyro.conf.subcommand("eval")]
+        | Annotated[Render, tyro.conf.subcommand("render")]
+        | Annotated[Dereflect, tyro.conf.subcommand("dereflect")]
+        | Annotated[Demo, tyro.conf.subcommand("demo")]
+        | Annotated[Bench, tyro.conf.subcommand("bench")]
+    )
     command = tyro.cli(
-        Command,
+        any_command,
         prog="glassplat",
         description="Gaussian splatting for scenes with window panes, showcases and mirrors.",
         args=arguments,
@@ -62,6 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def guarded(command: Train | Evaluate | Render | Dereflect | Demo | Bench, console: Console) -> int:
     """Runs a command and turns expected errors into one readable message and an exit code."""
     try:
+        check_options(command)
         command.run(console)
     except INPUT_ERRORS as error:
         Console(stderr=True).print(f"[red]error:[/red] {error}", highlight=False)

@@ -28,6 +28,7 @@ from glassplat.commands.bench_tables import (
 from glassplat.commands.train import Train
 from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
+from glassplat.data.ranges import Downscale, Seed, Several
 from glassplat.train.ablations import ABLATIONS, Ablated, Ablation, Switch
 from glassplat.train.recipe import RECIPES
 from glassplat.train.run_directory import write_text
@@ -61,9 +62,9 @@ class BenchScenes:
     output: Path
     methods: tuple[Method, ...] = ("splat", "planar")
     strategies: tuple[Strategy, ...] = ("default",)
-    seeds: tuple[int, ...] = (0,)
-    iterations: int = 7000
-    downscale: float = 1.0
+    seeds: tuple[Seed, ...] = (0,)
+    iterations: Several = 7000
+    downscale: Downscale = 1.0
     mask_polarity: Polarity = "auto"
 
     def run(self, console: Console) -> None:
@@ -104,9 +105,9 @@ class BenchAblation:
     output: Path
     method: Ablated = "planar"
     switches: tuple[Switch, ...] = ()
-    seeds: tuple[int, ...] = (0,)
-    iterations: int = 7000
-    downscale: float = 1.0
+    seeds: tuple[Seed, ...] = (0,)
+    iterations: Several = 7000
+    downscale: Downscale = 1.0
     mask_polarity: Polarity = "auto"
 
     def run(self, console: Console) -> None:

@@ -10,6 +10,7 @@ from rich.console import Console
 from glassplat.commands.evaluate import evaluate_run, results_table
 from glassplat.commands.stored_run import open_run
 from glassplat.commands.train import Train
+from glassplat.data.ranges import Seed, Several
 from glassplat.kernels.devices import DeviceName
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.run_directory import RunDirectory
@@ -30,8 +31,8 @@ class Demo:
     """
 
     output: Path = Path("runs/demo")
-    iterations: int = 3000
-    seed: int = 0
+    iterations: Several = 3000
+    seed: Seed = 0
     device: DeviceName = "auto"
 
     def run(self, console: Console) -> None:

@@ -84,6 +84,8 @@ LearningRate = Annotated[float, Range(0, 1)]
 """Of Adam, which moves a raw parameter by about so much at every step; 0 keeps it as it is."""
 Count = Annotated[int, Range(0, MOST)]
 Several = Annotated[int, Range(1, MOST)]
+Downscale = Annotated[float, Range(1, 1000)]
+"""Of photographs: width and height are divided by it."""
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 ShDegree = Annotated[int, Range(0, 3)]
 PaneLabel = Annotated[int, Range(1, 255)]
