@@ -12,6 +12,7 @@ import tyro
 from rich.console import Console
 from rich.logging import RichHandler
 
+from glassplat.commands.arguments import check_arguments
 from glassplat.commands.bench import Bench
 from glassplat.commands.demo import Demo
 from glassplat.commands.dereflect import Dereflect
@@ -39,7 +40,12 @@ INPUT_ERROR_CODE, FAILURE_CODE, INTERRUPTED_CODE = 2, 1, 130
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code (0 done, 1 failed, 2 bad input, 130 interrupted)."""
-    train, arguments = train_command(sys.argv[1:] if arguments is None else arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        check_arguments(arguments)
+    except InputError as error:
+        return refused(error)
+    train, arguments = train_command(arguments)
     any_command: Any = (
         Annotated[train, tyro.conf.subcommand("train")]
         | Annotated[Evaluate, tyro.conf.subcommand("eval")]
@@ -68,8 +74,7 @@ def guarded(command: Train | Evaluate | Render | Dereflect | Demo | Bench, conso
         check_options(command)
         command.run(console)
     except INPUT_ERRORS as error:
-        Console(stderr=True).print(f"[red]error:[/red] {error}", highlight=False)
-        return INPUT_ERROR_CODE
+        return refused(error)
     except (TrainingDivergedError, OSError) as error:
         Console(stderr=True).print(f"[red]stopped:[/red] {error}", highlight=False)
         return FAILURE_CODE
@@ -82,6 +87,12 @@ def guarded(command: Train | Evaluate | Render | Dereflect | Demo | Bench, conso
         Console(stderr=True).print(GOES_ON, highlight=False)
         return INTERRUPTED_CODE
     return 0
+
+
+def refused(error: Exception) -> int:
+    """Says what is wrong with the input; returns the exit code."""
+    Console(stderr=True).print(f"[red]error:[/red] {error}", highlight=False)
+    return INPUT_ERROR_CODE
 
 
 if __name__ == "__main__":

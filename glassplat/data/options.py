@@ -99,8 +99,12 @@ def _structure(hint: Any) -> str:
     if origin in UNIONS:
         return " or ".join("None" if option is type(None) else expectation(*unwrapped(option)) for option in inner)
     if origin is tuple:
-        element = expectation(*unwrapped(inner[0]))
-        return f"any number of values, each {element}" if inner[-1] is ... else f"{len(inner)} values, each {element}"
+        if inner[-1] is ...:
+            return f"any number of values, each {expectation(*unwrapped(inner[0]))}"
+        kinds = dict.fromkeys(expectation(*unwrapped(part)) for part in inner)
+        return f"{len(inner)} values, " + (
+            f"each {next(iter(kinds))}" if len(kinds) == 1 else f"out of: {'; '.join(kinds)}"
+        )
     return "an object with named values"
 
 
@@ -199,7 +203,10 @@ def _tuple(hint: Any, value: Any, name: str) -> tuple[Any, ...]:
     if not isinstance(value, (list, tuple)) or (inner[-1] is not ... and len(value) != len(inner)):
         raise OptionError(name, value, _structure(hint))
     kinds = inner[:1] * len(value) if inner[-1] is ... else inner
-    return tuple(checked(kind, element, name) for kind, element in zip(kinds, value, strict=True))
+    try:
+        return tuple(checked(kind, element, name) for kind, element in zip(kinds, value, strict=True))
+    except OptionError as error:
+        raise OptionError(name, value, _structure(hint)) from error
 
 
 def _dict(hint: Any, value: Any, name: str) -> dict[Any, Any]:

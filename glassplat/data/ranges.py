@@ -53,6 +53,8 @@ class Range:
     @property
     def expected(self) -> str:
         """The bounds in words."""
+        if self.low is not None and self.high is not None:
+            return f"from {self.low} to {self.high}"
         bounds = ((">=", self.low), (">", self.above), ("<=", self.high), ("<", self.below))
         return " and ".join(f"{sign} {bound}" for sign, bound in bounds if bound is not None) or "that is finite"
 

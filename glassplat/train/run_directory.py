@@ -11,6 +11,8 @@ from typing import Any
 from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
+from glassplat.data.options import options_from_json
+from glassplat.data.ranges import Downscale, Seed, Several
 from glassplat.files.atomic import atomic_write
 from glassplat.files.cameras_json import write_cameras
 from glassplat.files.environment_image import write_equirect
@@ -34,9 +36,9 @@ class RunSettings:
     """
 
     data: str
-    iterations: int
-    downscale: float = 1.0
-    seed: int = 0
+    iterations: Several
+    downscale: Downscale = 1.0
+    seed: Seed = 0
     device: str = "cpu"
     mask_polarity: Polarity = "auto"
 
@@ -82,7 +84,11 @@ class RunDirectory:
 
     def recipe(self) -> Any:
         """The recorded recipe."""
-        return recipe_from_json(self._read("recipe.json"))
+        written = self._read("recipe.json")
+        try:
+            return recipe_from_json(written)
+        except InputError as error:
+            raise InputError(f"{self.path / 'recipe.json'}: {error}") from error
 
     def was_begun_with(self, recipe: Any) -> bool:
         """Whether `begin` recorded just this recipe.
@@ -91,13 +97,13 @@ class RunDirectory:
         with which the run was not made.
         """
         written = self._read("recipe.json")
-        return recipe_from_json(written) == recipe and json.loads(written) == json.loads(recipe_to_json(recipe))
+        return self.recipe() == recipe and json.loads(written) == json.loads(recipe_to_json(recipe))
 
     def settings(self) -> RunSettings:
         """The recorded settings."""
         try:
-            return RunSettings(**json.loads(self._read("settings.json")))
-        except (ValueError, TypeError) as error:
+            return options_from_json(RunSettings, json.loads(self._read("settings.json")))
+        except (ValueError, RecursionError) as error:
             raise InputError(f"{self.path / 'settings.json'} cannot be read ({error}); train again") from error
 
     def export(self, scene: Scene, step: int) -> Path:
@@ -128,7 +134,10 @@ class RunDirectory:
             raise InputError(
                 f"{self.path} is not a run directory: no {name} in it; expected what `glassplat train --output` wrote"
             )
-        return file.read_text(encoding="utf-8")
+        try:
+            return file.read_text(encoding="utf-8")
+        except UnicodeDecodeError as error:
+            raise InputError(f"{file} is not a text ({error}); train again") from error
 
 
 def write_text(path: Path, text: str) -> None:
