@@ -22,7 +22,7 @@ from glassplat.scene.camera import Camera
 
 Rgb = tuple[float, float, float]
 WHITE: Rgb = (1.0, 1.0, 1.0)
-LEAST_SIDE = 16
+LEAST_SIDE = 8
 """Pixels along the side of a photograph that was reduced; below that are no edges to tell panes or details by."""
 
 
