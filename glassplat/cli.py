@@ -95,24 +95,36 @@ def parsed(arguments: list[str]) -> Any:
     """
     import tyro
 
+    from glassplat.commands.arguments import check_arguments
+
+    check_arguments(arguments)
     if arguments[:1] == ["--version"]:
         print(f"glassplat {__version__}")
         raise SystemExit(0)
     config = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes)
     name = arguments[0] if arguments else ""
     if name in COMMANDS:
-        return tyro.cli(command_class(name), prog=f"glassplat {name}", args=arguments[1:], config=config)
+        from glassplat.data.options import check_options
+
+        kind, options = chosen(name, arguments[1:])
+        command = tyro.cli(kind, prog=f"glassplat {name}", args=options, config=config)
+        check_options(command)
+        return command
     # Nothing is left to run after the list of commands; only a shell's completions need to know every option.
     complete = name.startswith("--tyro-")
-    kinds = {known: command_class(known) if complete else stub(known) for known in COMMANDS}
+    kinds = {known: chosen(known, [])[0] if complete else stub(known) for known in COMMANDS}
     tyro.cli(overview(kinds), prog="glassplat", description=DESCRIPTION, args=arguments, config=config)
     raise SystemExit(USAGE_CODE)
 
 
-def command_class(name: str) -> type:
-    """The class of a command, from its module, which is imported now."""
+def chosen(name: str, options: list[str]) -> tuple[type, list[str]]:
+    """The class of a command, from its module, which is imported now, and the arguments for it."""
+    if name == "train":
+        from glassplat.commands.train_options import train_command
+
+        return train_command(options)
     listed = COMMANDS[name]
-    return getattr(importlib.import_module(f"glassplat.commands.{listed.module}"), listed.kind)
+    return getattr(importlib.import_module(f"glassplat.commands.{listed.module}"), listed.kind), options
 
 
 def stub(name: str) -> type:
