@@ -146,7 +146,7 @@ def natural_loops(blocks: list[Block]) -> dict[int, set[int]]:
 
 
 def dominators_of(blocks: list[Block], before: list[list[int]]) -> list[set[int]]:
-    """The blocks through which every way to a block leads, from the first one; of unreachable blocks, none but itself."""
+    """The blocks through which every way from the first one to a block leads; of an unreachable one, itself."""
     reached, waiting = {0}, [0]
     while waiting:
         for other in blocks[waiting.pop()].following:

@@ -86,10 +86,12 @@ def test_a_driver_of_the_compilers_version_or_newer_will_do(gpu: pytest.MonkeyPa
     assert cuda_problem() is None
 
 
-def test_a_compiler_newer_than_the_driver_is_explained(gpu: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_compiler_newer_than_the_driver_is_explained(
+    gpu: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     gpu.setattr(torch.version, "cuda", "12.8")
     gpu.setattr(toolchain, "driver_version", lambda: 12040)
-    with pytest.raises(CudaUnavailableError, match=r"driver knows CUDA 12\.4, but the kernels' compiler is that of CUDA 13"):
+    with pytest.raises(CudaUnavailableError, match=r"knows CUDA 12\.4, but the kernels' compiler is that of CUDA 13"):
         chosen_device("cuda")
     assert "pip install 'glassplat[cuda12]'" in str(cuda_problem())
     with caplog.at_level(logging.INFO):

@@ -74,7 +74,7 @@ def _sequence(depths: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
     return order, in_order.cumsum(0) - in_order
 
 
-def _spans(real: type) -> tuple[Scalar, Scalar]:
+def _spans(real: type) -> tuple[Scalar, Scalar, Scalar]:
     half_height, outline, band = ellipse_maths()
     pixel_range = pixel_ranges()
     zero, endless = real(0.0), real(np.inf)

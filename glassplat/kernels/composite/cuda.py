@@ -83,8 +83,8 @@ def composite(
     if deviation:
         where = deviation.where.detach().contiguous()
         composite_deviation(real)(
-            tiles, PIXELS, *geometry, values.view(-1), num_channels, count, num_primary, deviation.channel, where, *lists, *saved[1:3],
-            saved.kept_spread, image, alpha, center, lean, deviated,
+            tiles, PIXELS, *geometry, values.view(-1), num_channels, count, num_primary, deviation.channel, where,
+            *lists, *saved[1:3], saved.kept_spread, image, alpha, center, lean, deviated,
         )  # fmt: skip
     return image, alpha, mask, deviated, saved
 

@@ -18,13 +18,13 @@ def fused_maths() -> Scalar:
     if SIMULATED:
 
         @inlined
-        def rounded_twice(a, b, c):  # type: ignore[no-untyped-def]
+        def rounded_twice(a, b, c):
             return a * b + c
 
         return rounded_twice
 
     @inlined
-    def fused(a, b, c):  # type: ignore[no-untyped-def]
+    def fused(a, b, c):
         return cuda.fma(a, b, c)
 
     return fused
@@ -44,7 +44,7 @@ def reciprocal_maths(real: type) -> Scalar:
         return _instruction("rcp.approx.ftz.f32")
 
     @inlined
-    def reciprocal(x):  # type: ignore[no-untyped-def]
+    def reciprocal(x):
         return one / x
 
     return reciprocal
@@ -56,14 +56,13 @@ def _instruction(name: str) -> Scalar:
     from llvmlite import ir
     from numba.cuda.extending import intrinsic
 
-    number = ir.FloatType()
-
     @intrinsic
-    def run(typing_context, x):  # type: ignore[no-untyped-def]
-        def lower(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def run(typing_context, x):
+        def lower(context, builder, signature, arguments):
+            number = ir.FloatType()
             made = ir.InlineAsm(ir.FunctionType(number, [number]), f"{name} $0, $1;", "=f,f")
             return builder.call(made, arguments)
 
         return types.float32(types.float32), lower
 
-    return run  # type: ignore[no-any-return]
+    return run

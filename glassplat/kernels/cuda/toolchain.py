@@ -23,7 +23,7 @@ def install_hint() -> str:
 
 
 def toolchain_problem() -> str | None:
-    """Why no kernel could be compiled or loaded on a machine with a GPU, with the remedy; None where nothing is known."""
+    """Why kernels could not be compiled or loaded, with the remedy; None where nothing is known to be in the way."""
     if not has_numba_cuda():
         return install_hint()
     major = bindings_major()
