@@ -40,7 +40,9 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
     offsets = torch.zeros(2, count + 1, dtype=torch.int64, device=device)
     torch.cumsum(counts, 1, out=offsets[:, 1:])
     splat_offsets, span_offsets = offsets
-    num_pairs, num_spans = offsets[:, -1].tolist()
+    active, num_active = _active(active_tiles, num_tiles, device)
+    # The one thing that the program asks of the GPU, and waits for.
+    num_pairs, num_spans, num_active = torch.cat([offsets[:, -1], num_active]).tolist()
     check_pair_count(num_pairs)
     spans = torch.empty(num_spans, 3, dtype=torch.int32, device=device)
     list_spans(real)(
@@ -57,12 +59,22 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
     edges = torch.arange(num_tiles + 1, dtype=tiles.dtype, device=device)
     pair_slots = torch.empty_like(slots)
     pair_slots[slots[order].long()] = torch.arange(num_pairs, dtype=torch.int32, device=device)
-    if active_tiles is None:
-        active = torch.arange(num_tiles, dtype=torch.int32, device=device)
-    else:
-        active = active_tiles.flatten().nonzero()[:, 0].to(torch.int32)
     tile_offsets = torch.searchsorted(by_tile, edges)
-    return TileBins(members[order], tile_offsets, pair_slots, splat_offsets, active, width, height, num_cameras)
+    return TileBins(
+        members[order], tile_offsets, pair_slots, splat_offsets, active[:num_active], width, height, num_cameras
+    )
+
+
+def _active(active_tiles: Tensor | None, num_tiles: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """The active tiles in order, in the front of a longer list, and how many they are [1]."""
+    every = torch.arange(num_tiles, dtype=torch.int32, device=device)
+    if active_tiles is None:
+        return every, torch.full((1,), num_tiles, device=device)
+    flags = active_tiles.flatten()
+    counted = flags.cumsum(0)
+    # All that are not active are written to the place behind the last.
+    places = torch.where(flags, counted - 1, num_tiles)
+    return every.new_empty(num_tiles + 1).scatter_(0, places, every), flags.sum()[None]
 
 
 def _sequence(depths: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
