@@ -118,13 +118,18 @@ def parsed(arguments: list[str]) -> Any:
 
 
 def chosen(name: str, options: list[str]) -> tuple[type, list[str]]:
-    """The class of a command, from its module, which is imported now, and the arguments for it."""
+    """What tyro makes of a command's arguments, and these; those of `train` decide on its defaults."""
     if name == "train":
         from glassplat.commands.train_options import train_command
 
         return train_command(options)
+    return command_class(name), options
+
+
+def command_class(name: str) -> type:
+    """The class of a command, from its module, which is imported now."""
     listed = COMMANDS[name]
-    return getattr(importlib.import_module(f"glassplat.commands.{listed.module}"), listed.kind), options
+    return getattr(importlib.import_module(f"glassplat.commands.{listed.module}"), listed.kind)
 
 
 def stub(name: str) -> type:

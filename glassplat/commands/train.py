@@ -13,7 +13,7 @@ from glassplat.commands.messages import say, warn
 from glassplat.commands.training_progress import TrainingProgress
 from glassplat.data.dataset import Dataset, load_dataset
 from glassplat.data.masks import Polarity
-from glassplat.data.ranges import Downscale, Seed, Several
+from glassplat.data.ranges import Downscale, Positive, Seed, Several
 from glassplat.kernels.devices import DeviceName, chosen_device
 from glassplat.train.background import photo_background
 from glassplat.train.recipe import Preset, Recipe
@@ -82,10 +82,6 @@ class Train(Generic[RecipeKind]):
 
     def _check(self) -> None:
         """Refuse what can be told to fail before photographs are read."""
-        if self.iterations < 1:
-            raise InputError(f"--iterations is {self.iterations}; expected at least 1")
-        if not self.checkpoint_every > 0:
-            raise InputError(f"--checkpoint-every is {self.checkpoint_every}; expected more than 0 seconds")
         check_output(RunDirectory(self.output), resume=self.resume)
 
     def left_behind(self) -> str:
