@@ -189,10 +189,8 @@ class Planar:
         channels = torch.cat([projected.colors, intensity[..., None]], dim=-1)
         screen = (screen_pass("primary", projected, direct=False),) if probed else ()
         result = composite(splats, channels, bins, probe=joined_probe(screen))
-        reflections = result.image
-        if any(self.background):
-            colors = over_background(reflections[..., :3], result.alpha, self.background)
-            reflections = torch.cat([colors, reflections[..., 3:]], dim=-1)
+        # The background, too, is as bright in a pane as it is: with no intensity of its own it would be black there.
+        reflections = over_background(result.image, result.alpha, (*self.background, 1.0))
         return SecondPass(reflections, shown(projected), screen)
 
     def _screen(self, first: FirstPass, second: SecondPass, hits: PaneHits, result: Glazed) -> tuple[ScreenPass, ...]:

@@ -75,8 +75,8 @@ def joined_probe(screen: Sequence[ScreenPass]) -> Tensor | None:
     return torch.cat([record.probe for record in screen], dim=1) if screen else None
 
 
-def over_background(image: Tensor, alpha: Tensor, background: tuple[float, float, float]) -> Tensor:
-    """Adds the light of a constant background [3] behind an image [..., 3] with coverage alpha [...]."""
+def over_background(image: Tensor, alpha: Tensor, background: tuple[float, ...]) -> Tensor:
+    """Adds a constant background [D] behind an image [..., D] with coverage alpha [...]."""
     if not any(background):
         return image
     return image + (1 - alpha)[..., None] * constant(tuple(background), image.dtype, image.device)
