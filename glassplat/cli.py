@@ -95,19 +95,18 @@ def parsed(arguments: list[str]) -> Any:
     """
     import tyro
 
-    from glassplat.commands.arguments import check_arguments
-
-    check_arguments(arguments)
     if arguments[:1] == ["--version"]:
         print(f"glassplat {__version__}")
         raise SystemExit(0)
     config = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes)
     name = arguments[0] if arguments else ""
     if name in COMMANDS:
+        from glassplat.commands.arguments import check_arguments
         from glassplat.data.options import check_options
 
+        check_arguments(arguments)
         kind, options = chosen(name, arguments[1:])
-        command = tyro.cli(kind, prog=f"glassplat {name}", args=options, config=config)
+        command: Any = tyro.cli(kind, prog=f"glassplat {name}", args=options, config=config)
         check_options(command)
         return command
     # Nothing is left to run after the list of commands; only a shell's completions need to know every option.
