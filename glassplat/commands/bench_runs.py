@@ -140,7 +140,7 @@ def execute(
             failures.append(f"{run.title}: {error}")
             console.print(f"[red]failed:[/red] {error}", highlight=False)
         except KeyboardInterrupt:
-            console.print(f"stopped in run {number} of {len(runs)}; the same command goes on from here")
+            console.print(f"stopped in run {number} of {len(runs)}")
             raise
         after_each(_finished(runs))
     if failures:

@@ -69,6 +69,12 @@ class Train(Generic[RecipeKind]):
         )
         console.print(f"next: glassplat eval {self.output}")
 
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        if RunDirectory(self.output).checkpoint.is_file():
+            return f"{self.output} holds a checkpoint: repeat the command with --resume to go on from it"
+        return "no checkpoint was written yet: repeat the command to begin again"
+
     def settings(self) -> RunSettings:
         """What the run's directory records beside the recipe."""
         device = str(chosen_device(self.device))

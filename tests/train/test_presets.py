@@ -51,7 +51,7 @@ def documented(page: str) -> list[str]:
 def parsed(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
     """The recipe of a command line of `train`."""
     taken: list[Any] = []
-    monkeypatch.setattr(cli, "guarded", lambda command, console: taken.append(command) or 0)
+    monkeypatch.setattr(cli, "run", taken.append)
     assert cli.main(["train", arguments[0], "--data", "x", "--output", "y", *arguments[1:]]) == 0
     return taken[0].recipe
 
