@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 import time
 from collections import Counter
@@ -18,6 +17,7 @@ from glassplat.commands.stored_run import open_run
 from glassplat.commands.train import Train
 from glassplat.data.dataset import load_dataset
 from glassplat.data.errors import InputError, first_names
+from glassplat.files.json_text import read_json
 from glassplat.init.planes import PlaneFitError
 from glassplat.train.background import with_background
 from glassplat.train.run_directory import RunDirectory
@@ -72,8 +72,10 @@ class PlannedRun:
     def results(self) -> dict[str, Any] | None:
         """The metrics of the finished run, None before it is finished."""
         try:
-            results = json.loads(self.directory.results.read_text(encoding="utf-8"))
-        except (FileNotFoundError, json.JSONDecodeError):
+            results = read_json(self.directory.results)
+        except (FileNotFoundError, ValueError):
+            return None
+        if not isinstance(results, dict):
             return None
         made = (results.get("method"), results.get("iterations"), results.get("seed"))
         wanted = (self.train.recipe.method, self.train.iterations, self.train.seed)

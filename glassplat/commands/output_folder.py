@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from glassplat.data.errors import InputError, first_names
+from glassplat.files.json_text import read_json
 from glassplat.train.run_directory import write_text
 
 RECORD = "glassplat.json"
@@ -41,7 +42,7 @@ def picture_paths(names: Sequence[str]) -> dict[str, Path]:
 def _recorded_command(record: Path) -> str | None:
     """Who wrote the folder; None where nobody says."""
     try:
-        content = json.loads(record.read_text(encoding="utf-8"))
+        content = read_json(record)
     except (FileNotFoundError, ValueError):
         return None
     return content.get("command") if isinstance(content, dict) else None

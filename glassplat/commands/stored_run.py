@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from glassplat.data.dataset import Dataset, View, load_dataset
-from glassplat.data.errors import InputError
+from glassplat.data.errors import InputError, input_checked
 from glassplat.kernels.devices import DeviceName, chosen_device
 from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
@@ -42,6 +42,8 @@ def open_run(path: Path, device: DeviceName = "auto") -> StoredRun:
     directory = RunDirectory(path)
     recorded, settings = directory.recipe(), directory.settings()
     scene, iterations = directory.latest_scene()
+    with input_checked():
+        recorded.renderer().check(scene)
     scene = scene.to(chosen_device(device))
     dataset = load_dataset(
         Path(settings.data),

@@ -16,6 +16,7 @@ from glassplat.render.frame import Frame, ScreenPass
 from glassplat.render.glazing import Blend, Glazed, glazed, layer_slopes, own_masks, visibilities
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
+    check_colored,
     joined_probe,
     joined_splats,
     mean_depth,
@@ -130,6 +131,17 @@ class Planar:
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
         screen = self._screen(first, second, hits, result) if probed else ()
         return Frame(result.rgb, layers, first.direct, second.mirrored, screen)
+
+    def check(self, scene: Scene) -> None:
+        """Raises ValueError where a scene lacks colours, or its panes what they need; there may be no panes."""
+        check_colored(scene.primary)
+        if len(scene.planes) and "log_intensity" not in scene.primary.channels:
+            raise ValueError(
+                f"the Gaussians have the channels {sorted(scene.primary.channels)}; expected log_intensity, as "
+                "`planar` trains it"
+            )
+        if "logit_mark" not in scene.glass.channels:
+            raise ValueError(f"the glass has the channels {sorted(scene.glass.channels)}; expected logit_mark")
 
     def _first_pass(self, scene: Scene, camera: Camera, probed: bool) -> FirstPass:
         near = NEAR_PER_EXTENT * scene.extent

@@ -13,6 +13,7 @@ from typing import Any, TextIO
 
 from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError
+from glassplat.data.photographs_read import photographs_read
 from glassplat.train.background import settled
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.messages import Message, StepDone
@@ -66,13 +67,16 @@ def prepare(recipe: Any, settings: RunSettings, directory: RunDirectory, dataset
                 f"resume it, got {settings}. Repeat the original options, with the version of glassplat that began "
                 "it, or choose another --output"
             )
-        return load_checkpoint(directory.checkpoint).to(settings.device)
+        state = load_checkpoint(
+            directory.checkpoint, method=recipe.method, seed=settings.seed, iterations=settings.iterations
+        )
+        return state.to(settings.device)
     if directory.checkpoint.exists() or directory.results.exists():
         raise InputError(
             f"{directory.path} already holds a run; pass --resume to go on with it, or choose another --output"
         )
     directory.begin(recipe, settings, dataset)
-    return TrainState(recipe.initialise(dataset), settings.seed).to(settings.device)
+    return TrainState(recipe.initialise(dataset), settings.seed, method=recipe.method).to(settings.device)
 
 
 def run_training(
@@ -83,7 +87,7 @@ def run_training(
     A recipe that names no background gets the one that transparent photographs are laid over; it is recorded.
 
     Raises:
-        InputError: as `prepare` and `settled` do.
+        InputError: as `prepare` and `settled` do, or a photograph that cannot be read, of the test views too.
         KeyboardInterrupt: the user stopped the run; the checkpoint is written.
         TrainingDivergedError: a loss is not finite; the last checkpoint stays.
     """
@@ -91,8 +95,13 @@ def run_training(
     state = prepare(recipe, settings, directory, dataset, resume)
     every = max(settings.iterations // 10, 500)
     resumed_seconds, started = state.seconds, time.perf_counter()
-    with stop_on_interrupt() as stop, open_log(directory, state.step) as log:
+    with (
+        stop_on_interrupt() as stop,
+        open_log(directory, state.step) as log,
+        photographs_read(dataset) as check_photographs,
+    ):
         for message in train(recipe.stages(settings.seed), dataset, state, settings.iterations):
+            check_photographs()
             listen(message)
             write_log(log, message)
             if not isinstance(message, StepDone):

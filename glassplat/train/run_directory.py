@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
+import typing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from glassplat.data.dataset import Dataset
-from glassplat.data.errors import InputError
+from glassplat.data.errors import InputError, input_checked
 from glassplat.data.masks import Polarity
-from glassplat.data.options import options_from_json
-from glassplat.data.ranges import Downscale, Seed, Several
 from glassplat.files.atomic import atomic_write
 from glassplat.files.cameras_json import write_cameras
 from glassplat.files.environment_image import write_equirect
+from glassplat.files.fields import Choice, Field, Number, Optional, Text, Whole, checked
+from glassplat.files.json_text import parse_json
+from glassplat.files.reading import read_text
 from glassplat.files.scene_folder import read_scene, write_scene
 from glassplat.render.environment import equirect_from_environment
 from glassplat.scene.scene import Scene
@@ -36,11 +39,24 @@ class RunSettings:
     """
 
     data: str
-    iterations: Several
-    downscale: Downscale = 1.0
-    seed: Seed = 0
+    iterations: int
+    downscale: float = 1.0
+    seed: int = 0
     device: str = "cpu"
     mask_polarity: Polarity = "auto"
+
+
+SETTINGS: dict[str, Field] = {
+    "data": Text(),
+    "iterations": Whole(1),
+    "downscale": Optional(Number(1), 1.0),
+    "seed": Optional(Whole(), 0),
+    "device": Optional(Text(), "cpu"),
+    "mask_polarity": Optional(Choice(typing.get_args(Polarity)), "auto"),
+}
+"""What `settings.json` holds of `RunSettings`; options that earlier versions did not have have their defaults."""
+NUMBERED = re.compile(r"iteration_([0-9]{1,18})")
+"""The folder of a scene; people keep copies under other names beside it."""
 
 
 @dataclass(frozen=True)
@@ -84,11 +100,7 @@ class RunDirectory:
 
     def recipe(self) -> Any:
         """The recorded recipe."""
-        written = self._read("recipe.json")
-        try:
-            return recipe_from_json(written)
-        except InputError as error:
-            raise InputError(f"{self.path / 'recipe.json'}: {error}") from error
+        return recipe_from_json(self._read("recipe.json"), str(self.path / "recipe.json"))
 
     def was_begun_with(self, recipe: Any) -> bool:
         """Whether `begin` recorded just this recipe.
@@ -97,14 +109,13 @@ class RunDirectory:
         with which the run was not made.
         """
         written = self._read("recipe.json")
-        return self.recipe() == recipe and json.loads(written) == json.loads(recipe_to_json(recipe))
+        return self.recipe() == recipe and parse_json(written, "recipe.json") == json.loads(recipe_to_json(recipe))
 
     def settings(self) -> RunSettings:
         """The recorded settings."""
-        try:
-            return options_from_json(RunSettings, json.loads(self._read("settings.json")))
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{self.path / 'settings.json'} cannot be read ({error}); train again") from error
+        path = self.path / "settings.json"
+        with input_checked():
+            return RunSettings(**checked(parse_json(self._read(path.name), str(path)), SETTINGS, str(path)))
 
     def export(self, scene: Scene, step: int) -> Path:
         """Writes the scene in the formats that others read; returns its folder."""
@@ -117,7 +128,8 @@ class RunDirectory:
 
     def latest_scene(self) -> tuple[Scene, int]:
         """The exported scene of the highest iteration, and that iteration."""
-        folders = {int(f.name.rpartition("_")[2]): f for f in self.path.glob("point_cloud/iteration_*")}
+        named = {NUMBERED.fullmatch(folder.name): folder for folder in self.path.glob("point_cloud/*")}
+        folders = {int(match[1]): folder for match, folder in named.items() if match and folder.is_dir()}
         if not folders:
             raise InputError(
                 f"{self.path} holds no point_cloud/iteration_N; expected a finished run. Train first, or --resume it"
@@ -125,7 +137,7 @@ class RunDirectory:
         step = max(folders)
         try:
             return read_scene(folders[step]), step
-        except ValueError as error:
+        except (ValueError, FileNotFoundError) as error:
             raise InputError(f"the scene in {folders[step]} cannot be read: {error}") from error
 
     def _read(self, name: str) -> str:
@@ -134,10 +146,8 @@ class RunDirectory:
             raise InputError(
                 f"{self.path} is not a run directory: no {name} in it; expected what `glassplat train --output` wrote"
             )
-        try:
-            return file.read_text(encoding="utf-8")
-        except UnicodeDecodeError as error:
-            raise InputError(f"{file} is not a text ({error}); train again") from error
+        with input_checked():
+            return read_text(file)
 
 
 def write_text(path: Path, text: str) -> None:

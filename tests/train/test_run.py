@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -11,15 +12,16 @@ from typing import Any
 import pytest
 import torch
 
+from glassplat.data.dataset import load_dataset
 from glassplat.data.errors import InputError
-from glassplat.train.checkpoint import load_checkpoint, recorded_seconds
+from glassplat.train.checkpoint import load_checkpoint, recorded_seconds, save_checkpoint
 from glassplat.train.messages import Message, StepDone
 from glassplat.train.planar_recipe import PlanarRecipe, ReflectionWeights
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
 from glassplat.train.run import run_training
 from glassplat.train.run_directory import RunDirectory, RunSettings
 from glassplat.train.splat_recipe import SplatRecipe
-from tests.train.tiny_capture import tiny_capture
+from tests.train.tiny_capture import tiny_capture, write_tiny_capture
 
 SETTINGS = RunSettings("tiny", iterations=12)
 RECIPE = SplatRecipe(sh_degree=1)
@@ -76,6 +78,33 @@ def test_the_exported_scene_is_the_trained_one(tmp_path: Path) -> None:
     assert scene.extent == state.scene.extent
     for name, tensor in state.scene.primary.tensors().items():
         assert torch.equal(tensor, scene.primary.tensors()[name]), name
+
+
+def test_a_broken_test_photograph_ends_a_run_at_the_start(tmp_path: Path) -> None:
+    dataset = load_dataset(write_tiny_capture(tmp_path / "capture"))
+    path = dataset.test[0].image_path
+    os.truncate(path, path.stat().st_size // 2)
+
+    def listen(message: Message) -> None:
+        assert message.step < 2000, "the photograph was not found"
+
+    with pytest.raises(InputError, match=path.name):
+        run_training(
+            RECIPE, RunSettings("", 10**6), RunDirectory(tmp_path / "run"), dataset, resume=False, listen=listen
+        )
+
+
+def test_the_checkpoint_of_another_method_is_not_gone_on_with(tmp_path: Path) -> None:
+    run(tmp_path)
+    state = load_checkpoint(RunDirectory(tmp_path).checkpoint)
+    for changed, message in (
+        (replace(state, method="planar"), "is a checkpoint of planar; expected one of splat"),
+        (replace(state, step=13), "is of step 13; expected one of at most 12"),
+        (replace(state, seed=1), "is of a run with the seed 1; expected 0"),
+    ):
+        save_checkpoint(RunDirectory(tmp_path).checkpoint, changed)
+        with pytest.raises(InputError, match=message):
+            run(tmp_path, resume=True)
 
 
 @pytest.mark.parametrize(
