@@ -12,7 +12,7 @@ import pytest
 
 from glassplat.cli import main
 from glassplat.commands import bench
-from glassplat.commands.bench_runs import FinishedRun, PlannedRun, RunClock, in_words, scene_names
+from glassplat.commands.bench_runs import FinishedRun, PlannedRun, RunClock, scene_names
 from glassplat.commands.train import Train, TrainingProgress
 from glassplat.data.errors import InputError
 from glassplat.init.planes import PlaneFitError
@@ -224,4 +224,3 @@ def test_the_time_left_is_judged_by_the_most_similar_runs() -> None:
     clock = RunClock(finished)
     assert clock.left([planned("room", "planar")]) == "about 5 min left"
     assert clock.left([planned("yard", "planar"), planned("hall", "splat")]) == "about 7 min left"
-    assert (in_words(20), in_words(90), in_words(5400)) == ("20 s", "2 min", "1 h 30 min")
