@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,6 +101,44 @@ def test_an_interrupted_bench_goes_on(
     assert len(json.loads((output / "scenes.json").read_text())["differences"]) == 1
 
 
+def rows_of(capture: Path) -> list[tuple[str, str]]:
+    contents = json.loads((capture.parent / "bench" / "scenes.json").read_text())
+    return [(row["scene"], row["title"]) for row in contents["means"]]
+
+
+def test_commands_for_one_scene_each_share_their_tables(capture: Path, tmp_path: Path) -> None:
+    other = write_tiny_capture(tmp_path / "other")
+    assert bench_scenes(capture, "--methods", "splat") == 0
+    assert bench_scenes(capture, "--data", str(other), "--methods", "splat") == 0
+    assert rows_of(capture) == [("other", "splat"), ("tiny", "splat")]
+    shutil.rmtree(other)
+    assert bench_scenes(capture, "--methods", "planar", "--seeds", "0") == 0
+    assert rows_of(capture) == [("tiny", "splat"), ("tiny", "planar"), ("other", "splat")]
+    table = (capture.parent / "bench" / "scenes.md").read_text()
+    assert "| tiny | planar - splat |" in table and "| other | splat |" in table
+
+
+def test_runs_that_cannot_stand_in_one_table_are_told_apart(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = write_tiny_capture(tmp_path / "other")
+    assert bench_scenes(capture, "--methods", "splat") == 0
+    before = (capture.parent / "bench" / "scenes.md").read_bytes()
+    for options in (("--iterations", "9"), ("--downscale", "2")):
+        assert bench_scenes(capture, "--data", str(other), "--methods", "splat", *options) == 2
+        assert "because one table holds both" in " ".join(capsys.readouterr().err.split())
+    assert (capture.parent / "bench" / "scenes.md").read_bytes() == before
+    assert not (capture.parent / "bench" / "runs" / "other").exists()
+
+
+def test_a_bench_too_short_for_a_method_ends_before_the_first_run(
+    capture: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert bench_scenes(capture, "--iterations", "5") == 2
+    assert "leave no room for the stage" in " ".join(capsys.readouterr().err.split())
+    assert not (capture.parent / "bench").exists()
+
+
 def test_another_run_in_the_way_is_not_overwritten(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert bench_scenes(capture, "--methods", "splat") == 0
     before = written(capture.parent / "bench")
@@ -152,6 +191,9 @@ def test_the_ablation_tables_differences_to_the_full_method(capture: Path) -> No
     before = written(output)
     assert main([*arguments, "--switches", "fresnel", "mask"]) == 0
     assert written(output) == before
+    table = (output / "ablation.md").read_bytes()
+    assert main([*arguments, "--switches", "mask"]) == 0
+    assert written(output) == before and (output / "ablation.md").read_bytes() == table
 
 
 @pytest.mark.parametrize("method", sorted(ABLATIONS))
