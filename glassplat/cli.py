@@ -143,14 +143,12 @@ def overview(kinds: Mapping[str, type]) -> type:
 
 
 def run(command: Any) -> None:
-    """Runs a command; its console shows its log too."""
-    import logging
-
-    from glassplat.commands.messages import LogLines, message_console
+    """Runs a command; its console shows the package's log too, and what libraries warn of."""
+    from glassplat.commands.messages import heard_by, message_console
 
     console = message_console()
-    logging.basicConfig(level=logging.INFO, handlers=[LogLines(console)])
-    command.run(console)
+    with heard_by(console):
+        command.run(console)
 
 
 def interrupted(stop: KeyboardInterrupt, command: Any) -> int:

@@ -11,7 +11,10 @@ import logging
 import os
 import re
 import sys
-from typing import Literal
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.text import Text
@@ -90,3 +93,17 @@ class LogLines(logging.Handler):
             warn(self._console, record.getMessage())
         else:
             say(self._console, record.getMessage())
+
+
+@contextmanager
+def heard_by(console: Console) -> Iterator[None]:
+    """Shows on a console what the package logs and what libraries warn of, each as a line."""
+
+    def show(message: Warning | str, *place: Any, **more: Any) -> None:
+        warn(console, message)
+
+    logging.basicConfig(level=logging.WARNING, handlers=[LogLines(console)])
+    logging.getLogger("glassplat").setLevel(logging.INFO)
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
