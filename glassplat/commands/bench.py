@@ -150,6 +150,10 @@ class Bench:
         """Runs the comparison."""
         self.comparison.run(console)
 
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        return f"finished runs stay in {self.comparison.output}: repeat the command to go on"
+
 
 def variant_name(method: str, strategy: str) -> str:
     """What tables and directories call a method with a strategy."""

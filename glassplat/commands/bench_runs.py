@@ -158,9 +158,9 @@ def _check_comparable(run: PlannedRun, like: Train) -> None:
     alike = (run.train.iterations, run.train.downscale) == (like.iterations, like.downscale)
     if not alike or not run.directory.was_begun_with(wanted):
         raise InputError(
-            f"{run.directory.path} holds a run of {run.train.iterations} iterations at downscale {run.train.downscale}, "
-            f"or with another recipe; expected {like.iterations} at {like.downscale} and the recipe of this "
-            "version, because one table holds both. Choose another --output, or move the run away"
+            f"{run.directory.path} holds a run of {run.train.iterations} iterations at downscale "
+            f"{run.train.downscale}, or with another recipe; expected {like.iterations} at {like.downscale} and the "
+            "recipe of this version, because one table holds both. Choose another --output, or move the run away"
         )
 
 
@@ -199,7 +199,7 @@ def execute(
             failures.append(f"{run.title}: {error}")
             complain("failed", error)
         except KeyboardInterrupt:
-            say(console, f"stopped in run {number} of {len(runs)}; the same command goes on from here")
+            say(console, f"stopped in run {number} of {len(runs)}")
             raise
         after_each(_finished(runs))
     if failures:

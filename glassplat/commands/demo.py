@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from glassplat.commands.evaluate import evaluate_run, results_table
+from glassplat.commands.evaluate import evaluate_run, print_results
 from glassplat.commands.messages import say
 from glassplat.commands.stored_run import open_run
 from glassplat.commands.train import Train
@@ -44,5 +44,9 @@ class Demo:
             run = Train(recipe, SCENE, folder, self.iterations, seed=self.seed, device=self.device, resume=begun)
             run.run(console)
             results.append(evaluate_run(open_run(folder, self.device)))
-        console.print(results_table(*results))
+        print_results(console, *results)
         say(console, f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
+
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        return f"what is finished stays in {self.output}: repeat the command to go on"

@@ -60,6 +60,10 @@ class Dereflect:
             write_image(self.output / paths[view.name], self._image(stored, renderer, view))
         say(console, f"{len(views)} images without reflections -> {self.output}")
 
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        return f"images already written to {self.output} are whole: repeat the command for all of them"
+
     def _image(self, stored: StoredRun, renderer: Planar, view: View) -> Tensor:
         frame, _ = timed_render(renderer, stored.scene, view)
         if self.source == "render":

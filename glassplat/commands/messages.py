@@ -6,8 +6,15 @@ as a picture, and break it at 80 columns where the output goes to a file; a cont
 
 from __future__ import annotations
 
+import io
+import logging
+import os
 import re
-from typing import Literal
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.text import Text
@@ -55,3 +62,48 @@ def complain(label: Literal["error", "stopped", "failed"], text: object) -> None
 def printable(text: str) -> str:
     r"""The text with what no terminal should get written out, such as `\x1b`."""
     return UNPRINTABLE.sub(lambda found: repr(found.group())[1:-1], text)
+
+
+def plain_streams() -> None:
+    """Lets every program be started from: with output that is closed, or in an encoding that lacks a character."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - Until the process ends.
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def drop_output() -> None:
+    """Sends what is still to be printed nowhere, since nobody reads it any more."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+
+
+class LogLines(logging.Handler):
+    """Shows what is logged among the other lines of a command, above its progress bar."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self._console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Prints one record."""
+        if record.levelno >= logging.WARNING:
+            warn(self._console, record.getMessage())
+        else:
+            say(self._console, record.getMessage())
+
+
+@contextmanager
+def heard_by(console: Console) -> Iterator[None]:
+    """Shows on a console what the package logs and what libraries warn of, each as a line."""
+
+    def show(message: Warning | str, *place: Any, **more: Any) -> None:
+        warn(console, message)
+
+    logging.basicConfig(level=logging.WARNING, handlers=[LogLines(console)])
+    logging.getLogger("glassplat").setLevel(logging.INFO)
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield

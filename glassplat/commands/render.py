@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -37,6 +38,13 @@ Layer = Literal[
     "environment",
 ]
 
+LAYERS: dict[str, tuple[Layer, ...]] = {
+    "splat": ("rgb", "depth", "alpha"),
+    "planar": ("rgb", "transmission", "without_panes", "reflection", "strength", "mask", "depth", "alpha"),
+    "deferred": ("rgb", "base", "reflection", "strength", "normal", "environment", "depth", "alpha"),
+}
+"""What each method renders that is worth looking at; its frames hold more for the losses."""
+
 
 @dataclass(frozen=True)
 class Render:
@@ -63,6 +71,7 @@ class Render:
     def run(self, console: Console) -> None:
         """Renders."""
         stored = open_run(self.run_directory, self.device, self.data)
+        check_layers(self.layers, stored.recipe.method)
         scene = self.edits.applied(stored.scene)
         renderer = stored.renderer
         if "environment" in self.layers and isinstance(renderer, Deferred):
@@ -79,21 +88,32 @@ class Render:
         for view in track(views, "rendering", console=console):
             frame, _ = timed_render(renderer, scene, view)
             for layer in self.layers:
-                image = layer_image(frame, layer, stored.recipe.method)
+                image = layer_image(frame, layer)
                 write_image(self.output / layer / paths[view.name], image)
         say(console, f"{len(views)} views x {len(self.layers)} layers -> {self.output}")
 
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        return f"images already written to {self.output} are whole: repeat the command for all of them"
 
-def layer_image(frame: Frame, layer: str, method: str) -> Tensor:
-    """A layer of a frame as an image in [0, 1]; depth is colour-mapped, near bright, normals are (n + 1) / 2.
+
+def check_layers(layers: Sequence[str], method: str) -> None:
+    """Refuses layers that a method does not render, before anything is rendered.
 
     Raises:
-        InputError: the method has no such layer.
+        InputError: there are such, or none is asked for.
     """
+    known = LAYERS[method]
+    foreign = [layer for layer in layers if layer not in known]
+    if foreign or not layers:
+        asked = f"renders no layer {', '.join(foreign)}" if foreign else "renders nothing without --layers"
+        raise InputError(f"{method} {asked}; expected --layers out of {', '.join(known)}")
+
+
+def layer_image(frame: Frame, layer: str) -> Tensor:
+    """A layer of a frame as an image in [0, 1]; depth is colour-mapped, near bright, normals are (n + 1) / 2."""
     if layer == "rgb":
         return frame.rgb.clamp(0, 1)
-    if layer not in frame.layers:
-        raise InputError(f"{method} renders no layer {layer!r}; it has {['rgb', *sorted(frame.layers)]}")
     image = frame.layers[layer]
     if layer == "normal":
         return normal_colors(image)

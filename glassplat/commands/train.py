@@ -91,6 +91,12 @@ class Train:
             raise InputError(f"--checkpoint-every is {self.checkpoint_every}; expected more than 0 seconds")
         check_output(RunDirectory(self.output), resume=self.resume)
 
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        if RunDirectory(self.output).checkpoint.is_file():
+            return f"{self.output} holds a checkpoint: repeat the command with --resume to go on from it"
+        return "no checkpoint was written yet: repeat the command to begin again"
+
     def settings(self) -> RunSettings:
         """What the run's directory records beside the recipe."""
         device = str(chosen_device(self.device))

@@ -160,4 +160,4 @@ def test_a_full_gpu_is_explained(
     monkeypatch.setattr("glassplat.commands.train.run_training", full)
     assert train("splat", tmp_path / "run", "--iterations", "3") == 1
     said = " ".join(capsys.readouterr().err.split())
-    assert "CUDA out of memory; pass a larger --downscale" in said
+    assert "stopped: CUDA out of memory; " in said and "--downscale" in said and "--device cpu" in said
