@@ -9,13 +9,14 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import field, make_dataclass
 from typing import Annotated, Any, NamedTuple, Union
 
 from glassplat import __version__
 
-USAGE_CODE, INTERRUPTED_CODE = 2, 130
+USAGE_CODE, INTERRUPTED_CODE, UNREAD_CODE = 2, 130, 141
+"""The last two as shells report a process that Ctrl-C or a closed pipe ended."""
 DESCRIPTION = "Gaussian splatting for scenes with window panes, showcases and mirrors."
 
 
@@ -50,7 +51,8 @@ COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code.
 
-    That is 0 done, 1 failed, 2 bad input, 130 interrupted (143 and 129 where another signal than Ctrl-C asked for it).
+    That is 0 done, 1 failed, 2 bad input, 130 interrupted (143 and 129 where another signal than Ctrl-C asked for it),
+    141 when nobody reads the output any more.
 
     Raises:
         SystemExit: after help (0) and after options that cannot be understood (2).
@@ -65,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def guarded(arguments: list[str], *, is_program: bool) -> int:
     """Runs a command; whatever happens ends in one readable message and an exit code."""
     from glassplat.commands.endings import ending
-    from glassplat.commands.messages import complain, plain_streams
+    from glassplat.commands.messages import complain, drop_output, plain_streams
     from glassplat.commands.signals import immediate_end, raised_signals
 
     plain_streams()
@@ -79,10 +81,15 @@ def guarded(arguments: list[str], *, is_program: bool) -> int:
             return interrupted(stop, command)
         except SystemExit:
             raise
+        except BrokenPipeError:
+            drop_output()
+            return UNREAD_CODE
         except BaseException as error:  # noqa: BLE001 - The last guard: nobody is to read a traceback.
             if raised:
                 return interrupted(raised[-1], command)
-            complain(*(end := ending(error))[:2])
+            end = ending(error)
+            with suppress(OSError):  # Nobody hears it where the output is full or closed.
+                complain(end.label, end.text)
             return end.code
     return 0
 
@@ -153,14 +160,12 @@ def overview(kinds: Mapping[str, type]) -> type:
 
 
 def run(command: Any) -> None:
-    """Runs a command; its console shows its log too."""
-    import logging
-
-    from glassplat.commands.messages import LogLines, message_console
+    """Runs a command; its console shows the package's log too, and what libraries warn of."""
+    from glassplat.commands.messages import heard_by, message_console
 
     console = message_console()
-    logging.basicConfig(level=logging.INFO, handlers=[LogLines(console)])
-    command.run(console)
+    with heard_by(console):
+        command.run(console)
 
 
 def interrupted(stop: KeyboardInterrupt, command: Any) -> int:

@@ -8,6 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from glassplat.commands.evaluate import evaluate_run, print_results
+from glassplat.commands.messages import say
 from glassplat.commands.stored_run import open_run
 from glassplat.commands.train import Train
 from glassplat.data.ranges import Seed, Several
@@ -45,7 +46,7 @@ class Demo:
             run.run(console)
             results.append(evaluate_run(open_run(folder, self.device)))
         print_results(console, *results)
-        console.print(f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
+        say(console, f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
 
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import dataclass, replace
 
@@ -17,8 +16,10 @@ from glassplat.densify.order import in_morton_order
 from glassplat.densify.perturb import perturb_opacities
 from glassplat.render.contribution import contributions
 from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.sight import behind_panes
+from glassplat.train.messages import Working
 from glassplat.train.optimizer import Rate
-from glassplat.train.stage import Clock, Every
+from glassplat.train.stage import Clock, Every, Work
 from glassplat.train.state import TrainState
 
 MEGAPIXEL = 1e6
@@ -122,9 +123,12 @@ class PruneIdle:
         return self.densifier.least_contribution > 0 and clock.is_at(self.densifier.contribution_moments)
 
     @torch.no_grad()
-    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Edits `state`, if there is anything to edit."""
-        most = functools.reduce(torch.maximum, (contributions(state.scene, view.camera) for view in dataset.train))
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
+        """Edits `state`, if there is anything to edit, and tells how far it is."""
+        most = torch.zeros_like(state.scene.primary.logit_opacities)
+        for done, view in enumerate(dataset.train):
+            yield Working("looking for Gaussians that no view needs", done, len(dataset.train))
+            most = torch.maximum(most, contributions(state.scene, view.camera))
         busy = most >= self.densifier.least_contribution
         if bool(busy.all()):
             return False
@@ -240,12 +244,17 @@ class PerturbOpacity:
         """Whether to act after this step."""
         return self.amplitude > 0 and self.when.due(clock)
 
-    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Edits `state`, if there is anything to edit."""
-        perturbed, selected = perturb_opacities(
+    @torch.no_grad()
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
+        """Edits `state`, if there is anything to edit, and tells how far it is."""
+        means, planes = state.scene.primary.means, state.scene.planes
+        selected = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+        for done, view in enumerate(dataset.train):
+            yield Working("looking for what is seen through panes", done, len(dataset.train))
+            selected |= behind_panes(means, planes, [view.camera])
+        perturbed = perturb_opacities(
             state.scene.primary,
-            state.scene.planes,
-            [view.camera for view in dataset.train],
+            selected,
             amplitude=self.amplitude,
             bounds=self.bounds,
             generator=state.generator(self.name),

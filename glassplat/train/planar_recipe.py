@@ -20,7 +20,7 @@ from glassplat.data.ranges import (
 )
 from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
-from glassplat.init.planes import PlaneFit, fit_planes
+from glassplat.init.planes import PlaneFit, PlaneFitError, fit_planes
 from glassplat.kernels.panes import Fresnel
 from glassplat.losses.geometry import depth_deviation_loss
 from glassplat.losses.reflection import gradient_conflict, intensity_departure, mask_loss
@@ -213,10 +213,21 @@ class PlanarRecipe:
             PlaneFitError: the masks do not do. The planes are fitted to the measured points once and forgotten,
                 because a bad mask should end a run before the first iteration and not at the second stage.
         """
-        if dataset.measured_points or not dataset.pane_labels:
+        if not dataset.pane_labels:
+            raise PlaneFitError(
+                f"{self._lack_of_masks(dataset)}, and planar needs to know where the panes are: expected masks of 3 to "
+                f"10 photographs in {dataset.root / 'masks'}, named <photograph's name>.png, each pixel the label 1, "
+                "2, ... of a pane, or 0. `glassplat train splat` needs none"
+            )
+        if dataset.measured_points:
             positions, annotations = dataset.points.positions, annotations_of(dataset)
             fit_planes(positions, annotations, extent=dataset.extent, options=self.plane_fit)
         return Scene(self._population().initial(dataset.points, self.sh_degree), dataset.extent)
+
+    @staticmethod
+    def _lack_of_masks(dataset: Dataset) -> str:
+        count = sum(view.is_annotated for view in (*dataset.train, *dataset.test))
+        return f"none of the {count} masks of {dataset.root} names a pane" if count else f"{dataset.root} has no masks"
 
     def renderer(self) -> Planar:
         """The renderer of the finished scene, with all its layers."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import re
 import typing
 from dataclasses import dataclass
@@ -11,13 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from glassplat.data.dataset import Dataset
-from glassplat.data.errors import InputError, input_checked
+from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.data.masks import Polarity
 from glassplat.files.atomic import atomic_write
 from glassplat.files.cameras_json import write_cameras
 from glassplat.files.environment_image import write_equirect
 from glassplat.files.fields import Choice, Field, Number, Optional, Text, Whole, checked
-from glassplat.files.json_text import parse_json
+from glassplat.files.folders import make_folder
+from glassplat.files.json_text import parse_json, read_json
 from glassplat.files.reading import read_text
 from glassplat.files.scene_folder import read_scene, write_scene
 from glassplat.render.environment import equirect_from_environment
@@ -46,6 +48,17 @@ class RunSettings:
     mask_polarity: Polarity = "auto"
 
 
+FILES = (
+    "recipe.json",
+    "settings.json",
+    "log.jsonl",
+    "cameras.json",
+    "per_view.json",
+    "sheets",
+    "uses.png",
+    "index.html",
+)
+"""What a run writes beside its checkpoint, scene and metrics."""
 SETTINGS: dict[str, Field] = {
     "data": Text(),
     "iterations": Whole(1),
@@ -66,6 +79,7 @@ class RunDirectory:
     ```
     recipe.json  settings.json         what was run
     log.jsonl                          one line per logged step
+    train.lock                         held while a training writes here
     checkpoint.safetensors             to resume from
     cameras.json                       all cameras
     point_cloud/iteration_N/           point_cloud.ply, glass.ply, environment.safetensors, scene.json
@@ -91,9 +105,57 @@ class RunDirectory:
         """Where the metrics are."""
         return self.path / "results.json"
 
+    @property
+    def is_saved(self) -> bool:
+        """Whether there is something in it that took training to make."""
+        return any((self.path / name).exists() for name in (self.checkpoint.name, self.results.name, "point_cloud"))
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether a run was begun here, whatever has become of it."""
+        try:
+            self.recipe()
+        except InputError:
+            return False
+        return True
+
+    def check_vacant(self) -> None:
+        """Refuse to begin a run where something would be lost by it.
+
+        Raises:
+            InputError: the directory holds a run, or files of somebody else that have the names of a run's.
+        """
+        if self.checkpoint.exists():
+            raise InputError(
+                f"{self.path} already holds a run; pass --resume to go on with it, or choose another --output"
+            )
+        if self.is_saved:
+            raise InputError(f"{self.path} already holds a trained scene; choose another --output, or move it away")
+        found = [name for name in FILES if os.path.lexists(self.path / name)]
+        if found and not self.is_begun:
+            raise InputError(
+                f"{self.path} holds {first_names(found)}, which is not from a run of this version and would be "
+                "overwritten; choose another --output"
+            )
+
+    def check_saved(self) -> None:
+        """Refuse to go on with a run of which there is no checkpoint.
+
+        Raises:
+            InputError: there is none.
+        """
+        if self.checkpoint.is_file():
+            return
+        if self.is_saved:
+            raise InputError(
+                f"{self.path} holds a trained scene, but no {self.checkpoint.name} to go on from; train it again with "
+                "another --output"
+            )
+        raise InputError(f"nothing was saved yet in {self.path}; begin again without --resume")
+
     def begin(self, recipe: Any, settings: RunSettings, dataset: Dataset) -> None:
         """Creates the directory and records what is about to run."""
-        self.path.mkdir(parents=True, exist_ok=True)
+        make_folder(self.path)
         write_text(self.path / "recipe.json", recipe_to_json(recipe))
         write_text(self.path / "settings.json", json.dumps(dataclasses.asdict(settings), indent=2))
         write_cameras(self.path / "cameras.json", [(v.name, v.camera) for v in (*dataset.train, *dataset.test)])
@@ -116,6 +178,13 @@ class RunDirectory:
         path = self.path / "settings.json"
         with input_checked():
             return RunSettings(**checked(parse_json(self._read(path.name), str(path)), SETTINGS, str(path)))
+
+    def photographs(self) -> set[str] | None:
+        """Names of the photographs that the run was begun with; None where that is not recorded legibly."""
+        try:
+            return {entry["img_name"] for entry in read_json(self.path / "cameras.json")}
+        except (OSError, ValueError, TypeError, KeyError):
+            return None
 
     def export(self, scene: Scene, step: int) -> Path:
         """Writes the scene in the formats that others read; returns its folder."""

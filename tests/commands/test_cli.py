@@ -108,7 +108,9 @@ def test_planar_without_masks_says_what_to_annotate(tmp_path: Path, capsys: pyte
     capture = tmp_path / "capture"
     shutil.copytree(SCENE, capture, ignore=shutil.ignore_patterns("masks", "gt"))
     options = ["--output", str(tmp_path / "run"), "--downscale", "4", "--iterations", "20"]
-    fails_with(["train", "planar", "--data", str(capture), *options], capsys, "error:", "mask")
+    words = ("error:", "has no masks", "capture/masks", "`glassplat train splat` needs none")
+    fails_with(["train", "planar", "--data", str(capture), *options], capsys, *words)
+    assert not (tmp_path / "run").exists()
 
 
 def test_an_unknown_option_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -72,7 +72,7 @@ def test_a_wrong_option_ends_with_one_message(
     method, option, *_ = arguments
     output = tmp_path / "run"
     message = refused(["train", method, "--data", str(SCENE), "--output", str(output), *arguments[1:]], capsys)
-    named = {"--cap": "--mcmc.cap"}.get(option, option)
+    named = {"--cap": "--mcmc.cap", "--downscale": "downscale"}.get(option, option)
     assert message.startswith("error: ") and named in message and "expected" in message
     assert not output.exists()
 
