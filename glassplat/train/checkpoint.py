@@ -56,6 +56,7 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
         "active_sh_degree": {part: g.active_sh_degree for part, g in scene.gaussian_sets().items()},
         "updates": state.optimizer.updates,
         "paused": state.optimizer.paused,
+        "hurried": state.optimizer.hurried,
         "records": state.records,
     }
     with atomic_write(path) as temporary:
@@ -135,6 +136,7 @@ def restored_state(header: dict, tensors: dict[str, Tensor]) -> TrainState:
             {name: (first[name], second[name]) for name in first},
             updates=dict(header["updates"]),
             paused=dict(header.get("paused", {})),
+            hurried=dict(header.get("hurried", {})),
         ),
         statistics={part: ScreenStatistics(**under(statistics, f"{part}/")) for part in sorted(parts)},
         means=under(tensors, "means/"),

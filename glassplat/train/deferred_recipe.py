@@ -12,16 +12,15 @@ from glassplat.data.dataset import Dataset
 from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
 from glassplat.densify.propagate import NormalPropagation
-from glassplat.init.region import reflective_region
 from glassplat.losses.geometry import normal_consistency
 from glassplat.losses.reflectors import mean_strength, strength_outside
 from glassplat.losses.term import LossTerm, weighted
 from glassplat.render.deferred import INVISIBLE, Deferred, Shading
 from glassplat.render.splat import Splat
 from glassplat.scene.activations import logit
-from glassplat.scene.environment import Environment
 from glassplat.scene.scene import Scene
 from glassplat.train.background import BLACK
+from glassplat.train.environment_entry import AddEnvironment
 from glassplat.train.optimizer import Rate
 from glassplat.train.propagation import (
     GrowShAfterPropagation,
@@ -110,16 +109,11 @@ class DeferredRecipe:
     mcmc: McmcDensify = field(default_factory=McmcDensify)
 
     def initialise(self, dataset: Dataset) -> Scene:
-        """The first scene: one Gaussian per point that hardly reflects, and a random environment."""
+        """The first scene: one Gaussian per point that hardly reflects, and no environment yet."""
         primary = self._population().initial(dataset.points, self.sh_degree)
         strengths = torch.full((len(primary),), logit(self.first_strength))
         primary = replace(primary, channels={"logit_strength": strengths})
-        environment = Environment.random(
-            min(self.first_texels, self.texels), generator=torch.Generator().manual_seed(0)
-        )
-        region = self.region or reflective_region([view.camera for view in dataset.train])
-        environment = replace(environment, region=region)
-        return Scene(primary, dataset.extent, environment=environment)
+        return Scene(primary, dataset.extent)
 
     def renderer(self) -> Deferred:
         """The renderer of the finished scene, with all its layers."""
@@ -140,6 +134,7 @@ class DeferredRecipe:
             densify_until=population.densify_until,
         )
         beat = Every(self.rhythm.beat, 0.0, self.schedule.stop, self.rhythm.least, skip_multiples_of=3)
+        renderer = Deferred(self.background or BLACK, self.shading, depth=self.consistency_weight != 0)
         guidance = weighted(
             LossTerm("outside", self.outside_weight, strength_outside),
             LossTerm("strength", self.strength_weight, mean_strength),
@@ -148,7 +143,7 @@ class DeferredRecipe:
         reflection = Stage(
             name="2 reflection",
             share=self.schedule.stop - self.bootstrap,
-            renderer=Deferred(self.background or BLACK, self.shading, depth=self.consistency_weight != 0),
+            renderer=renderer,
             losses=(*image, *guidance, *population.terms),
             rates=self.rates.of("primary") | self.reflection_rates.of(),
             actions=(
@@ -156,20 +151,31 @@ class DeferredRecipe:
                 GrowShAfterPropagation(Every(self.rhythm.sh)),
                 *population.resets,
                 *(ResetAfterPropagation.following(reset) for reset in population.resets),
-                Propagate(beat, self.propagation, self.schedule),
+                Propagate(beat, self.propagation, self.schedule, renderer, matte_rates=self._matte_rates()),
                 RefineEnvironment(self.refinements, self.texels),
             ),
             motions=population.motions,
+            entry=AddEnvironment(min(self.first_texels, self.texels), self.region),
             densify_until=population.densify_until,
         )
         refinement = replace(
             reflection,
+            entry=None,
             name="3 refinement",
             share=1 - self.schedule.stop,
             renderer=Deferred(self.background or BLACK, self.shading, depth=False),
             losses=tuple(term for term in reflection.losses if term.name != "consistency"),
         )
         return bootstrap, reflection, refinement
+
+    def _matte_rates(self) -> dict[str, Rate]:
+        """What brings the learning rates to those of `splat`, where nothing reflects that higher ones would spoil."""
+        missing = GaussianRates().short_run_power - self.rates.short_run_power
+        return {
+            name: Rate(1.0, short_run_power=missing)
+            for name, rate in GaussianRates().of("primary").items()
+            if rate.short_run_power
+        }
 
     def _population(self) -> Population:
         means_rate = self.rates.of("primary")["primary.means"]
