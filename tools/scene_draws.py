@@ -23,10 +23,9 @@ Coating = Literal["mirror", "metal", "glaze", "patterned glaze"]
 
 SHAPES: tuple[Shape, ...] = ("ball", "egg", "box", "pebble", "torus")
 COATINGS: tuple[Coating, ...] = ("mirror", "metal", "glaze", "patterned glaze")
-MOST_BODIES = 3
-SIZES = ((0.55, 0.72), (0.33, 0.42), (0.26, 0.33))
-"""Least and largest radius of one body, of two and of three, world units."""
-DISTANCES = (0.0, 0.46, 0.52)
+SIZES = ((0.6, 0.75), (0.42, 0.5))
+"""Least and largest radius of a body that is alone, and of one of two, world units."""
+DISTANCES = (0.0, 0.55)
 """From the middle of the stand to the middle of each body, for as many bodies."""
 
 
@@ -73,7 +72,7 @@ class DrawnScene:
 def draw_scene(seed: int) -> DrawnScene:
     """The scene of a seed, the same one wherever it is drawn."""
     generator = np.random.default_rng(seed)
-    count = int(generator.integers(1, MOST_BODIES + 1))
+    count = int(generator.integers(1, len(SIZES) + 1))
     bodies = tuple(_draw_body(generator, count, number) for number in range(count))
     height = max(float(body.triangles.positions[:, 2].max()) for body in bodies)
     # Bodies were made to stand on z = 0; cameras look a little below the origin.
@@ -97,7 +96,7 @@ def _draw_body(generator: np.random.Generator, count: int, number: int) -> Body:
     shape = SHAPES[generator.integers(len(SHAPES))]
     size = generator.uniform(*SIZES[count - 1])
     triangles = _draw_shape(generator, shape, size)
-    angle = 2 * np.pi * number / count + generator.uniform(-0.2, 0.2)
+    angle = 2 * np.pi * number / count + generator.uniform(-0.1, 0.1)
     lowest = float(triangles.positions[:, 2].min())
     offset = np.array([DISTANCES[count - 1] * np.cos(angle), DISTANCES[count - 1] * np.sin(angle), -lowest])
     return Body(
@@ -129,7 +128,7 @@ def _radius_function(generator: np.random.Generator, shape: Shape, size: float) 
         return lambda d: (1 + taper * d[..., 2]) / (1 + taper) * np.sum((d / half_axes) ** 2, axis=-1) ** -0.5
     if shape == "box":
         power = generator.uniform(3.5, 6.0)
-        return lambda d: 0.85 * np.sum(np.abs(d / half_axes) ** power, axis=-1) ** (-1 / power)
+        return lambda d: 0.75 * np.sum(np.abs(d / half_axes) ** power, axis=-1) ** (-1 / power)
     depth, frequency, seed = generator.uniform(0.15, 0.35), generator.uniform(0.25, 0.45), int(generator.integers(1000))
     return lambda d: size * (1 - depth * solid_noise(d, frequency, seed))
 

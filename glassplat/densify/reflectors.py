@@ -1,4 +1,8 @@
-"""What reflects, and what looks as if it should: shares of what the views show."""
+"""What reflects, and what looks as if it should: shares of what the views show.
+
+The paper counts reflective Gaussians. But a mirror ball that fills a third of the images may be a hundredth of the
+Gaussians, of which most stand in empty space at first, and in a matte scene as many reflect a little.
+"""
 
 from __future__ import annotations
 
@@ -26,39 +30,37 @@ class Search:
 
     Attributes:
         views: how many training views to look at.
-        strength: Gaussians of more than this strength reflect (the paper's criterion for the end).
+        strength: Gaussians of more than this strength cannot have been overlooked (the paper's "reflective").
         spread: standard deviation of the residual over the views, sRGB, from which it turns with the view.
     """
 
     views: int = 12
     strength: float = 0.1
-    spread: float = 0.08
+    spread: float = 0.04
 
     @torch.no_grad()
     def reflective(self, scene: Scene, views: Sequence[View]) -> float:
-        """Share of what is seen that reflects."""
+        """Share of what is seen that is reflection: the mean strength."""
         shown = sum((contributions(scene, view.camera) for view in self._chosen(views)), torch.zeros(()))
-        return share_in_region(scene, shown, self._reflects(scene))
+        return mean_in_region(scene, shown, torch.sigmoid(scene.primary.channels["logit_strength"]))
 
     @torch.no_grad()
     def turning(self, scene: Scene, views: Sequence[View], renderer: Deferred) -> float:
         """Share of what is seen that does not reflect, although its residual turns with the view."""
         shown, spreads = residual_spreads(scene, self._chosen(views), renderer)
-        return share_in_region(scene, shown, ~self._reflects(scene) & (spreads > self.spread))
+        reflects = scene.primary.channels["logit_strength"] > logit(self.strength)
+        return mean_in_region(scene, shown, ~reflects & (spreads > self.spread))
 
     def _chosen(self, views: Sequence[View]) -> list[View]:
         """Evenly among all of them."""
         count = min(self.views, len(views))
         return [views[len(views) * number // count] for number in range(count)]
 
-    def _reflects(self, scene: Scene) -> Tensor:
-        return scene.primary.channels["logit_strength"] > logit(self.strength)
 
-
-def share_in_region(scene: Scene, shown: Tensor, selected: Tensor) -> float:
-    """Of what is shown [N] of the Gaussians in the region, the share of those selected [N]; 0 where nothing is."""
+def mean_in_region(scene: Scene, shown: Tensor, values: Tensor) -> float:
+    """Mean of values [N] over what is shown [N] of the Gaussians in the region; 0 where nothing is."""
     shown = torch.where(in_region(scene), shown, 0)
-    return float(shown[selected].sum() / shown.sum().clamp(min=1e-6))
+    return float((shown * values).sum() / shown.sum().clamp(min=1e-6))
 
 
 def in_region(scene: Scene) -> Tensor:

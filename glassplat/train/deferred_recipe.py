@@ -148,10 +148,11 @@ class DeferredRecipe:
             rates=self.rates.of("primary") | self.reflection_rates.of(),
             actions=(
                 *population.edits,
+                # Before the resets: it looks at what is seen, also at the beats that it leaves to them.
+                Propagate(beat, self.propagation, self.schedule, renderer, matte_rates=self._matte_rates()),
                 GrowShAfterPropagation(Every(self.rhythm.sh)),
                 *population.resets,
                 *(ResetAfterPropagation.following(reset) for reset in population.resets),
-                Propagate(beat, self.propagation, self.schedule, renderer, matte_rates=self._matte_rates()),
                 RefineEnvironment(self.refinements, self.texels),
             ),
             motions=population.motions,

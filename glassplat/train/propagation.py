@@ -21,15 +21,16 @@ from glassplat.train.state import TrainState
 
 log = logging.getLogger("glassplat.train")
 
-ENDED, MOST, GREW = "propagation ended", "most reflective", "reflective grew"
-"""Names in `TrainState.records`: the step of the end, the largest share that reflects, and the step of its growth."""
+ENDED, MOST, GREW, TURNS = "propagation ended", "most reflective", "reflective grew", "turns with the view"
+"""Names in `TrainState.records`: the step of the end, the largest share of reflection, the step of its growth, and the
+share that does not reflect, but turns with the view."""
 GROWTH = 0.01
-"""By how much the share has to rise to count as growing; a ratio would let the few that noise makes reflective in a
-matte scene go on for ever."""
-FOUND = 0.01
+"""By how much the share has to rise to count as growing; a ratio would let the little that noise makes of it in a matte
+scene go on for ever."""
+FOUND = 0.03
 """Share from which on something reflective has been found."""
-LOOKS_REFLECTIVE = 0.05
-"""Share that turns with the view, from which on it is worth to look for longer."""
+LOOKS_REFLECTIVE = 0.06
+"""Share that turns with the view, below which there is nothing to look for."""
 NOTHING_FOUND = "step %d: nothing reflective was found, so that the rest of the run trains like splat; %s"
 MATTE = "nothing looks different from different sides either: splat suits such a scene"
 OVERLOOKED = (
@@ -45,8 +46,8 @@ class PropagationSchedule:
     Attributes:
         end: `settled` ends it when what reflects has stopped growing (the paper's criterion), `fixed` at `stop`.
         stop: share of the run after which nothing is propagated any more.
-        patience: beats without growth after which it counts as settled. A strength needs some hundred steps to be seen,
-            however short the run. Twice as many where nothing reflects yet, but looks as if it did.
+        patience: beats without growth after which it counts as settled; a strength needs some hundred steps to be seen,
+            however short the run. One is enough where nothing reflects nor looks as if it did.
         pause: steps for which raised opacities are held.
     """
 
@@ -86,7 +87,7 @@ class Propagate:
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state`, until propagation has ended."""
-        if has_ended(state):
+        if has_ended(state) or clock.step < min(self._first(clock), self._last(clock)):
             return False
         if clock.step >= self._last(clock) or self._settles(state, dataset, clock):
             self._end(state, dataset, clock)
@@ -105,6 +106,13 @@ class Propagate:
         """All of them."""
         return replace(self.when, skip_multiples_of=None)
 
+    def _first(self, clock: Clock) -> int:
+        """The first beat that is left to a reset.
+
+        Before it, what random points became is still in the way everywhere; made opaque, it hides the surfaces.
+        """
+        return self.when.interval(clock) * (self.when.skip_multiples_of or 1)
+
     def _last(self, clock: Clock) -> int:
         """The step at which it ends at the latest."""
         return round(self.schedule.stop * clock.iterations)
@@ -117,25 +125,35 @@ class Propagate:
         if GREW not in state.records or share > state.records[MOST] + GROWTH:
             state.records |= {MOST: share, GREW: clock.step}
         waited = (clock.step - state.records[GREW]) / self.when.interval(clock)
-        if waited < self.schedule.patience:
+        return waited >= (1 if self._looks_matte(state, dataset, clock) else self.schedule.patience)
+
+    def _looks_matte(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Whether nothing reflects nor turns with the view; keeps the record.
+
+        That is asked at the beat after a reset. At others, raised opacities have whatever stands in the way turn with
+        the view.
+        """
+        if state.records[MOST] >= FOUND:
             return False
-        return (
-            state.records[MOST] >= FOUND
-            or waited >= 2 * self.schedule.patience
-            or self.search.turning(state.scene, dataset.train, self.renderer) < LOOKS_REFLECTIVE
-        )
+        if clock.step % self._first(clock) == self.when.interval(clock):
+            state.records[TURNS] = self.search.turning(state.scene, dataset.train, self.renderer)
+        return state.records.get(TURNS, 1.0) < LOOKS_REFLECTIVE
 
     def _end(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
         """Notes the end and says what was found."""
         state.records[ENDED] = clock.step
-        share = self.search.reflective(state.scene, dataset.train)
+        share = max(self.search.reflective(state.scene, dataset.train), state.records.get(MOST, 0.0))
         if share >= FOUND:
-            log.info("step %d: normal propagation has ended, %.0f %% of what is seen reflects", clock.step, 100 * share)
+            log.info(
+                "step %d: normal propagation has ended, %.0f %% of what is seen is reflection", clock.step, 100 * share
+            )
             return
         hurried = {name: rate.at(0.0, 1.0, clock.iterations) for name, rate in self.matte_rates.items()}
         state.optimizer.hurried |= hurried
-        turning = self.search.turning(state.scene, dataset.train, self.renderer)
-        log.warning(NOTHING_FOUND, clock.step, MATTE if turning < LOOKS_REFLECTIVE else OVERLOOKED % (100 * turning))
+        turns = state.records.get(TURNS)
+        if turns is None:
+            turns = self.search.turning(state.scene, dataset.train, self.renderer)
+        log.warning(NOTHING_FOUND, clock.step, MATTE if turns < LOOKS_REFLECTIVE else OVERLOOKED % (100 * turns))
 
 
 @dataclass(frozen=True)
