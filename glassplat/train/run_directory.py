@@ -13,8 +13,6 @@ from typing import Any
 from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.data.masks import Polarity
-from glassplat.data.options import options_from_json
-from glassplat.data.ranges import Downscale, Seed, Several
 from glassplat.files.atomic import atomic_write
 from glassplat.files.cameras_json import write_cameras
 from glassplat.files.environment_image import write_equirect
@@ -41,9 +39,9 @@ class RunSettings:
     """
 
     data: str
-    iterations: Several
-    downscale: Downscale = 1.0
-    seed: Seed = 0
+    iterations: int
+    downscale: float = 1.0
+    seed: int = 0
     device: str = "cpu"
     mask_polarity: Polarity = "auto"
 
@@ -153,11 +151,7 @@ class RunDirectory:
 
     def recipe(self) -> Any:
         """The recorded recipe."""
-        written = self._read("recipe.json")
-        try:
-            return recipe_from_json(written)
-        except InputError as error:
-            raise InputError(f"{self.path / 'recipe.json'}: {error}") from error
+        return recipe_from_json(self._read("recipe.json"), str(self.path / "recipe.json"))
 
     def was_begun_with(self, recipe: Any) -> bool:
         """Whether `begin` recorded just this recipe.
