@@ -112,12 +112,28 @@ def parsed(arguments: list[str]) -> Any:
     config = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes)
     name = arguments[0] if arguments else ""
     if name in COMMANDS:
-        return tyro.cli(command_class(name), prog=f"glassplat {name}", args=arguments[1:], config=config)
+        from glassplat.commands.arguments import check_arguments
+        from glassplat.data.options import check_options
+
+        check_arguments(arguments)
+        kind, options = chosen(name, arguments[1:])
+        command: Any = tyro.cli(kind, prog=f"glassplat {name}", args=options, config=config)
+        check_options(command)
+        return command
     # Nothing is left to run after the list of commands; only a shell's completions need to know every option.
     complete = name.startswith("--tyro-")
-    kinds = {known: command_class(known) if complete else stub(known) for known in COMMANDS}
+    kinds = {known: chosen(known, [])[0] if complete else stub(known) for known in COMMANDS}
     tyro.cli(overview(kinds), prog="glassplat", description=DESCRIPTION, args=arguments, config=config)
     raise SystemExit(USAGE_CODE)
+
+
+def chosen(name: str, options: list[str]) -> tuple[type, list[str]]:
+    """What tyro makes of a command's arguments, and these; those of `train` decide on its defaults."""
+    if name == "train":
+        from glassplat.commands.train_options import train_command
+
+        return train_command(options)
+    return command_class(name), options
 
 
 def command_class(name: str) -> type:

@@ -8,8 +8,10 @@ from pathlib import Path
 from rich.console import Console
 
 from glassplat.commands.evaluate import evaluate_run, print_results
+from glassplat.commands.messages import say
 from glassplat.commands.stored_run import open_run
 from glassplat.commands.train import Train
+from glassplat.data.ranges import Seed, Several
 from glassplat.kernels.devices import DeviceName
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.run_directory import RunDirectory
@@ -30,8 +32,8 @@ class Demo:
     """
 
     output: Path = Path("runs/demo")
-    iterations: int = 3000
-    seed: int = 0
+    iterations: Several = 3000
+    seed: Seed = 0
     device: DeviceName = "auto"
 
     def run(self, console: Console) -> None:
@@ -44,7 +46,7 @@ class Demo:
             run.run(console)
             results.append(evaluate_run(open_run(folder, self.device)))
         print_results(console, *results)
-        console.print(f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
+        say(console, f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
 
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""

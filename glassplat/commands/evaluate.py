@@ -28,14 +28,16 @@ class Evaluate:
     Attributes:
         run_directory: the run's directory.
         device: where to render; auto takes an NVIDIA GPU where one can be used.
+        data: where the capture is now, if it has moved since training.
     """
 
     run_directory: tyro.conf.Positional[Path]
     device: DeviceName = "auto"
+    data: Path | None = None
 
     def run(self, console: Console) -> None:
         """Evaluates and reports."""
-        stored = open_run(self.run_directory, self.device)
+        stored = open_run(self.run_directory, self.device, self.data)
         with console.status(f"rendering {len(stored.dataset.test)} test views"):
             results = evaluate_run(stored)
         print_results(console, results)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from glassplat.data.dataset import Dataset
@@ -23,6 +23,7 @@ from glassplat.evaluate.sheet import comparison_sheet
 from glassplat.evaluate.uses import Uses
 from glassplat.files.atomic import atomic_write
 from glassplat.files.images import write_image
+from glassplat.files.picture_paths import flat_picture_names
 from glassplat.render.glazing import Blend
 
 USES_FILE = "uses.png"
@@ -76,10 +77,7 @@ class Report:
 
 def sheet_names(names: list[str]) -> dict[str, str]:
     """File of each view's sheet, relative to the run; distinct also for `a.jpg` and `a.png`."""
-    flat = {name: name.replace("/", "_") for name in names}
-    stems = {name: PurePosixPath(file).stem for name, file in flat.items()}
-    chosen = stems if len(set(stems.values())) == len(names) else flat
-    return {name: f"sheets/{file}.png" for name, file in chosen.items()}
+    return {name: f"sheets/{file}" for name, file in flat_picture_names(names).items()}
 
 
 def overview_page(

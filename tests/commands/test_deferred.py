@@ -29,7 +29,7 @@ def run(tmp_path: Path) -> Path:
     """A run of a few steps, whose capture knows its environment."""
     capture = write_object_capture(tmp_path / "ball")
     write_equirect(capture / "environment.exr", 0.2 + 0.6 * torch.rand(8, 16, 3))
-    options = ["--data", str(capture), "--output", str(tmp_path / "run"), "--iterations", "8"]
+    options = ["--data", str(capture), "--output", str(tmp_path / "run"), "--iterations", "12"]
     assert main(["train", "deferred", *options, "--sh-degree", "1", "--texels", "8", "--first-texels", "4"]) == 0
     return tmp_path / "run"
 
@@ -58,7 +58,7 @@ def test_the_stored_scene_is_the_trained_one(run: Path) -> None:
     }
     for name, tensor in trained.parameters().items():
         torch.testing.assert_close(stored.parameters()[name], tensor, rtol=0, atol=0, msg=name)
-    panorama = read_equirect(run / "point_cloud" / "iteration_8" / "environment.png")
+    panorama = read_equirect(run / "point_cloud" / "iteration_12" / "environment.png")
     expected = equirect_from_environment(trained.environment, panorama.shape[0])
     torch.testing.assert_close(panorama, expected, atol=0.01, rtol=0)
 
