@@ -9,6 +9,7 @@ import math
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from os.path import lexists
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,7 @@ def read_model(folder: Path) -> Model:
     if not images:
         raise InputError(f"{folder / f'images{suffix}'} registers no photograph; expected a finished reconstruction")
     points_path = folder / f"points3D{suffix}"
-    rows = _records_of(points_path) if points_path.is_file() else []
+    rows = _records_of(points_path) if lexists(points_path) else []
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
     return Model(lenses, images, PointCloud.from_arrays(table[:, :3], table[:, 3:]))
 
