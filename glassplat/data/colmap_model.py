@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from glassplat.data.capture import PointCloud
-from glassplat.data.errors import InputError
+from glassplat.data.errors import InputError, input_checked
 from glassplat.data.lens import make_lens
 from glassplat.files.reading import reading
 from glassplat.scene.pose import rotation_from_quat
@@ -74,7 +74,8 @@ def read_model(folder: Path) -> Model:
     points_path = folder / f"points3D{suffix}"
     rows = _records_of(points_path) if lexists(points_path) else []
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
-    return Model(lenses, images, PointCloud.from_arrays(table[:, :3], table[:, 3:]))
+    with input_checked(points_path):
+        return Model(lenses, images, PointCloud.from_arrays(table[:, :3], table[:, 3:]))
 
 
 def pose_matrix(image: ModelImage) -> NDArray[np.float64]:

@@ -124,4 +124,5 @@ def read_points(root: Path, settings: Settings) -> PointCloud | None:
         if any(c is None for c in rgb)
         else np.stack([c for c in rgb if c is not None], 1)
     )
-    return PointCloud.from_arrays(positions, colors) if len(positions) else None
+    with input_checked(path):
+        return PointCloud.from_arrays(positions, colors) if len(positions) else None
