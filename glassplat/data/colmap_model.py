@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 import torch
 from numpy.typing import NDArray
 
 from glassplat.data.capture import PointCloud
+from glassplat.data.colmap_library import pycolmap
 from glassplat.data.errors import InputError, input_checked
 from glassplat.data.lens import make_lens
 from glassplat.files.reading import reading

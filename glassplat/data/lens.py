@@ -8,10 +8,10 @@ from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 from PIL import Image
 
+from glassplat.data.colmap_library import pycolmap
 from glassplat.data.errors import InputError
 
 Interpolation = Literal["BILINEAR", "NEAREST_NEIGHBOR"]
