@@ -205,7 +205,8 @@ def _check_observations(line: str, name: str) -> None:
 def _text_points(stream: Iterator[str]) -> Iterator[tuple[float, ...]]:
     for line in _records(stream):
         fields = line.split(maxsplit=7)
-        yield (*(float(value) for value in fields[1:4]), *(float(int(value)) for value in fields[4:7]))
+        _, x, y, z, red, green, blue = fields[:7]
+        yield (float(x), float(y), float(z), float(int(red)), float(int(green)), float(int(blue)))
 
 
 PARSERS: dict[str, tuple[Callable[[_Bytes], Iterator[Any]], Callable[[Iterator[str]], Iterator[Any]]]] = {
