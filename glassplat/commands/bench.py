@@ -28,9 +28,10 @@ from glassplat.commands.messages import say
 from glassplat.commands.train import Train
 from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
+from glassplat.data.ranges import Downscale, Seed, Several
 from glassplat.files.folders import check_folder
 from glassplat.train.ablations import ABLATIONS, Ablated, Ablation, Switch
-from glassplat.train.recipe import RECIPES
+from glassplat.train.recipe import RECIPES, Preset, recipe_of
 from glassplat.train.run_directory import write_text
 
 Method = Literal["splat", "planar", "deferred"]
@@ -52,6 +53,7 @@ class BenchScenes:
         output: where the tables and one directory per run go.
         methods: which methods.
         strategies: how Gaussians are added and removed.
+        presets: the recipes that this project found best, or those of the papers.
         seeds: one run for each.
         iterations: length of each run.
         downscale: shrink the photographs by this factor.
@@ -62,15 +64,17 @@ class BenchScenes:
     output: Path
     methods: tuple[Method, ...] = ("splat", "planar")
     strategies: tuple[Strategy, ...] = ("default",)
-    seeds: tuple[int, ...] = (0,)
-    iterations: int = 7000
-    downscale: float = 1.0
+    presets: tuple[Preset, ...] = ("glassplat",)
+    seeds: tuple[Seed, ...] = (0,)
+    iterations: Several = 7000
+    downscale: Downscale = 1.0
     mask_polarity: Polarity = "auto"
 
     def run(self, console: Console) -> None:
         """Runs what is missing and writes `scenes.md` and `scenes.json`, of earlier commands' runs in it too."""
         recipes = {
-            variant_name(method, strategy): with_strategy(RECIPES[method](), strategy)
+            variant_name(method, strategy, preset): with_strategy(recipe_of(method, preset), strategy)
+            for preset in unique(self.presets, "presets")
             for strategy in unique(self.strategies, "strategies")
             for method in unique(self.methods, "methods")
         }
@@ -100,9 +104,9 @@ class BenchAblation:
     output: Path
     method: Ablated = "planar"
     switches: tuple[Switch, ...] = ()
-    seeds: tuple[int, ...] = (0,)
-    iterations: int = 7000
-    downscale: float = 1.0
+    seeds: tuple[Seed, ...] = (0,)
+    iterations: Several = 7000
+    downscale: Downscale = 1.0
     mask_polarity: Polarity = "auto"
 
     def run(self, console: Console) -> None:
@@ -155,18 +159,37 @@ class Bench:
         return f"finished runs stay in {self.comparison.output}: repeat the command to go on"
 
 
-def variant_name(method: str, strategy: str) -> str:
-    """What tables and directories call a method with a strategy."""
-    return method if strategy == "default" else f"{method}-{strategy}"
+def variant_name(method: str, strategy: str, preset: Preset = "glassplat") -> str:
+    """What tables and directories call a method with a strategy and a preset."""
+    name = method if strategy == "default" else f"{method}-{strategy}"
+    return name if preset == "glassplat" else f"{name}-{preset}"
 
 
 def all_variants() -> dict[str, Any]:
     """The recipe of every variant that a table of scenes may hold."""
     return {
-        variant_name(method, strategy): with_strategy(RECIPES[method](), strategy)
+        variant_name(method, strategy, preset): with_strategy(recipe_of(method, preset), strategy)
+        for preset in get_args(Preset)
         for strategy in get_args(Strategy)
         for method in get_args(Method)
     }
+
+
+def compared_variants() -> list[tuple[str, str]]:
+    """Which variants tables of scenes set against each other: methods and `splat`, and recipes and their papers'."""
+    strategies, presets = get_args(Strategy), get_args(Preset)
+    gains = [
+        (variant_name(method, strategy, preset), variant_name("splat", strategy, preset))
+        for preset in presets
+        for strategy in strategies
+        for method in ("planar", "deferred")
+    ]
+    changes = [
+        (variant_name(method, strategy), variant_name(method, strategy, "paper"))
+        for strategy in strategies
+        for method in get_args(Method)
+    ]
+    return gains + changes
 
 
 def off_name(switch: Switch) -> str:
@@ -238,12 +261,7 @@ def planned_runs(bench: BenchScenes | BenchAblation, recipes: dict[str, Any]) ->
 
 def write_scenes(output: Path, finished: Sequence[FinishedRun]) -> None:
     """Writes what is finished."""
-    pairs = [
-        Pair(f"{reflective} - {splat}", reflective, splat)
-        for strategy in get_args(Strategy)
-        for reflective in (variant_name("planar", strategy), variant_name("deferred", strategy))
-        for splat in (variant_name("splat", strategy),)
-    ]
+    pairs = [Pair(f"{first} - {second}", first, second) for first, second in compared_variants()]
     measured = measured_runs(finished)
     reached, compared = means(measured), differences(measured, pairs)
     tables = [means_table(reached, "Scenes", " ".join([SPREAD_NOTE, *remarks(finished)]))]

@@ -11,6 +11,7 @@ from glassplat.commands.evaluate import evaluate_run, print_results
 from glassplat.commands.messages import say
 from glassplat.commands.stored_run import open_run
 from glassplat.commands.train import Train
+from glassplat.data.ranges import Seed, Several
 from glassplat.kernels.devices import DeviceName
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.run_directory import RunDirectory
@@ -31,8 +32,8 @@ class Demo:
     """
 
     output: Path = Path("runs/demo")
-    iterations: int = 3000
-    seed: int = 0
+    iterations: Several = 3000
+    seed: Seed = 0
     device: DeviceName = "auto"
 
     def run(self, console: Console) -> None:

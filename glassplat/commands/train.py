@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Generic, TypeVar
 
 import tyro
 from rich.console import Console
@@ -12,29 +12,25 @@ from rich.console import Console
 from glassplat.commands.messages import say, warn
 from glassplat.commands.training_progress import TrainingProgress
 from glassplat.data.dataset import Dataset, load_dataset
-from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
+from glassplat.data.ranges import Downscale, Positive, Seed, Several
 from glassplat.kernels.devices import DeviceName, chosen_device
 from glassplat.train.background import photo_background
-from glassplat.train.deferred_recipe import DeferredRecipe
-from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.recipe import Preset, Recipe
 from glassplat.train.run import CHECKPOINT_SECONDS, check_output, run_training
 from glassplat.train.run_directory import RunDirectory, RunSettings
-from glassplat.train.splat_recipe import SplatRecipe
 
-AnyRecipe = (
-    Annotated[SplatRecipe, tyro.conf.subcommand("splat")]
-    | Annotated[PlanarRecipe, tyro.conf.subcommand("planar")]
-    | Annotated[DeferredRecipe, tyro.conf.subcommand("deferred")]
-)
+RecipeKind = TypeVar("RecipeKind", bound=Recipe)
 
 
 @dataclass(frozen=True)
-class Train:
+class Train(Generic[RecipeKind]):
     """Train a scene from photographs.
 
     Attributes:
-        recipe: method and its options.
+        recipe: method and its options; `train_options` tells the command line which there are.
+        preset: what the options of the method are unless they are given: those that this project found best, or those
+            of the paper, to compare with its results.
         data: directory of the capture (COLMAP or transforms.json; pane masks in masks/).
         output: directory of the run.
         iterations: length of the run; every schedule stretches with it.
@@ -47,16 +43,17 @@ class Train:
             run is interrupted, in any case.
     """
 
-    recipe: Annotated[AnyRecipe, tyro.conf.arg(name="")]
+    recipe: Annotated[RecipeKind, tyro.conf.arg(name="")]
     data: Path
     output: Path
-    iterations: int = 30_000
-    downscale: float = 1.0
-    seed: int = 0
+    iterations: Several = 30_000
+    downscale: Downscale = 1.0
+    seed: Seed = 0
     device: DeviceName = "auto"
     resume: bool = False
     mask_polarity: Polarity = "auto"
-    checkpoint_every: float = CHECKPOINT_SECONDS
+    checkpoint_every: Positive = CHECKPOINT_SECONDS
+    preset: Preset = "glassplat"
 
     def run(self, console: Console) -> None:
         """Trains, with a progress bar or lines."""
@@ -85,10 +82,6 @@ class Train:
 
     def _check(self) -> None:
         """Refuse what can be told to fail before photographs are read."""
-        if self.iterations < 1:
-            raise InputError(f"--iterations is {self.iterations}; expected at least 1")
-        if not self.checkpoint_every > 0:
-            raise InputError(f"--checkpoint-every is {self.checkpoint_every}; expected more than 0 seconds")
         check_output(RunDirectory(self.output), resume=self.resume)
 
     def left_behind(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from glassplat.data.dataset import View
+from glassplat.losses.term import LossFunction
 from glassplat.render.frame import Frame
 from glassplat.scene.scene import Scene
 
@@ -32,6 +34,11 @@ def mean_scale(frame: Frame, view: View, scene: Scene) -> Tensor:
     """
     scales = _direct(scene.primary.log_scales, frame).exp()
     return scales.sum() / max(scales.numel(), 1) / scene.extent
+
+
+def of_all(term: LossFunction) -> LossFunction:
+    """A term of what the view shows directly, as one of all Gaussians."""
+    return lambda frame, view, scene: term(replace(frame, direct=None), view, scene)
 
 
 def view_dependence(frame: Frame, view: View, scene: Scene) -> Tensor:

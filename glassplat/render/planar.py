@@ -85,6 +85,9 @@ class Planar:
         deviation: also compute the depth deviation where a pane is hit (Eq. 14), for training.
         deviation_depth_gradient: let the deviation's gradient pass through the mean depth D_t.
         blend: space in which Eqs. 1 and 13 hold: linear radiance, where light adds up, or sRGB as in the paper.
+        nearest_only: of panes that are seen through one another, show the nearest only, as the paper does.
+        tells_mirrored: whether the records of a probed frame tell mirror images from what is seen directly, and how
+            much is left of either; if not, all of them count alike.
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -94,6 +97,8 @@ class Planar:
     deviation: bool = False
     deviation_depth_gradient: bool = False
     blend: Blend = "linear"
+    nearest_only: bool = False
+    tells_mirrored: bool = True
 
     def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are."""
@@ -110,7 +115,7 @@ class Planar:
             layers |= {"transmission": first.image, "reflection": torch.zeros_like(first.image)}
             layers |= {"strength": nothing, "share": nothing}
             return Frame(first.image, layers, direct=first.direct, screen=first.screen)
-        seen = seen_panes(scene.planes, camera, hits, first.mask)
+        seen = seen_panes(scene.planes, camera, hits, first.mask, most=1 if self.nearest_only else None)
         second = self._second_pass(scene, camera, seen, probed)
         masks = self._visibilities(scene, camera, seen, first)
         result = glazed(
@@ -124,7 +129,7 @@ class Planar:
             blend=self.blend,
         )
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
-        screen = weighted_screen(first, second, hits, result, self.blend) if probed else ()
+        screen = self._screen(first, second, hits, result) if probed else ()
         return Frame(result.rgb, layers, first.direct, second.mirrored, screen)
 
     def check(self, scene: Scene) -> None:
@@ -188,6 +193,12 @@ class Planar:
             colors = over_background(reflections[..., :3], result.alpha, self.background)
             reflections = torch.cat([colors, reflections[..., 3:]], dim=-1)
         return SecondPass(reflections, shown(projected), screen)
+
+    def _screen(self, first: FirstPass, second: SecondPass, hits: PaneHits, result: Glazed) -> tuple[ScreenPass, ...]:
+        """The records of both passes."""
+        if self.tells_mirrored:
+            return weighted_screen(first, second, hits, result, self.blend)
+        return (*first.screen, *(replace(record, direct=True) for record in second.screen))
 
     def _visibilities(self, scene: Scene, camera: Camera, seen: SeenPanes, first: FirstPass) -> list[Tensor]:
         """[H, W] for each of `seen.order`: how much of that pane is visible."""

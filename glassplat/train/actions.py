@@ -77,8 +77,10 @@ class Densify:
         return f"densify {self.part}"
 
     def due(self, clock: Clock) -> bool:
-        """Whether to act after this step; never more often than about once per pass over the views."""
-        least = max(self.densifier.interval, min(clock.views, 2 * self.densifier.interval))
+        """Whether to act after this step."""
+        least = self.densifier.interval
+        if self.densifier.whole_passes:
+            least = max(least, min(clock.views, 2 * least))
         return Every(0.0, self.densifier.start, self.densifier.stop, least).due(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
@@ -87,7 +89,7 @@ class Densify:
         gaussians = state.scene.gaussian_sets()[self.part]
         if statistics is None or len(gaussians) == 0:
             return False
-        factor = threshold_factor(dataset)
+        factor = threshold_factor(dataset) if self.densifier.adapt_to_size else 1.0
         densifier = replace(
             self.densifier,
             gradient_threshold=self.densifier.gradient_threshold * factor,
@@ -187,11 +189,11 @@ class Relocate:
 class Explore:
     """Moves the primary Gaussians that a step's view shows at random, the transparent ones most (3DGS-MCMC).
 
-    The paper moves all of them in every step. Those that the view does not show have nothing to pull them back, and
-    what few views show would wander off.
+    The paper moves all of them in every step, as `densifier.reach` may ask for. Those that the view does not show have
+    nothing to pull them back, and what few views show would wander off.
 
     Attributes:
-        densifier: holds how strong the noise is.
+        densifier: holds how strong the noise is, and what it reaches.
         rate: learning rate of the positions, which the noise follows.
     """
 
@@ -203,7 +205,7 @@ class Explore:
         primary, extent = state.scene.primary, state.scene.extent
         rate = self.rate.at(clock.progress, 1.0, clock.iterations)
         offsets = self.densifier.noise(primary, rate=rate, extent=extent, generator=state.generator("explore"))
-        if visible is not None:
+        if visible is not None and self.densifier.reach == "shown":
             offsets *= visible[:, None]
         state.scene = replace(state.scene, primary=primary.with_tensors({"means": primary.means + offsets}))
 
@@ -235,6 +237,7 @@ class PerturbOpacity:
 
     when: Every
     amplitude: float = 0.4
+    bounds: tuple[float, float] = (0.01, 0.99)
     name: str = "perturb opacity"
 
     def due(self, clock: Clock) -> bool:
@@ -253,6 +256,7 @@ class PerturbOpacity:
             state.scene.primary,
             selected,
             amplitude=self.amplitude,
+            bounds=self.bounds,
             generator=state.generator(self.name),
         )
         state.scene = replace(state.scene, primary=perturbed)

@@ -157,9 +157,7 @@ def restored_state(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     Raises:
         InputError: the tensors do not belong to the header, or to one another.
     """
-    broken = sorted(name for name, tensor in tensors.items() if not tensor.is_floating_point())
-    if broken:
-        raise InputError(f"{broken[0]} holds {tensors[broken[0]].dtype}; expected floating-point numbers")
+    check_types(tensors)
     with input_checked():
         scene = restored_scene(header, tensors)
     first, second = under(tensors, "first/"), under(tensors, "second/")
@@ -231,6 +229,16 @@ def restored_statistics(tensors: Mapping[str, Tensor], scene: Scene) -> dict[str
             raise InputError(f"the statistics of {part} are {sorted(known)}; expected {sorted(expected)}")
         found[part] = ScreenStatistics(**known)
     return found
+
+
+def check_types(tensors: Mapping[str, Tensor]) -> None:
+    """Raises InputError unless all tensors hold floating-point numbers of one precision."""
+    for name, tensor in tensors.items():
+        if not tensor.is_floating_point():
+            raise InputError(f"{name} holds {tensor.dtype}; expected floating-point numbers")
+        first = next(iter(tensors.values()))
+        if tensor.dtype != first.dtype:
+            raise InputError(f"{name} holds {tensor.dtype}, other tensors {first.dtype}; expected one precision")
 
 
 def check_shapes(tensors: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...] | None], of: str) -> None:

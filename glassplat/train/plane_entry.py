@@ -38,6 +38,8 @@ class PlaneEntry:
         glass_count: glass Gaussians on each pane.
         seed: of the glass Gaussians' places.
         detect_mirrors: tell mirrors from glass, unless `fit` names the mirrors.
+        fixed_mirrors: mirrors keep their reflectance, and what is behind them moves to their front; if not, they only
+            start at that reflectance.
         seed_reflections: start what no photograph shows directly from the virtual points behind the panes.
     """
 
@@ -45,6 +47,7 @@ class PlaneEntry:
     glass_count: int
     seed: int
     detect_mirrors: bool = True
+    fixed_mirrors: bool = True
     seed_reflections: bool = True
 
     def __call__(self, state: TrainState, dataset: Dataset) -> Work:
@@ -58,6 +61,8 @@ class PlaneEntry:
             found = yield from mirrors_found(scene, dataset)
             log.info("mirrors among the panes: %s", ", ".join(map(str, found)) or "none")
             planes = with_mirrors(planes, found, self.fit.mirror_reflectance)
+        if not self.fixed_mirrors:
+            planes = replace(planes, mirrors=())
         state.scene = replace(scene, planes=planes)
         state.statistics.clear()
         for row, label in enumerate(planes.labels):

@@ -162,7 +162,7 @@ class RunDirectory:
 
     def recipe(self) -> Any:
         """The recorded recipe."""
-        return recipe_from_json(self._read("recipe.json"))
+        return recipe_from_json(self._read("recipe.json"), str(self.path / "recipe.json"))
 
     def was_begun_with(self, recipe: Any) -> bool:
         """Whether `begin` recorded just this recipe.
@@ -171,9 +171,7 @@ class RunDirectory:
         with which the run was not made.
         """
         written = self._read("recipe.json")
-        return recipe_from_json(written) == recipe and parse_json(written, "recipe.json") == json.loads(
-            recipe_to_json(recipe)
-        )
+        return self.recipe() == recipe and parse_json(written, "recipe.json") == json.loads(recipe_to_json(recipe))
 
     def settings(self) -> RunSettings:
         """The recorded settings."""

@@ -87,7 +87,7 @@ def test_an_interrupted_bench_goes_on(
     assert bench_scenes(capture) == 130
     captured = capsys.readouterr()
     assert "stopped in run 2 of 2" in captured.out
-    assert "bench command, goes on" in " ".join(captured.err.split())
+    assert "repeat the command to go on" in " ".join(captured.err.split())
     output = capture.parent / "bench"
     assert [run["variant"] for run in json.loads((output / "scenes.json").read_text())["runs"]] == ["splat"]
     interrupted = output / "runs" / "tiny" / "planar-seed0"
@@ -266,3 +266,14 @@ def test_the_time_left_is_judged_by_the_most_similar_runs() -> None:
     clock = RunClock(finished)
     assert clock.left([planned("room", "planar")]) == "about 5 min left"
     assert clock.left([planned("yard", "planar"), planned("hall", "splat")]) == "about 7 min left"
+
+
+def test_the_recipes_of_the_papers_are_compared_by_name(capture: Path) -> None:
+    assert bench_scenes(capture, "--methods", "splat", "--presets", "glassplat", "paper") == 0
+    output = capture.parent / "bench"
+    contents = json.loads((output / "scenes.json").read_text())
+    runs = contents["runs"]
+    assert [row["title"] for row in contents["differences"]] == ["splat - splat-paper"]
+    assert [run["variant"] for run in runs] == ["splat", "splat-paper"]
+    recorded = [json.loads((Path(run["directory"]) / "recipe.json").read_text()) for run in runs]
+    assert [recipe["densify"]["split_by"] for recipe in recorded] == ["pull", "gradient"]

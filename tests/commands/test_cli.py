@@ -97,7 +97,9 @@ def test_bad_input_ends_with_one_message(tmp_path: Path, capsys: pytest.CaptureF
     empty = tmp_path / "empty"
     empty.mkdir()
     fails_with(["train", "splat", "--data", str(empty), *output], capsys, "error:", "Looked for")
-    fails_with(["train", "splat", "--data", str(SCENE), *output, "--iterations", "0"], capsys, "expected at least 1")
+    fails_with(
+        ["train", "splat", "--data", str(SCENE), *output, "--iterations", "0"], capsys, "--iterations is 0; expected"
+    )
     fails_with(["eval", str(empty)], capsys, "is not a run directory")
     assert not (tmp_path / "run").exists()
 

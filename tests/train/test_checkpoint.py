@@ -125,6 +125,7 @@ TENSORS: list[tuple[str, Any, str]] = [
     ("scene/primary/quats", torch.zeros(40, 3), r"quats of primary has shape \[40, 3\]; expected rows of \[4\]"),
     ("scene/primary/sh", torch.zeros(40, 2, 3), r"sh of primary has shape \[40, 2, 3\]"),
     ("scene/primary/means", torch.zeros(40, 3, dtype=torch.int64), "holds torch.int64; expected floating-point"),
+    ("scene/primary/means", torch.zeros(40, 3, dtype=torch.float64), "expected one precision"),
     ("scene/glass/logit_mark", torch.zeros(()), r"logit_mark of glass has shape \[\]"),
     ("scene/planes/tangents", None, r"planes has the tensors .*; expected .*'tangents'"),
     ("scene/planes/normals", torch.zeros(1, 3), r"planes has the tensors .*'normals'.*; expected"),

@@ -305,5 +305,5 @@ def test_a_recipe_survives_its_file(recipe: Any) -> None:
 
 def test_a_recipe_with_a_choice_that_there_is_no_more_is_refused() -> None:
     text = recipe_to_json(PlanarRecipe()).replace('"fresnel": "pane"', '"fresnel": true')
-    with pytest.raises(InputError, match=r"True where one of .'pane', 'schlick', 'none'. is expected"):
+    with pytest.raises(InputError, match="fresnel is True; expected one of pane, schlick, none"):
         recipe_from_json(text)
