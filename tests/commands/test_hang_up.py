@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import pty
 import signal
 import subprocess
 import sys
-import termios
 from pathlib import Path
 
 import pytest
@@ -26,9 +24,8 @@ def command(tmp_path: Path) -> list[str]:
     return [sys.executable, "-m", "glassplat.cli", "train", "splat", *options]
 
 
-def take_terminal() -> None:
-    """Makes standard input the terminal whose end is a hang-up."""
-    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+TAKE_TERMINAL = "import os, sys; os.open(os.ttyname(0), os.O_RDWR); os.execv(sys.argv[1], sys.argv[1:])"
+"""Makes standard input the terminal of a new session, whose end is a hang-up; then becomes the command."""
 
 
 def read_until(descriptor: int, words: bytes) -> None:
@@ -39,9 +36,8 @@ def read_until(descriptor: int, words: bytes) -> None:
 
 def test_a_terminal_that_closes_costs_nothing(tmp_path: Path) -> None:
     mine, its = pty.openpty()
-    with subprocess.Popen(
-        command(tmp_path), stdin=its, stdout=its, stderr=its, start_new_session=True, preexec_fn=take_terminal
-    ) as process:
+    arguments = [sys.executable, "-c", TAKE_TERMINAL, *command(tmp_path)]
+    with subprocess.Popen(arguments, stdin=its, stdout=its, stderr=its, start_new_session=True) as process:
         os.close(its)
         read_until(mine, b"loss")
         os.close(mine)
