@@ -13,6 +13,8 @@ from typing import Any
 from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.data.masks import Polarity
+from glassplat.data.options import options_from_json
+from glassplat.data.ranges import Downscale, Seed, Several
 from glassplat.files.atomic import atomic_write
 from glassplat.files.cameras_json import write_cameras
 from glassplat.files.environment_image import write_equirect
@@ -39,9 +41,9 @@ class RunSettings:
     """
 
     data: str
-    iterations: int
-    downscale: float = 1.0
-    seed: int = 0
+    iterations: Several
+    downscale: Downscale = 1.0
+    seed: Seed = 0
     device: str = "cpu"
     mask_polarity: Polarity = "auto"
 
