@@ -175,8 +175,10 @@ def list_spans(real: type) -> Kernel:
         rows = rows_of(means2d, conics, opacities, radii, s, height)
         shape, first, found = shape_of(means2d, conics, s, rows), rows[0] // TILE, 0
         for i in range(span_offsets[s], span_offsets[s + 1]):
-            row = first + i - span_offsets[s]
-            left, right = columns_of(shape, row, width)
+            row, left, right = first + i - span_offsets[s], 0, -1
+            # Should the passes ever round differently, a row that only the first one saw is empty.
+            if row * TILE <= rows[1]:
+                left, right = columns_of(shape, row, width)
             found += active_between(active_tiles, s // per_camera, row, left, right)
             spans[i, 0], spans[i, 1], spans[i, 2] = row, left, found
 
