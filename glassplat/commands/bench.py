@@ -25,11 +25,14 @@ from glassplat.commands.bench_tables import (
     plain_rows,
     values_of,
 )
+from glassplat.commands.messages import say
 from glassplat.commands.train import Train
 from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
+from glassplat.data.ranges import Downscale, Seed, Several
+from glassplat.files.folders import check_folder
 from glassplat.train.ablations import ABLATIONS, Ablated, Ablation, Switch
-from glassplat.train.recipe import RECIPES
+from glassplat.train.recipe import RECIPES, Preset, recipe_of
 from glassplat.train.run_directory import write_text
 
 Method = Literal["splat", "planar", "deferred"]
@@ -51,6 +54,7 @@ class BenchScenes:
         output: where the tables and one directory per run go.
         methods: which methods.
         strategies: how Gaussians are added and removed.
+        presets: the recipes that this project found best, or those of the papers.
         seeds: one run for each.
         iterations: length of each run.
         downscale: shrink the photographs by this factor.
@@ -61,28 +65,31 @@ class BenchScenes:
     output: Path
     methods: tuple[Method, ...] = ("splat", "planar")
     strategies: tuple[Strategy, ...] = ("default",)
-    seeds: tuple[int, ...] = (0,)
-    iterations: int = 7000
-    downscale: float = 1.0
+    presets: tuple[Preset, ...] = ("glassplat",)
+    seeds: tuple[Seed, ...] = (0,)
+    iterations: Several = 7000
+    downscale: Downscale = 1.0
     mask_polarity: Polarity = "auto"
 
     def run(self, console: Console) -> None:
         """Runs what is missing and writes `scenes.md` and `scenes.json`."""
         recipes = {
-            variant_name(method, strategy): with_strategy(RECIPES[method](), strategy)
+            variant_name(method, strategy, preset): with_strategy(recipe_of(method, preset), strategy)
+            for preset in unique(self.presets, "presets")
             for strategy in unique(self.strategies, "strategies")
             for method in unique(self.methods, "methods")
         }
         pairs = [
             Pair(f"{reflective} - {splat}", reflective, splat)
+            for preset in self.presets
             for strategy in self.strategies
             for method in ("planar", "deferred")
-            if (reflective := variant_name(method, strategy)) in recipes
-            and (splat := variant_name("splat", strategy)) in recipes
+            if (reflective := variant_name(method, strategy, preset)) in recipes
+            and (splat := variant_name("splat", strategy, preset)) in recipes
         ]
         runs = planned_runs(self, recipes)
         execute(runs, console, partial(write_scenes, self.output, pairs))
-        console.print(f"tables: {self.output / 'scenes.md'}, {self.output / 'scenes.json'}")
+        say(console, f"tables: {self.output / 'scenes.md'}, {self.output / 'scenes.json'}")
 
 
 @dataclass(frozen=True)
@@ -104,9 +111,9 @@ class BenchAblation:
     output: Path
     method: Ablated = "planar"
     switches: tuple[Switch, ...] = ()
-    seeds: tuple[int, ...] = (0,)
-    iterations: int = 7000
-    downscale: float = 1.0
+    seeds: tuple[Seed, ...] = (0,)
+    iterations: Several = 7000
+    downscale: Downscale = 1.0
     mask_polarity: Polarity = "auto"
 
     def run(self, console: Console) -> None:
@@ -116,7 +123,7 @@ class BenchAblation:
         recipes = {FULL: full} | {f"no-{switch}": ablation.off(full) for switch, ablation in ablations.items()}
         runs = planned_runs(self, recipes)
         execute(runs, console, partial(write_ablation, self.output, ablations))
-        console.print(f"tables: {self.output / 'ablation.md'}, {self.output / 'ablation.json'}")
+        say(console, f"tables: {self.output / 'ablation.md'}, {self.output / 'ablation.json'}")
 
     def chosen(self) -> dict[Switch, Ablation]:
         """The parts to switch off.
@@ -150,10 +157,15 @@ class Bench:
         """Runs the comparison."""
         self.comparison.run(console)
 
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        return f"finished runs stay in {self.comparison.output}: repeat the command to go on"
 
-def variant_name(method: str, strategy: str) -> str:
-    """What tables and directories call a method with a strategy."""
-    return method if strategy == "default" else f"{method}-{strategy}"
+
+def variant_name(method: str, strategy: str, preset: Preset = "glassplat") -> str:
+    """What tables and directories call a method with a strategy and a preset."""
+    name = method if strategy == "default" else f"{method}-{strategy}"
+    return name if preset == "glassplat" else f"{name}-{preset}"
 
 
 def with_strategy(recipe: Any, strategy: str) -> Any:
@@ -184,6 +196,7 @@ def unique(choices: Sequence[Any], option: str) -> list[Any]:
 
 def planned_runs(bench: BenchScenes | BenchAblation, recipes: dict[str, Any]) -> list[PlannedRun]:
     """A run per capture, variant and seed; the paths are absolute, so that a bench goes on from any folder."""
+    check_folder(bench.output)
     captures = zip(scene_names(bench.data), bench.data, strict=True)
     seeds = unique(bench.seeds, "seeds")
     return [

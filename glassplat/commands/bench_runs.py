@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 import time
 from collections import Counter
@@ -12,12 +11,16 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.text import Text
 
 from glassplat.commands.evaluate import evaluate_run
+from glassplat.commands.messages import complain, printable, say
 from glassplat.commands.stored_run import open_run
 from glassplat.commands.train import Train
+from glassplat.commands.training_progress import in_words
 from glassplat.data.dataset import load_dataset
 from glassplat.data.errors import InputError, first_names
+from glassplat.files.json_text import read_json
 from glassplat.init.planes import PlaneFitError
 from glassplat.train.background import with_background
 from glassplat.train.run_directory import RunDirectory
@@ -72,8 +75,10 @@ class PlannedRun:
     def results(self) -> dict[str, Any] | None:
         """The metrics of the finished run, None before it is finished."""
         try:
-            results = json.loads(self.directory.results.read_text(encoding="utf-8"))
-        except (FileNotFoundError, json.JSONDecodeError):
+            results = read_json(self.directory.results)
+        except (FileNotFoundError, ValueError):
+            return None
+        if not isinstance(results, dict):
             return None
         made = (results.get("method"), results.get("iterations"), results.get("seed"))
         wanted = (self.train.recipe.method, self.train.iterations, self.train.seed)
@@ -125,22 +130,22 @@ def execute(
     finished = _finished(runs)
     after_each(finished)
     if finished:
-        console.print(f"{len(finished)} of {len(runs)} runs are finished already")
+        say(console, f"{len(finished)} of {len(runs)} runs are finished already")
     _check_captures([run for run in runs if run.results() is None])
     clock, failures = RunClock(finished), []
     for number, run in enumerate(runs, start=1):
         if run.results() is not None:
             continue
         waiting = [other for other in runs[number - 1 :] if other.results() is None]
-        console.rule(f"run {number} of {len(runs)}: {run.title} ({clock.left(waiting)})")
+        console.rule(Text(f"run {number} of {len(runs)}: {printable(run.title)} ({clock.left(waiting)})"))
         try:
             clock.measure(run, lambda run=run: _train_and_evaluate(run, console))  # type: ignore[misc]
         except (PlaneFitError, TrainingDivergedError) as error:
             # One scene that cannot be trained must not cost the night that the others take.
             failures.append(f"{run.title}: {error}")
-            console.print(f"[red]failed:[/red] {error}", highlight=False)
+            complain("failed", error)
         except KeyboardInterrupt:
-            console.print(f"stopped in run {number} of {len(runs)}; the same command goes on from here")
+            say(console, f"stopped in run {number} of {len(runs)}")
             raise
         after_each(_finished(runs))
     if failures:
@@ -192,12 +197,3 @@ class RunClock:
         same = [s for other, s in self._seconds if (other.scene, other.variant) == (run.scene, run.variant)]
         method = [s for other, s in self._seconds if other.train.recipe.method == run.train.recipe.method]
         return statistics.fmean(same or method or [s for _, s in self._seconds])
-
-
-def in_words(seconds: float) -> str:
-    """A duration as someone who waits would say it."""
-    minutes = round(seconds / 60)
-    if minutes < 1:
-        return f"{seconds:.0f} s"
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min"

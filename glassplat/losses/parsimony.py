@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from glassplat.data.dataset import View
+from glassplat.losses.term import LossFunction
 from glassplat.render.frame import Frame
 from glassplat.scene import transfer
 from glassplat.scene.scene import Scene
@@ -33,6 +35,11 @@ def mean_scale(frame: Frame, view: View, scene: Scene) -> Tensor:
     capture's units. Differentiable in the raw scales. Of what the view shows directly, as `mean_opacity`.
     """
     return _direct_mean(scene.primary.log_scales, torch.exp, frame) / scene.extent
+
+
+def of_all(term: LossFunction) -> LossFunction:
+    """A term of what the view shows directly, as one of all Gaussians."""
+    return lambda frame, view, scene: term(replace(frame, direct=None), view, scene)
 
 
 def view_dependence(frame: Frame, view: View, scene: Scene) -> Tensor:

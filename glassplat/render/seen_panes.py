@@ -54,19 +54,22 @@ def nearest_hits(
     return pane_hits(rectangles, camera.intrinsics, camera.width, camera.height, mask, beyond=beyond)
 
 
-def seen_panes(planes: Planes, camera: Camera, first: PaneHits, mask: Tensor | None = None) -> SeenPanes | None:
-    """All panes on the ray of each pixel, None where no tile shows any; the planes keep their gradient.
+def seen_panes(
+    planes: Planes, camera: Camera, first: PaneHits, mask: Tensor | None = None, *, most: int | None = None
+) -> SeenPanes | None:
+    """The panes on the ray of each pixel, None where no tile shows any; the planes keep their gradient.
 
     Args:
         planes: the scene's.
         camera: of the view.
         first: `nearest_hits` of these.
         mask: [H, W] as given to `nearest_hits`.
+        most: how many of them on one ray, the nearest ones; all if None.
     """
     hits, seen = [first], _shown(first)
     if not any(seen):
         return None
-    while len(hits) < len(planes):
+    while len(hits) < (len(planes) if most is None else most):
         further = nearest_hits(planes, camera, mask, beyond=hits[-1])
         shown = _shown(further)
         if not any(shown):

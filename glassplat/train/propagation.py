@@ -9,9 +9,10 @@ from typing import Literal
 import torch
 
 from glassplat.data.dataset import Dataset
+from glassplat.data.ranges import Count, Share
 from glassplat.densify.propagate import NormalPropagation
 from glassplat.render.environment import resized
-from glassplat.train.actions import GrowSh, ResetOpacity
+from glassplat.train.actions import Densify, GrowSh, ResetOpacity
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
 
@@ -34,12 +35,14 @@ class PropagationSchedule:
         stop: share of the run after which nothing is propagated any more.
         patience: share of the run without growth after which the number counts as settled.
         pause: steps for which raised opacities are held.
+        last_reset: reset opacities once more after the end, if no regular reset comes after it.
     """
 
     end: Literal["settled", "fixed"] = "settled"
-    stop: float = 0.75
-    patience: float = 0.1
-    pause: int = 100
+    stop: Share = 0.75
+    patience: Share = 0.1
+    pause: Count = 100
+    last_reset: bool = True
 
 
 @dataclass(frozen=True)
@@ -135,8 +138,28 @@ class ResetAfterPropagation(ResetOpacity):
 
 
 @dataclass(frozen=True)
+class DensifyWhilePropagating(Densify):
+    """Densifies at an interval of its own while normals are propagated, and as at any other time once that has ended.
+
+    Attributes:
+        regular: what densifies then.
+    """
+
+    regular: Densify = field(kw_only=True)
+
+    def due(self, clock: Clock) -> bool:
+        """Whether to act after this step, before or after the end."""
+        return super().due(clock) or self.regular.due(clock)
+
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`, if this is a moment of the interval that holds."""
+        turn: Densify = self.regular if has_ended(state) else Densify(self.densifier, self.part)
+        return turn.due(clock) and turn.apply(state, dataset, clock)
+
+
+@dataclass(frozen=True)
 class RefineEnvironment:
-    """Doubles the environment's texels at certain moments.
+    """Doubles the environment's texels at certain moments, twice where two fall on one step.
 
     A normal has a gradient only as far as the texels that its reflection meets reach. Large texels at first let normals
     find their way from farther off; small ones make the reflection sharp in the end.
@@ -160,7 +183,8 @@ class RefineEnvironment:
         environment = state.scene.environment
         if environment.size >= self.largest:
             return False
-        finer = resized(environment, min(2 * environment.size, self.largest))
+        doublings = sum(round(moment * clock.iterations) == clock.step for moment in self.moments)
+        finer = resized(environment, min(2**doublings * environment.size, self.largest))
         state.scene = replace(state.scene, environment=finer)
         return True
 

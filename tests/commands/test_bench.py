@@ -225,3 +225,12 @@ def test_the_time_left_is_judged_by_the_most_similar_runs() -> None:
     assert clock.left([planned("room", "planar")]) == "about 5 min left"
     assert clock.left([planned("yard", "planar"), planned("hall", "splat")]) == "about 7 min left"
     assert (in_words(20), in_words(90), in_words(5400)) == ("20 s", "2 min", "1 h 30 min")
+
+
+def test_the_recipes_of_the_papers_are_compared_by_name(capture: Path) -> None:
+    assert bench_scenes(capture, "--methods", "splat", "--presets", "glassplat", "paper") == 0
+    output = capture.parent / "bench"
+    runs = json.loads((output / "scenes.json").read_text())["runs"]
+    assert [run["variant"] for run in runs] == ["splat", "splat-paper"]
+    recorded = [json.loads((Path(run["directory"]) / "recipe.json").read_text()) for run in runs]
+    assert [recipe["densify"]["split_by"] for recipe in recorded] == ["pull", "gradient"]

@@ -73,9 +73,19 @@ def test_planes_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", ["[{]", "[[1]]", json.dumps([{"label": 1}]), json.dumps([PLANE | {"normal": [0, 0, 0]}])]
+    ("content", "message"),
+    [
+        ("[{]", r"planes\.json is not valid JSON"),
+        ("[" * 10**5, r"planes\.json is nested more than"),
+        ("{}", r"planes\.json holds \{\}; expected a list with one object per plane"),
+        ("[[1]]", r"plane 1 in .*planes\.json is \[1\]; expected an object with label, center"),
+        (json.dumps([{"label": 1}]), "plane 1 in .* has no center; expected a list of 3 values"),
+        (json.dumps([PLANE | {"label": 1e30}]), r"label of plane 1 in .* is 1e\+30; expected a whole number"),
+        (json.dumps([PLANE | {"half_u": [0, 0, 10**400]}]), "entry 3 of half_u of plane 1 in .* is inf; expected"),
+        (json.dumps([PLANE | {"normal": [0, 0, 0]}]), "normal of plane 1 in .* has length 0; expected a direction"),
+    ],
 )
-def test_broken_planes_are_refused(tmp_path: Path, content: str) -> None:
+def test_broken_planes_are_refused(tmp_path: Path, content: str, message: str) -> None:
     (tmp_path / "planes.json").write_text(content)
-    with pytest.raises(InputError, match=r"cannot read .*planes\.json .*expected a list of planes with label, center"):
+    with pytest.raises(InputError, match=message):
         load_truth(tmp_path)

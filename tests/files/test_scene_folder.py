@@ -36,7 +36,7 @@ def test_a_scene_survives_bit_for_bit(tmp_path: Path, panes: bool, environment: 
 def test_a_damaged_environment_is_named(tmp_path: Path) -> None:
     write_scene(tmp_path, replace(in_single_precision(showcase()), environment=lit()))
     (tmp_path / "environment.safetensors").write_bytes(b"cut")
-    with pytest.raises(ValueError, match=r"environment\.safetensors is truncated or no environment"):
+    with pytest.raises(ValueError, match=r"environment\.safetensors is truncated or not an environment"):
         read_scene(tmp_path)
 
 

@@ -13,7 +13,13 @@ from glassplat.train.actions import ResetOpacity
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.messages import ActionDone, Message, StepDone
-from glassplat.train.propagation import ENDED, Propagate, PropagationSchedule, ResetAfterPropagation
+from glassplat.train.propagation import (
+    ENDED,
+    Propagate,
+    PropagationSchedule,
+    RefineEnvironment,
+    ResetAfterPropagation,
+)
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
@@ -26,7 +32,7 @@ RECIPE = DeferredRecipe(
     bootstrap=0.2,
     texels=4,
     first_texels=2,
-    refinements=(0.4, 0.6, 0.8),
+    refinements=(0.4, 0.6),
     region=(0.0, 0.0, 3.5, 1.0),
     rhythm=Rhythm(beat=0.1, least=2, sh=0.1),
     schedule=PropagationSchedule(end="fixed", stop=0.7, pause=2),
@@ -175,6 +181,46 @@ def test_the_environment_is_refined_up_to_its_size() -> None:
         sizes[message.step] = state.scene.environment.size
     assert [sizes[step] for step in (4, 7, 8, 12, 20)] == [2, 2, 4, 4, 4]
     assert state.scene.environment.region == RECIPE.region
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "sizes"),
+    [
+        (16, 256, [16, 32, 64, 128, 256]),
+        (16, 64, [16, 32, 64]),
+        (16, 32, [16, 32]),
+        (16, 40, [16, 32, 40]),
+        (64, 64, [64]),
+        (64, 16, [16]),
+        (1, 1000, [1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000]),
+    ],
+)
+def test_the_environment_reaches_any_size_between_its_first_and_last_refinement(
+    first: int, last: int, sizes: list[int]
+) -> None:
+    recipe = DeferredRecipe(first_texels=first, texels=last)
+    state, reached = fresh_state(recipe), {}
+    (action,) = [a for a in recipe.stages(seed=0)[1].actions if isinstance(a, RefineEnvironment)]
+    for step in range(1, 101):
+        clock = Clock(step, 100, views=6)
+        if action.due(clock):
+            action.apply(state, tiny_capture(), clock)
+        reached.setdefault(state.scene.environment.size, step)
+    assert list(reached) == sizes
+    assert len(sizes) == 1 or list(reached.values())[1] == 45
+    assert len(sizes) < 3 or list(reached.values())[-1] == 65
+
+
+@pytest.mark.parametrize("iterations", [1, 3, 10])
+def test_the_shortest_run_refines_its_environment_in_full(iterations: int) -> None:
+    recipe = DeferredRecipe(texels=256)
+    state = fresh_state(recipe)
+    (action,) = [a for a in recipe.stages(seed=0)[1].actions if isinstance(a, RefineEnvironment)]
+    for step in range(iterations + 1):
+        clock = Clock(step, iterations, views=6)
+        if action.due(clock):
+            action.apply(state, tiny_capture(), clock)
+    assert state.scene.environment.size == 256
 
 
 @pytest.mark.parametrize("iterations", [20, 23, 7001])
