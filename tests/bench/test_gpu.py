@@ -6,6 +6,8 @@ import argparse
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -127,6 +129,11 @@ def test_the_command_itself_needs_pytorch_alone() -> None:
 
 
 def test_the_first_launch_is_checked(monkeypatch: pytest.MonkeyPatch) -> None:
-    ones = torch.ones
-    monkeypatch.setattr(torch, "ones", lambda *size, device: ones(*size))
+    # The optimiser's kernel of the CPU stands in for that of the GPU.
+    monkeypatch.setattr(torch, "ones", partial(made_on_the_cpu, torch.ones))
     assert "launched" in gpu.launch(argparse.Namespace())
+
+
+def made_on_the_cpu(make: Callable[..., torch.Tensor], *size: int, device: str) -> torch.Tensor:
+    assert device == "cuda"
+    return make(*size)
