@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -53,18 +53,24 @@ def mirror_labels(scene: Scene, views: Sequence[View]) -> tuple[int, ...]:
         scene: primary Gaussians after the first stage, with fitted planes and glass.
         views: training views; those without pane labels are passed over.
     """
-    annotated = [view for view in views if view.is_annotated]
-    pairs = [pane_pixels(scene, view) for view in annotated]
+    return mirrors_among(scene.planes.labels, [pane_pixels(scene, view) for view in views if view.is_annotated])
+
+
+def mirrors_among(labels: Sequence[int], pairs: Sequence[PanePixels]) -> tuple[int, ...]:
+    """Labels of the panes that are mirrors, by the `pane_pixels` of the annotated views."""
     found = []
-    for label in scene.planes.labels:
+    for label in labels:
         mirrored, photographed = (torch.cat([pair[label][side] for pair in pairs]) for side in (0, 1))
         if len(mirrored) >= FEWEST_PIXELS and likeness(mirrored, photographed).is_mirror:
             found.append(label)
     return tuple(found)
 
 
+PanePixels = Mapping[int, tuple[Tensor, Tensor]]
+
+
 @torch.no_grad()
-def pane_pixels(scene: Scene, view: View) -> dict[int, tuple[Tensor, Tensor]]:
+def pane_pixels(scene: Scene, view: View) -> PanePixels:
     """Mirrored and photographed colours [P, 3] of each pane's pixels in one view, by label, about their local means."""
     mirrored, coverage, _ = mirrored_image(scene, view.camera)
     photo = view.photo.to(mirrored.device).to(mirrored.dtype) / 255
@@ -98,14 +104,10 @@ def mirrored_image(scene: Scene, camera: Camera) -> MirroredImage:
 
 
 @torch.no_grad()
-def mirrored_coverage(scene: Scene, pane: Planes, cameras: Sequence[Camera]) -> float:
-    """Share of what a pane could mirror, over all views, that Gaussians cover; 1 where no view shows the pane."""
-    covered, whole = 0.0, 0
-    for camera in cameras:
-        mirrored = mirrored_image(replace(scene, planes=pane), camera)
-        covered += float(mirrored.coverage.sum())
-        whole += int(mirrored.seen.sum())
-    return covered / whole if whole else 1.0
+def mirrored_coverage(scene: Scene, pane: Planes, camera: Camera) -> tuple[float, int]:
+    """How much of what a pane could mirror in a view is covered by Gaussians, and how much it is; pixels."""
+    mirrored = mirrored_image(replace(scene, planes=pane), camera)
+    return float(mirrored.coverage.sum()), int(mirrored.seen.sum())
 
 
 def about_local_mean(image: Tensor, region: Tensor) -> Tensor:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from glassplat.data.ranges import ESSENTIAL, InnerShare, PaneLabel, PositiveShare, Range, Seed, Share
 from glassplat.init.annotation import PaneView, pane_views, plane_candidates
 from glassplat.init.consistency import mask_agreement
 from glassplat.init.footprint import pane_rectangle
@@ -56,17 +58,17 @@ class PlaneFit:
         seed: of RANSAC.
     """
 
-    mirror_labels: tuple[int, ...] = ()
-    glass_reflectance: float = 0.2
-    mirror_reflectance: float = 0.999
-    band: float = 20 / 1200
-    inlier_distance: float = 0.01
-    hypotheses: int = 1000
-    refined: int = 4
-    most_views: int = 12
-    least_agreement: float = 0.5
-    margin: float = 1.08
-    seed: int = 0
+    mirror_labels: Annotated[tuple[PaneLabel, ...], ESSENTIAL] = ()
+    glass_reflectance: InnerShare = 0.2
+    mirror_reflectance: InnerShare = 0.999
+    band: PositiveShare = 20 / 1200
+    inlier_distance: PositiveShare = 0.01
+    hypotheses: Annotated[int, Range(1, 1_000_000)] = 1000
+    refined: Annotated[int, Range(1, 1000)] = 4
+    most_views: Annotated[int, Range(2, 1000)] = 12
+    least_agreement: Share = 0.5
+    margin: Annotated[float, Range(0.1, 10)] = 1.08
+    seed: Seed = 0
 
 
 @dataclass(frozen=True)
@@ -146,8 +148,7 @@ def _fit_pane(
     objectives = {}
     for source, points in clouds.items():
         chosen = points[plane_candidates(points, views, band=options.band)]
-        distance = options.inlier_distance * extent
-        objectives[source] = Objective(views, chosen, np.ones(len(chosen)), extent, distance)
+        objectives[source] = Objective(views, chosen, extent, options.inlier_distance * extent)
     try:
         fits = _fits(label, objectives, options)
         found = best_supported(label, fits, next(iter(objectives.values())))

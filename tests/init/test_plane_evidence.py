@@ -61,7 +61,7 @@ def test_gaussians_decide_where_measured_points_lead_to_no_plane(caplog: pytest.
 @pytest.mark.parametrize("degrees", [1.0, 5.0, 40.0])
 def test_the_better_plane_is_kept_in_either_order(degrees: float) -> None:
     views = pane_views(scene_of([FRONT]), 1)
-    evidence = Objective(views, np.zeros((0, 3)), np.zeros(0), EXTENT, 0.01 * EXTENT)
+    evidence = Objective(views, np.zeros((0, 3)), EXTENT, 0.01 * EXTENT)
     fits = [Fit("one", framed(FRONT)), Fit("other", framed(turned(FRONT, degrees)))]
     assert best_supported(1, fits, evidence) is fits[0].plane
     assert best_supported(1, fits[::-1], evidence) is fits[0].plane
@@ -71,7 +71,7 @@ def test_virtual_points_behind_a_mirror_do_not_speak_against_its_plane() -> None
     """Nothing lies on the mirror, and everything that was measured in it lies behind."""
     views = pane_views(scene_of([FRONT]), 1)
     virtual = np.random.default_rng(0).uniform([-2, -1, 2.5], [2, 1, 6], (5000, 3))
-    evidence = Objective(views, virtual, np.ones(len(virtual)), EXTENT, 0.01 * EXTENT)
+    evidence = Objective(views, virtual, EXTENT, 0.01 * EXTENT)
     wall = replace(FRONT, center=FRONT.center + np.array([0, 0, 0.6]))
     assert score(framed(FRONT), evidence) > score(framed(wall), evidence) + 0.2
 
@@ -83,9 +83,7 @@ def test_the_score_does_not_depend_on_the_unit_of_length() -> None:
             for camera, labels in scene_of([FRONT])
         ]
         points = factor * frame_and_clutter([FRONT], wall=0).numpy()
-        evidence = Objective(
-            pane_views(annotations, 1), points, np.ones(len(points)), factor * EXTENT, 0.01 * factor * EXTENT
-        )
+        evidence = Objective(pane_views(annotations, 1), points, factor * EXTENT, 0.01 * factor * EXTENT)
         pane = replace(turned(FRONT, 2), center=factor * FRONT.center)
         return score(framed(pane), evidence)
 

@@ -112,7 +112,7 @@ def test_masks_agree_on_the_true_plane_and_on_no_other() -> None:
     agreement = mask_agreement(around, views)
     assert agreement[0] > 0.97
     assert (agreement[1:] < agreement[0]).all()
-    objective = Objective(views, np.zeros((0, 3)), np.zeros(0), EXTENT, 0.01 * EXTENT)
+    objective = Objective(views, np.zeros((0, 3)), EXTENT, 0.01 * EXTENT)
     cost = objective.terms(FramedPlanes(around, np.zeros(len(around))), 0.004).cost
     assert cost[0] < 0.1
     assert (cost[1:] > cost[0]).all()
