@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 AGREEMENT_WEIGHT = 0.1
 """Weight of the agreement of the masks against that of their edges, which know of frames."""
-POOL, LEAST_OF_BEST = 200, 0.75
+POOL, LEAST_OF_BEST = 200, 0.5
 """Number of the hypotheses on which the masks agree best whose edges are compared, and the share of the best agreement
 below which no edges are looked at."""
 BY_AREAS, BY_EDGES, CHILDREN = 12, 6, 30
@@ -46,7 +46,7 @@ def best_plane(objective: Objective, *, hypotheses: int, refine: int, rng: np.ra
         refine: number of planes that are refined at last.
         rng: source of randomness.
     """
-    beam = _hypotheses(objective, hypotheses, rng)
+    beam = first_hypotheses(objective, hypotheses, rng)
     for tilt, shift, tolerance in ROUNDS:
         beam = _followed(beam, objective, (tilt, shift), tolerance, rng)
     beam = _agreed(refined(beam, objective, (COARSE, MIDDLE)), objective)
@@ -71,7 +71,7 @@ def contradiction(
     return mean
 
 
-def _hypotheses(objective: Objective, count: int, rng: np.random.Generator) -> FramedPlanes:
+def first_hypotheses(objective: Objective, count: int, rng: np.random.Generator) -> FramedPlanes:
     """The planes, of those drawn through points and masks, on which the masks agree best, or their edges.
 
     Areas lead there from afar. But where a pane fills most of the photographs they agree by more than nine tenths on

@@ -12,9 +12,10 @@ import torch
 from glassplat.init.annotation import pane_views
 from glassplat.init.plane_evidence import Fit, best_supported, score
 from glassplat.init.plane_objective import Objective
+from glassplat.init.plane_search import first_hypotheses
 from glassplat.init.planes import PlaneFit, fit_planes
 from glassplat.init.ransac import FramedPlanes, PlaneEquations
-from tests.init.pane_scene import FRONT, Pane, frame_and_clutter, normal_error, scene_of
+from tests.init.pane_scene import FRONT, Pane, camera_from, frame_and_clutter, label_image, normal_error, scene_of
 
 QUICK = PlaneFit(hypotheses=300, refined=2)
 EXTENT = 3.0
@@ -94,3 +95,18 @@ def with_translation(matrix: torch.Tensor, factor: float) -> torch.Tensor:
     scaled = matrix.clone()
     scaled[:3, 3] *= factor
     return scaled
+
+
+def test_a_pane_that_fills_the_photographs_is_among_the_first_hypotheses() -> None:
+    """Its masks overlap on almost any plane, so that ranking by it left only planes 24 degrees off."""
+    wide = Pane(np.array([0.5, 0.0, 2.0]), FRONT.normal, FRONT.tangent, (2.2, 0.8))
+    eyes = [(-2.0 + 0.5 * number, 0.05 * (-1) ** number, 0.3 + 0.1 * (number % 3)) for number in range(7)]
+    cameras = [
+        camera_from(eye, np.array([0.6 * eye[0] + 0.4, 0.15 * (-1) ** number, 2.0])) for number, eye in enumerate(eyes)
+    ]
+    views = pane_views([(camera, label_image(camera, [wide])) for camera in cameras], 1)
+    evidence = Objective(views, np.zeros((0, 3)), EXTENT, 0.01 * EXTENT)
+    for seed in range(8):
+        followed = first_hypotheses(evidence, 300, np.random.default_rng((seed, 1)))
+        cosines = np.abs(followed.planes.normals @ wide.normal)
+        assert np.degrees(np.arccos(cosines.max())) < 15
