@@ -38,6 +38,7 @@ HEADER: dict[str, Field] = {
     "active_sh_degree": ByName(SH_DEGREE),
     "updates": ByName(Whole(0)),
     "paused": Optional(ByName(Whole(0)), {}),
+    "hurried": Optional(ByName(Number(0)), {}),
     "records": Optional(ByName(Number()), {}),
 }
 """What is `Optional` was added after the first checkpoints were written."""
@@ -83,6 +84,7 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
         "active_sh_degree": {part: g.active_sh_degree for part, g in scene.gaussian_sets().items()},
         "updates": state.optimizer.updates,
         "paused": state.optimizer.paused,
+        "hurried": state.optimizer.hurried,
         "records": state.records,
     }
     write_tensors(path, tensors, header)
@@ -178,6 +180,7 @@ def restored_state(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
             {name: (first[name], second[name]) for name in first},
             updates=dict(header["updates"]),
             paused=dict(header["paused"]),
+            hurried=dict(header["hurried"]),
         ),
         statistics=restored_statistics(under(tensors, "statistics/"), scene),
         means=under(tensors, "means/"),
