@@ -44,9 +44,15 @@ def all_kernels(real: type = np.float32) -> list[Any]:
         for value in vars(module).values()
         if isinstance(value, _lru_cache_wrapper)
         and value.__module__ == module.__name__
-        and next(iter(inspect.signature(value).parameters), None) == "real"
+        and first_parameter(value) in ("real", "key")
     }
-    return sorted((factory(real) for factory in factories), key=lambda kernel: str(kernel.name))
+    made = (factory(real) if first_parameter(factory) == "real" else factory() for factory in factories)
+    return sorted(made, key=lambda kernel: str(kernel.name))
+
+
+def first_parameter(factory: Callable[..., Any]) -> str | None:
+    """What a factory of kernels takes first: `real` or, of kernels without floating-point numbers, `key`."""
+    return next(iter(inspect.signature(factory).parameters), None)
 
 
 @contextmanager

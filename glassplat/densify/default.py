@@ -13,6 +13,7 @@ from glassplat.data.ranges import ESSENTIAL, Ascending, Count, NotNegative, Posi
 from glassplat.densify.edit import Edit, Moments, apply_edit, clone, forget, keep, split
 from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.transfer import constant
 
 
 @dataclass(frozen=True)
@@ -85,12 +86,13 @@ def accumulate(
         direct: whether the views see the Gaussians themselves, and not their mirror images.
     """
     visible = (radii > 0).all(dim=-1)
-    pixels_per_unit = means2d_gradient.new_tensor([width / 2, height / 2])
+    like = means2d_gradient.dtype, means2d_gradient.device
+    pixels_per_unit = constant((width / 2, height / 2), *like)
 
     def norms(gradient: Tensor) -> Tensor:
         return torch.where(visible, (gradient * pixels_per_unit).norm(dim=-1), 0).sum(dim=0)
 
-    rows = means2d_gradient.new_tensor([[1.0], [float(direct)]])
+    rows = constant(((1.0,), (float(direct),)), *like)
     shares = torch.where(visible, radii.amax(dim=-1) / max(width, height), 0)
     return ScreenStatistics(
         gradient_sum=statistics.gradient_sum + rows * norms(means2d_gradient),

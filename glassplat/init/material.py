@@ -112,11 +112,24 @@ def mirrored_coverage(scene: Scene, pane: Planes, camera: Camera) -> tuple[float
 
 def about_local_mean(image: Tensor, region: Tensor) -> Tensor:
     """An image [H, W, 3] minus its mean over the part of a square window that lies in the region [H, W]."""
-    side = 2 * max(round(WINDOW * image.shape[1] / 2), 1) + 1
+    reach = max(round(WINDOW * image.shape[1] / 2), 1)
     inside = region.to(image.dtype)[..., None]
-    stacked = torch.cat([image * inside, inside], dim=-1).permute(2, 0, 1)[None]
-    sums = torch.nn.functional.avg_pool2d(stacked, side, stride=1, padding=side // 2)[0].permute(1, 2, 0)
-    return image - sums[..., :3] / sums[..., 3:].clamp(min=1e-6)
+    sums = window_sums(torch.cat([image * inside, inside], dim=-1), reach)
+    return image - (sums[..., :3] / sums[..., 3:].clamp(min=1)).to(image.dtype)
+
+
+def window_sums(image: Tensor, reach: int) -> Tensor:
+    """[H, W, D] float64 sums over the square of pixels up to `reach` away, cut off at the image's border.
+
+    Differences of running sums, one axis after the other: as much work for a window of any size.
+    """
+    sums = image.double()
+    for axis in (0, 1):
+        running = torch.cat([torch.zeros_like(sums.narrow(axis, 0, 1)), sums.cumsum(axis)], dim=axis)
+        places = torch.arange(image.shape[axis], device=image.device)
+        after, before = (places + reach + 1).clamp(max=len(places)), (places - reach).clamp(min=0)
+        sums = running.index_select(axis, after) - running.index_select(axis, before)
+    return sums
 
 
 def likeness(mirrored: Tensor, photographed: Tensor) -> Likeness:

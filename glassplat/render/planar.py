@@ -26,6 +26,7 @@ from glassplat.render.rasterize import (
     shown,
 )
 from glassplat.render.seen_panes import SeenPanes, glass_owners, nearest_hits, seen_panes
+from glassplat.scene import transfer
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
@@ -110,12 +111,12 @@ class Planar:
         layers["hit"] = hit
         if first.deviation is not None:
             layers["deviation"] = first.deviation
-        if not hits.tiles.any():
+        seen = seen_panes(scene.planes, camera, hits, first.mask, most=1 if self.nearest_only else None)
+        if seen is None:
             nothing = torch.zeros_like(hit)
             layers |= {"transmission": first.image, "reflection": torch.zeros_like(first.image)}
             layers |= {"strength": nothing, "share": nothing}
             return Frame(first.image, layers, direct=first.direct, screen=first.screen)
-        seen = seen_panes(scene.planes, camera, hits, first.mask, most=1 if self.nearest_only else None)
         second = self._second_pass(scene, camera, seen, probed)
         masks = self._visibilities(scene, camera, seen, first)
         result = glazed(
@@ -188,10 +189,8 @@ class Planar:
         channels = torch.cat([projected.colors, intensity[..., None]], dim=-1)
         screen = (screen_pass("primary", projected, direct=False),) if probed else ()
         result = composite(splats, channels, bins, probe=joined_probe(screen))
-        reflections = result.image
-        if any(self.background):
-            colors = over_background(reflections[..., :3], result.alpha, self.background)
-            reflections = torch.cat([colors, reflections[..., 3:]], dim=-1)
+        # The background, too, is as bright in a pane as it is: with no intensity of its own it would be black there.
+        reflections = over_background(result.image, result.alpha, (*self.background, 1.0))
         return SecondPass(reflections, shown(projected), screen)
 
     def _screen(self, first: FirstPass, second: SecondPass, hits: PaneHits, result: Glazed) -> tuple[ScreenPass, ...]:
@@ -226,7 +225,8 @@ def weighted_screen(
     pixels = rows.clamp(0, height - 1), columns.clamp(0, width - 1)
     behind = first.splats.depths[:, : primary.means2d.shape[1]] > hits.depth[pixels]
     primary = replace(primary, weight=torch.where(behind, through[pixels], 1.0))
-    weight = float(mirrored[hit].mean())
+    weight: float | Tensor
+    weight = mirrored.sum() / hit.sum().clamp(min=1) if transfer.waits(hit.device) else float(mirrored[hit].mean())
     return (primary, glass, *(replace(record, weight=weight) for record in second.screen))
 
 

@@ -110,5 +110,5 @@ def rate_tensor(rate: Rate, parameter: Tensor, progress: float, extent: float, i
     if rate.rest is None:
         return value
     columns = torch.full(parameter.shape[1:], value * rate.rest, dtype=parameter.dtype, device=parameter.device)
-    columns[:1] = value
+    columns[:1].fill_(value)
     return columns.flatten()

@@ -6,7 +6,6 @@ import dataclasses
 import json
 import os
 import re
-import typing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,11 @@ from typing import Any
 from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.data.masks import Polarity
+from glassplat.data.options import options_from_json
+from glassplat.data.ranges import Downscale, Seed, Several
 from glassplat.files.atomic import atomic_write
 from glassplat.files.cameras_json import write_cameras
 from glassplat.files.environment_image import write_equirect
-from glassplat.files.fields import Choice, Field, Number, Optional, Text, Whole, checked
 from glassplat.files.folders import make_folder
 from glassplat.files.json_text import parse_json, read_json
 from glassplat.files.reading import read_text
@@ -41,9 +41,9 @@ class RunSettings:
     """
 
     data: str
-    iterations: int
-    downscale: float = 1.0
-    seed: int = 0
+    iterations: Several
+    downscale: Downscale = 1.0
+    seed: Seed = 0
     device: str = "cpu"
     mask_polarity: Polarity = "auto"
 
@@ -59,15 +59,6 @@ FILES = (
     "index.html",
 )
 """What a run writes beside its checkpoint, scene and metrics."""
-SETTINGS: dict[str, Field] = {
-    "data": Text(),
-    "iterations": Whole(1),
-    "downscale": Optional(Number(1), 1.0),
-    "seed": Optional(Whole(), 0),
-    "device": Optional(Text(), "cpu"),
-    "mask_polarity": Optional(Choice(typing.get_args(Polarity)), "auto"),
-}
-"""What `settings.json` holds of `RunSettings`; options that earlier versions did not have have their defaults."""
 NUMBERED = re.compile(r"iteration_([0-9]{1,18})")
 """The folder of a scene; people keep copies under other names beside it."""
 
@@ -177,7 +168,11 @@ class RunDirectory:
         """The recorded settings."""
         path = self.path / "settings.json"
         with input_checked():
-            return RunSettings(**checked(parse_json(self._read(path.name), str(path)), SETTINGS, str(path)))
+            written = parse_json(self._read(path.name), str(path))
+        try:
+            return options_from_json(RunSettings, written)
+        except InputError as error:
+            raise InputError(f"{path} cannot be read: {error}; train again") from error
 
     def photographs(self) -> set[str] | None:
         """Names of the photographs that the run was begun with; None where that is not recorded legibly."""

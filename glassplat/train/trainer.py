@@ -171,7 +171,8 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Di
     learning = scene.with_parameters(leaves)
     frame = stage.renderer(learning, view.camera, probed=probed)
     terms = weighted_terms(stage, frame, view, learning)
-    total = torch.stack(list(terms.values())).sum()
+    stacked = torch.stack(list(terms.values()))
+    total = stacked.sum()
     tracked = [record for record in frame.screen if record.means2d.requires_grad and record.means2d.numel() > 0]
     centers, probes = [record.means2d for record in tracked], [record.probe for record in tracked]
     found = torch.autograd.grad(total, [*leaves.values(), *centers, *probes], allow_unused=True)
@@ -179,7 +180,7 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Di
     on_screen = found[len(leaves) :]
     pulls = zip(tracked, on_screen[: len(tracked)], on_screen[len(tracked) :], strict=True)
     screen = [(s, v_means, v_probe) for s, v_means, v_probe in pulls if v_means is not None and v_probe is not None]
-    losses = {name: float(value.detach()) for name, value in terms.items()}
+    losses = dict(zip(terms, stacked.tolist(), strict=True))
     return Differentiated(losses, gradients, screen, frame.visible)
 
 

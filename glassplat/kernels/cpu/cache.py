@@ -65,6 +65,9 @@ def _described(value: Any, seen: set[int]) -> Iterator[str]:
         if id(value) not in seen:
             seen.add(id(value))
             yield from _described_function(value, seen)
+    elif type(value).__name__ == "_Intrinsic":
+        # What a kernel says to the compiler in its own words, in a function that Numba wraps.
+        yield from _described(value._defn, seen)
     else:
         raise TypeError(
             f"a kernel uses {value!r}, a {type(value).__name__}, whose changes the cache would not notice; expected "
