@@ -102,9 +102,13 @@ def parsed(arguments: list[str]) -> Any:
     """The command that the arguments describe.
 
     Raises:
+        InputError: an option is out of range.
         SystemExit: they ask for help or the version, or cannot be understood.
     """
     import tyro
+
+    from glassplat.commands.arguments import check_arguments
+    from glassplat.data.options import check_options
 
     if arguments[:1] == ["--version"]:
         print(f"glassplat {__version__}")
@@ -112,23 +116,20 @@ def parsed(arguments: list[str]) -> Any:
     config = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes)
     name = arguments[0] if arguments else ""
     if name in COMMANDS:
-        from glassplat.commands.arguments import check_arguments
-        from glassplat.data.options import check_options
-
         check_arguments(arguments)
-        kind, options = chosen(name, arguments[1:])
-        command: Any = tyro.cli(kind, prog=f"glassplat {name}", args=options, config=config)
+        kind, options = command_line(name, arguments[1:])
+        command = tyro.cli(kind, prog=f"glassplat {name}", args=options, config=config)
         check_options(command)
         return command
     # Nothing is left to run after the list of commands; only a shell's completions need to know every option.
     complete = name.startswith("--tyro-")
-    kinds = {known: chosen(known, [])[0] if complete else stub(known) for known in COMMANDS}
+    kinds = {known: command_line(known, [])[0] if complete else stub(known) for known in COMMANDS}
     tyro.cli(overview(kinds), prog="glassplat", description=DESCRIPTION, args=arguments, config=config)
     raise SystemExit(USAGE_CODE)
 
 
-def chosen(name: str, options: list[str]) -> tuple[type, list[str]]:
-    """What tyro makes of a command's arguments, and these; those of `train` decide on its defaults."""
+def command_line(name: str, options: list[str]) -> tuple[Any, list[str]]:
+    """What tyro should make of a command's options, and how it should see them; that of `train` depends on them."""
     if name == "train":
         from glassplat.commands.train_options import train_command
 
