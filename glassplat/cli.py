@@ -9,13 +9,14 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import field, make_dataclass
 from typing import Annotated, Any, NamedTuple, Union
 
 from glassplat import __version__
 
-USAGE_CODE, INTERRUPTED_CODE = 2, 130
+FAILURE_CODE, USAGE_CODE, INTERRUPTED_CODE, UNREAD_CODE = 1, 2, 130, 141
+"""The last two as shells report a process that Ctrl-C or a closed pipe ended."""
 DESCRIPTION = "Gaussian splatting for scenes with window panes, showcases and mirrors."
 
 
@@ -50,7 +51,8 @@ COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code.
 
-    That is 0 done, 1 failed, 2 bad input, 130 interrupted (143 and 129 where another signal than Ctrl-C asked for it).
+    That is 0 done, 1 failed, 2 bad input, 130 interrupted (143 and 129 where another signal than Ctrl-C asked for it),
+    141 when nobody reads the output any more.
 
     Raises:
         SystemExit: after help (0) and after options that cannot be understood (2).
@@ -60,12 +62,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:  # In the moments before anybody listens, or while the end is being reported.
         print("interrupted", file=sys.stderr)
         return INTERRUPTED_CODE
+    except Exception as error:  # noqa: BLE001 - Even the report failed, as it may when memory has run out.
+        reason = "out of memory" if isinstance(error, MemoryError) else type(error).__name__
+        print(f"stopped: {reason}", file=sys.stderr)
+        return FAILURE_CODE
 
 
 def guarded(arguments: list[str], *, is_program: bool) -> int:
     """Runs a command; whatever happens ends in one readable message and an exit code."""
     from glassplat.commands.endings import ending
-    from glassplat.commands.messages import complain, plain_streams
+    from glassplat.commands.messages import complain, drop_output, plain_streams
     from glassplat.commands.signals import immediate_end, raised_signals
 
     plain_streams()
@@ -79,10 +85,15 @@ def guarded(arguments: list[str], *, is_program: bool) -> int:
             return interrupted(stop, command)
         except SystemExit:
             raise
+        except BrokenPipeError:
+            drop_output()
+            return UNREAD_CODE
         except BaseException as error:  # noqa: BLE001 - The last guard: nobody is to read a traceback.
             if raised:
                 return interrupted(raised[-1], command)
-            complain(*(end := ending(error))[:2])
+            end = ending(error)
+            with suppress(OSError):  # Nobody hears it where the output is full or closed.
+                complain(end.label, end.text)
             return end.code
     return 0
 
@@ -91,9 +102,13 @@ def parsed(arguments: list[str]) -> Any:
     """The command that the arguments describe.
 
     Raises:
+        InputError: an option is out of range.
         SystemExit: they ask for help or the version, or cannot be understood.
     """
     import tyro
+
+    from glassplat.commands.arguments import check_arguments
+    from glassplat.data.options import check_options
 
     if arguments[:1] == ["--version"]:
         print(f"glassplat {__version__}")
@@ -101,23 +116,20 @@ def parsed(arguments: list[str]) -> Any:
     config = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes)
     name = arguments[0] if arguments else ""
     if name in COMMANDS:
-        from glassplat.commands.arguments import check_arguments
-        from glassplat.data.options import check_options
-
         check_arguments(arguments)
-        kind, options = chosen(name, arguments[1:])
-        command: Any = tyro.cli(kind, prog=f"glassplat {name}", args=options, config=config)
+        kind, options = command_line(name, arguments[1:])
+        command = tyro.cli(kind, prog=f"glassplat {name}", args=options, config=config)
         check_options(command)
         return command
     # Nothing is left to run after the list of commands; only a shell's completions need to know every option.
     complete = name.startswith("--tyro-")
-    kinds = {known: chosen(known, [])[0] if complete else stub(known) for known in COMMANDS}
+    kinds = {known: command_line(known, [])[0] if complete else stub(known) for known in COMMANDS}
     tyro.cli(overview(kinds), prog="glassplat", description=DESCRIPTION, args=arguments, config=config)
     raise SystemExit(USAGE_CODE)
 
 
-def chosen(name: str, options: list[str]) -> tuple[type, list[str]]:
-    """What tyro makes of a command's arguments, and these; those of `train` decide on its defaults."""
+def command_line(name: str, options: list[str]) -> tuple[Any, list[str]]:
+    """What tyro should make of a command's options, and how it should see them; that of `train` depends on them."""
     if name == "train":
         from glassplat.commands.train_options import train_command
 
@@ -152,14 +164,12 @@ def overview(kinds: Mapping[str, type]) -> type:
 
 
 def run(command: Any) -> None:
-    """Runs a command; its console shows its log too."""
-    import logging
-
-    from glassplat.commands.messages import LogLines, message_console
+    """Runs a command; its console shows the package's log too, and what libraries warn of."""
+    from glassplat.commands.messages import heard_by, message_console
 
     console = message_console()
-    logging.basicConfig(level=logging.INFO, handlers=[LogLines(console)])
-    command.run(console)
+    with heard_by(console):
+        command.run(console)
 
 
 def interrupted(stop: KeyboardInterrupt, command: Any) -> int:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 from rich.console import Console
 
-from glassplat.commands.bench_runs import FinishedRun, PlannedRun, execute, scene_names
+from glassplat.commands.bench_runs import RUNS, FinishedRun, PlannedRun, earlier_runs, execute, scene_names
 from glassplat.commands.bench_tables import (
     Measured,
     Pair,
@@ -72,23 +71,17 @@ class BenchScenes:
     mask_polarity: Polarity = "auto"
 
     def run(self, console: Console) -> None:
-        """Runs what is missing and writes `scenes.md` and `scenes.json`."""
+        """Runs what is missing and writes `scenes.md` and `scenes.json`, of earlier commands' runs in it too."""
         recipes = {
             variant_name(method, strategy, preset): with_strategy(recipe_of(method, preset), strategy)
             for preset in unique(self.presets, "presets")
             for strategy in unique(self.strategies, "strategies")
             for method in unique(self.methods, "methods")
         }
-        pairs = [
-            Pair(f"{reflective} - {splat}", reflective, splat)
-            for preset in self.presets
-            for strategy in self.strategies
-            for method in ("planar", "deferred")
-            if (reflective := variant_name(method, strategy, preset)) in recipes
-            and (splat := variant_name("splat", strategy, preset)) in recipes
-        ]
         runs = planned_runs(self, recipes)
-        execute(runs, console, partial(write_scenes, self.output, pairs))
+        variants = all_variants()
+        earlier = earlier_runs(self.output, variants, runs)
+        execute(runs, console, lambda done: write_scenes(self.output, in_order([*done, *earlier], variants)))
         say(console, f"tables: {self.output / 'scenes.md'}, {self.output / 'scenes.json'}")
 
 
@@ -117,12 +110,16 @@ class BenchAblation:
     mask_polarity: Polarity = "auto"
 
     def run(self, console: Console) -> None:
-        """Runs what is missing and writes `ablation.md` and `ablation.json`."""
+        """Runs what is missing and writes `ablation.md` and `ablation.json`, of earlier commands' runs in it too."""
         full = RECIPES[self.method]()
         ablations = self.chosen()
-        recipes = {FULL: full} | {f"no-{switch}": ablation.off(full) for switch, ablation in ablations.items()}
-        runs = planned_runs(self, recipes)
-        execute(runs, console, partial(write_ablation, self.output, ablations))
+        runs = planned_runs(self, ablation_recipes(full, ablations))
+        known = ABLATIONS[self.method]
+        variants = ablation_recipes(full, known)
+        earlier = earlier_runs(self.output, variants, runs)
+        kept = {run.run.variant for run in earlier}
+        tabled = {s: part for s, part in known.items() if s in ablations or off_name(s) in kept}
+        execute(runs, console, lambda done: write_ablation(self.output, tabled, in_order([*done, *earlier], variants)))
         say(console, f"tables: {self.output / 'ablation.md'}, {self.output / 'ablation.json'}")
 
     def chosen(self) -> dict[Switch, Ablation]:
@@ -168,6 +165,49 @@ def variant_name(method: str, strategy: str, preset: Preset = "glassplat") -> st
     return name if preset == "glassplat" else f"{name}-{preset}"
 
 
+def all_variants() -> dict[str, Any]:
+    """The recipe of every variant that a table of scenes may hold."""
+    return {
+        variant_name(method, strategy, preset): with_strategy(recipe_of(method, preset), strategy)
+        for preset in get_args(Preset)
+        for strategy in get_args(Strategy)
+        for method in get_args(Method)
+    }
+
+
+def compared_variants() -> list[tuple[str, str]]:
+    """Which variants tables of scenes set against each other: methods and `splat`, and recipes and their papers'."""
+    strategies, presets = get_args(Strategy), get_args(Preset)
+    gains = [
+        (variant_name(method, strategy, preset), variant_name("splat", strategy, preset))
+        for preset in presets
+        for strategy in strategies
+        for method in ("planar", "deferred")
+    ]
+    changes = [
+        (variant_name(method, strategy), variant_name(method, strategy, "paper"))
+        for strategy in strategies
+        for method in get_args(Method)
+    ]
+    return gains + changes
+
+
+def off_name(switch: Switch) -> str:
+    """What tables and directories call a method without one of its parts."""
+    return f"no-{switch}"
+
+
+def ablation_recipes(full: Any, ablations: Mapping[Switch, Ablation]) -> dict[str, Any]:
+    """The full recipe, and those without one of its parts, by variant."""
+    return {FULL: full} | {off_name(switch): ablation.off(full) for switch, ablation in ablations.items()}
+
+
+def in_order(finished: Sequence[FinishedRun], variants: Iterable[str]) -> list[FinishedRun]:
+    """The runs by scene, in the order in which scenes come, by seed, and as the variants are listed."""
+    scenes, names = list(dict.fromkeys(f.run.scene for f in finished)), list(variants)
+    return sorted(finished, key=lambda f: (scenes.index(f.run.scene), f.run.train.seed, names.index(f.run.variant)))
+
+
 def with_strategy(recipe: Any, strategy: str) -> Any:
     """The recipe with a densification strategy.
 
@@ -206,7 +246,7 @@ def planned_runs(bench: BenchScenes | BenchAblation, recipes: dict[str, Any]) ->
             Train(
                 recipe,
                 data.resolve(),
-                bench.output / "runs" / scene / f"{variant}-seed{seed}",
+                bench.output / RUNS / scene / f"{variant}-seed{seed}",
                 iterations=bench.iterations,
                 downscale=bench.downscale,
                 seed=seed,
@@ -219,8 +259,9 @@ def planned_runs(bench: BenchScenes | BenchAblation, recipes: dict[str, Any]) ->
     ]
 
 
-def write_scenes(output: Path, pairs: Sequence[Pair], finished: Sequence[FinishedRun]) -> None:
+def write_scenes(output: Path, finished: Sequence[FinishedRun]) -> None:
     """Writes what is finished."""
+    pairs = [Pair(f"{first} - {second}", first, second) for first, second in compared_variants()]
     measured = measured_runs(finished)
     reached, compared = means(measured), differences(measured, pairs)
     tables = [means_table(reached, "Scenes", " ".join([SPREAD_NOTE, *remarks(finished)]))]
@@ -233,7 +274,7 @@ def write_scenes(output: Path, pairs: Sequence[Pair], finished: Sequence[Finishe
 def write_ablation(output: Path, ablations: Mapping[Switch, Ablation], finished: Sequence[FinishedRun]) -> None:
     """Writes what is finished."""
     measured = measured_runs(finished)
-    pairs = [Pair(ablation.title, f"no-{switch}", FULL) for switch, ablation in ablations.items()]
+    pairs = [Pair(ablation.title, off_name(switch), FULL) for switch, ablation in ablations.items()]
     reached, compared = means(measured), differences(measured, pairs)
     published = [ablation for ablation in ablations.values() if ablation.paper_psnr is not None]
     paper = "; ".join(f"{ablation.title} {ablation.paper_psnr:+.2f}" for ablation in published)

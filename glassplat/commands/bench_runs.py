@@ -5,8 +5,8 @@ from __future__ import annotations
 import statistics
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,11 @@ from glassplat.files.json_text import read_json
 from glassplat.init.planes import PlaneFitError
 from glassplat.train.background import with_background
 from glassplat.train.run_directory import RunDirectory
+from glassplat.train.stage import check_length
 from glassplat.train.trainer import TrainingDivergedError
+
+RUNS = "runs"
+"""Folder of a comparison's runs: `<scene>/<variant>-seed<seed>`."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +115,55 @@ def scene_names(captures: Sequence[Path]) -> list[str]:
     return ["-".join(part.strip("/") for part in path.parts[-depth:]) for path in folders]
 
 
+def earlier_runs(output: Path, recipes: Mapping[str, Any], planned: Sequence[PlannedRun]) -> list[FinishedRun]:
+    """Finished runs that earlier commands left in the same output, of other captures, variants or seeds.
+
+    They stay in the tables, which would otherwise hold the last command's runs only.
+
+    Args:
+        output: of the comparison.
+        recipes: of every variant that its tables may hold.
+        planned: the runs of this command.
+
+    Raises:
+        InputError: one of them cannot stand in a table with those that are planned, because its length, scale or
+            recipe is another.
+    """
+    own, like = {run.directory.path.resolve() for run in planned}, planned[0].train
+    found = []
+    for path in sorted((output / RUNS).glob("*/*-seed*")):
+        variant, _, seed = path.name.rpartition("-seed")
+        if variant not in recipes or not seed.isdecimal() or path.resolve() in own:
+            continue
+        recorded = RunDirectory(path).settings()
+        train = replace(
+            like,
+            recipe=recipes[variant],
+            data=Path(recorded.data),
+            output=path,
+            seed=int(seed),
+            iterations=recorded.iterations,
+            downscale=recorded.downscale,
+        )
+        run = PlannedRun(path.parent.name, variant, train)
+        results = run.results()
+        if results is not None:
+            _check_comparable(run, like)
+            found.append(FinishedRun(run, results))
+    return found
+
+
+def _check_comparable(run: PlannedRun, like: Train) -> None:
+    wanted = with_background(run.train.recipe, run.directory.recipe().background)
+    alike = (run.train.iterations, run.train.downscale) == (like.iterations, like.downscale)
+    if not alike or not run.directory.was_begun_with(wanted):
+        raise InputError(
+            f"{run.directory.path} holds a run of {run.train.iterations} iterations at downscale "
+            f"{run.train.downscale}, or with another recipe; expected {like.iterations} at {like.downscale} and the "
+            "recipe of this version, because one table holds both. Choose another --output, or move the run away"
+        )
+
+
 def execute(
     runs: Sequence[PlannedRun], console: Console, after_each: Callable[[list[FinishedRun]], None]
 ) -> list[FinishedRun]:
@@ -127,6 +180,7 @@ def execute(
     """
     for run in runs:
         run.check()
+        check_length(run.train.recipe.stages(run.train.seed), run.train.iterations)
     finished = _finished(runs)
     after_each(finished)
     if finished:

@@ -8,9 +8,13 @@ from __future__ import annotations
 
 import io
 import logging
+import os
 import re
 import sys
-from typing import Literal
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.text import Text
@@ -61,10 +65,19 @@ def printable(text: str) -> str:
 
 
 def plain_streams() -> None:
-    """Lets output in an encoding that lacks a character show its number, where it would end with an error."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
+    """Lets every program be started from: with output that is closed, or in an encoding that lacks a character."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - Until the process ends.
+        elif isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+
+
+def drop_output() -> None:
+    """Sends what is still to be printed nowhere, since nobody reads it any more."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
 
 
 class LogLines(logging.Handler):
@@ -80,3 +93,17 @@ class LogLines(logging.Handler):
             warn(self._console, record.getMessage())
         else:
             say(self._console, record.getMessage())
+
+
+@contextmanager
+def heard_by(console: Console) -> Iterator[None]:
+    """Shows on a console what the package logs and what libraries warn of, each as a line."""
+
+    def show(message: Warning | str, *place: Any, **more: Any) -> None:
+        warn(console, message)
+
+    logging.basicConfig(level=logging.WARNING, handlers=[LogLines(console)])
+    logging.getLogger("glassplat").setLevel(logging.INFO)
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield

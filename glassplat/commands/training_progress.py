@@ -10,7 +10,15 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from glassplat.commands.messages import say, warn
 from glassplat.train.messages import (
@@ -28,6 +36,8 @@ FIRST_PAUSE, LONGEST_PAUSE = 1.0, 10.0
 SPEED_SECONDS = 60.0
 """How far back the speed is measured from which the time left follows."""
 SMOOTHING = 0.98
+WIDE = 110
+"""Columns of a terminal from which on the last checkpoint has room in the bar."""
 FREQUENT = ("densify", "grow")
 """Actions of which nobody wants to read each time, by how their names begin."""
 
@@ -105,10 +115,13 @@ class TrainingProgress:
 
 
 class StepBar:
-    """A bar with loss, number of Gaussians, remaining time and the last checkpoint; it appears with the first step."""
+    """A bar with loss, number of Gaussians, remaining time and, if there is room, the last checkpoint.
+
+    It appears with the first step.
+    """
 
     def __init__(self, console: Console) -> None:
-        columns = (
+        columns: list[ProgressColumn] = [
             TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
@@ -117,8 +130,9 @@ class StepBar:
             TimeElapsedColumn(),
             TextColumn("left"),
             TimeRemainingColumn(compact=True),
-            TextColumn("{task.fields[saved]}"),
-        )
+        ]
+        if console.width >= WIDE:
+            columns.append(TextColumn("{task.fields[saved]}"))
         self._bar = Progress(*columns, console=console, refresh_per_second=4)
         self._begun = False
 

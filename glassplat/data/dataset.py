@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
+from os.path import isdir
 from pathlib import Path
 
 import torch
@@ -123,7 +124,7 @@ def load_dataset(
 
 def _load_capture(root: Path) -> Capture:
     """The answer of the first loader that knows the format."""
-    if not root.is_dir():
+    if not isdir(root):
         raise FileNotFoundError(f"no folder {root}; expected the folder of a capture")
     for load, _ in LOADERS:
         capture = load(root)

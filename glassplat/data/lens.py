@@ -25,7 +25,7 @@ SHORTEST_FOCAL, LONGEST_FOCAL = 1e-3, 1e5
 """In sizes of the image; beyond lies no lens, and float32 cannot resolve what such a camera shows."""
 FARTHEST_CENTER = 1e3
 """Of the principal point from the image, in sizes of the image; cropped photographs have it outside."""
-LARGEST_COEFFICIENT = 1e9
+LARGEST_COEFFICIENT = 1e6
 """Of distortion; those of a calibration are below 100."""
 LEAST_SIDE = 8
 """Of a photograph, in pixels; smaller ones are what a failed download or export leaves."""

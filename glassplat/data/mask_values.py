@@ -72,6 +72,7 @@ def _read_shades(path: Path) -> NDArray[np.uint8]:
     """[H, W] grey values, or the indices of a palette."""
     with input_checked():
         image = open_image(path)
+    image.info.pop("transparency", None)  # It says nothing about panes, and Pillow warns of some ways to store it.
     if image.mode == "1" or (image.mode == "P" and not _is_black_and_white(image)):
         return np.array(image).astype(np.uint8)
     if image.mode in SHADES_16:

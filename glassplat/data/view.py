@@ -14,7 +14,7 @@ from torch import Tensor
 
 from glassplat.data.capture import Shot
 from glassplat.data.errors import InputError, input_checked
-from glassplat.data.lens import Pinhole, PixelMap, lens_for_image, nearest_resize, pinhole_of
+from glassplat.data.lens import MOST_SKEW, Pinhole, PixelMap, lens_for_image, nearest_resize, pinhole_of
 from glassplat.data.masks import PaneMask
 from glassplat.data.poses import rigid_pose
 from glassplat.files.images import image_size, read_image
@@ -180,7 +180,8 @@ def _is_multiple(large: tuple[int, int], small: tuple[int, int]) -> bool:
     """Whether one size is an integer multiple of the other, up to the rounding of the smaller one."""
     factor = round(large[0] / small[0])
     return factor >= 1 and all(
-        abs(a / factor - b) < 1 and (factor > 1 or a == b) for a, b in zip(large, small, strict=True)
+        abs(a / factor - b) < min(1, MOST_SKEW * b) and (factor > 1 or a == b)
+        for a, b in zip(large, small, strict=True)
     )
 
 
@@ -190,9 +191,9 @@ def _opaque(pixels: NDArray[np.uint8], background: Rgb) -> NDArray[np.uint8]:
         return np.repeat(pixels, 3, axis=2)
     if pixels.shape[2] == 3:
         return np.ascontiguousarray(pixels)
-    alpha = pixels[:, :, 3].astype(np.float32) / 255
     behind = np.asarray(background, dtype=np.float32) * 255
-    opaque = np.empty((*alpha.shape, 3), dtype=np.uint8)
-    for index in range(3):  # One after the other: as floats a channel takes more memory than the photograph.
-        opaque[:, :, index] = np.round(pixels[:, :, index] * alpha + behind[index] * (1 - alpha))
+    opaque = np.empty((*pixels.shape[:2], 3), dtype=np.uint8)
+    for row, seen in enumerate(pixels):  # Row by row: as floats a photograph takes four times its memory.
+        alpha = seen[:, 3:].astype(np.float32) / 255
+        opaque[row] = np.round(seen[:, :3] * alpha + behind * (1 - alpha))
     return opaque

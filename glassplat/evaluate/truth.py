@@ -94,12 +94,13 @@ class GroundTruth:
                 f"ground truth for {image_name} is incomplete: {', '.join(missing)} missing; add or remove all"
             )
         size = (width, height)
-        return TrueView(
-            transmission=torch.from_numpy(_resized_color(read_image(paths["transmission"]), size)),
-            reflection=torch.from_numpy(_resized_color(read_image(paths["reflection"]), size)),
-            strength=torch.from_numpy(resized_float(read_image_float(paths["strength"])[..., 0], size)),
-            labels=torch.from_numpy(_resized_labels(read_image(paths["labels"])[..., 0], size)),
-        )
+        with input_checked():
+            return TrueView(
+                transmission=torch.from_numpy(_resized_color(read_image(paths["transmission"]), size)),
+                reflection=torch.from_numpy(_resized_color(read_image(paths["reflection"]), size)),
+                strength=torch.from_numpy(resized_float(read_image_float(paths["strength"])[..., 0], size)),
+                labels=torch.from_numpy(_resized_labels(read_image(paths["labels"])[..., 0], size)),
+            )
 
 
 def load_truth(folder: Path | None) -> GroundTruth | None:
@@ -129,7 +130,8 @@ def _true_plane(entry: Any, where: str) -> TruePlane:
 
 
 def _resized_color(pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    return np.array(Image.fromarray(pixels[..., :3]).resize(size, Image.Resampling.BOX))
+    colors = np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else np.ascontiguousarray(pixels[..., :3])
+    return np.array(Image.fromarray(colors).resize(size, Image.Resampling.BOX))
 
 
 def resized_float(pixels: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:

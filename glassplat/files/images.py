@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +22,8 @@ MOST_PIXELS = 2**27
 SHADES_16 = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 _FULL_SCALE_16 = 65535
 
+# Damaged tags that do not matter end in warnings that name no file; those that do matter raise errors.
+warnings.filterwarnings("ignore", module=r"PIL\.")
 Image.MAX_IMAGE_PIXELS = None  # `opened` sets the bound, and says which file is too large; Pillow warns and names none.
 
 

@@ -38,6 +38,7 @@ HEADER: dict[str, Field] = {
     "active_sh_degree": ByName(SH_DEGREE),
     "updates": ByName(Whole(0)),
     "paused": Optional(ByName(Whole(0)), {}),
+    "hurried": Optional(ByName(Number(0)), {}),
     "records": Optional(ByName(Number()), {}),
 }
 """What is `Optional` was added after the first checkpoints were written."""
@@ -83,6 +84,7 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
         "active_sh_degree": {part: g.active_sh_degree for part, g in scene.gaussian_sets().items()},
         "updates": state.optimizer.updates,
         "paused": state.optimizer.paused,
+        "hurried": state.optimizer.hurried,
         "records": state.records,
     }
     write_tensors(path, tensors, header)
@@ -157,15 +159,16 @@ def restored_state(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     Raises:
         InputError: the tensors do not belong to the header, or to one another.
     """
-    broken = sorted(name for name, tensor in tensors.items() if not tensor.is_floating_point())
-    if broken:
-        raise InputError(f"{broken[0]} holds {tensors[broken[0]].dtype}; expected floating-point numbers")
+    check_types(tensors)
     with input_checked():
         scene = restored_scene(header, tensors)
     first, second = under(tensors, "first/"), under(tensors, "second/")
     if not first.keys() == second.keys() <= header["updates"].keys():
         raise InputError("not every parameter that was stepped has both moments and a count of its updates")
     check_like(second, first, "the second moments")
+    lost = sorted(first.keys() - scene.parameters().keys())
+    if lost:
+        raise InputError(f"it has moments of {', '.join(lost)}, but no such parameters")
     return TrainState(
         scene=scene,
         method=header["method"],
@@ -177,6 +180,7 @@ def restored_state(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
             {name: (first[name], second[name]) for name in first},
             updates=dict(header["updates"]),
             paused=dict(header["paused"]),
+            hurried=dict(header["hurried"]),
         ),
         statistics=restored_statistics(under(tensors, "statistics/"), scene),
         means=under(tensors, "means/"),
@@ -190,6 +194,8 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
         raise InputError(
             f"it holds the sets of Gaussians {sorted(header['active_sh_degree'])}; expected primary, glass"
         )
+    if "scene/glass/logit_mark" not in tensors:
+        raise InputError("the glass has no logit_mark")
     sets = {
         part: restored_gaussians(under(tensors, f"scene/{part}/"), part, degree)
         for part, degree in header["active_sh_degree"].items()
@@ -231,6 +237,16 @@ def restored_statistics(tensors: Mapping[str, Tensor], scene: Scene) -> dict[str
             raise InputError(f"the statistics of {part} are {sorted(known)}; expected {sorted(expected)}")
         found[part] = ScreenStatistics(**known)
     return found
+
+
+def check_types(tensors: Mapping[str, Tensor]) -> None:
+    """Raises InputError unless all tensors hold floating-point numbers of one precision."""
+    for name, tensor in tensors.items():
+        if not tensor.is_floating_point():
+            raise InputError(f"{name} holds {tensor.dtype}; expected floating-point numbers")
+        first = next(iter(tensors.values()))
+        if tensor.dtype != first.dtype:
+            raise InputError(f"{name} holds {tensor.dtype}, other tensors {first.dtype}; expected one precision")
 
 
 def check_shapes(tensors: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...] | None], of: str) -> None:

@@ -27,18 +27,17 @@ from glassplat.data.ranges import (
 from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
 from glassplat.densify.propagate import NormalPropagation
-from glassplat.init.region import reflective_region
 from glassplat.losses.geometry import normal_consistency
 from glassplat.losses.reflectors import mean_strength, strength_outside
 from glassplat.losses.term import LossTerm, weighted
 from glassplat.render.deferred import INVISIBLE, Deferred, Shading
 from glassplat.render.splat import Splat
 from glassplat.scene.activations import logit
-from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import SH_ZERO
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, ResetOpacity
 from glassplat.train.background import BLACK
+from glassplat.train.environment_entry import AddEnvironment
 from glassplat.train.optimizer import Rate
 from glassplat.train.propagation import (
     DensifyWhilePropagating,
@@ -100,6 +99,8 @@ class DeferredRecipe:
         consistency_weight: weight of the difference between normals and the slope of the depths, while normals spread.
         propagation: how normals spread and colours are sabotaged.
         schedule: when they do.
+        hurry_matte: raise the learning rates to those of `splat` for the rest of a run in which propagation has found
+            nothing that reflects.
         propagation_interval: steps between densifications while normals spread; None keeps `densify.interval`.
         rates: learning rates of the Gaussians; they do not rise in short runs, which costs a mirror ball its normals
             (docs/experiments.md).
@@ -129,6 +130,7 @@ class DeferredRecipe:
     consistency_weight: NotNegative = 0.3
     propagation: NormalPropagation = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
+    hurry_matte: bool = True
     propagation_interval: Several | None = None
     rates: GaussianRates = field(default_factory=partial(GaussianRates, short_run_power=0.0))
     reflection_rates: ReflectionRates = field(default_factory=ReflectionRates)
@@ -150,6 +152,7 @@ class DeferredRecipe:
             consistency_weight=0.0,
             propagation=NormalPropagation(sabotage=0.4 * SH_ZERO),
             schedule=PropagationSchedule(end="fixed", stop=24_000 / CODE_ITERATIONS, pause=200, last_reset=False),
+            hurry_matte=False,
             propagation_interval=500,
             rates=GaussianRates(decay=30_000 / CODE_ITERATIONS, short_run_power=0.0),
             reflection_rates=ReflectionRates(strength=6e-3),
@@ -170,18 +173,11 @@ class DeferredRecipe:
         )
 
     def initialise(self, dataset: Dataset) -> Scene:
-        """The first scene: one Gaussian per point that hardly reflects, and a random environment."""
+        """The first scene: one Gaussian per point that hardly reflects, and no environment yet."""
         primary = self._population().initial(dataset.points, self.sh_degree)
         strengths = torch.full((len(primary),), logit(self.first_strength))
         primary = replace(primary, channels={"logit_strength": strengths})
-        environment = Environment.random(
-            min(self.first_texels, self.texels), generator=torch.Generator().manual_seed(0)
-        )
-        region = self.region
-        if region is None and self.find_region:
-            region = reflective_region([view.camera for view in dataset.train])
-        environment = replace(environment, region=region)
-        return Scene(primary, dataset.extent, environment=environment)
+        return Scene(primary, dataset.extent)
 
     def renderer(self) -> Deferred:
         """The renderer of the finished scene, with all its layers."""
@@ -202,6 +198,7 @@ class DeferredRecipe:
             densify_until=population.densify_until,
         )
         beat = Every(self.rhythm.beat, 0.0, self.schedule.stop, self.rhythm.least, skip_multiples_of=3)
+        renderer = Deferred(self.background or BLACK, self.shading, depth=self.consistency_weight != 0)
         guidance = weighted(
             LossTerm("outside", self.outside_weight, strength_outside),
             LossTerm("strength", self.strength_weight, mean_strength),
@@ -210,22 +207,25 @@ class DeferredRecipe:
         reflection = Stage(
             name="2 reflection",
             share=self.schedule.stop - self.bootstrap,
-            renderer=Deferred(self.background or BLACK, self.shading, depth=self.consistency_weight != 0),
+            renderer=renderer,
             losses=(*image, *guidance, *population.terms),
             rates=self.rates.of("primary") | self.reflection_rates.of(),
             actions=(
                 *self._edits(population),
+                # Before the resets: it looks at what is seen, also at the beats that it leaves to them.
+                Propagate(beat, self.propagation, self.schedule, renderer, matte_rates=self._matte_rates()),
                 GrowShAfterPropagation(Every(self.rhythm.sh)),
                 *population.resets,
                 *self._last_resets(population),
-                Propagate(beat, self.propagation, self.schedule),
                 RefineEnvironment(self._doublings(), self.texels),
             ),
             motions=population.motions,
+            entry=AddEnvironment(min(self.first_texels, self.texels), self.region, self.find_region),
             densify_until=population.densify_until,
         )
         refinement = replace(
             reflection,
+            entry=None,
             name="3 refinement",
             share=1 - self.schedule.stop,
             renderer=Deferred(self.background or BLACK, self.shading, depth=False),
@@ -235,10 +235,10 @@ class DeferredRecipe:
 
     def contradiction(self) -> str | None:
         """What is wrong with the options together, if anything."""
-        if self.schedule.stop < self.bootstrap:
+        if self.schedule.stop <= self.bootstrap:
             return (
                 f"--schedule.stop is {self.schedule.stop} and --bootstrap {self.bootstrap}; normals spread in between, "
-                "so expected --schedule.stop to be no smaller"
+                "so expected --schedule.stop to be larger"
             )
         return None
 
@@ -262,6 +262,17 @@ class DeferredRecipe:
         """The resets after propagation."""
         resets = population.resets if self.schedule.last_reset else ()
         return tuple(ResetAfterPropagation.following(reset) for reset in resets)
+
+    def _matte_rates(self) -> dict[str, Rate]:
+        """What brings the learning rates to those of `splat`, where nothing reflects that higher ones would spoil."""
+        if not self.hurry_matte:
+            return {}
+        missing = GaussianRates().short_run_power - self.rates.short_run_power
+        return {
+            name: Rate(1.0, short_run_power=missing)
+            for name, rate in GaussianRates().of("primary").items()
+            if rate.short_run_power
+        }
 
     def _population(self) -> Population:
         means_rate = self.rates.of("primary")["primary.means"]

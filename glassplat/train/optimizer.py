@@ -60,11 +60,13 @@ class Optimizer:
         moments: first and second moment of each parameter.
         updates: how often each parameter was stepped, for the bias correction.
         paused: for how many more steps a parameter is left as it is.
+        hurried: by what the rate of a parameter is multiplied from now on; 1 where nothing is said.
     """
 
     moments: Moments = field(default_factory=dict)
     updates: dict[str, int] = field(default_factory=dict)
     paused: dict[str, int] = field(default_factory=dict)
+    hurried: dict[str, float] = field(default_factory=dict)
 
     def step(
         self, parameters: Mapping[str, Tensor], gradients: Mapping[str, Tensor], rates: Mapping[str, float | Tensor]
@@ -76,7 +78,14 @@ class Optimizer:
                 continue
             first, second = self.moments_of(name, parameter)
             self.updates[name] = self.updates.get(name, 0) + 1
-            adam(parameter, gradient, first, second, lr=rates[name], step=self.updates[name])
+            adam(
+                parameter,
+                gradient,
+                first,
+                second,
+                lr=rates[name] * self.hurried.get(name, 1.0),
+                step=self.updates[name],
+            )
 
     def _waits(self, name: str) -> bool:
         """Whether a parameter is paused; counts the step."""

@@ -7,7 +7,7 @@ import json
 from typing import Any, Literal, Protocol
 
 from glassplat.data.dataset import Dataset
-from glassplat.data.errors import InputError
+from glassplat.data.errors import InputError, input_checked
 from glassplat.data.options import options_from_json, shown
 from glassplat.data.view import Rgb
 from glassplat.files.json_text import parse_json
@@ -61,20 +61,18 @@ def recipe_to_json(recipe: Any) -> str:
     return json.dumps({"method": recipe.method, **dataclasses.asdict(recipe)}, indent=2)
 
 
-def recipe_from_json(text: str) -> Any:
-    """The recipe that `recipe_to_json` wrote.
+def recipe_from_json(text: str, where: str = "the recipe") -> Any:
+    """The recipe that `recipe_to_json` wrote; `where` names the text in messages.
 
     Raises:
         InputError: not a recipe, or written by a version with other fields; says which value is wrong.
     """
-    try:
-        fields = parse_json(text, "the recipe")
-    except ValueError as error:
-        raise InputError(f"this is not a recipe but {shown(text)}; expected JSON. {REMEDY}") from error
+    with input_checked():
+        fields = parse_json(text, where)
     method = fields.pop("method", None) if isinstance(fields, dict) else None
     if not isinstance(method, str) or method not in RECIPES:
-        raise InputError(f"the method is {shown(method)}; expected one of {', '.join(RECIPES)}. {REMEDY}")
+        raise InputError(f"{where}: the method is {shown(method)}; expected one of {', '.join(RECIPES)}. {REMEDY}")
     try:
         return options_from_json(RECIPES[method], fields)
     except InputError as error:
-        raise InputError(f"this is not a recipe that this version can read: {error}. {REMEDY}") from error
+        raise InputError(f"{where} is not one that this version can read: {error}. {REMEDY}") from error

@@ -153,11 +153,7 @@ class RunDirectory:
 
     def recipe(self) -> Any:
         """The recorded recipe."""
-        written = self._read("recipe.json")
-        try:
-            return recipe_from_json(written)
-        except InputError as error:
-            raise InputError(f"{self.path / 'recipe.json'}: {error}") from error
+        return recipe_from_json(self._read("recipe.json"), str(self.path / "recipe.json"))
 
     def was_begun_with(self, recipe: Any) -> bool:
         """Whether `begin` recorded just this recipe.

@@ -62,10 +62,13 @@ class Every:
     skip_multiples_of: int | None = None
     only_multiples_of: int | None = None
 
+    def interval(self, clock: Clock) -> int:
+        """Steps from one multiple to the next."""
+        return max(round(self.share * clock.iterations), self.least, 1)
+
     def due(self, clock: Clock) -> bool:
         """Whether the moment is now."""
-        interval = max(round(self.share * clock.iterations), self.least, 1)
-        count, remainder = divmod(clock.step, interval)
+        count, remainder = divmod(clock.step, self.interval(clock))
         if remainder or not self.start * clock.iterations < clock.step <= self.stop * clock.iterations:
             return False
         if self.skip_multiples_of and count % self.skip_multiples_of == 0:

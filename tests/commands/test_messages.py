@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import io
+import logging
+import warnings
 
 import pytest
 from rich.console import Console
 from rich.table import Table
 
-from glassplat.commands.messages import complain, message_console, printable, say, warn
+from glassplat.commands.messages import complain, heard_by, message_console, printable, say, warn
 
 AWKWARD = [
     "/data/[bold]/run",
@@ -71,3 +73,25 @@ def test_tables_show_names_as_they_are(capsys: pytest.CaptureFixture[str]) -> No
     message_console().print(table)
     shown = capsys.readouterr().out
     assert all(name in shown for name in ("[bold]", "[/x]", ":smile:"))
+
+
+def test_what_is_logged_and_warned_of_is_a_line_each(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+    monkeypatch.setattr(logging.getLogger(), "level", logging.WARNING)
+    package, library = logging.getLogger("glassplat.kernels"), logging.getLogger("somebody.else")
+    with heard_by(message_console()):
+        package.info("compiling [bold] for %s", "this :x: machine")
+        package.warning("cannot keep [/x]")
+        library.info("chatter")
+        library.warning("beware")
+        with warnings.catch_warnings():
+            warnings.simplefilter("default")
+            warnings.warn("an image of [127] megapixels", stacklevel=1)
+    assert capsys.readouterr().out.splitlines() == [
+        "compiling [bold] for this :x: machine",
+        "warning: cannot keep [/x]",
+        "warning: beware",
+        "warning: an image of [127] megapixels",
+    ]

@@ -58,12 +58,8 @@ def ended(script: str) -> tuple[int, str, str]:
     [
         ("glassplat.commands.messages", "SIGINT"),
         ("tyro", "SIGINT"),
-        ("torch", "SIGINT"),
         ("torch._C", "SIGINT"),
-        ("numba", "SIGINT"),
-        ("pycolmap", "SIGINT"),
         ("pycolmap._core", "SIGINT"),
-        ("scipy.spatial._ckdtree", "SIGINT"),
         ("glassplat.train.run", "SIGTERM"),
         ("torch._C", "SIGHUP"),
     ],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -113,3 +114,31 @@ def test_completions_for_a_shell_know_the_options_of_every_command(capsys: pytes
         main(["--tyro-print-completion", "bash"])
     said = capsys.readouterr().out
     assert "--mask-polarity" in said and "--layers" in said
+
+
+SHELL = {
+    "glassplat --help >&-": (0, ""),
+    "glassplat trian 2>&-": (2, ""),
+    "glassplat --version >&- 2>&-": (0, ""),
+    "glassplat eval none 2>/dev/full": (2, ""),
+    "glassplat --help >/dev/full": (1, "stopped: no space left on device; free some space, then repeat the command\n"),
+    "PYTHONIOENCODING=ascii glassplat --help >/dev/null": (0, ""),
+    "LC_ALL=C PYTHONUTF8=0 glassplat [bold]-ä 2>/dev/null": (2, ""),
+}
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="the machine has no device that is always full")
+@pytest.mark.parametrize(("line", "expected"), SHELL.items(), ids=SHELL)
+def test_output_that_is_closed_full_or_narrow_changes_no_exit_code(line: str, expected: tuple[int, str]) -> None:
+    line = line.replace("glassplat", f"{sys.executable} -m glassplat")
+    done = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == expected
+
+
+def test_a_reader_that_leaves_ends_the_command_in_silence() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "glassplat", "--help"]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, "")

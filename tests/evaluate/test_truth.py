@@ -60,6 +60,24 @@ def test_a_view_may_be_absent_but_not_incomplete(tmp_path: Path) -> None:
         truth.view("0008.jpg", 6, 2)
 
 
+def test_a_broken_layer_is_named(tmp_path: Path) -> None:
+    write_view(tmp_path, "0008", LABELS)
+    (tmp_path / "refl" / "0008.png").write_bytes(b"no image")
+    truth = load_truth(tmp_path)
+    assert truth is not None
+    with pytest.raises(InputError, match=r"cannot read .*refl.0008\.png as an image"):
+        truth.view("0008.jpg", 6, 2)
+
+
+def test_a_layer_may_be_grey(tmp_path: Path) -> None:
+    write_view(tmp_path, "0008", LABELS)
+    Image.fromarray(np.full((2, 6), 30, np.uint8)).save(tmp_path / "refl" / "0008.png")
+    truth = load_truth(tmp_path)
+    assert truth is not None
+    view = truth.view("0008.jpg", 6, 2)
+    assert view is not None and view.reflection.tolist() == np.full((2, 6, 3), 30).tolist()
+
+
 PLANE = {"label": 3, "center": [0, 1, 2], "normal": [0, 0, 1], "half_u": [1, 0, 0], "half_v": [0, 1, 0], "ior": 1.5}
 PLANE |= {"mirror": True, "base_reflectance": 1.0}
 

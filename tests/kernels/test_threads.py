@@ -40,6 +40,10 @@ doubled_in_place("first")(values)
 doubled_in_place("second")(values)
 print(values.tolist(), numba.threading_layer())
 """
+ONE_KERNEL = """
+doubled_in_place("first")(np.ones(2, np.float32))
+print(numba.threading_layer())
+"""
 TWO_PYTHON_THREADS = """
 doubled = doubled_in_place("doubled")
 doubled(np.ones(1, np.float32))
@@ -120,17 +124,17 @@ def test_a_tbb_that_happens_to_be_there_is_not_used_and_the_log_says_so_once(tmp
 def test_tbb_stays_out_when_the_environment_changes_before_the_first_kernel(tmp_path: Path) -> None:
     # Numba then reads all its variables anew, and forgets what was set in between.
     change = 'import os\nos.environ["NUMBA_DEVELOPER_MODE"] = "0"\n'
-    *_, result = printed_with_tbb(tmp_path, change + TWO_KERNELS)
-    assert result.split()[-1] in ("omp", "workqueue")
+    *_, result = printed_with_tbb(tmp_path, change + ONE_KERNEL)
+    assert result in ("omp", "workqueue")
 
 
 @pytest.mark.parametrize(
     "asked", [{"NUMBA_THREADING_LAYER": "tbb"}, {"NUMBA_THREADING_LAYER_PRIORITY": "tbb omp workqueue"}], ids=str
 )
 def test_who_asks_for_tbb_gets_it(tmp_path: Path, asked: dict[str, str]) -> None:
-    said, result = printed_with_tbb(tmp_path, TWO_KERNELS, **asked)
+    said, result = printed_with_tbb(tmp_path, ONE_KERNEL, **asked)
     assert said == "kernels run on 2 threads of TBB"
-    assert result.split()[-1] == "tbb"
+    assert result == "tbb"
 
 
 def test_two_python_threads_may_use_kernels_on_the_work_queue(tmp_path: Path) -> None:
