@@ -15,7 +15,7 @@ from typing import Annotated, Any, NamedTuple, Union
 
 from glassplat import __version__
 
-USAGE_CODE, INTERRUPTED_CODE, UNREAD_CODE = 2, 130, 141
+FAILURE_CODE, USAGE_CODE, INTERRUPTED_CODE, UNREAD_CODE = 1, 2, 130, 141
 """The last two as shells report a process that Ctrl-C or a closed pipe ended."""
 DESCRIPTION = "Gaussian splatting for scenes with window panes, showcases and mirrors."
 
@@ -62,6 +62,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:  # In the moments before anybody listens, or while the end is being reported.
         print("interrupted", file=sys.stderr)
         return INTERRUPTED_CODE
+    except Exception as error:  # noqa: BLE001 - Even the report failed, as it may when memory has run out.
+        reason = "out of memory" if isinstance(error, MemoryError) else type(error).__name__
+        print(f"stopped: {reason}", file=sys.stderr)
+        return FAILURE_CODE
 
 
 def guarded(arguments: list[str], *, is_program: bool) -> int:

@@ -29,6 +29,14 @@ BAD_PATH = (
 )
 BAD_PATH_NUMBERS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EROFS, errno.EINVAL)
 FULL = (errno.ENOSPC, errno.EDQUOT)
+OUT_OF_MEMORY = (
+    "can't allocate memory",
+    "Cannot allocate memory",
+    "not enough memory",
+    "bad_alloc",
+    "bad allocation",
+    "failed to map segment",
+)
 LONGEST_QUOTE = 300
 REMEDY = "photographs made smaller (train with a larger --downscale) or fewer Gaussians need less"
 
@@ -82,11 +90,12 @@ def _failure(error: BaseException) -> str:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether the CPU's memory ran out; PyTorch says so in words only."""
-    texts = ("can't allocate memory", "not enough memory", "bad_alloc", "bad allocation")
-    return isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError) and any(text in str(error) for text in texts)
-    )
+    """Whether the CPU's memory ran out, or that is what made a library fail; many say so in words only."""
+    if isinstance(error, MemoryError):
+        return True
+    if isinstance(error, RuntimeError | ImportError | OSError) and any(text in str(error) for text in OUT_OF_MEMORY):
+        return True
+    return error.__cause__ is not None and is_out_of_memory(error.__cause__)
 
 
 def quoted(error: BaseException) -> str:
@@ -100,7 +109,8 @@ def saved_traceback(error: BaseException) -> str:
     trace = "".join(traceback.format_exception(error))
     head = (
         f"glassplat {__version__}, Python {platform.python_version()}, PyTorch {_version('torch')}, "
-        f"Numba {_version('numba')}, {platform.platform()}\n{time.strftime('%Y-%m-%d %H:%M:%S %z')}\n{sys.argv}\n\n"
+        f"Numba {_version('numba')}, {platform.system()} {platform.release()} {platform.machine()}\n"
+        f"{time.strftime('%Y-%m-%d %H:%M:%S %z')}\n{sys.argv}\n\n"
     )
     try:
         with tempfile.NamedTemporaryFile(

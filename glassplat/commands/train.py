@@ -57,7 +57,7 @@ class Train(Generic[RecipeKind]):
 
     def run(self, console: Console) -> None:
         """Trains, with a progress bar or lines."""
-        self._check()
+        check_output(RunDirectory(self.output), resume=self.resume)
         background = photo_background(self.recipe)
         dataset = load_dataset(
             self.data, downscale=self.downscale, background=background, mask_polarity=self.mask_polarity
@@ -79,10 +79,6 @@ class Train(Generic[RecipeKind]):
             f"{len(state.scene.primary)} Gaussians, {len(state.scene.planes)} panes -> {self.output}",
         )
         say(console, f"next: glassplat eval {self.output}")
-
-    def _check(self) -> None:
-        """Refuse what can be told to fail before photographs are read."""
-        check_output(RunDirectory(self.output), resume=self.resume)
 
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""

@@ -9,6 +9,7 @@ import math
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from os.path import lexists
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from glassplat.data.capture import PointCloud
 from glassplat.data.colmap_library import pycolmap
-from glassplat.data.errors import InputError
+from glassplat.data.errors import InputError, input_checked
 from glassplat.data.lens import make_lens
 from glassplat.files.reading import reading
 from glassplat.scene.pose import rotation_from_quat
@@ -71,9 +72,10 @@ def read_model(folder: Path) -> Model:
     if not images:
         raise InputError(f"{folder / f'images{suffix}'} registers no photograph; expected a finished reconstruction")
     points_path = folder / f"points3D{suffix}"
-    rows = _records_of(points_path) if points_path.is_file() else []
+    rows = _records_of(points_path) if lexists(points_path) else []
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
-    return Model(lenses, images, PointCloud.from_arrays(table[:, :3], table[:, 3:]))
+    with input_checked(points_path):
+        return Model(lenses, images, PointCloud.from_arrays(table[:, :3], table[:, 3:]))
 
 
 def pose_matrix(image: ModelImage) -> NDArray[np.float64]:
@@ -203,7 +205,8 @@ def _check_observations(line: str, name: str) -> None:
 def _text_points(stream: Iterator[str]) -> Iterator[tuple[float, ...]]:
     for line in _records(stream):
         fields = line.split(maxsplit=7)
-        yield (*(float(value) for value in fields[1:4]), *(float(int(value)) for value in fields[4:7]))
+        _, x, y, z, red, green, blue = fields[:7]
+        yield (float(x), float(y), float(z), float(int(red)), float(int(green)), float(int(blue)))
 
 
 PARSERS: dict[str, tuple[Callable[[_Bytes], Iterator[Any]], Callable[[Iterator[str]], Iterator[Any]]]] = {

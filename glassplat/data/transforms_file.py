@@ -6,7 +6,7 @@ Their poses are camera-to-world in OpenGL axes (+y up, -z forward); they are con
 from __future__ import annotations
 
 from collections.abc import Mapping
-from os.path import isfile, normpath
+from os.path import isfile, lexists, normpath
 from pathlib import Path
 from typing import Any
 
@@ -104,10 +104,12 @@ def read_points(root: Path, settings: Settings) -> PointCloud | None:
     named = settings.get("ply_file_path")
     if named is not None and not isfile(root / named):
         raise InputError(f"ply_file_path names {root / named}, which does not exist; copy it there or delete the entry")
-    candidates = [named] if named is not None else [name for name in POINT_FILES if isfile(root / name)]
+    candidates = [named] if named is not None else [name for name in POINT_FILES if lexists(root / name)]
     if not candidates:
         return None
     path = root / candidates[0]
+    if not isfile(path):
+        raise InputError(f"{path} is no file that can be read; replace or remove it")
     with input_checked():
         columns = read_table(path).columns
     lacking = [axis for axis in "xyz" if axis not in columns]
@@ -122,4 +124,5 @@ def read_points(root: Path, settings: Settings) -> PointCloud | None:
         if any(c is None for c in rgb)
         else np.stack([c for c in rgb if c is not None], 1)
     )
-    return PointCloud.from_arrays(positions, colors) if len(positions) else None
+    with input_checked(path):
+        return PointCloud.from_arrays(positions, colors) if len(positions) else None

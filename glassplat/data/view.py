@@ -14,7 +14,7 @@ from torch import Tensor
 
 from glassplat.data.capture import Shot
 from glassplat.data.errors import InputError, input_checked
-from glassplat.data.lens import MOST_SKEW, PixelMap, lens_for_image, nearest_resize, pinhole_of
+from glassplat.data.lens import MOST_SKEW, Pinhole, PixelMap, lens_for_image, nearest_resize, pinhole_of
 from glassplat.data.masks import PaneMask
 from glassplat.data.poses import rigid_pose
 from glassplat.files.images import image_size, read_image
@@ -22,8 +22,8 @@ from glassplat.scene.camera import Camera
 
 Rgb = tuple[float, float, float]
 WHITE: Rgb = (1.0, 1.0, 1.0)
-LEAST_REDUCED = 4
-"""Pixels along a side of a reduced photograph."""
+LEAST_SIDE = 8
+"""Pixels along the side of a photograph that was reduced; below that are no edges to tell panes or details by."""
 
 
 @dataclass(frozen=True)
@@ -134,12 +134,7 @@ def prepare_view(shot: Shot, mask: PaneMask | None, options: ViewOptions) -> Pre
         width, height = image_size(shot.image_path)
     lens = lens_for_image(shot.lens, (width, height), shot.name)
     pinhole, distorted = pinhole_of(lens)
-    small = max(1, round(pinhole.width / options.downscale)), max(1, round(pinhole.height / options.downscale))
-    if min(small) < min(LEAST_REDUCED, pinhole.width, pinhole.height):
-        raise InputError(
-            f"a downscale of {options.downscale:g} leaves {small[0]}x{small[1]} pixels of {shot.name}; expected at "
-            f"least {LEAST_REDUCED} along each side: choose a smaller one"
-        )
+    small = _reduced_size(pinhole, options.downscale, shot.name)
     pixel_map = PixelMap(lens if distorted else None, *small)
     pose = torch.from_numpy(rigid_pose(shot.cam_from_world, shot.name)).float()
     camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.width, pinhole.height)
@@ -151,6 +146,22 @@ def prepare_view(shot: Shot, mask: PaneMask | None, options: ViewOptions) -> Pre
         read_pane_labels=None if mask is None else _mask_file(mask, (width, height), pixel_map),
     )
     return PreparedView(view, lens is not shot.lens)
+
+
+def _reduced_size(pinhole: Pinhole, downscale: float, name: str) -> tuple[int, int]:
+    """Width and height of a photograph that is reduced by a factor.
+
+    Raises:
+        InputError: that makes it too small to learn from.
+    """
+    width, height = (max(1, round(side / downscale)) for side in (pinhole.width, pinhole.height))
+    if downscale > 1 and min(width, height) < LEAST_SIDE:
+        most = max(min(pinhole.width, pinhole.height) / LEAST_SIDE, 1)
+        raise InputError(
+            f"{name} is {pinhole.width}x{pinhole.height} pixels large, and reduced by {downscale:g} {width}x{height}; "
+            f"expected at least {LEAST_SIDE} pixels along each side: use --downscale {int(10 * most) / 10:g} or less"
+        )
+    return width, height
 
 
 def _mask_file(mask: PaneMask, size: tuple[int, int], pixel_map: PixelMap) -> MaskFile:

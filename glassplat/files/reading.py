@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,9 +18,12 @@ def reading(path: Path) -> Iterator[None]:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: a folder, a file without permission, a name that is too long, a loop of links, a failing disk.
+        ValueError: a folder, a pipe or a device, which may never end, a file without permission, a name that is too
+            long, a loop of links, a failing disk.
     """
     try:
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            raise ValueError(f"{path} cannot be read (it is a folder, a pipe or a device); expected a file")
         yield
     except FileNotFoundError as error:
         raise FileNotFoundError(f"no file {path}; expected it there") from error

@@ -18,6 +18,9 @@ from glassplat.scene.scene import Scene
 
 PRIMARY, GLASS, PLANES, SCENE = "point_cloud.ply", "glass.ply", "planes.json", "scene.json"
 ENVIRONMENT = "environment.safetensors"
+LARGEST_COLOR = 1e6
+LARGEST_LOG = 40.0
+"""Of a logarithm: its exponential, squared, fits float32."""
 EXTENT = Number(above=0, most=4 * LARGEST_COORDINATE)
 SH_DEGREE = Whole(0, 3)
 HEADER: dict[str, Field] = {
@@ -69,7 +72,7 @@ def read_scene(folder: Path) -> Scene:
 
 
 def _primary(folder: Path, active_sh_degree: int) -> Gaussians:
-    gaussians = read_gaussians(folder / PRIMARY)
+    gaussians = _drawable(folder / PRIMARY)
     try:
         return replace(gaussians, active_sh_degree=active_sh_degree)
     except ValueError as error:
@@ -78,7 +81,25 @@ def _primary(folder: Path, active_sh_degree: int) -> Gaussians:
 
 def _glass(path: Path) -> Gaussians:
     """Glass with its marks, without which nothing tells where it reflects."""
-    glass = read_gaussians(path)
+    glass = _drawable(path)
     if "logit_mark" not in glass.channels:
         raise ValueError(f"{path} has no property logit_mark; expected glass as `planar` exports it")
     return glass
+
+
+def _drawable(path: Path) -> Gaussians:
+    """Gaussians whose colours and channels leave images finite; where one cannot be, it is left out by the renderers.
+
+    Raises:
+        ValueError: a value that training does not come to.
+    """
+    gaussians = read_gaussians(path)
+    bounds = {"sh": LARGEST_COLOR} | {
+        name: LARGEST_LOG if name.startswith("log_") else LARGEST_COLOR for name in gaussians.channels
+    }
+    for name, most in bounds.items():
+        values = gaussians.tensors()[name]
+        broken = ~(values.abs() <= most)  # NaN is not.
+        if bool(broken.any()):
+            raise ValueError(f"{path} holds the value {values[broken][0]:g} of {name}; expected at most {most:g}")
+    return gaussians

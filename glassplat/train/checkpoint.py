@@ -166,6 +166,9 @@ def restored_state(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     if not first.keys() == second.keys() <= header["updates"].keys():
         raise InputError("not every parameter that was stepped has both moments and a count of its updates")
     check_like(second, first, "the second moments")
+    lost = sorted(first.keys() - scene.parameters().keys())
+    if lost:
+        raise InputError(f"it has moments of {', '.join(lost)}, but no such parameters")
     return TrainState(
         scene=scene,
         method=header["method"],
@@ -191,6 +194,8 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
         raise InputError(
             f"it holds the sets of Gaussians {sorted(header['active_sh_degree'])}; expected primary, glass"
         )
+    if "scene/glass/logit_mark" not in tensors:
+        raise InputError("the glass has no logit_mark")
     sets = {
         part: restored_gaussians(under(tensors, f"scene/{part}/"), part, degree)
         for part, degree in header["active_sh_degree"].items()

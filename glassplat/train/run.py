@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError
@@ -34,9 +34,26 @@ STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SI
 
 @dataclass
 class StopRequest:
-    """Set when the user asks a run to stop; the run ends after the current step."""
+    """Set when the user asks a run to stop; the run ends after the current step.
 
-    requested: bool = False
+    Attributes:
+        number: the signal by which it was asked; None as long as it was not.
+        answer: what the signal did before the run began.
+    """
+
+    number: int | None = None
+    answer: Callable[[int, FrameType | None], Any] | int | None = None
+
+    @property
+    def requested(self) -> bool:
+        """Whether the run is to stop."""
+        return self.number is not None
+
+    def end(self) -> NoReturn:
+        """Ends the run as the signal would have ended it, so that the caller can tell one from the other."""
+        if callable(self.answer) and self.number is not None:
+            self.answer(self.number, None)
+        raise KeyboardInterrupt
 
 
 @contextmanager
@@ -49,8 +66,8 @@ def stop_on_interrupt() -> Iterator[StopRequest]:
 
     def ask(number: int, frame: FrameType | None) -> None:
         if request.requested:
-            raise KeyboardInterrupt
-        request.requested = True
+            request.end()
+        request.number, request.answer = number, previous[number]
 
     main = threading.current_thread() is threading.main_thread()
     heard = [number for number in STOP_SIGNALS if main and signal.getsignal(number) != signal.SIG_IGN]
@@ -189,7 +206,7 @@ class Sitting:
                     self._save()
                     self.tell(CheckpointWritten(message.step))
                 if self._stop.requested and not is_last:
-                    raise KeyboardInterrupt
+                    self._stop.end()
 
     def tell(self, message: Message) -> None:
         """Passes a message on; should nobody be there any more to hear it, what was trained is saved first."""
@@ -199,8 +216,8 @@ class Sitting:
         except BaseException as error:
             if isinstance(message, StepDone | ActionDone):
                 self._save()
-            if self._stop.requested:  # A terminal that was closed can show nothing, and that is no failure.
-                raise KeyboardInterrupt from error
+            if self._stop.requested and isinstance(error, OSError):
+                self._stop.end()  # A terminal that was closed can show nothing, and that is no failure.
             raise
 
     def _save(self) -> None:

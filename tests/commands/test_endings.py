@@ -38,6 +38,13 @@ def too_large_for_torch() -> None:
     torch.empty(10**16)
 
 
+def library_without_memory() -> None:
+    try:
+        raise ImportError("_core.so: failed to map segment from shared object")
+    except ImportError as error:
+        raise RuntimeError("Cannot import the C++ backend") from error
+
+
 def too_deep() -> None:
     endless(0)
 
@@ -91,6 +98,8 @@ FAILURES = [
     (too_large_for_torch, ["out of memory", "--downscale"]),
     (too_large_for_numpy, ["out of memory", "--downscale"]),
     (raising(MemoryError()), ["out of memory", "--downscale"]),
+    (library_without_memory, ["out of memory"]),
+    (raising(ImportError("libtorch_cpu.so: failed to map segment from shared object")), ["out of memory"]),
 ]
 UNFORESEEN = [
     (too_deep, "RecursionError"),
@@ -161,6 +170,17 @@ def test_where_no_file_can_be_written_the_line_says_where_the_error_was(
     assert ended(raising(KeyError("x")), monkeypatch) == 1
     said = capsys.readouterr().err
     assert re.search(r"raised in \S*test_endings.py, line \d+\n$", said) and said.count("\n") == 1
+
+
+def test_a_report_that_fails_itself_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def no_memory(error: BaseException) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("glassplat.commands.endings.ending", no_memory)
+    assert ended(raising(KeyError("x")), monkeypatch) == 1
+    assert capsys.readouterr().err == "stopped: out of memory\n"
 
 
 def test_a_library_that_cannot_be_loaded_is_one_line_too(

@@ -175,6 +175,7 @@ def test_cut_off_binary_file_is_named(capture, name: str, share: float) -> None:
         ("images", "1 1 0 0 0 1 2 3 1 0000.png\n2 1 0 0 0 1 2 3 1 0001.png", "line after 0000.png is no list of obser"),
         ("images", "1 1 0 0 0 1 2", r"images\.txt is cut off or damaged"),
         ("points3D", f"1 0 0 0 {10**400} 2 3 0", r"points3D\.txt is cut off or damaged"),
+        ("points3D", "1 0 0 0 1 2 3 0\n2 0.5 0.5 0", r"points3D\.txt is cut off or damaged"),
         ("points3D", "1 0 0 0 256 2 3 0", "colour value 256; expected 0 to 255"),
         ("points3D", "1 0 0 0 1 2 -3 0", "colour value -3; expected 0 to 255"),
         ("points3D", "1 1e38 0 0 1 2 3 0", r"no point of the capture is finite and within 1e\+12"),

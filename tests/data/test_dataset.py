@@ -164,12 +164,6 @@ def test_view_in_memory(capture) -> None:
     assert View.in_memory("rendered.png", camera, photo=photo).pane_labels is None
 
 
-def test_a_downscale_that_leaves_no_photograph_is_refused(capture) -> None:
-    capture.write_colmap()
-    with pytest.raises(InputError, match=r"a downscale of 1000 leaves 1x1 pixels of 0000\.png; expected at least 4"):
-        load_dataset(capture.root, downscale=1000)
-
-
 def test_a_folder_whose_name_is_too_long_is_not_there() -> None:
     with pytest.raises(FileNotFoundError, match="no folder"):
         load_dataset("a" * 5000)

@@ -268,3 +268,17 @@ def test_distorted_photograph_is_undistorted(capture) -> None:
     view = load_dataset(capture.root).train[0]
     assert (view.camera.width, view.camera.height) == (pinhole.width, pinhole.height)
     assert tuple(view.photo.shape) == (pinhole.height, pinhole.width, 3)
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_points_that_are_a_link_to_nowhere_are_not_replaced_by_random_ones(capture, binary: bool) -> None:
+    capture.write_images()
+    capture.write_transforms({**LENS, "frames": capture.frames()})
+    (capture.root / "points3d.ply").symlink_to("/nowhere")
+    with pytest.raises(InputError, match=r"points3d\.ply is no file that can be read"):
+        load_dataset(capture.root)
+    points = capture.write_colmap(binary=binary) / f"points3D.{'bin' if binary else 'txt'}"
+    points.unlink()
+    points.mkdir()
+    with pytest.raises(InputError, match=r"points3D\.\w+ cannot be read \(it is a folder"):
+        load_dataset(capture.root)

@@ -51,7 +51,13 @@ def test_what_is_no_file_is_named(tmp_path: Path) -> None:
         read_json(tmp_path / "absent.json")
     os.symlink(tmp_path / "loop.json", tmp_path / "loop.json")
     (tmp_path / "folder.json").mkdir()
-    for name, reason in (("folder", "Is a directory"), ("loop", "levels of symbolic links"), ("n" * 300, "too long")):
+    os.mkfifo(tmp_path / "pipe.json")  # Nobody writes into it: opening it would wait for ever.
+    for name, reason in (
+        ("folder", "a folder, a pipe or a device"),
+        ("pipe", "a folder, a pipe or a device"),
+        ("loop", "levels of symbolic links"),
+        ("n" * 300, "too long"),
+    ):
         with pytest.raises(ValueError, match=rf"{name}\.json cannot be read \(.*{reason}"):
             read_json(tmp_path / f"{name}.json")
 

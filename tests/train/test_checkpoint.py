@@ -131,6 +131,8 @@ TENSORS: list[tuple[str, Any, str]] = [
     ("scene/planes/normals", torch.zeros(1, 3), r"planes has the tensors .*'normals'.*; expected"),
     ("scene/environment/texels", torch.zeros(6, 1, 1, 3), r"environment has the tensors \['texels'\]; expected"),
     ("scene/environment/raw", torch.zeros(3), r"raw has shape \(3,\); expected \(6, S, S, 3\)"),
+    ("scene/glass/logit_mark", None, "the glass has no logit_mark"),
+    ("scene/primary/log_intensity", None, "it has moments of primary.log_intensity, but no such parameters"),
     ("second/primary.means", None, "has both moments"),
     ("second/primary.means", torch.zeros(2, 3), r"primary.means of the second moments has shape \[2, 3\]; expected"),
     ("statistics/primary/view_count", None, "the statistics of primary are"),

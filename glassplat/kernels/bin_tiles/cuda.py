@@ -34,9 +34,10 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
     num_tiles = num_cameras * -(-height // TILE) * -(-width // TILE)
     shapes = (splats.means2d.view(count, 2), splats.conics.view(count, 3), splats.opacities.view(count))
     radii = splats.radii.view(count, 2)
-    mask = radii.new_zeros(0, 0, 0, dtype=torch.bool) if active_tiles is None else active_tiles
     counts = torch.empty(2, count, dtype=torch.int32, device=device)
-    count_tiles(real)(blocks_for(count, THREADS), THREADS, *shapes, radii, mask, per_camera, width, height, counts)
+    count_tiles(real)(
+        blocks_for(count, THREADS), THREADS, *shapes, radii, active_tiles, per_camera, width, height, counts
+    )
     offsets = torch.zeros(2, count + 1, dtype=torch.int64, device=device)
     torch.cumsum(counts, 1, out=offsets[:, 1:])
     splat_offsets, span_offsets = offsets
@@ -46,14 +47,15 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
     check_pair_count(num_pairs)
     spans = torch.empty(num_spans, 3, dtype=torch.int32, device=device)
     list_spans(real)(
-        blocks_for(count, THREADS), THREADS, *shapes, radii, mask, per_camera, width, height, span_offsets, spans
-    )
+        blocks_for(count, THREADS), THREADS, *shapes, radii, active_tiles, per_camera, width, height, span_offsets,
+        spans,
+    )  # fmt: skip
     narrow = num_tiles < np.iinfo(np.int16).max
     tiles = torch.empty(num_pairs, dtype=torch.int16 if narrow else torch.int32, device=device)
     members, slots = torch.empty(2, num_pairs, dtype=torch.int32, device=device)
     emit_tiles(np.int16 if narrow else np.int32)(
-        blocks_for(num_pairs, THREADS), THREADS, mask, per_camera, -(-height // TILE), -(-width // TILE), num_tiles,
-        *_sequence(splats.depths, counts[0]), splat_offsets, span_offsets, spans, tiles, members, slots,
+        blocks_for(num_pairs, THREADS), THREADS, active_tiles, per_camera, -(-height // TILE), -(-width // TILE),
+        num_tiles, *_sequence(splats.depths, counts[0]), splat_offsets, span_offsets, spans, tiles, members, slots,
     )  # fmt: skip
     by_tile, order = torch.sort(tiles, stable=True)
     edges = torch.arange(num_tiles + 1, dtype=tiles.dtype, device=device)
@@ -175,8 +177,10 @@ def list_spans(real: type) -> Kernel:
         rows = rows_of(means2d, conics, opacities, radii, s, height)
         shape, first, found = shape_of(means2d, conics, s, rows), rows[0] // TILE, 0
         for i in range(span_offsets[s], span_offsets[s + 1]):
-            row = first + i - span_offsets[s]
-            left, right = columns_of(shape, row, width)
+            row, left, right = first + i - span_offsets[s], 0, -1
+            # Should the passes ever round differently, a row that only the first one saw is empty.
+            if row * TILE <= rows[1]:
+                left, right = columns_of(shape, row, width)
             found += active_between(active_tiles, s // per_camera, row, left, right)
             spans[i, 0], spans[i, 1], spans[i, 2] = row, left, found
 

@@ -71,7 +71,8 @@ class Kernel:
         Args:
             blocks: how many of them.
             threads: in each block.
-            arguments: contiguous tensors of one device, and numbers, in the order of the signature.
+            arguments: contiguous tensors of one device, and numbers, in the order of the signature. None stands for
+                an array without elements.
         """
         if blocks == 0:
             return
@@ -119,12 +120,16 @@ class Expected:
         self._dtype = torch.bool if element == "bool" else getattr(torch, element)
         self._is_bool = element == "bool"
         self._size = self._dtype.itemsize
+        self._nothing = (0, 0, 0, self._size, 0, *(0,) * (2 * self._ndim))
         self.layout = f"{5 + 2 * self._ndim}q" if self._is_array else f"{FORMATS[element]}{8 - self._size}x"
 
     def append(self, values: list[Any], argument: Any) -> None:
         """Adds what stands for an argument in Numba's calling convention to the values of a launch."""
         if not self._is_array:
             values.append(argument)
+            return
+        if argument is None:
+            values += self._nothing
             return
         shape = argument.shape
         if argument.dtype != self._dtype or len(shape) != self._ndim or not argument.is_contiguous():
@@ -137,6 +142,8 @@ class Expected:
         """What stands for an argument in the simulator."""
         if not self._is_array:
             return bool(argument) if self._is_bool else np.dtype(str(self.type)).type(argument)
+        if argument is None:
+            return np.empty((0,) * self.type.ndim, np.dtype(str(self.type.dtype)))
         array = argument.detach().numpy()
         if argument.dtype != self._dtype or array.ndim != self.type.ndim or not array.flags.c_contiguous:
             raise TypeError(f"got {array.dtype} of shape {array.shape}, expected contiguous {self.type}")

@@ -181,6 +181,19 @@ def test_what_the_driver_refuses_is_named(gpu: Driver) -> None:
         declared()(5, 64, torch.zeros(3, 2), 1, True)
 
 
+@pytest.mark.parametrize("ndim", [1, 3])
+def test_none_stands_for_an_array_without_elements(ndim: int) -> None:
+    tensor = torch.zeros((0,) * ndim)
+    given, own = [], []
+    expected = Expected(types.Array(types.float32, ndim, "C"))
+    expected.append(given, tensor)
+    expected.append(own, None)
+    assert own[:4] == given[:4]
+    assert own[4] == tensor.data_ptr() == 0
+    # No element, no step from one to the next: shapes agree, strides do not count.
+    assert own[5 : 5 + ndim] == given[5 : 5 + ndim] == [0] * ndim
+
+
 @pytest.mark.parametrize(
     "tensor",
     [torch.zeros(2, 3, dtype=torch.float64), torch.zeros(3), torch.zeros(3, 2).T],
