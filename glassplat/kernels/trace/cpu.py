@@ -65,8 +65,8 @@ def trace_forward(real: type, flat: bool) -> Kernel:
         stride = even_stride(num_blocks)
         for task in prange(num_blocks):
             block = task * stride % num_blocks
-            ts, found, ids = np.empty(CHUNK, real), np.empty(CHUNK, real), np.empty(CHUNK, np.int32)
-            entries, stack, waiting = np.empty(WIDTH, real), np.empty(STACK, np.int64), np.empty(STACK, real)
+            ts, found, ids = np.empty((CHUNK,), real), np.empty((CHUNK,), real), np.empty((CHUNK,), np.int32)
+            entries, stack, waiting = np.empty((WIDTH,), real), np.empty((STACK,), np.int64), np.empty((STACK,), real)
             for r in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
                 o, d, inverse, length, usable = ray(origins, directions, r)
                 red = green = blue = depth = zero

@@ -88,8 +88,8 @@ def trace_collect(real: type, flat: bool) -> Kernel:
         for task in prange(num_blocks):
             block = task * stride % num_blocks
             seen = places[numba.get_thread_id(), 0]
-            ts, alphas, ids = np.empty(CHUNK, real), np.empty(CHUNK, real), np.empty(CHUNK, np.int32)
-            entries, stack, waiting = np.empty(WIDTH, real), np.empty(STACK, np.int64), np.empty(STACK, real)
+            ts, alphas, ids = np.empty((CHUNK,), real), np.empty((CHUNK,), real), np.empty((CHUNK,), np.int32)
+            entries, stack, waiting = np.empty((WIDTH,), real), np.empty((STACK,), np.int64), np.empty((STACK,), real)
             different = 0
             for r in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
                 o, d, inverse, _, _ = ray(origins, directions, r)
@@ -117,7 +117,7 @@ def _pull(real: type, flat: bool) -> Scalar:
     zero = real(0.0)
 
     @inlined
-    def pull(offset, d, frame, hit, opacity, v_alpha, v_t, row, v_origin, v_direction):  # type: ignore[no-untyped-def]
+    def pull(offset, d, frame, hit, opacity, v_alpha, v_t, row, v_origin, v_direction):
         t, q, covered = hit
         v_covered = v_alpha if covered < most else zero
         row[OPACITY_AT] += v_covered * covered / opacity
@@ -139,7 +139,7 @@ def _shade(real: type) -> Scalar:
     zero, half = real(0.0), real(0.5)
 
     @inlined
-    def shade(sh, degree, unit, v_color, weight, v_sh, v_unit):  # type: ignore[no-untyped-def]
+    def shade(sh, degree, unit, v_color, weight, v_sh, v_unit):
         if degree < 0:
             return zero
         x, y, z = unit[0], unit[1], unit[2]
@@ -174,7 +174,7 @@ def trace_backward(real: type, flat: bool) -> Kernel:
             block = task * stride % num_blocks
             seen, own = places[numba.get_thread_id(), 0], places[numba.get_thread_id(), 1]
             free = row_offsets[block]
-            unit, v_unit = np.empty(3, real), np.empty(3, real)
+            unit, v_unit = np.empty((3,), real), np.empty((3,), real)
             for r in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
                 o = origins[r, 0], origins[r, 1], origins[r, 2]
                 d = directions[r, 0], directions[r, 1], directions[r, 2]
