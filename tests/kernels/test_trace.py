@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.build_bvh import build_bvh
+from glassplat.kernels.build_bvh.hilbert import hilbert_codes
 from glassplat.kernels.splats import RawGaussians
 from glassplat.kernels.trace import Bvh, Rays, Traced, trace
 from glassplat.kernels.trace.reference import trace as twin
@@ -218,6 +219,18 @@ def test_every_gaussian_has_one_place_in_the_hierarchy(count: int) -> None:
     top = bvh.boxes[-1]
     full = top[0] <= top[3]
     assert bool((top[:3, full].amin(1) <= cloud(count, DISCS).means.amin(0)).all())
+
+
+def test_neighbours_on_the_curve_are_neighbours_in_space() -> None:
+    grid = torch.cartesian_prod(*[torch.arange(8.0)] * 3)
+    along = grid[hilbert_codes(grid).argsort()]
+    assert bool((along.diff(dim=0).abs().sum(1) == 1).all())
+
+
+def test_places_on_the_curve_need_no_extent() -> None:
+    points = torch.tensor([[1.0, 2.0, 3.0]]).repeat(4, 1)
+    points[2, 1] = math.nan
+    assert hilbert_codes(points).argsort(stable=True).tolist() == [0, 1, 3, 2]
 
 
 def test_moving_rays_and_gaussians_together_changes_nothing() -> None:

@@ -8,8 +8,8 @@ import torch
 from numba import prange
 from torch import Tensor
 
+from glassplat.kernels.build_bvh.hilbert import hilbert_codes
 from glassplat.kernels.cpu.jit import Kernel, kernel
-from glassplat.kernels.morton import morton_codes
 from glassplat.kernels.tensor_checks import REAL_OF
 from glassplat.kernels.trace.cpu_traversal import WIDTH
 from glassplat.kernels.trace.records import Bvh, Shapes
@@ -20,7 +20,7 @@ def build_bvh(shapes: Shapes, *, flat: bool, order: Tensor | None) -> Bvh:
     """As the operation."""
     count, real = shapes.means.shape[0], REAL_OF[shapes.means.dtype]
     if order is None:
-        order = torch.argsort(morton_codes(shapes.means), stable=True).to(torch.int32)
+        order = torch.argsort(hilbert_codes(shapes.means.detach()), stable=True).to(torch.int32)
     sizes = level_sizes(count)
     offsets = torch.tensor([0, *sizes]).cumsum(0)
     boxes = shapes.means.new_empty(int(offsets[-1]), 6, WIDTH)

@@ -19,7 +19,7 @@ from glassplat.kernels.maths.blending import TRANSMITTANCE_MIN
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.tensor_checks import REAL_OF
 from glassplat.kernels.trace.cpu_backward import trace_gradients
-from glassplat.kernels.trace.cpu_traversal import CHUNK, STACK, WIDTH, traversal
+from glassplat.kernels.trace.cpu_traversal import CHUNK, STACK, WIDTH, arrays_of, traversal
 
 __all__ = ["trace", "trace_gradients"]
 
@@ -40,7 +40,8 @@ def trace(
         torch.empty(count, dtype=torch.int32),
     )
     trace_forward(real, flat)(
-        *(tensor.numpy() for tensor in (*shapes, *rays, *bvh)),
+        *(tensor.numpy() for tensor in (*shapes, *rays)),
+        *arrays_of(bvh),
         degree,
         real(near),
         *(tensor.numpy() for tensor in outputs),

@@ -23,7 +23,15 @@ from glassplat.kernels.maths.blending import ALPHA_MAX, Scalar
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.maths.ray_hit import ray_hit_maths
 from glassplat.kernels.tensor_checks import REAL_OF
-from glassplat.kernels.trace.cpu_traversal import CHUNK, STACK, WIDTH, coverage_maths, shape_reader, traversal
+from glassplat.kernels.trace.cpu_traversal import (
+    CHUNK,
+    STACK,
+    WIDTH,
+    arrays_of,
+    coverage_maths,
+    shape_reader,
+    traversal,
+)
 
 BLOCK = 256
 """Rays per task, whose sums share rows."""
@@ -47,7 +55,7 @@ def trace_gradients(
     places = np.full((numba.get_num_threads(), 2, count), -1, np.int32)
     inputs = tuple(tensor.numpy() for tensor in (*shapes[:3], *rays))
     trace_collect(real, flat)(
-        *inputs, *(tensor.numpy() for tensor in bvh), real(near), hit_offsets.numpy(), places, met.numpy(),
+        *inputs, *arrays_of(bvh), real(near), hit_offsets.numpy(), places, met.numpy(),
         distinct.numpy(),
     )  # fmt: skip
     row_offsets = torch.cat([distinct.new_zeros(1), distinct.cumsum(0)])

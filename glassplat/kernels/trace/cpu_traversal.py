@@ -6,9 +6,14 @@ boxes that begin behind the farthest of those found so far (Knoll et al. 2019; E
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
+from torch import Tensor
 
 from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.cpu.vector import bits_of, lowest_bit, maximum, minimum, store, vector_kind
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar, blend_maths
 from glassplat.kernels.maths.ray_hit import MOST_DEVIATIONS, ray_hit_maths
 
@@ -16,12 +21,20 @@ CHUNK = 16
 """Hits that a search returns at most."""
 WIDTH = 8
 """Children of a node."""
+NODE = 6 * WIDTH
+"""Numbers of a node: the lowest x, y, z and the highest x, y, z of its children."""
 STACK = 128
 """Nodes that wait at most: seven siblings on each of the levels that 32-bit places can have, and the nearest."""
 SLACK = 1e-5
 """Share by which boxes begin earlier and end later, so that rounding loses no hit."""
 LARGEST_INVERSE = 1e18
 """In place of 1 / 0 in the direction of a ray."""
+
+
+def arrays_of(bvh: Sequence[Tensor]) -> tuple[NDArray[Any], ...]:
+    """Order, boxes in one dimension, and where levels begin, as kernels take them."""
+    order, boxes, offsets = bvh
+    return order.numpy(), boxes.numpy().reshape(-1), offsets.numpy()
 
 
 class Traversal(NamedTuple):
@@ -94,21 +107,27 @@ def coverage_maths(real: type) -> Scalar:
 
 
 def _entry(real: type) -> Scalar:
-    """Fills `entries` with where a ray enters each of a node's boxes, infinite where it misses."""
-    zero, nowhere, sooner, later = real(0.0), real("inf"), real(1.0 - SLACK), real(1.0 + SLACK)
+    """Puts down where a ray enters each of a node's boxes; returns which of them it meets, as bits."""
+    full, load = vector_kind(real, WIDTH)
+    zero, sooner, later = real(0.0), real(1.0 - SLACK), real(1.0 + SLACK)
 
     @inlined
     def enter(boxes, node, o, inverse, first, last, entries):  # type: ignore[no-untyped-def]
         # Faces are chosen by the sign of the direction, so that an empty box, whose lowest corner lies above its
         # highest, is missed.
-        x0, y0, z0 = 0 if inverse[0] > zero else 3, 1 if inverse[1] > zero else 4, 2 if inverse[2] > zero else 5
-        x1, y1, z1 = 3 - x0, 5 - y0, 7 - z0
-        for k in range(WIDTH):
-            x, y, z = boxes[node, x0, k] - o[0], boxes[node, y0, k] - o[1], boxes[node, z0, k] - o[2]
-            near = max(x * inverse[0], y * inverse[1], z * inverse[2], first)
-            x, y, z = boxes[node, x1, k] - o[0], boxes[node, y1, k] - o[1], boxes[node, z1, k] - o[2]
-            far = min(x * inverse[0], y * inverse[1], z * inverse[2], last)
-            entries[k] = near if near * sooner <= far * later else nowhere
+        lowest = node * NODE
+        highest = lowest + 3 * WIDTH
+        x0, x1 = (lowest, highest) if inverse[0] > zero else (highest, lowest)
+        y0, y1 = (lowest, highest) if inverse[1] > zero else (highest, lowest)
+        z0, z1 = (lowest, highest) if inverse[2] > zero else (highest, lowest)
+        x, y = (load(boxes, x0) - o[0]) * inverse[0], (load(boxes, y0 + WIDTH) - o[1]) * inverse[1]
+        z = (load(boxes, z0 + 2 * WIDTH) - o[2]) * inverse[2]
+        near = maximum(maximum(x, y), maximum(z, full(first)))
+        x, y = (load(boxes, x1) - o[0]) * inverse[0], (load(boxes, y1 + WIDTH) - o[1]) * inverse[1]
+        z = (load(boxes, z1 + 2 * WIDTH) - o[2]) * inverse[2]
+        far = minimum(minimum(x, y), minimum(z, full(last)))
+        store(entries, 0, near)
+        return bits_of(near * sooner <= far * later)
 
     return enter
 
@@ -135,8 +154,8 @@ def _next_hits(real: type, flat: bool) -> Scalar:
     ):  # fmt: skip
         count, top = 0, 0
         farthest, farthest_id = nowhere, 2147483647
-        if boxes.shape[0] > 0:
-            stack[0], waiting[0] = boxes.shape[0] - 1, zero
+        if boxes.size > 0:
+            stack[0], waiting[0] = boxes.size // NODE - 1, zero
             top = 1
         while top > 0:
             top -= 1
@@ -146,26 +165,25 @@ def _next_hits(real: type, flat: bool) -> Scalar:
             level = 0
             while offsets[level + 1] <= node:
                 level += 1
-            enter(boxes, node, o, inverse, first, farthest, entries)
+            met = enter(boxes, node, o, inverse, first, farthest, entries)
             child = (node - offsets[level]) * WIDTH
             if level > 0:
                 child += offsets[level - 1]
                 begin = top
-                for k in range(WIDTH):
-                    at = entries[k]
-                    if at < nowhere:
-                        # Nearest last, so that it is taken next.
-                        place = top
-                        while place > begin and waiting[place - 1] < at:
-                            stack[place], waiting[place] = stack[place - 1], waiting[place - 1]
-                            place -= 1
-                        stack[place], waiting[place] = child + k, at
-                        top += 1
+                while met != 0:
+                    k = lowest_bit(met)
+                    met &= met - 1
+                    at, place = entries[k], top
+                    # Nearest last, so that it is taken next.
+                    while place > begin and waiting[place - 1] < at:
+                        stack[place], waiting[place] = stack[place - 1], waiting[place - 1]
+                        place -= 1
+                    stack[place], waiting[place] = child + k, at
+                    top += 1
                 continue
-            for k in range(WIDTH):
-                if not entries[k] < nowhere:
-                    continue
-                g = order[child + k]
+            while met != 0:
+                g = order[child + lowest_bit(met)]
+                met &= met - 1
                 offset, frame = shape(means, frames, g, o)
                 t, _, squared = meet(offset, d, frame)
                 if not (t > first or (t == first and g > first_id)):
