@@ -12,15 +12,21 @@ from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
+from llvmlite import ir
+from numba.core import types
 from numba.core.caching import FunctionCache
 from numba.core.cpu import CPUContext
 from numba.core.registry import cpu_target
+from numba.extending import intrinsic
 
 log = logging.getLogger("glassplat.kernels")
 
 PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
 NAMED = (ModuleType, type, BuiltinFunctionType, np.ufunc)
-LIBRARIES = ("numba", "numpy")
+SPELLED = (types.Type, ir.Type)
+"""Types whose text says all about them."""
+LIBRARIES = ("numba", "numpy", "llvmlite")
+INTRINSIC = type(intrinsic(lambda typing: None))
 
 
 def fingerprint(function: Callable[..., Any], flags: str) -> str:
@@ -56,6 +62,11 @@ def _described(value: Any, seen: set[int]) -> Iterator[str]:
         yield from _described(value.co_consts, seen)
     elif isinstance(value, NAMED) or (isinstance(value, FunctionType) and value.__module__.startswith(LIBRARIES)):
         yield f"{getattr(value, '__module__', '')} {value.__name__}"
+    elif isinstance(value, SPELLED):
+        yield f"{type(value).__name__} {value}"
+    elif isinstance(value, INTRINSIC):
+        yield "intrinsic"
+        yield from _described(value.__wrapped__, seen)
     elif isinstance(value, FunctionType):
         if id(value) not in seen:
             seen.add(id(value))

@@ -12,8 +12,9 @@ from numba.extending import register_jitable
 
 from glassplat.kernels.cpu.cache import KernelCache
 
-HOW = Path(__file__).read_text()
-"""This file; how a kernel is compiled decides, with its own code, whether the cache still holds."""
+HOW = "".join(Path(__file__).with_name(name).read_text() for name in ("jit.py", "vector.py"))
+"""This file and what operators on vectors mean, which no kernel names: with its own code, they decide whether the cache
+still holds."""
 
 # `nnan` and `ninf` stay out: with them a comparison with NaN is undefined, and culling bad Gaussians relies on it.
 FAST_MATH = frozenset({"contract", "reassoc", "nsz", "arcp", "afn"})
