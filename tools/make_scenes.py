@@ -2,6 +2,7 @@
 
     pip install -e '.[scenes]'
     python -m tools.make_scenes --output runs/reflective --scenes ball torus control
+    python -m tools.make_scenes --output runs/drawn --seed 1 2 3
 
 docs/scenes.md describes the scenes and their files.
 """
@@ -21,11 +22,15 @@ import tyro
 from numpy.typing import NDArray
 from PIL import Image
 
+from glassplat.data.random_points import points_in_box
+from glassplat.files.ply_table import write_table
 from tools.make_demo_scene import srgb_from_linear
+from tools.scene_draws import Body, DrawnScene, draw_scene
 from tools.scene_environment import make_environment
 from tools.scene_surfaces import Triangles, ball_texture, disc, ground_texture, torus, torus_depth
 
 SceneName = Literal["ball", "torus", "control"]
+NAMES: tuple[SceneName, ...] = ("ball", "torus", "control")
 Variant = Literal["llvm_ad_rgb", "cuda_ad_rgb"]
 Array = NDArray[np.floating]
 
@@ -62,8 +67,10 @@ class Arguments:
 
     output: Path
     """Folder that gets one folder per scene; those must not exist yet."""
-    scenes: tuple[SceneName, ...] = ("ball", "torus", "control")
-    """Which scenes to make."""
+    scenes: tuple[SceneName, ...] = ()
+    """Which of the scenes with names to make; all of them if no seed is given either."""
+    seed: tuple[int, ...] = ()
+    """Scenes drawn by chance to make, each named after its seed."""
     size: int = 256
     """Width and height of the images, pixels."""
     train: int = 80
@@ -72,6 +79,8 @@ class Arguments:
     """Test views."""
     samples: int = 256
     """Light paths per pixel."""
+    points: int = 0
+    """Random grey points to write beside the images; 0 leaves them to whoever reads the scene (glassplat: 100,000)."""
     environment_height: int = 512
     """Height of the equirectangular environment, pixels."""
     variant: Variant = "llvm_ad_rgb"
@@ -80,12 +89,18 @@ class Arguments:
 
 @dataclass(frozen=True)
 class Studio:
-    """One scene in Mitsuba and the shape in it that counts as reflective, if any."""
+    """One scene in Mitsuba and how many of its shapes, the first ones, count as reflective."""
 
     mitsuba: Any
     scene: Any
-    mirror: Any | None
+    mirrors: int
     size: int
+
+    def shows_mirror(self, hits: Any) -> Array:
+        """Which of the hits [R] lie on something reflective, as 0 and 1."""
+        # A scene may copy shapes while it is built, so that they are found again by their place.
+        shapes = self.scene.shapes()[: self.mirrors]
+        return sum((np.array(hits.shape == shape, dtype=np.float64) for shape in shapes), np.zeros(1))
 
 
 def camera_positions(count: int, azimuth_rad: float) -> Array:
@@ -150,22 +165,53 @@ def make_body(mitsuba: Any, name: SceneName) -> tuple[Any, float]:
     return mitsuba.load_dict({"type": "sphere", "radius": BALL_RADIUS, "bsdf": material}), -BALL_RADIUS
 
 
+def make_drawn_body(mitsuba: Any, body: Body) -> Any:
+    """One thing of a drawn scene."""
+    tint = {"type": "rgb", "value": list(body.tint)}
+    if body.coating == "mirror":
+        material: dict[str, Any] = {"type": "conductor", "material": "none"}
+    elif body.coating == "metal":
+        # A metal reflects more than half of the light, whatever its colour.
+        value = [0.5 + channel / 2 for channel in body.tint]
+        material = {"type": "conductor", "material": "none", "specular_reflectance": {"type": "rgb", "value": value}}
+    else:
+        pattern = textured(mitsuba, ball_texture(TEXTURE_SIZE, seed=body.pattern_seed))["reflectance"]
+        color = tint if body.coating == "glaze" else pattern
+        material = {"type": "plastic", "int_ior": body.refraction, "diffuse_reflectance": color}
+    return mesh(mitsuba, body.triangles, material)
+
+
 def make_studio(mitsuba: Any, name: SceneName, environment: Array, size: int) -> Studio:
-    """Object, ground and environment; what the camera sees of the environment is transparent."""
+    """A scene with a name: object, ground and environment."""
     body, ground_z = make_body(mitsuba, name)
     ground = mesh(
         mitsuba, disc(GROUND_RADIUS, ground_z), textured(mitsuba, ground_texture(GROUND_RADIUS, TEXTURE_SIZE))
     )
+    return assembled(mitsuba, (body,), ground, environment, mirrors=0 if name == "control" else 1, size=size)
+
+
+def make_drawn_studio(mitsuba: Any, drawn: DrawnScene, environment: Array, size: int) -> Studio:
+    """A drawn scene: its bodies, stand and environment."""
+    stand = drawn.stand
+    picture = ground_texture(stand.radius, TEXTURE_SIZE, checker_size=stand.checker_size, seed=stand.pattern_seed)
+    ground = mesh(mitsuba, disc(stand.radius, stand.z), textured(mitsuba, picture))
+    bodies = tuple(make_drawn_body(mitsuba, body) for body in drawn.bodies)
+    return assembled(mitsuba, bodies, ground, environment, mirrors=len(bodies), size=size)
+
+
+def assembled(
+    mitsuba: Any, bodies: tuple[Any, ...], ground: Any, environment: Array, *, mirrors: int, size: int
+) -> Studio:
+    """Bodies, of which the first `mirrors` reflect, ground and environment; where it shows, images are transparent."""
     sky = {
         "type": "envmap",
         "bitmap": mitsuba.Bitmap(np.ascontiguousarray(environment)),
         "to_world": mitsuba.ScalarTransform4f(WORLD_FROM_MITSUBA_SKY),
     }
     tracer = {"type": "path", "max_depth": BOUNCES, "hide_emitters": True}
-    scene = mitsuba.load_dict({"type": "scene", "integrator": tracer, "body": body, "ground": ground, "sky": sky})
-    # A scene may merge or copy shapes while it is built, so the object is found again by its place.
-    mirror = None if name == "control" else scene.shapes()[0]
-    return Studio(mitsuba, scene, mirror, size)
+    shapes = {f"body{number}": body for number, body in enumerate(bodies)} | {"ground": ground}
+    scene = mitsuba.load_dict({"type": "scene", "integrator": tracer, **shapes, "sky": sky})
+    return Studio(mitsuba, scene, mirrors, size)
 
 
 def make_sensor(studio: Studio, pose: Array, samples: int) -> Any:
@@ -219,8 +265,7 @@ def visible_surfaces(studio: Studio, pose: Array) -> tuple[Array, Array]:
     hits = studio.scene.ray_intersect(rays)
     seen = np.array(hits.is_valid(), dtype=np.float64)
     normals = np.array(hits.sh_frame.n, dtype=np.float64).T * seen[:, None]
-    is_mirror = np.zeros(fine * fine) if studio.mirror is None else np.array(hits.shape == studio.mirror) * seen
-    sums = pixel_means(np.column_stack([normals, seen, is_mirror]), studio.size)
+    sums = pixel_means(np.column_stack([normals, seen, studio.shows_mirror(hits) * seen]), studio.size)
     lengths = np.linalg.norm(sums[..., :3], axis=-1, keepdims=True)
     return np.concatenate([sums[..., :3] / np.maximum(lengths, 1e-9), sums[..., 3:4]], axis=-1), sums[..., 4]
 
@@ -274,9 +319,18 @@ def write_environment(mitsuba: Any, environment: Array, folder: Path) -> None:
     )
 
 
+def write_points(count: int, folder: Path) -> None:
+    """Writes `points3d.ply`: random points of the box in which such captures lie."""
+    cloud = points_in_box(count)
+    rows = np.concatenate([cloud.positions.numpy(), cloud.colors.numpy()], axis=1).astype(np.float32)
+    write_table(folder / "points3d.ply", ["x", "y", "z", "red", "green", "blue"], rows)
+
+
 def main(arguments: Arguments) -> None:
     """Makes every scene that was asked for, after checking that none would be overwritten."""
-    folders: dict[SceneName, Path] = {name: arguments.output / name for name in arguments.scenes}
+    names = arguments.scenes or (() if arguments.seed else NAMES)
+    wanted: list[SceneName | int] = [*names, *arguments.seed]
+    folders = {key: arguments.output / (key if isinstance(key, str) else f"drawn-{key}") for key in wanted}
     existing = [str(folder) for folder in folders.values() if folder.exists()]
     if existing:
         raise FileExistsError(f"{', '.join(existing)} exist; expected new folders, so remove them first")
@@ -284,13 +338,26 @@ def main(arguments: Arguments) -> None:
     import mitsuba
 
     mitsuba.set_variant(arguments.variant)
-    environment = make_environment(arguments.environment_height)
-    for name, folder in folders.items():
-        folder.mkdir(parents=True)
-        write_environment(mitsuba, environment, folder)
-        studio = make_studio(mitsuba, name, environment, arguments.size)
-        write_views(studio, folder, "test", arguments)
-        write_views(studio, folder, "train", arguments)
+    for key, folder in folders.items():
+        make_scene(mitsuba, key, folder, arguments)
+
+
+def make_scene(mitsuba: Any, key: SceneName | int, folder: Path, arguments: Arguments) -> None:
+    """Makes the scene of a name or a seed in a new folder."""
+    folder.mkdir(parents=True)
+    if isinstance(key, int):
+        drawn = draw_scene(key)
+        environment = make_environment(arguments.environment_height, drawn.surroundings)
+        studio = make_drawn_studio(mitsuba, drawn, environment, arguments.size)
+        print(f"{folder.name}: " + ", ".join(f"{body.coating} {body.shape}" for body in drawn.bodies))
+    else:
+        environment = make_environment(arguments.environment_height)
+        studio = make_studio(mitsuba, key, environment, arguments.size)
+    write_environment(mitsuba, environment, folder)
+    if arguments.points:
+        write_points(arguments.points, folder)
+    write_views(studio, folder, "test", arguments)
+    write_views(studio, folder, "train", arguments)
 
 
 if __name__ == "__main__":

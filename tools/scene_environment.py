@@ -73,6 +73,30 @@ SIGNS = (
     Sign(180.0, 12.0, (26.0, 16.0), "-x"),
     Sign(-90.0, 12.0, (26.0, 16.0), "-y"),
 )
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What an environment shows; the defaults are those of the scenes with names.
+
+    Attributes:
+        zenith, horizon: colours of the sky, linear radiance.
+        far_floor, near_floor: of the tiles below the horizon, at the horizon and at the nadir.
+        panels: lamps and windows; later ones cover earlier ones.
+        signs: boards with writing.
+        charts: whether checkers, stripes and a skylight are drawn, for judging how sharp a recovered environment is.
+    """
+
+    zenith: Color = ZENITH
+    horizon: Color = HORIZON
+    far_floor: Color = FAR_FLOOR
+    near_floor: Color = NEAR_FLOOR
+    panels: tuple[Panel, ...] = PANELS
+    signs: tuple[Sign, ...] = SIGNS
+    charts: bool = True
+
+
+NAMED = Surroundings()
 SKYLIGHT_DEG = 72.0
 """Elevation above which bright fields around the zenith alternate with the sky."""
 BAR_DEG = 1.2
@@ -87,17 +111,18 @@ def directions(height: int) -> Array:
     return np.stack([horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.cos(polar) + 0 * azimuth], axis=-1)
 
 
-def make_environment(height: int) -> NDArray[np.float32]:
+def make_environment(height: int, surroundings: Surroundings = NAMED) -> NDArray[np.float32]:
     """Linear radiance [height, 2 height, 3], mostly within [0, 1]; lamps reach 1.2."""
     fine = height * SUPERSAMPLING
     direction = directions(fine)
     elevation_deg = np.degrees(np.arcsin(direction[..., 2]))
     azimuth_deg = np.degrees(np.arctan2(direction[..., 1], direction[..., 0]))
-    radiance = _sky_and_floor(azimuth_deg, elevation_deg)
-    _draw_bands(radiance, azimuth_deg, elevation_deg)
-    for panel in PANELS:
+    radiance = _sky_and_floor(surroundings, azimuth_deg, elevation_deg)
+    if surroundings.charts:
+        _draw_bands(radiance, azimuth_deg, elevation_deg)
+    for panel in surroundings.panels:
         _draw_panel(radiance, panel, azimuth_deg, elevation_deg)
-    _draw_signs(radiance, SIGNS)
+    _draw_signs(radiance, surroundings.signs)
     blocks = radiance.reshape(height, SUPERSAMPLING, 2 * height, SUPERSAMPLING, 3)
     return blocks.mean(axis=(1, 3)).astype(np.float32)
 
@@ -107,10 +132,10 @@ def _blend(low: Color, high: Color, share: Array) -> Array:
     return np.asarray(low) + share[..., None] * (np.asarray(high) - np.asarray(low))
 
 
-def _sky_and_floor(azimuth_deg: Array, elevation_deg: Array) -> Array:
+def _sky_and_floor(surroundings: Surroundings, azimuth_deg: Array, elevation_deg: Array) -> Array:
     """A gradient above the horizon and tiles below, which meet in a sharp line."""
-    sky = _blend(HORIZON, ZENITH, np.clip(elevation_deg / 70, 0, 1) ** 0.7)
-    floor = _blend(FAR_FLOOR, NEAR_FLOOR, np.clip(-elevation_deg / 60, 0, 1))
+    sky = _blend(surroundings.horizon, surroundings.zenith, np.clip(elevation_deg / 70, 0, 1) ** 0.7)
+    floor = _blend(surroundings.far_floor, surroundings.near_floor, np.clip(-elevation_deg / 60, 0, 1))
     tiles = (np.floor(azimuth_deg / 15) + np.floor(elevation_deg / 7.5)) % 2
     return np.where((elevation_deg > 0)[..., None], sky, floor * (0.7 + 0.6 * tiles[..., None]))
 

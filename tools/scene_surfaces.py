@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +82,46 @@ def torus_depth(major: float, minor: float, tilt_deg: float) -> float:
     return major * float(np.sin(np.radians(tilt_deg))) + minor
 
 
+def star_shaped(radius_along: Callable[[Array], Array], rings: int = 320, segments: int = 160) -> Triangles:
+    """A closed surface about the origin that every ray from there meets once.
+
+    Args:
+        radius_along: distance [...] of the surface in unit directions [..., 3]; smooth, for the sake of the normals.
+        rings: vertices around +z.
+        segments: vertices from pole to pole.
+    """
+    azimuth, polar = np.meshgrid(
+        2 * np.pi * np.arange(rings + 1) / rings, np.pi * np.arange(segments + 1) / segments, indexing="ij"
+    )
+    directions = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
+    positions = directions * radius_along(directions)[..., None]
+    corner = (np.arange(rings)[:, None] * (segments + 1) + np.arange(segments)).ravel()
+    beside, below = corner + segments + 1, corner + 1
+    faces = np.concatenate([np.stack([corner, below, beside + 1], -1), np.stack([corner, beside + 1, beside], -1)])
+    return Triangles(
+        positions=positions.reshape(-1, 3),
+        normals=_star_normals(positions.reshape(-1, 3), radius_along),
+        coordinates=np.stack([azimuth / (2 * np.pi), polar / np.pi], axis=-1).reshape(-1, 2),
+        faces=faces,
+    )
+
+
+def _star_normals(positions: Array, radius_along: Callable[[Array], Array], step: float = 1e-4) -> Array:
+    """Unit normals [V, 3]: the gradient of |p| - radius(p / |p|), by central differences."""
+
+    def excess(points: Array) -> Array:
+        distances = np.linalg.norm(points, axis=-1)
+        return distances - radius_along(points / distances[..., None])
+
+    slopes = np.stack([excess(positions + offset) - excess(positions - offset) for offset in step * np.eye(3)], -1)
+    return np.asarray(slopes / np.linalg.norm(slopes, axis=-1, keepdims=True))
+
+
+def placed(triangles: Triangles, turn: Array, offset: Array) -> Triangles:
+    """The mesh rotated by `turn` [3, 3] about the origin, then moved by `offset` [3]."""
+    return replace(triangles, positions=triangles.positions @ turn.T + offset, normals=triangles.normals @ turn.T)
+
+
 def solid_noise(points: Array, frequency: float, seed: int, waves: int = WAVES) -> Array:
     """A smooth random pattern in space: [...] in about [0, 1] at points [..., 3].
 
@@ -101,27 +142,29 @@ def solid_noise(points: Array, frequency: float, seed: int, waves: int = WAVES) 
     return 0.5 + total / np.sqrt(8 * waves)
 
 
-def ground_texture(radius: float, size: int) -> NDArray[np.float32]:
+def ground_texture(
+    radius: float, size: int, *, checker_size: float = CHECKER_SIZE, seed: int = 1
+) -> NDArray[np.float32]:
     """Linear reflectance [size, size, 3] of the disc: a checkerboard, each half of it with its own pattern."""
     line = radius * (2 * (np.arange(size) + 0.5) / size - 1)
     x, y = np.meshgrid(line, line)
     points = np.stack([x, y, np.zeros_like(x)], axis=-1)
-    light = (np.floor(x / CHECKER_SIZE) + np.floor(y / CHECKER_SIZE)) % 2 == 0
-    patches = _patches(points, frequency=1.2, seed=1)
-    grain = 0.8 + 0.4 * solid_noise(points, frequency=9.0, seed=2)[..., None]
+    light = (np.floor(x / checker_size) + np.floor(y / checker_size)) % 2 == 0
+    patches = _patches(points, frequency=1.2, seed=seed)
+    grain = 0.8 + 0.4 * solid_noise(points, frequency=9.0, seed=seed + 1)[..., None]
     shade = np.where(light[..., None], 0.35 + 0.65 * patches, 0.12 + 0.3 * patches[..., ::-1])
     return np.clip(shade * grain, 0.02, 0.9).astype(np.float32)
 
 
-def ball_texture(size: int) -> NDArray[np.float32]:
+def ball_texture(size: int, *, seed: int = 3) -> NDArray[np.float32]:
     """Linear reflectance [size, 2 size, 3] of a matte ball: coloured patches with a fine grain."""
     azimuth = 2 * np.pi * (np.arange(2 * size) + 0.5) / (2 * size)
     polar = (np.pi * (np.arange(size) + 0.5) / size)[:, None]
     points = np.stack(
         [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar) + 0 * azimuth], -1
     )
-    grain = 0.7 + 0.6 * solid_noise(points, frequency=7.0, seed=4)[..., None]
-    return np.clip(_patches(points, frequency=0.9, seed=3) * grain, 0.02, 0.9).astype(np.float32)
+    grain = 0.7 + 0.6 * solid_noise(points, frequency=7.0, seed=seed + 1)[..., None]
+    return np.clip(_patches(points, frequency=0.9, seed=seed) * grain, 0.02, 0.9).astype(np.float32)
 
 
 def _patches(points: Array, *, frequency: float, seed: int) -> Array:

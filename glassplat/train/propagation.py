@@ -3,71 +3,99 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
 
 from glassplat.data.dataset import Dataset
+from glassplat.data.ranges import Count, Several, Share
 from glassplat.densify.propagate import NormalPropagation
+from glassplat.densify.reflectors import Search
+from glassplat.render.deferred import Deferred
 from glassplat.render.environment import resized
-from glassplat.train.actions import GrowSh, ResetOpacity
+from glassplat.train.actions import Densify, GrowSh, ResetOpacity
+from glassplat.train.optimizer import Rate
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
 
 log = logging.getLogger("glassplat.train")
 
-ENDED, MOST, GREW = "propagation ended", "most reflective", "reflective grew"
-"""Names in `TrainState.records`: the step of the end, the largest number of reflective Gaussians, and its step."""
+ENDED, MOST, GREW, TURNS = "propagation ended", "most reflective", "reflective grew", "turns with the view"
+"""Names in `TrainState.records`: the step of the end, the largest share of reflection, the step of its growth, and the
+share that does not reflect, but turns with the view."""
 GROWTH = 0.01
-"""Share of all Gaussians by which the number has to rise to count as growing; a share of the number itself would let
-the few that noise makes reflective in a matte scene go on for ever."""
+"""By how much the share has to rise to count as growing; a ratio would let the little that noise makes of it in a matte
+scene go on for ever."""
+FOUND = 0.03
+"""Share from which on something reflective has been found."""
+LOOKS_REFLECTIVE = 0.06
+"""Share that turns with the view, below which there is nothing to look for."""
+NOTHING_FOUND = "step %d: nothing reflective was found, so that the rest of the run trains like splat; %s"
+MATTE = "nothing looks different from different sides either: splat suits such a scene"
+OVERLOOKED = (
+    "but %.0f %% of what is seen looks different from different sides. More --iterations give normals more time to "
+    "spread, and --region X Y Z RADIUS names the place where something reflects"
+)
 
 
 @dataclass(frozen=True)
 class PropagationSchedule:
-    """When normals are propagated; at the beats of `Rhythm` that do not reset opacities.
+    """When normals are propagated: at the beats of `Rhythm`, but for those that reset opacities.
 
     Attributes:
-        end: `settled` ends it when the number of reflective Gaussians has stopped growing (the paper's criterion),
-            `fixed` at `stop`.
+        end: `settled` ends it when what reflects has stopped growing (the paper's criterion), `fixed` at `stop`.
         stop: share of the run after which nothing is propagated any more.
-        patience: share of the run without growth after which the number counts as settled.
+        patience: beats without growth after which it counts as settled; a strength needs some hundred steps to be seen,
+            however short the run. One is enough where nothing reflects nor looks as if it did.
         pause: steps for which raised opacities are held.
+        last_reset: reset opacities once more after the end, if no regular reset comes after it.
     """
 
     end: Literal["settled", "fixed"] = "settled"
-    stop: float = 0.75
-    patience: float = 0.1
-    pause: int = 100
+    stop: Share = 0.75
+    patience: Several = 5
+    pause: Count = 100
+    last_reset: bool = True
 
 
 @dataclass(frozen=True)
 class Propagate:
     """Propagates normals and disturbs the colours of what does not reflect, until no more reflectors are found.
 
+    Where none has been found, the run goes on like one of `splat`, and the log says what may help.
+
     Attributes:
-        when: the beats at which it happens.
+        when: the beats at which it happens; whether to go on is asked at those that it skips, too.
         propagation: what it does.
         schedule: when it ends.
+        renderer: that of the stage.
+        matte_rates: factors on learning rates for the rest of the run where nothing reflective was found, by dotted
+            parameter name; of them the value for a run of this length is taken.
+        search: what tells how much reflects.
     """
 
     when: Every
     propagation: NormalPropagation
     schedule: PropagationSchedule
+    renderer: Deferred
+    matte_rates: Mapping[str, Rate] = field(default_factory=dict)
+    search: Search = field(default_factory=Search)
     name: str = "propagate normals"
 
     def due(self, clock: Clock) -> bool:
         """Whether to act after this step."""
-        return self.when.due(clock) or clock.step == self._last(clock)
+        return self._beats.due(clock) or clock.step == self._last(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state`, until propagation has ended."""
-        if has_ended(state):
+        if has_ended(state) or clock.step < min(self._first(clock), self._last(clock)):
             return False
-        if self._settles(state, clock) or clock.step >= self._last(clock):
-            state.records[ENDED] = clock.step
-            log.info("step %d: normal propagation has ended, %d reflective Gaussians", clock.step, self._count(state))
+        if clock.step >= self._last(clock) or self._settles(state, dataset, clock):
+            self._end(state, dataset, clock)
+            return False
+        if not self.when.due(clock):
             return False
         primary, moments = self.propagation.propagate(state.scene.primary, state.optimizer.moments)
         primary, moments = self.propagation.disturb(primary, moments, state.generator(self.name))
@@ -76,21 +104,59 @@ class Propagate:
             state.optimizer.paused["primary.logit_opacities"] = self.schedule.pause
         return True
 
+    @property
+    def _beats(self) -> Every:
+        """All of them."""
+        return replace(self.when, skip_multiples_of=None)
+
+    def _first(self, clock: Clock) -> int:
+        """The first beat that is left to a reset.
+
+        Before it, what random points became is still in the way everywhere; made opaque, it hides the surfaces.
+        """
+        return self.when.interval(clock) * (self.when.skip_multiples_of or 1)
+
     def _last(self, clock: Clock) -> int:
         """The step at which it ends at the latest."""
         return round(self.schedule.stop * clock.iterations)
 
-    def _settles(self, state: TrainState, clock: Clock) -> bool:
-        """Whether the number of reflective Gaussians has not grown for long enough; keeps the records."""
-        count = self._count(state)
-        least = GROWTH * len(state.scene.primary)
-        if GREW not in state.records or count > state.records[MOST] + least:
-            state.records |= {MOST: count, GREW: clock.step}
-        waited = clock.step - state.records[GREW]
-        return self.schedule.end == "settled" and waited >= self.schedule.patience * clock.iterations
+    def _settles(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Whether what reflects has not grown for long enough; keeps the records."""
+        if self.schedule.end == "fixed":
+            return False
+        share = self.search.reflective(state.scene, dataset.train)
+        if GREW not in state.records or share > state.records[MOST] + GROWTH:
+            state.records |= {MOST: share, GREW: clock.step}
+        waited = (clock.step - state.records[GREW]) / self.when.interval(clock)
+        return waited >= (1 if self._looks_matte(state, dataset, clock) else self.schedule.patience)
 
-    def _count(self, state: TrainState) -> int:
-        return self.propagation.count_reflective(state.scene.primary)
+    def _looks_matte(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Whether nothing reflects nor turns with the view; keeps the record.
+
+        That is asked at the beat after a reset. At others, raised opacities have whatever stands in the way turn with
+        the view.
+        """
+        if state.records[MOST] >= FOUND:
+            return False
+        if clock.step % self._first(clock) == self.when.interval(clock):
+            state.records[TURNS] = self.search.turning(state.scene, dataset.train, self.renderer)
+        return state.records.get(TURNS, 1.0) < LOOKS_REFLECTIVE
+
+    def _end(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
+        """Notes the end and says what was found."""
+        state.records[ENDED] = clock.step
+        share = max(self.search.reflective(state.scene, dataset.train), state.records.get(MOST, 0.0))
+        if share >= FOUND:
+            log.info(
+                "step %d: normal propagation has ended, %.0f %% of what is seen is reflection", clock.step, 100 * share
+            )
+            return
+        hurried = {name: rate.at(0.0, 1.0, clock.iterations) for name, rate in self.matte_rates.items()}
+        state.optimizer.hurried |= hurried
+        turns = state.records.get(TURNS)
+        if turns is None:
+            turns = self.search.turning(state.scene, dataset.train, self.renderer)
+        log.warning(NOTHING_FOUND, clock.step, MATTE if turns < LOOKS_REFLECTIVE else OVERLOOKED % (100 * turns))
 
 
 @dataclass(frozen=True)
@@ -109,7 +175,8 @@ class ResetAfterPropagation(ResetOpacity):
     """Resets opacities once more, if propagation has gone on after the last regular reset.
 
     Propagation raises every opacity, also of what only stands in the way, as in the hole of a ring. Most of that is
-    never lowered again without a reset.
+    never lowered again without a reset. A scene whose opacities have not come back is worse than one in which something
+    stands in the way: the rest of the run has to be as long as the time between two regular resets.
 
     Attributes:
         when: its moments, of which it takes the first after the end of propagation; they begin after the regular ones.
@@ -126,17 +193,41 @@ class ResetAfterPropagation(ResetOpacity):
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state`, once, and only if no reset has come since propagation ended."""
-        if not has_ended(state):
+        if not has_ended(state) or clock.step + self._recovery(clock) > clock.iterations:
             return False
         since = range(int(state.records[ENDED]) + 1, clock.step)
         if any(when.due(replace(clock, step=step)) for step in since for when in (self.regular, self.when)):
             return False
         return super().apply(state, dataset, clock)
 
+    def _recovery(self, clock: Clock) -> int:
+        """Steps in which opacities come back: those between two regular resets."""
+        return self.regular.interval(clock) * (self.regular.only_multiples_of or 1)
+
+
+@dataclass(frozen=True)
+class DensifyWhilePropagating(Densify):
+    """Densifies at an interval of its own while normals are propagated, and as at any other time once that has ended.
+
+    Attributes:
+        regular: what densifies then.
+    """
+
+    regular: Densify = field(kw_only=True)
+
+    def due(self, clock: Clock) -> bool:
+        """Whether to act after this step, before or after the end."""
+        return super().due(clock) or self.regular.due(clock)
+
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`, if this is a moment of the interval that holds."""
+        turn: Densify = self.regular if has_ended(state) else Densify(self.densifier, self.part)
+        return turn.due(clock) and turn.apply(state, dataset, clock)
+
 
 @dataclass(frozen=True)
 class RefineEnvironment:
-    """Doubles the environment's texels at certain moments.
+    """Doubles the environment's texels at certain moments, twice where two fall on one step.
 
     A normal has a gradient only as far as the texels that its reflection meets reach. Large texels at first let normals
     find their way from farther off; small ones make the reflection sharp in the end.
@@ -160,7 +251,8 @@ class RefineEnvironment:
         environment = state.scene.environment
         if environment.size >= self.largest:
             return False
-        finer = resized(environment, min(2 * environment.size, self.largest))
+        doublings = sum(round(moment * clock.iterations) == clock.step for moment in self.moments)
+        finer = resized(environment, min(2**doublings * environment.size, self.largest))
         state.scene = replace(state.scene, environment=finer)
         return True
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,10 @@ from PIL import Image
 
 from glassplat.data.dataset import load_dataset
 from tools.make_demo_scene import linear_from_srgb
-from tools.make_scenes import BALL_RADIUS, Arguments, camera_positions, main, world_from_opengl
+from tools.make_scenes import BALL_RADIUS, Arguments, camera_positions, main, world_from_opengl, write_points
+from tools.scene_draws import COATINGS, SHAPES, DrawnScene, draw_scene
 from tools.scene_environment import directions, make_environment
-from tools.scene_surfaces import Triangles, disc, ground_texture, torus, torus_depth
+from tools.scene_surfaces import Array, Triangles, disc, ground_texture, placed, star_shaped, torus, torus_depth
 
 BALL = Path(__file__).parent.parent / "data_files" / "ball"
 TEST_FRAMES = json.loads((BALL / "transforms_test.json").read_text())["frames"]
@@ -59,18 +61,89 @@ def test_cameras_look_at_the_object_from_above() -> None:
         assert pose[2, 1] > 0 and pose[2, 0] == pytest.approx(0)
 
 
-@pytest.mark.parametrize("triangles", [disc(1.2, -0.5), torus(0.6, 0.25, 40.0, rings=24, segments=16)])
+def ellipsoid_radius(directions: Array) -> Array:
+    return np.asarray(np.sum((directions / [0.3, 0.5, 0.7]) ** 2, axis=-1) ** -0.5)
+
+
+MESHES = [
+    disc(1.2, -0.5),
+    torus(0.6, 0.25, 40.0, rings=24, segments=16),
+    star_shaped(ellipsoid_radius, rings=48, segments=24),
+    placed(star_shaped(ellipsoid_radius, rings=48, segments=24), np.diag([-1.0, 1.0, -1.0]), np.array([1.0, 2.0, 3.0])),
+]
+
+
+@pytest.mark.parametrize("triangles", MESHES, ids=["disc", "torus", "ellipsoid", "turned and moved"])
 def test_faces_turn_the_way_their_normals_point(triangles: Triangles) -> None:
     first, second, third = (triangles.positions[triangles.faces[:, corner]] for corner in range(3))
     turned = np.cross(second - first, third - first)
     normals = triangles.normals[triangles.faces].mean(axis=1)
-    assert ((turned * normals).sum(axis=-1) > 0).all()
+    # At a pole all but one of a quad's corners coincide, and so one of its two triangles has no area.
+    has_area = np.linalg.norm(turned, axis=-1) > 1e-12
+    assert has_area.mean() > 0.9
+    assert ((turned * normals).sum(axis=-1) > 0)[has_area].all()
     np.testing.assert_allclose(np.linalg.norm(triangles.normals, axis=-1), 1)
 
 
 def test_a_torus_stands_on_its_lowest_point() -> None:
     lowest = torus(0.6, 0.25, 40.0).positions[:, 2].min()
     assert lowest == pytest.approx(-torus_depth(0.6, 0.25, 40.0), abs=1e-3)
+
+
+def test_a_star_shaped_surface_has_the_normals_of_its_equation() -> None:
+    mesh = star_shaped(ellipsoid_radius, rings=24, segments=12)
+    gradient = mesh.positions / np.array([0.3, 0.5, 0.7]) ** 2
+    expected = gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
+    np.testing.assert_allclose(mesh.normals, expected, atol=1e-5)
+    assert mesh.coordinates.min() >= 0 and mesh.coordinates.max() <= 1
+
+
+def drawn_values(scene: DrawnScene) -> list:
+    meshes = [body.triangles.positions.tolist() for body in scene.bodies]
+    looks = [(body.shape, body.coating, body.tint, body.refraction) for body in scene.bodies]
+    return [meshes, looks, scene.stand, scene.surroundings]
+
+
+def test_a_seed_is_a_scene() -> None:
+    assert drawn_values(draw_scene(7)) == drawn_values(draw_scene(7))
+    assert drawn_values(draw_scene(7)) != drawn_values(draw_scene(8))
+
+
+SEEDS = range(40)
+
+
+def test_all_shapes_and_coatings_are_drawn() -> None:
+    bodies = [body for seed in SEEDS for body in draw_scene(seed).bodies]
+    assert {body.shape for body in bodies} == set(SHAPES)
+    assert {body.coating for body in bodies} == set(COATINGS)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_drawn_things_stand_side_by_side_on_their_stand(seed: int) -> None:
+    scene = draw_scene(seed)
+    points = [body.triangles.positions for body in scene.bodies]
+    assert all(np.abs(positions).max() < 1.3 for positions in points) and scene.stand.radius < 1.3
+    assert all(positions[:, 2].min() == pytest.approx(scene.stand.z) for positions in points)
+    middles = [(positions.max(axis=0) + positions.min(axis=0)) / 2 for positions in points]
+    assert all(np.linalg.norm(middle[:2]) < scene.stand.radius for middle in middles)
+    if len(points) == 2:
+        apart = middles[1] - middles[0]
+        assert (points[0] @ apart).max() < (points[1] @ apart).min()
+
+
+def test_drawn_surroundings_can_be_rendered() -> None:
+    pictures = [make_environment(32, draw_scene(seed).surroundings) for seed in (1, 2)]
+    assert all(picture.min() >= 0 and picture.max() <= 1.2 + 1e-6 for picture in pictures)
+    assert np.abs(pictures[0] - pictures[1]).mean() > 0.05
+    assert all(picture.std() > 0.05 for picture in pictures)
+
+
+def test_points_come_with_a_scene_where_they_are_asked_for(tmp_path: Path) -> None:
+    folder = tmp_path / "ball"
+    shutil.copytree(BALL, folder)
+    write_points(500, folder)
+    dataset = load_dataset(folder)
+    assert len(dataset.points) == 500 and float(dataset.points.positions.abs().max()) <= 1.3
 
 
 def test_a_panorama_is_seen_from_inside() -> None:
