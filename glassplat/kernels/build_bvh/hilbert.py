@@ -6,10 +6,12 @@ Boxes around runs of eight are smaller than along a Morton curve, which leaps: r
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
 from numba import prange
+from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
@@ -79,7 +81,7 @@ def hilbert_places(real: type) -> Kernel:
     """Fills the places of cells along the curve."""
 
     @kernel("hilbert_places", real)
-    def fill(cells, places):
+    def fill(cells: NDArray[Any], places: NDArray[Any]) -> None:
         count = places.size
         for chunk in prange((count + CHUNK - 1) // CHUNK):
             for i in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
