@@ -27,7 +27,7 @@ from glassplat.train.propagation import (
     Propagate,
     PropagationSchedule,
     RefineEnvironment,
-    ResetAfterPropagation,
+    ResetRaised,
 )
 from glassplat.train.splat_recipe import GaussianRates, image_terms
 from glassplat.train.stage import Every, Stage
@@ -128,7 +128,8 @@ class DeferredRecipe:
             share=self.bootstrap,
             renderer=Splat(self.background or BLACK, depth=False),
             losses=(*image, *population.terms),
-            rates=self.rates.of("primary"),
+            # No normal means anything yet that higher rates could spoil.
+            rates=replace(self.rates, short_run_power=GaussianRates().short_run_power).of("primary"),
             actions=population.edits,
             motions=population.motions,
             densify_until=population.densify_until,
@@ -151,8 +152,7 @@ class DeferredRecipe:
                 # Before the resets: it looks at what is seen, also at the beats that it leaves to them.
                 Propagate(beat, self.propagation, self.schedule, renderer, matte_rates=self._matte_rates()),
                 GrowShAfterPropagation(Every(self.rhythm.sh)),
-                *population.resets,
-                *(ResetAfterPropagation.following(reset) for reset in population.resets),
+                *(ResetRaised.instead_of(reset) for reset in population.resets),
                 RefineEnvironment(self.refinements, self.texels),
             ),
             motions=population.motions,
