@@ -1,83 +1,185 @@
-"""The command line: `glassplat train | eval | render | dereflect | demo | bench`."""
+"""The command line: `glassplat train | eval | render | dereflect | demo | bench`.
+
+A command's module is imported when the command is chosen, and nothing before that which takes long: the list of
+commands appears at once, and Ctrl-C works from the beginning.
+"""
 
 from __future__ import annotations
 
-import logging
+import importlib
 import sys
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import field, make_dataclass
+from typing import Annotated, Any, NamedTuple, Union
 
-import torch
-import tyro
-from rich.console import Console
-from rich.logging import RichHandler
+from glassplat import __version__
 
-from glassplat.commands.bench import Bench
-from glassplat.commands.demo import Demo
-from glassplat.commands.dereflect import Dereflect
-from glassplat.commands.evaluate import Evaluate
-from glassplat.commands.render import Render
-from glassplat.commands.train import Train
-from glassplat.data.errors import InputError
-from glassplat.init.planes import PlaneFitError
-from glassplat.kernels.devices import CudaUnavailableError
-from glassplat.train.trainer import TrainingDivergedError
+FAILURE_CODE, USAGE_CODE, INTERRUPTED_CODE, UNREAD_CODE = 1, 2, 130, 141
+"""The last two as shells report a process that Ctrl-C or a closed pipe ended."""
+DESCRIPTION = "Gaussian splatting for scenes with window panes, showcases and mirrors."
 
-Command = (
-    Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Evaluate, tyro.conf.subcommand("eval")]
-    | Annotated[Render, tyro.conf.subcommand("render")]
-    | Annotated[Dereflect, tyro.conf.subcommand("dereflect")]
-    | Annotated[Demo, tyro.conf.subcommand("demo")]
-    | Annotated[Bench, tyro.conf.subcommand("bench")]
-)
-INPUT_ERRORS = (
-    InputError,
-    PlaneFitError,
-    CudaUnavailableError,
-    FileNotFoundError,
-    NotADirectoryError,
-    PermissionError,
-)
-GOES_ON = "interrupted; everything saved so far is intact: train --resume, or the same demo or bench command, goes on"
-INPUT_ERROR_CODE, FAILURE_CODE, INTERRUPTED_CODE = 2, 1, 130
+
+class Listed(NamedTuple):
+    """A command in the list: its class, the module in `commands/` that holds it, and the class's first sentence."""
+
+    module: str
+    kind: str
+    summary: str
+
+
+COMMANDS = {
+    "train": Listed("train", "Train", "Train a scene from photographs."),
+    "eval": Listed("evaluate", "Evaluate", "Measure a run on its test views and write comparison sheets."),
+    "render": Listed(
+        "render", "Render", "Render the layers of a run from its cameras, with its panes as they are or edited."
+    ),
+    "dereflect": Listed(
+        "dereflect",
+        "Dereflect",
+        "Take the reflections out of a planar run's photographs; one PNG per photograph, under its name.",
+    ),
+    "demo": Listed(
+        "demo",
+        "Demo",
+        "Train planar and splat on the bundled showcase and compare them; goes on where it was interrupted.",
+    ),
+    "bench": Listed("bench", "Bench", "Compare methods over scenes, or the parts of a method with each other."),
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command; returns the exit code (0 done, 1 failed, 2 bad input, 130 interrupted)."""
-    command = tyro.cli(
-        Command,
-        prog="glassplat",
-        description="Gaussian splatting for scenes with window panes, showcases and mirrors.",
-        args=arguments,
-        config=(tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes),
-    )
-    console = Console()
-    logging.basicConfig(
-        level=logging.INFO, format="%(message)s", handlers=[RichHandler(console=console, show_path=False)]
-    )
-    return guarded(command, console)
+    """Runs one command; returns the exit code.
 
+    That is 0 done, 1 failed, 2 bad input, 130 interrupted (143 and 129 where another signal than Ctrl-C asked for it),
+    141 when nobody reads the output any more.
 
-def guarded(command: Train | Evaluate | Render | Dereflect | Demo | Bench, console: Console) -> int:
-    """Runs a command and turns expected errors into one readable message and an exit code."""
+    Raises:
+        SystemExit: after help (0) and after options that cannot be understood (2).
+    """
     try:
-        command.run(console)
-    except INPUT_ERRORS as error:
-        Console(stderr=True).print(f"[red]error:[/red] {error}", highlight=False)
-        return INPUT_ERROR_CODE
-    except (TrainingDivergedError, OSError) as error:
-        Console(stderr=True).print(f"[red]stopped:[/red] {error}", highlight=False)
-        return FAILURE_CODE
-    except torch.OutOfMemoryError as error:
-        reason = str(error).split(". ")[0]
-        remedy = "pass a larger --downscale, cap the Gaussians, or use --device cpu; the last checkpoint stays"
-        Console(stderr=True).print(f"[red]stopped:[/red] {reason}; {remedy}", highlight=False)
-        return FAILURE_CODE
-    except KeyboardInterrupt:
-        Console(stderr=True).print(GOES_ON, highlight=False)
+        return guarded(sys.argv[1:] if arguments is None else list(arguments), is_program=arguments is None)
+    except KeyboardInterrupt:  # In the moments before anybody listens, or while the end is being reported.
+        print("interrupted", file=sys.stderr)
         return INTERRUPTED_CODE
+    except Exception as error:  # noqa: BLE001 - Even the report failed, as it may when memory has run out.
+        reason = "out of memory" if isinstance(error, MemoryError) else type(error).__name__
+        print(f"stopped: {reason}", file=sys.stderr)
+        return FAILURE_CODE
+
+
+def guarded(arguments: list[str], *, is_program: bool) -> int:
+    """Runs a command; whatever happens ends in one readable message and an exit code."""
+    from glassplat.commands.endings import ending
+    from glassplat.commands.messages import complain, drop_output, plain_streams
+    from glassplat.commands.signals import immediate_end, raised_signals
+
+    plain_streams()
+    command = None
+    with raised_signals() as raised:
+        try:
+            with immediate_end() if is_program else nullcontext():
+                command = parsed(arguments)
+            run(command)
+        except KeyboardInterrupt as stop:
+            return interrupted(stop, command)
+        except SystemExit:
+            raise
+        except BrokenPipeError:
+            drop_output()
+            return UNREAD_CODE
+        except BaseException as error:  # noqa: BLE001 - The last guard: nobody is to read a traceback.
+            if raised:
+                return interrupted(raised[-1], command)
+            end = ending(error)
+            with suppress(OSError):  # Nobody hears it where the output is full or closed.
+                complain(end.label, end.text)
+            return end.code
     return 0
+
+
+def parsed(arguments: list[str]) -> Any:
+    """The command that the arguments describe.
+
+    Raises:
+        InputError: an option is out of range.
+        SystemExit: they ask for help or the version, or cannot be understood.
+    """
+    import tyro
+
+    from glassplat.commands.arguments import check_arguments
+    from glassplat.data.options import check_options
+
+    if arguments[:1] == ["--version"]:
+        print(f"glassplat {__version__}")
+        raise SystemExit(0)
+    config = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes)
+    name = arguments[0] if arguments else ""
+    if name in COMMANDS:
+        check_arguments(arguments)
+        kind, options = command_line(name, arguments[1:])
+        command = tyro.cli(kind, prog=f"glassplat {name}", args=options, config=config)
+        check_options(command)
+        return command
+    # Nothing is left to run after the list of commands; only a shell's completions need to know every option.
+    complete = name.startswith("--tyro-")
+    kinds = {known: command_line(known, [])[0] if complete else stub(known) for known in COMMANDS}
+    tyro.cli(overview(kinds), prog="glassplat", description=DESCRIPTION, args=arguments, config=config)
+    raise SystemExit(USAGE_CODE)
+
+
+def command_line(name: str, options: list[str]) -> tuple[Any, list[str]]:
+    """What tyro should make of a command's options, and how it should see them; that of `train` depends on them."""
+    if name == "train":
+        from glassplat.commands.train_options import train_command
+
+        return train_command(options)
+    return command_class(name), options
+
+
+def command_class(name: str) -> type:
+    """The class of a command, from its module, which is imported now."""
+    listed = COMMANDS[name]
+    return getattr(importlib.import_module(f"glassplat.commands.{listed.module}"), listed.kind)
+
+
+def stub(name: str) -> type:
+    """What the list of commands shows of a command whose module is not imported."""
+    return make_dataclass(COMMANDS[name].kind, [], namespace={"__doc__": COMMANDS[name].summary})
+
+
+def overview(kinds: Mapping[str, type]) -> type:
+    """What can be asked of `glassplat` itself: one of the commands, or the version."""
+    import tyro
+
+    commands: Any = Union[tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in kinds.items())]  # noqa: UP007
+    version = tyro.conf.arg(help="show the version and exit", help_behavior_hint="")
+    return make_dataclass(
+        "Glassplat",
+        [
+            ("command", Annotated[commands, tyro.conf.arg(name="")]),
+            ("version", Annotated[bool, tyro.conf.FlagCreatePairsOff, version], field(default=False)),
+        ],
+    )
+
+
+def run(command: Any) -> None:
+    """Runs a command; its console shows the package's log too, and what libraries warn of."""
+    from glassplat.commands.messages import heard_by, message_console
+
+    console = message_console()
+    with heard_by(console):
+        command.run(console)
+
+
+def interrupted(stop: KeyboardInterrupt, command: Any) -> int:
+    """Says what an interrupted command leaves behind, and how to go on."""
+    from glassplat.commands.messages import message_console, say
+    from glassplat.commands.signals import code_of
+
+    left = "" if command is None else f"; {command.left_behind()}"
+    say(message_console(stderr=True), f"{str(stop) or 'interrupted'}{left}")
+    return code_of(stop)
 
 
 if __name__ == "__main__":

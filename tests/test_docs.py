@@ -51,7 +51,7 @@ def test_the_readme_shows_how_to_start() -> None:
 @pytest.mark.parametrize("arguments", commands("glassplat"), ids=" ".join)
 def test_the_command_line_takes_every_command_shown(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     taken = []
-    monkeypatch.setattr(cli, "guarded", lambda command, console: taken.append(command) or 0)
+    monkeypatch.setattr(cli, "run", taken.append)
     assert cli.main(arguments) == 0
     assert len(taken) == 1
 
@@ -60,3 +60,22 @@ def test_the_command_line_takes_every_command_shown(arguments: list[str], monkey
 def test_make_has_every_target_shown(arguments: list[str]) -> None:
     targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     assert set(arguments) <= targets
+
+
+LAB_BOOK = ROOT / "docs" / "experiments.md"
+
+
+def anchor(heading: str) -> str:
+    """The anchor that a Markdown page gives a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+def test_the_lab_book_answers_every_question_in_its_index() -> None:
+    indexed = re.findall(r"\| \[(.*?)\]\(experiments/(\w+\.md)#(\S+)\) \| \S", LAB_BOOK.read_text())
+    entries = {
+        (heading, page.name, anchor(heading))
+        for page in (ROOT / "docs" / "experiments").glob("*.md")
+        for heading in re.findall(r"^## (.*)$", page.read_text(), re.MULTILINE)
+    }
+    assert len(indexed) == len(set(indexed))
+    assert set(indexed) == entries

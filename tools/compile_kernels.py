@@ -1,7 +1,8 @@
 """Compiles every CUDA kernel without a GPU and says what each of them takes: python -m tools.compile_kernels.
 
 NVVM makes PTX for a compute capability, and nvJitLink, which is what Numba links with on a GPU, makes machine code of
-it and reports registers, spills and shared memory. Neither needs a driver.
+it and reports registers, spills and shared memory; nvdisasm shows the machine code, in which loops and their
+instructions are counted. None of them needs a driver.
 """
 
 from __future__ import annotations
@@ -20,9 +21,16 @@ from unittest import mock
 
 import numpy as np
 
+from tools.machine_loops import Loops, loops_of
+
 CAPABILITIES = ((8, 0), (9, 0), (12, 0))
 SUPPORTED = ((7, 5), (8, 0), (8, 6), (8, 9), (9, 0), (10, 0), (12, 0))
 PACKAGE = "glassplat.kernels"
+COSTS = ("shared bytes", "instructions of a turn", "float64 in loops")
+
+
+COUNTED = (9, 0)
+"""The compute capability whose machine code is counted."""
 
 
 class Resources(NamedTuple):
@@ -31,6 +39,13 @@ class Resources(NamedTuple):
     registers: int
     spilled: int
     shared: int
+
+
+class Linked(NamedTuple):
+    """Machine code of a kernel, and what it takes."""
+
+    cubin: bytes
+    resources: Resources
 
 
 def all_kernels(real: type = np.float32) -> list[Any]:
@@ -44,9 +59,15 @@ def all_kernels(real: type = np.float32) -> list[Any]:
         for value in vars(module).values()
         if isinstance(value, _lru_cache_wrapper)
         and value.__module__ == module.__name__
-        and next(iter(inspect.signature(value).parameters), None) == "real"
+        and first_parameter(value) in ("real", "key")
     }
-    return sorted((factory(real) for factory in factories), key=lambda kernel: str(kernel.name))
+    made = (factory(real) if first_parameter(factory) == "real" else factory() for factory in factories)
+    return sorted(made, key=lambda kernel: str(kernel.name))
+
+
+def first_parameter(factory: Callable[..., Any]) -> str | None:
+    """What a factory of kernels takes first: `real` or, of kernels without floating-point numbers, `key`."""
+    return next(iter(inspect.signature(factory).parameters), None)
 
 
 @contextmanager
@@ -76,7 +97,7 @@ def ptx_of(kernel: Any, capabilities: Sequence[tuple[int, int]] = CAPABILITIES) 
         return ["".join(library.get_asm_strs(cc=capability)) for capability in capabilities]
 
 
-def resources_of(ptx: str, capability: tuple[int, int]) -> Resources:
+def linked(ptx: str, capability: tuple[int, int]) -> Linked:
     """Links PTX into machine code and reads the linker's report."""
     from cuda.bindings import nvjitlink
 
@@ -87,9 +108,11 @@ def resources_of(ptx: str, capability: tuple[int, int]) -> Resources:
         nvjitlink.complete(handle)
         report = bytearray(nvjitlink.get_info_log_size(handle))
         nvjitlink.get_info_log(handle, report)
+        cubin = bytearray(nvjitlink.get_linked_cubin_size(handle))
+        nvjitlink.get_linked_cubin(handle, cubin)
     finally:
         nvjitlink.destroy(handle)
-    return read_report(report.decode())
+    return Linked(bytes(cubin), read_report(report.decode()))
 
 
 def read_report(report: str) -> Resources:
@@ -103,14 +126,24 @@ def read_report(report: str) -> Resources:
 
 
 def table(kernels: Sequence[Any]) -> list[str]:
-    """A markdown table of the resources of kernels, one column for each compute capability."""
-    names = [f"sm_{major}{minor}" for major, minor in CAPABILITIES]
-    lines = ["| kernel | " + " | ".join(names) + " | shared bytes |", "| --- " * (len(names) + 2) + "|"]
+    """A markdown table of what kernels take, one column of registers for each compute capability."""
+    heads = ["kernel", *(f"sm_{major}{minor}" for major, minor in CAPABILITIES), *COSTS]
+    lines = ["| " + " | ".join(heads) + " |", "| --- " * len(heads) + "|"]
     for kernel in kernels:
-        found = [resources_of(ptx, cc) for ptx, cc in zip(ptx_of(kernel), CAPABILITIES, strict=True)]
+        made = {cc: linked(ptx, cc) for ptx, cc in zip(ptx_of(kernel), CAPABILITIES, strict=True)}
+        found = [one.resources for one in made.values()]
         cells = [f"{r.registers}" + (f" ({r.spilled} B spilled)" if r.spilled else "") for r in found]
-        lines.append(f"| {kernel.name} | " + " | ".join(cells) + f" | {found[-1].shared} |")
+        cells += [str(found[-1].shared), *loop_cells(loops_of(made[COUNTED].cubin))]
+        lines.append("| " + " | ".join([kernel.name, *cells]) + " |")
     return lines
+
+
+def loop_cells(loops: Loops | None) -> tuple[str, str]:
+    """The cheapest and the dearest turn of the dearest innermost loop, and float64 instructions in all loops."""
+    if loops is None:
+        return "?", "?"
+    least, most = loops.dearest
+    return (f"{least} to {most}" if most else ""), str(loops.float64 or "")
 
 
 def main() -> int:

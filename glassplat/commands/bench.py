@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 from rich.console import Console
 
-from glassplat.commands.bench_runs import FinishedRun, PlannedRun, execute, scene_names
+from glassplat.commands.bench_runs import RUNS, FinishedRun, PlannedRun, earlier_runs, execute, scene_names
 from glassplat.commands.bench_tables import (
     Measured,
     Pair,
@@ -25,11 +24,14 @@ from glassplat.commands.bench_tables import (
     plain_rows,
     values_of,
 )
+from glassplat.commands.messages import say
 from glassplat.commands.train import Train
 from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
+from glassplat.data.ranges import Downscale, Seed, Several
+from glassplat.files.folders import check_folder
 from glassplat.train.ablations import ABLATIONS, Ablated, Ablation, Switch
-from glassplat.train.recipe import RECIPES
+from glassplat.train.recipe import RECIPES, Preset, recipe_of
 from glassplat.train.run_directory import write_text
 
 Method = Literal["splat", "planar", "deferred"]
@@ -51,6 +53,7 @@ class BenchScenes:
         output: where the tables and one directory per run go.
         methods: which methods.
         strategies: how Gaussians are added and removed.
+        presets: the recipes that this project found best, or those of the papers.
         seeds: one run for each.
         iterations: length of each run.
         downscale: shrink the photographs by this factor.
@@ -61,28 +64,25 @@ class BenchScenes:
     output: Path
     methods: tuple[Method, ...] = ("splat", "planar")
     strategies: tuple[Strategy, ...] = ("default",)
-    seeds: tuple[int, ...] = (0,)
-    iterations: int = 7000
-    downscale: float = 1.0
+    presets: tuple[Preset, ...] = ("glassplat",)
+    seeds: tuple[Seed, ...] = (0,)
+    iterations: Several = 7000
+    downscale: Downscale = 1.0
     mask_polarity: Polarity = "auto"
 
     def run(self, console: Console) -> None:
-        """Runs what is missing and writes `scenes.md` and `scenes.json`."""
+        """Runs what is missing and writes `scenes.md` and `scenes.json`, of earlier commands' runs in it too."""
         recipes = {
-            variant_name(method, strategy): with_strategy(RECIPES[method](), strategy)
+            variant_name(method, strategy, preset): with_strategy(recipe_of(method, preset), strategy)
+            for preset in unique(self.presets, "presets")
             for strategy in unique(self.strategies, "strategies")
             for method in unique(self.methods, "methods")
         }
-        pairs = [
-            Pair(f"{reflective} - {splat}", reflective, splat)
-            for strategy in self.strategies
-            for method in ("planar", "deferred")
-            if (reflective := variant_name(method, strategy)) in recipes
-            and (splat := variant_name("splat", strategy)) in recipes
-        ]
         runs = planned_runs(self, recipes)
-        execute(runs, console, partial(write_scenes, self.output, pairs))
-        console.print(f"tables: {self.output / 'scenes.md'}, {self.output / 'scenes.json'}")
+        variants = all_variants()
+        earlier = earlier_runs(self.output, variants, runs)
+        execute(runs, console, lambda done: write_scenes(self.output, in_order([*done, *earlier], variants)))
+        say(console, f"tables: {self.output / 'scenes.md'}, {self.output / 'scenes.json'}")
 
 
 @dataclass(frozen=True)
@@ -104,19 +104,23 @@ class BenchAblation:
     output: Path
     method: Ablated = "planar"
     switches: tuple[Switch, ...] = ()
-    seeds: tuple[int, ...] = (0,)
-    iterations: int = 7000
-    downscale: float = 1.0
+    seeds: tuple[Seed, ...] = (0,)
+    iterations: Several = 7000
+    downscale: Downscale = 1.0
     mask_polarity: Polarity = "auto"
 
     def run(self, console: Console) -> None:
-        """Runs what is missing and writes `ablation.md` and `ablation.json`."""
+        """Runs what is missing and writes `ablation.md` and `ablation.json`, of earlier commands' runs in it too."""
         full = RECIPES[self.method]()
         ablations = self.chosen()
-        recipes = {FULL: full} | {f"no-{switch}": ablation.off(full) for switch, ablation in ablations.items()}
-        runs = planned_runs(self, recipes)
-        execute(runs, console, partial(write_ablation, self.output, ablations))
-        console.print(f"tables: {self.output / 'ablation.md'}, {self.output / 'ablation.json'}")
+        runs = planned_runs(self, ablation_recipes(full, ablations))
+        known = ABLATIONS[self.method]
+        variants = ablation_recipes(full, known)
+        earlier = earlier_runs(self.output, variants, runs)
+        kept = {run.run.variant for run in earlier}
+        tabled = {s: part for s, part in known.items() if s in ablations or off_name(s) in kept}
+        execute(runs, console, lambda done: write_ablation(self.output, tabled, in_order([*done, *earlier], variants)))
+        say(console, f"tables: {self.output / 'ablation.md'}, {self.output / 'ablation.json'}")
 
     def chosen(self) -> dict[Switch, Ablation]:
         """The parts to switch off.
@@ -150,10 +154,58 @@ class Bench:
         """Runs the comparison."""
         self.comparison.run(console)
 
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        return f"finished runs stay in {self.comparison.output}: repeat the command to go on"
 
-def variant_name(method: str, strategy: str) -> str:
-    """What tables and directories call a method with a strategy."""
-    return method if strategy == "default" else f"{method}-{strategy}"
+
+def variant_name(method: str, strategy: str, preset: Preset = "glassplat") -> str:
+    """What tables and directories call a method with a strategy and a preset."""
+    name = method if strategy == "default" else f"{method}-{strategy}"
+    return name if preset == "glassplat" else f"{name}-{preset}"
+
+
+def all_variants() -> dict[str, Any]:
+    """The recipe of every variant that a table of scenes may hold."""
+    return {
+        variant_name(method, strategy, preset): with_strategy(recipe_of(method, preset), strategy)
+        for preset in get_args(Preset)
+        for strategy in get_args(Strategy)
+        for method in get_args(Method)
+    }
+
+
+def compared_variants() -> list[tuple[str, str]]:
+    """Which variants tables of scenes set against each other: methods and `splat`, and recipes and their papers'."""
+    strategies, presets = get_args(Strategy), get_args(Preset)
+    gains = [
+        (variant_name(method, strategy, preset), variant_name("splat", strategy, preset))
+        for preset in presets
+        for strategy in strategies
+        for method in ("planar", "deferred")
+    ]
+    changes = [
+        (variant_name(method, strategy), variant_name(method, strategy, "paper"))
+        for strategy in strategies
+        for method in get_args(Method)
+    ]
+    return gains + changes
+
+
+def off_name(switch: Switch) -> str:
+    """What tables and directories call a method without one of its parts."""
+    return f"no-{switch}"
+
+
+def ablation_recipes(full: Any, ablations: Mapping[Switch, Ablation]) -> dict[str, Any]:
+    """The full recipe, and those without one of its parts, by variant."""
+    return {FULL: full} | {off_name(switch): ablation.off(full) for switch, ablation in ablations.items()}
+
+
+def in_order(finished: Sequence[FinishedRun], variants: Iterable[str]) -> list[FinishedRun]:
+    """The runs by scene, in the order in which scenes come, by seed, and as the variants are listed."""
+    scenes, names = list(dict.fromkeys(f.run.scene for f in finished)), list(variants)
+    return sorted(finished, key=lambda f: (scenes.index(f.run.scene), f.run.train.seed, names.index(f.run.variant)))
 
 
 def with_strategy(recipe: Any, strategy: str) -> Any:
@@ -184,6 +236,7 @@ def unique(choices: Sequence[Any], option: str) -> list[Any]:
 
 def planned_runs(bench: BenchScenes | BenchAblation, recipes: dict[str, Any]) -> list[PlannedRun]:
     """A run per capture, variant and seed; the paths are absolute, so that a bench goes on from any folder."""
+    check_folder(bench.output)
     captures = zip(scene_names(bench.data), bench.data, strict=True)
     seeds = unique(bench.seeds, "seeds")
     return [
@@ -193,7 +246,7 @@ def planned_runs(bench: BenchScenes | BenchAblation, recipes: dict[str, Any]) ->
             Train(
                 recipe,
                 data.resolve(),
-                bench.output / "runs" / scene / f"{variant}-seed{seed}",
+                bench.output / RUNS / scene / f"{variant}-seed{seed}",
                 iterations=bench.iterations,
                 downscale=bench.downscale,
                 seed=seed,
@@ -206,8 +259,9 @@ def planned_runs(bench: BenchScenes | BenchAblation, recipes: dict[str, Any]) ->
     ]
 
 
-def write_scenes(output: Path, pairs: Sequence[Pair], finished: Sequence[FinishedRun]) -> None:
+def write_scenes(output: Path, finished: Sequence[FinishedRun]) -> None:
     """Writes what is finished."""
+    pairs = [Pair(f"{first} - {second}", first, second) for first, second in compared_variants()]
     measured = measured_runs(finished)
     reached, compared = means(measured), differences(measured, pairs)
     tables = [means_table(reached, "Scenes", " ".join([SPREAD_NOTE, *remarks(finished)]))]
@@ -220,7 +274,7 @@ def write_scenes(output: Path, pairs: Sequence[Pair], finished: Sequence[Finishe
 def write_ablation(output: Path, ablations: Mapping[Switch, Ablation], finished: Sequence[FinishedRun]) -> None:
     """Writes what is finished."""
     measured = measured_runs(finished)
-    pairs = [Pair(ablation.title, f"no-{switch}", FULL) for switch, ablation in ablations.items()]
+    pairs = [Pair(ablation.title, off_name(switch), FULL) for switch, ablation in ablations.items()]
     reached, compared = means(measured), differences(measured, pairs)
     published = [ablation for ablation in ablations.values() if ablation.paper_psnr is not None]
     paper = "; ".join(f"{ablation.title} {ablation.paper_psnr:+.2f}" for ablation in published)

@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.text import Text
 
 from glassplat.commands.evaluate import evaluate_run
+from glassplat.commands.messages import complain, printable, say
 from glassplat.commands.stored_run import open_run
 from glassplat.commands.train import Train
+from glassplat.commands.training_progress import in_words
 from glassplat.data.dataset import load_dataset
 from glassplat.data.errors import InputError, first_names
+from glassplat.files.json_text import read_json
 from glassplat.init.planes import PlaneFitError
 from glassplat.train.background import with_background
 from glassplat.train.run_directory import RunDirectory
+from glassplat.train.stage import check_length
 from glassplat.train.trainer import TrainingDivergedError
+
+RUNS = "runs"
+"""Folder of a comparison's runs: `<scene>/<variant>-seed<seed>`."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +79,10 @@ class PlannedRun:
     def results(self) -> dict[str, Any] | None:
         """The metrics of the finished run, None before it is finished."""
         try:
-            results = json.loads(self.directory.results.read_text(encoding="utf-8"))
-        except (FileNotFoundError, json.JSONDecodeError):
+            results = read_json(self.directory.results)
+        except (FileNotFoundError, ValueError):
+            return None
+        if not isinstance(results, dict):
             return None
         made = (results.get("method"), results.get("iterations"), results.get("seed"))
         wanted = (self.train.recipe.method, self.train.iterations, self.train.seed)
@@ -106,6 +115,55 @@ def scene_names(captures: Sequence[Path]) -> list[str]:
     return ["-".join(part.strip("/") for part in path.parts[-depth:]) for path in folders]
 
 
+def earlier_runs(output: Path, recipes: Mapping[str, Any], planned: Sequence[PlannedRun]) -> list[FinishedRun]:
+    """Finished runs that earlier commands left in the same output, of other captures, variants or seeds.
+
+    They stay in the tables, which would otherwise hold the last command's runs only.
+
+    Args:
+        output: of the comparison.
+        recipes: of every variant that its tables may hold.
+        planned: the runs of this command.
+
+    Raises:
+        InputError: one of them cannot stand in a table with those that are planned, because its length, scale or
+            recipe is another.
+    """
+    own, like = {run.directory.path.resolve() for run in planned}, planned[0].train
+    found = []
+    for path in sorted((output / RUNS).glob("*/*-seed*")):
+        variant, _, seed = path.name.rpartition("-seed")
+        if variant not in recipes or not seed.isdecimal() or path.resolve() in own:
+            continue
+        recorded = RunDirectory(path).settings()
+        train = replace(
+            like,
+            recipe=recipes[variant],
+            data=Path(recorded.data),
+            output=path,
+            seed=int(seed),
+            iterations=recorded.iterations,
+            downscale=recorded.downscale,
+        )
+        run = PlannedRun(path.parent.name, variant, train)
+        results = run.results()
+        if results is not None:
+            _check_comparable(run, like)
+            found.append(FinishedRun(run, results))
+    return found
+
+
+def _check_comparable(run: PlannedRun, like: Train) -> None:
+    wanted = with_background(run.train.recipe, run.directory.recipe().background)
+    alike = (run.train.iterations, run.train.downscale) == (like.iterations, like.downscale)
+    if not alike or not run.directory.was_begun_with(wanted):
+        raise InputError(
+            f"{run.directory.path} holds a run of {run.train.iterations} iterations at downscale "
+            f"{run.train.downscale}, or with another recipe; expected {like.iterations} at {like.downscale} and the "
+            "recipe of this version, because one table holds both. Choose another --output, or move the run away"
+        )
+
+
 def execute(
     runs: Sequence[PlannedRun], console: Console, after_each: Callable[[list[FinishedRun]], None]
 ) -> list[FinishedRun]:
@@ -122,25 +180,26 @@ def execute(
     """
     for run in runs:
         run.check()
+        check_length(run.train.recipe.stages(run.train.seed), run.train.iterations)
     finished = _finished(runs)
     after_each(finished)
     if finished:
-        console.print(f"{len(finished)} of {len(runs)} runs are finished already")
+        say(console, f"{len(finished)} of {len(runs)} runs are finished already")
     _check_captures([run for run in runs if run.results() is None])
     clock, failures = RunClock(finished), []
     for number, run in enumerate(runs, start=1):
         if run.results() is not None:
             continue
         waiting = [other for other in runs[number - 1 :] if other.results() is None]
-        console.rule(f"run {number} of {len(runs)}: {run.title} ({clock.left(waiting)})")
+        console.rule(Text(f"run {number} of {len(runs)}: {printable(run.title)} ({clock.left(waiting)})"))
         try:
             clock.measure(run, lambda run=run: _train_and_evaluate(run, console))  # type: ignore[misc]
         except (PlaneFitError, TrainingDivergedError) as error:
             # One scene that cannot be trained must not cost the night that the others take.
             failures.append(f"{run.title}: {error}")
-            console.print(f"[red]failed:[/red] {error}", highlight=False)
+            complain("failed", error)
         except KeyboardInterrupt:
-            console.print(f"stopped in run {number} of {len(runs)}; the same command goes on from here")
+            say(console, f"stopped in run {number} of {len(runs)}")
             raise
         after_each(_finished(runs))
     if failures:
@@ -192,12 +251,3 @@ class RunClock:
         same = [s for other, s in self._seconds if (other.scene, other.variant) == (run.scene, run.variant)]
         method = [s for other, s in self._seconds if other.train.recipe.method == run.train.recipe.method]
         return statistics.fmean(same or method or [s for _, s in self._seconds])
-
-
-def in_words(seconds: float) -> str:
-    """A duration as someone who waits would say it."""
-    minutes = round(seconds / 60)
-    if minutes < 1:
-        return f"{seconds:.0f} s"
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min"

@@ -7,9 +7,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from glassplat.commands.evaluate import evaluate_run, results_table
+from glassplat.commands.evaluate import evaluate_run, print_results
+from glassplat.commands.messages import say
 from glassplat.commands.stored_run import open_run
 from glassplat.commands.train import Train
+from glassplat.data.ranges import Seed, Several
 from glassplat.kernels.devices import DeviceName
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.run_directory import RunDirectory
@@ -30,8 +32,8 @@ class Demo:
     """
 
     output: Path = Path("runs/demo")
-    iterations: int = 3000
-    seed: int = 0
+    iterations: Several = 3000
+    seed: Seed = 0
     device: DeviceName = "auto"
 
     def run(self, console: Console) -> None:
@@ -43,5 +45,9 @@ class Demo:
             run = Train(recipe, SCENE, folder, self.iterations, seed=self.seed, device=self.device, resume=begun)
             run.run(console)
             results.append(evaluate_run(open_run(folder, self.device)))
-        console.print(results_table(*results))
-        console.print(f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
+        print_results(console, *results)
+        say(console, f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
+
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        return f"what is finished stays in {self.output}: repeat the command to go on"

@@ -11,13 +11,15 @@ from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
-from glassplat.commands.output_folder import claim_folder, picture_paths
-from glassplat.commands.stored_run import Split, StoredRun, chosen_views, open_run
+from glassplat.commands.messages import say, warn
+from glassplat.commands.output_folder import check_targets, claim_folder
+from glassplat.commands.stored_run import Split, StoredRun, chosen_views, open_run, photographs_of, pictures_of
 from glassplat.data.errors import InputError
 from glassplat.data.view import View
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.evaluate.metrics import quantized
 from glassplat.files.images import write_image
+from glassplat.kernels.devices import DeviceName
 from glassplat.render.dereflect import dereflected_photo
 from glassplat.render.planar import Planar
 
@@ -32,26 +34,35 @@ class Dereflect:
         split: which photographs.
         source: photo keeps the photograph, and takes the rendered reflection off it where a pane is; render shows
             the rendered scene without its panes.
+        device: where to render; auto takes an NVIDIA GPU where one can be used.
+        data: where the capture is now, if it has moved since training.
     """
 
     run_directory: tyro.conf.Positional[Path]
     output: Path
     split: Split = "all"
     source: Literal["photo", "render"] = "photo"
+    device: DeviceName = "auto"
+    data: Path | None = None
 
     def run(self, console: Console) -> None:
         """Writes the images."""
-        stored = open_run(self.run_directory)
+        stored = open_run(self.run_directory, self.device, self.data)
         renderer = planar_renderer(stored)
         views = chosen_views(stored.dataset, self.split)
-        paths = picture_paths([view.name for view in views])
+        paths = pictures_of(stored.dataset)
+        check_targets(self.output, [self.output / paths[view.name] for view in views], photographs_of(stored.dataset))
         if claim_folder(self.output, "dereflect", self.run_directory):
-            console.print(f"replacing the images of an earlier run of this command in {self.output}")
+            say(console, f"replacing the images of an earlier run of this command in {self.output}")
         for warning in mirror_warnings(stored):
-            console.print(f"[yellow]warning:[/yellow] {warning}")
+            warn(console, warning)
         for view in track(views, "taking reflections off", console=console):
             write_image(self.output / paths[view.name], self._image(stored, renderer, view))
-        console.print(f"{len(views)} images without reflections -> {self.output}")
+        say(console, f"{len(views)} images without reflections -> {self.output}")
+
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        return f"images already written to {self.output} are whole: repeat the command for all of them"
 
     def _image(self, stored: StoredRun, renderer: Planar, view: View) -> Tensor:
         frame, _ = timed_render(renderer, stored.scene, view)

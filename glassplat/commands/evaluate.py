@@ -10,29 +10,15 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from glassplat.commands.messages import say
 from glassplat.commands.stored_run import StoredRun, open_run
 from glassplat.evaluate.evaluate import Evaluation, evaluate
-from glassplat.evaluate.report import SURFACE_METRICS, Report
+from glassplat.evaluate.metric_names import PLANE_COLUMNS, missing_reasons, shown_metrics, written
+from glassplat.evaluate.report import Report
 from glassplat.kernels.devices import DeviceName
 from glassplat.render.planar import Planar
 from glassplat.train.checkpoint import recorded_seconds
 from glassplat.train.run_directory import write_text
-
-SHOWN = (
-    "psnr",
-    "ssim",
-    "lpips",
-    "pane_psnr",
-    "transmission_psnr",
-    "reflection_psnr",
-    "normal_error_deg",
-    "reflective_normal_error_deg",
-    "strength_error",
-    "environment_psnr",
-    "environment_lpips",
-    "num_gaussians",
-    "seconds_per_frame",
-)
 
 
 @dataclass(frozen=True)
@@ -42,18 +28,24 @@ class Evaluate:
     Attributes:
         run_directory: the run's directory.
         device: where to render; auto takes an NVIDIA GPU where one can be used.
+        data: where the capture is now, if it has moved since training.
     """
 
     run_directory: tyro.conf.Positional[Path]
     device: DeviceName = "auto"
+    data: Path | None = None
 
     def run(self, console: Console) -> None:
         """Evaluates and reports."""
-        stored = open_run(self.run_directory, self.device)
+        stored = open_run(self.run_directory, self.device, self.data)
         with console.status(f"rendering {len(stored.dataset.test)} test views"):
             results = evaluate_run(stored)
-        console.print(results_table(results))
-        console.print(f"pictures: {stored.directory.path / 'index.html'}")
+        print_results(console, results)
+        say(console, f"pictures: {stored.directory.path / 'index.html'}")
+
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        return f"{self.run_directory} itself is as it was: repeat the command to evaluate it"
 
 
 def evaluate_run(stored: StoredRun) -> dict:
@@ -82,33 +74,42 @@ def train_seconds(stored: StoredRun) -> float | None:
     return recorded_seconds(file) if file.is_file() else None
 
 
+def print_results(console: Console, *results: dict) -> None:
+    """Shows the main metrics of one or several runs, side by side, and says why some have no value."""
+    console.print(results_table(*results))
+    for line in notes(*results):
+        say(console, line)
+
+
 def results_table(*results: dict) -> Table:
-    """The main metrics of one or several runs, side by side."""
+    """The main metrics of one or several runs, side by side, by their names in `results.json`."""
     table = Table("metric", *(r["method"] for r in results))
-    for name in SHOWN:
-        if name in SURFACE_METRICS and all(r.get(name) is None for r in results):
-            continue
-        table.add_row(name, *(shown(r.get(name)) for r in results))
+    metrics = {name: metric for r in results for name, metric in shown_metrics(r).items()}
+    for name in dict.fromkeys(name for r in results for name in shown_metrics(r)):
+        table.add_row(name, *(written(r.get(name), metrics[name].pattern) for r in results))
     for result in results:
         for plane in result.get("planes") or []:
-            if plane.get("normal_error_deg") is not None:
-                table.add_row(
-                    f"pane {plane['label']}",
-                    *(plane_text(plane) if r is result else "" for r in results),
-                )
+            cells = (plane_text(plane) if r is result else "" for r in results)
+            table.add_row(f"pane {plane['label']}", *cells)
     return table
 
 
 def plane_text(plane: dict) -> str:
-    """A plane's errors in one line."""
+    """A pane in one line: its reflectance, and its errors where the truth is known."""
+    text = f"R0 {written(plane['base_reflectance'], PLANE_COLUMNS['base_reflectance'].pattern)}"
+    if plane.get("normal_error_deg") is None:
+        return text
     return (
-        f"normal {plane['normal_error_deg']:.2f} deg, offset {100 * plane['offset_error']:.2f} %, "
-        f"R0 {plane['base_reflectance']:.3f} (error {plane['base_reflectance_error']:.3f})"
+        f"{text} (error {plane['base_reflectance_error']:.3f}), normal off by {plane['normal_error_deg']:.2f}°, "
+        f"centre by {100 * plane['offset_error']:.2f} % of the extent"
     )
 
 
-def shown(value: float | int | None) -> str:
-    """A metric for the table."""
-    if value is None:
-        return "-"
-    return str(value) if isinstance(value, int) else f"{value:.4g}"
+def notes(*results: dict) -> list[str]:
+    """Why metrics have no value, a line for each reason."""
+    heads = [f"{result['method']}: " if len(results) > 1 else "" for result in results]
+    return [
+        f"{head}no {', '.join(names)}: {reason}"
+        for head, result in zip(heads, results, strict=True)
+        for reason, names in missing_reasons(result).items()
+    ]

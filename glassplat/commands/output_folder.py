@@ -1,13 +1,15 @@
-"""Folders of pictures: which file holds which view, and whose the folder is."""
+"""Folders of pictures: whose one is, and what may be written into it."""
 
 from __future__ import annotations
 
 import json
-from collections import Counter
+import os
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from glassplat.data.errors import InputError, first_names
+from glassplat.files.folders import check_folder, make_folder
+from glassplat.files.json_text import read_json
 from glassplat.train.run_directory import write_text
 
 RECORD = "glassplat.json"
@@ -19,7 +21,9 @@ def claim_folder(folder: Path, command: str, run: Path) -> bool:
 
     Raises:
         InputError: the folder holds something else, which must not be overwritten.
+        NotADirectoryError: it is a file, or goes through one.
     """
+    check_folder(folder)
     record = folder / RECORD
     found = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
     if found and _recorded_command(record) != command:
@@ -27,21 +31,39 @@ def claim_folder(folder: Path, command: str, run: Path) -> bool:
             f"{folder} is not empty, and not from `glassplat {command}` (it holds {first_names(found)}); nothing was "
             "written. Choose a new folder for --output"
         )
+    make_folder(folder)
     write_text(record, json.dumps({"command": command, "run": str(run)}))
     return bool(found)
 
 
-def picture_paths(names: Sequence[str]) -> dict[str, Path]:
-    """The PNG of each view, relative to the folder: the photograph's name, also distinct for `a.jpg` and `a.png`."""
-    plain = {name: PurePosixPath(name).with_suffix(".png") for name in names}
-    times = Counter(plain.values())
-    return {name: Path(path if times[path] == 1 else f"{name}.png") for name, path in plain.items()}
+def check_targets(folder: Path, targets: Sequence[Path], photographs: Sequence[Path]) -> None:
+    """Refuse to write where a link leads, in a folder that is written again, out of it or to a photograph.
+
+    Args:
+        folder: what the pictures are written into.
+        targets: the files to write, in it.
+        photographs: what must stay whatever happens.
+
+    Raises:
+        InputError: names the file and where it leads; nothing has been written.
+    """
+    inside, kept = _real(folder), {_real(path) for path in photographs}
+    for target in (folder / RECORD, *targets):
+        real = _real(target)
+        if real in kept or not real.is_relative_to(inside):
+            what = "is a photograph of the capture" if real in kept else f"leads out of {folder}, to {real}"
+            raise InputError(f"{target} {what}; nothing was written. Choose a new folder for --output")
+
+
+def _real(path: Path) -> Path:
+    """Where a path leads through links; one that goes round in circles stays what it is."""
+    return Path(os.path.realpath(path))
 
 
 def _recorded_command(record: Path) -> str | None:
     """Who wrote the folder; None where nobody says."""
     try:
-        content = json.loads(record.read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
+        content = read_json(record)
+    except (OSError, ValueError):
         return None
     return content.get("command") if isinstance(content, dict) else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,9 +12,10 @@ from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
-from glassplat.commands.output_folder import claim_folder, picture_paths
+from glassplat.commands.messages import say
+from glassplat.commands.output_folder import check_targets, claim_folder
 from glassplat.commands.scene_edits import SceneEdits
-from glassplat.commands.stored_run import Split, chosen_views, open_run
+from glassplat.commands.stored_run import Split, chosen_views, open_run, photographs_of, pictures_of
 from glassplat.data.errors import InputError
 from glassplat.evaluate.colormap import depth_colors, normal_colors
 from glassplat.evaluate.evaluate import timed_render
@@ -36,6 +38,13 @@ Layer = Literal[
     "environment",
 ]
 
+LAYERS: dict[str, tuple[Layer, ...]] = {
+    "splat": ("rgb", "depth", "alpha"),
+    "planar": ("rgb", "transmission", "without_panes", "reflection", "strength", "mask", "depth", "alpha"),
+    "deferred": ("rgb", "base", "reflection", "strength", "normal", "environment", "depth", "alpha"),
+}
+"""What each method renders that is worth looking at; its frames hold more for the losses."""
+
 
 @dataclass(frozen=True)
 class Render:
@@ -48,6 +57,7 @@ class Render:
         split: which cameras.
         edits: changes to the panes.
         device: where to render; auto takes an NVIDIA GPU where one can be used.
+        data: where the capture is now, if it has moved since training.
     """
 
     run_directory: tyro.conf.Positional[Path]
@@ -56,38 +66,54 @@ class Render:
     split: Split = "test"
     edits: Annotated[SceneEdits, tyro.conf.arg(name="")] = field(default_factory=SceneEdits)
     device: DeviceName = "auto"
+    data: Path | None = None
 
     def run(self, console: Console) -> None:
         """Renders."""
-        stored = open_run(self.run_directory, self.device)
+        stored = open_run(self.run_directory, self.device, self.data)
+        check_layers(self.layers, stored.recipe.method)
         scene = self.edits.applied(stored.scene)
         renderer = stored.renderer
         if "environment" in self.layers and isinstance(renderer, Deferred):
             renderer = replace(renderer, environment=True)
         views = chosen_views(stored.dataset, self.split)
-        paths = picture_paths([view.name for view in views])
+        paths = pictures_of(stored.dataset)
+        targets = [self.output / layer / paths[view.name] for layer in self.layers for view in views]
+        check_targets(self.output, targets, photographs_of(stored.dataset))
         if claim_folder(self.output, "render", self.run_directory):
-            console.print(
-                f"adding to {self.output}, which `glassplat render` wrote earlier; images of one name are replaced"
+            say(
+                console,
+                f"adding to {self.output}, which `glassplat render` wrote earlier; images of one name are replaced",
             )
         for view in track(views, "rendering", console=console):
             frame, _ = timed_render(renderer, scene, view)
             for layer in self.layers:
-                image = layer_image(frame, layer, stored.recipe.method)
+                image = layer_image(frame, layer)
                 write_image(self.output / layer / paths[view.name], image)
-        console.print(f"{len(views)} views x {len(self.layers)} layers -> {self.output}")
+        say(console, f"{len(views)} views x {len(self.layers)} layers -> {self.output}")
+
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        return f"images already written to {self.output} are whole: repeat the command for all of them"
 
 
-def layer_image(frame: Frame, layer: str, method: str) -> Tensor:
-    """A layer of a frame as an image in [0, 1]; depth is colour-mapped, near bright, normals are (n + 1) / 2.
+def check_layers(layers: Sequence[str], method: str) -> None:
+    """Refuses layers that a method does not render, before anything is rendered.
 
     Raises:
-        InputError: the method has no such layer.
+        InputError: there are such, or none is asked for.
     """
+    known = LAYERS[method]
+    foreign = [layer for layer in layers if layer not in known]
+    if foreign or not layers:
+        asked = f"renders no layer {', '.join(foreign)}" if foreign else "renders nothing without --layers"
+        raise InputError(f"{method} {asked}; expected --layers out of {', '.join(known)}")
+
+
+def layer_image(frame: Frame, layer: str) -> Tensor:
+    """A layer of a frame as an image in [0, 1]; depth is colour-mapped, near bright, normals are (n + 1) / 2."""
     if layer == "rgb":
         return frame.rgb.clamp(0, 1)
-    if layer not in frame.layers:
-        raise InputError(f"{method} renders no layer {layer!r}; it has {['rgb', *sorted(frame.layers)]}")
     image = frame.layers[layer]
     if layer == "normal":
         return normal_colors(image)

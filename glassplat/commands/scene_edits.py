@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from glassplat.data.errors import InputError, input_checked
+from glassplat.data.ranges import Finite, PaneLabel, Share
 from glassplat.files.environment_image import read_equirect
 from glassplat.render.environment import environment_from_equirect
 from glassplat.scene.plane_edits import as_mirrors, shifted, tilted, with_reflectance, without_glass
@@ -27,10 +28,10 @@ class SceneEdits:
     """
 
     remove_glass: bool = False
-    as_mirror: tuple[int, ...] = ()
-    reflectance: dict[int, float] = field(default_factory=dict)
-    tilt: dict[int, tuple[float, float]] = field(default_factory=dict)
-    shift: dict[int, float] = field(default_factory=dict)
+    as_mirror: tuple[PaneLabel, ...] = ()
+    reflectance: dict[PaneLabel, Share] = field(default_factory=dict)
+    tilt: dict[PaneLabel, tuple[Finite, Finite]] = field(default_factory=dict)
+    shift: dict[PaneLabel, Finite] = field(default_factory=dict)
     surroundings: Path | None = None
 
     def applied(self, scene: Scene) -> Scene:

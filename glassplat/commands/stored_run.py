@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from glassplat.data.dataset import Dataset, View, load_dataset
-from glassplat.data.errors import InputError
+from glassplat.data.errors import InputError, first_names, input_checked
+from glassplat.files.picture_paths import picture_paths
 from glassplat.kernels.devices import DeviceName, chosen_device
 from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
@@ -27,30 +28,63 @@ class StoredRun(NamedTuple):
     iterations: int
 
 
-def open_run(path: Path, device: DeviceName = "auto") -> StoredRun:
+def open_run(path: Path, device: DeviceName = "auto", data: Path | None = None) -> StoredRun:
     """Opens the run in a directory, with the capture it was trained on, over the same background.
 
     Args:
         path: the run's directory.
         device: where to render.
+        data: where the capture is now; where it was during training if None.
 
     Raises:
         CudaUnavailableError: the GPU was asked for and cannot be used.
-        InputError: the directory holds no finished run.
+        InputError: the directory holds no finished run, or the capture is another one.
         FileNotFoundError: the capture is no longer where it was.
     """
     directory = RunDirectory(path)
-    recorded, settings = directory.recipe(), directory.settings()
+    recorded = directory.recipe()
     scene, iterations = directory.latest_scene()
+    with input_checked():
+        recorded.renderer().check(scene)
     scene = scene.to(chosen_device(device))
-    dataset = load_dataset(
-        Path(settings.data),
-        downscale=settings.downscale,
-        background=photo_background(recorded),
-        mask_polarity=settings.mask_polarity,
-    )
+    dataset = _capture(directory, recorded, data)
     recipe = settled(recorded, dataset)
     return StoredRun(directory, recipe, scene, recipe.renderer(), dataset, iterations)
+
+
+def _capture(directory: RunDirectory, recipe: Any, moved: Path | None) -> Dataset:
+    """The capture of a run, where it was or where it is said to be now."""
+    settings = directory.settings()
+    data = Path(settings.data) if moved is None else moved
+    if moved is None and not data.is_dir():
+        raise FileNotFoundError(
+            f"the capture of {directory.path} is no longer at {data}; say with --data where it is now"
+        )
+    dataset = load_dataset(
+        data,
+        downscale=settings.downscale,
+        background=photo_background(recipe),
+        mask_polarity=settings.mask_polarity,
+    )
+    if moved is not None:
+        _check_same(directory, dataset)
+    return dataset
+
+
+def _check_same(directory: RunDirectory, dataset: Dataset) -> None:
+    """Refuse a capture of other photographs than the run was trained on."""
+    trained, found = directory.photographs(), {view.name for view in (*dataset.train, *dataset.test)}
+    if trained is None or trained == found:
+        return
+    only = [
+        f"{first_names(sorted(names))} only in {where}"
+        for names, where in ((trained - found, "the run"), (found - trained, "the capture"))
+        if names
+    ]
+    raise InputError(
+        f"{dataset.root} is not the capture that {directory.path} was trained on: {', '.join(only)}. Give the same "
+        "photographs to --data"
+    )
 
 
 def chosen_views(dataset: Dataset, split: Split) -> tuple[View, ...]:
@@ -63,3 +97,13 @@ def chosen_views(dataset: Dataset, split: Split) -> tuple[View, ...]:
     if not parts[split]:
         raise InputError(f"{dataset.root} has no {split} views; choose another --split")
     return tuple(sorted(parts[split], key=lambda view: view.name))
+
+
+def pictures_of(dataset: Dataset) -> dict[str, Path]:
+    """The file of each view's picture in a folder, the same whichever views are asked for."""
+    return picture_paths([view.name for view in chosen_views(dataset, "all")])
+
+
+def photographs_of(dataset: Dataset) -> list[Path]:
+    """The files of all photographs."""
+    return [view.image_path for view in (*dataset.train, *dataset.test)]

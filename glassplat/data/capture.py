@@ -12,6 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from glassplat.data.errors import InputError
+
+WHITE = 255
+
 
 @dataclass(frozen=True)
 class PointCloud:
@@ -42,10 +46,21 @@ class PointCloud:
 
     @staticmethod
     def from_arrays(positions: NDArray[Any], colors: NDArray[Any]) -> PointCloud:
-        """Points from arrays of any real type; colours in 0..255."""
+        """Points from arrays of any real type.
+
+        Positions beyond float32 become infinite.
+
+        Raises:
+            InputError: a colour is not in 0..255.
+        """
+        colors = np.asarray(colors)
+        outside = ~((colors >= 0) & (colors <= WHITE))
+        if outside.any():
+            raise InputError(f"a point has the colour value {colors[outside][0]:g}; expected 0 to {WHITE}")
+        with np.errstate(over="ignore"):
+            positions = np.ascontiguousarray(positions, dtype=np.float32).reshape(-1, 3)
         return PointCloud(
-            torch.from_numpy(np.ascontiguousarray(positions, dtype=np.float32).reshape(-1, 3)),
-            torch.from_numpy(np.ascontiguousarray(colors, dtype=np.uint8).reshape(-1, 3)),
+            torch.from_numpy(positions), torch.from_numpy(np.ascontiguousarray(colors, dtype=np.uint8).reshape(-1, 3))
         )
 
 

@@ -5,20 +5,23 @@ COLMAP's own reader is not used: on a truncated file it reads garbage or does no
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from os.path import lexists
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 import torch
 from numpy.typing import NDArray
 
 from glassplat.data.capture import PointCloud
-from glassplat.data.errors import InputError
+from glassplat.data.colmap_library import pycolmap
+from glassplat.data.errors import InputError, input_checked
 from glassplat.data.lens import make_lens
+from glassplat.files.reading import reading
 from glassplat.scene.pose import rotation_from_quat
 
 UNIT_TOLERANCE = 1e-2
@@ -64,12 +67,15 @@ def read_model(folder: Path) -> Model:
     suffix = model_suffix(folder)
     if suffix is None:
         raise InputError(f"no COLMAP model in {folder}; expected cameras and images as .bin or .txt")
-    lenses = dict(_records_of(folder / f"cameras{suffix}"))
+    lenses = _by_id(_records_of(folder / f"cameras{suffix}"), folder / f"cameras{suffix}")
     images = tuple(_records_of(folder / f"images{suffix}"))
+    if not images:
+        raise InputError(f"{folder / f'images{suffix}'} registers no photograph; expected a finished reconstruction")
     points_path = folder / f"points3D{suffix}"
-    rows = _records_of(points_path) if points_path.is_file() else []
+    rows = _records_of(points_path) if lexists(points_path) else []
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
-    return Model(lenses, images, PointCloud.from_arrays(table[:, :3], table[:, 3:]))
+    with input_checked(points_path):
+        return Model(lenses, images, PointCloud.from_arrays(table[:, :3], table[:, 3:]))
 
 
 def pose_matrix(image: ModelImage) -> NDArray[np.float64]:
@@ -78,8 +84,7 @@ def pose_matrix(image: ModelImage) -> NDArray[np.float64]:
     Raises:
         InputError: the rotation is no unit quaternion.
     """
-    norm = float(np.linalg.norm(image.quat))
-    if not abs(norm - 1) < UNIT_TOLERANCE:
+    if not abs(math.hypot(*image.quat) - 1) < UNIT_TOLERANCE:
         quat = list(image.quat)
         raise InputError(f"the rotation of {image.name} is {quat}; expected a finite unit quaternion (w, x, y, z)")
     pose = np.eye(4)
@@ -88,20 +93,28 @@ def pose_matrix(image: ModelImage) -> NDArray[np.float64]:
     return pose
 
 
+def _by_id(records: list[tuple[int, Any]], path: Path) -> dict[int, Any]:
+    found = dict(records)
+    if len(found) < len(records):
+        raise InputError(f"{path} has two cameras of one id; expected every id once: export the model again")
+    return found
+
+
 def _records_of(path: Path) -> list[Any]:
     """Everything in one file of a model, with errors that name the file."""
     binary, text = PARSERS[path.stem]
-    found: list[Any] = []
     try:
-        if path.suffix == ".bin":
-            found.extend(binary(_Bytes(path.read_bytes())))
-        else:
-            found.extend(text(iter(path.read_text(encoding="utf-8").splitlines())))
+        with reading(path):
+            if path.suffix == ".bin":
+                return list(binary(_Bytes(path.read_bytes())))
+            with path.open(encoding="utf-8-sig") as stream:
+                return list(text(stream))
+    except FileNotFoundError as error:
+        raise InputError(str(error)) from error
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    except (struct.error, EOFError, ValueError, IndexError) as error:
+    except (struct.error, EOFError, ValueError, IndexError, OverflowError) as error:
         raise InputError(f"{path} is cut off or damaged ({error}); export the COLMAP model again") from error
-    return found
 
 
 class _Bytes:
@@ -172,14 +185,28 @@ def _text_images(stream: Iterator[str]) -> Iterator[ModelImage]:
     for line in _records(stream):
         fields = line.split(maxsplit=9)
         numbers = tuple(float(value) for value in fields[1:8])
-        yield ModelImage(fields[9], int(fields[8]), numbers[:4], numbers[4:])
-        next(stream, None)  # The observations; this line is empty where there are none.
+        name = fields[9]
+        _check_observations(next(stream, ""), name)
+        yield ModelImage(name, int(fields[8]), numbers[:4], numbers[4:])
+
+
+def _check_observations(line: str, name: str) -> None:
+    """What follows an image is its list of x, y and point; the line is empty, but there, where it has none.
+
+    Without it the next image would pass for the list, and be lost.
+    """
+    words = line.split()
+    if len(words) % 3 or not (not words or words[-1].lstrip("-").isdigit()):
+        raise InputError(
+            f"the line after {name} is no list of observations; expected one after every image, if only an empty line"
+        )
 
 
 def _text_points(stream: Iterator[str]) -> Iterator[tuple[float, ...]]:
     for line in _records(stream):
         fields = line.split(maxsplit=7)
-        yield (*(float(value) for value in fields[1:4]), *(float(int(value)) for value in fields[4:7]))
+        _, x, y, z, red, green, blue = fields[:7]
+        yield (float(x), float(y), float(z), float(int(red)), float(int(green)), float(int(blue)))
 
 
 PARSERS: dict[str, tuple[Callable[[_Bytes], Iterator[Any]], Callable[[Iterator[str]], Iterator[Any]]]] = {

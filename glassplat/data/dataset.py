@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
+from os.path import isdir
 from pathlib import Path
 
 import torch
@@ -16,6 +17,7 @@ from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.data.masks import MaskSet, Polarity, find_masks, known_masks
 from glassplat.data.random_points import points_in_view
 from glassplat.data.view import WHITE, PreparedView, Rgb, View, ViewOptions, prepare_view
+from glassplat.files.fields import LARGEST_COORDINATE
 from glassplat.files.images import is_transparent
 
 __all__ = ["Dataset", "PointCloud", "View", "load_dataset"]
@@ -25,6 +27,8 @@ EXTENT_MARGIN = 1.1
 FARTHEST_ORIGIN = 1e4
 SAME_PLACE = 1e-6
 """Cameras closer together than this share of their distance from the origin differ by rounding only."""
+LEAST_RADIUS = 1e-9
+"""World units. The square of a smaller one is lost in float32."""
 
 LOADERS: tuple[tuple[Loader, str], ...] = (
     (colmap.load_colmap, colmap.LOOKED_FOR),
@@ -120,7 +124,7 @@ def load_dataset(
 
 def _load_capture(root: Path) -> Capture:
     """The answer of the first loader that knows the format."""
-    if not root.is_dir():
+    if not isdir(root):
         raise FileNotFoundError(f"no folder {root}; expected the folder of a capture")
     for load, _ in LOADERS:
         capture = load(root)
@@ -184,7 +188,7 @@ def _extent(train: tuple[View, ...]) -> float:
     """1.1 x the radius of the training cameras about their mean; world units."""
     centers = torch.stack([view.camera.center.double() for view in train])
     radius = float((centers - centers.mean(0)).norm(dim=1).max())
-    if radius <= SAME_PLACE * float(centers.norm(dim=1).max()):
+    if radius <= max(SAME_PLACE * float(centers.norm(dim=1).max()), LEAST_RADIUS):
         raise InputError("all training cameras stand at one point; expected photographs from different places")
     return EXTENT_MARGIN * radius
 
@@ -206,13 +210,14 @@ def _points(capture: Capture, train: tuple[View, ...]) -> tuple[PointCloud, list
         return points, [
             f"The {capture.format_name} capture has no points; {len(points)} random points are used instead."
         ]
-    finite = torch.isfinite(capture.points.positions).all(dim=1)
-    if finite.all():
+    # Where a coordinate is NaN, the comparison is false.
+    usable = (capture.points.positions.abs() <= LARGEST_COORDINATE).all(dim=1)
+    if usable.all():
         return capture.points, []
-    kept = PointCloud(capture.points.positions[finite], capture.points.colors[finite])
+    kept = PointCloud(capture.points.positions[usable], capture.points.colors[usable])
     if not len(kept):
-        raise InputError("no point of the capture is finite; export the sparse model again")
-    return kept, [f"{int((~finite).sum())} points that are not finite are left out."]
+        raise InputError(f"no point of the capture is finite and within {LARGEST_COORDINATE:g}; export the model again")
+    return kept, [f"{int((~usable).sum())} points that are not finite or beyond {LARGEST_COORDINATE:g} are left out."]
 
 
 def _view_warnings(prepared: list[PreparedView], background: Rgb | None) -> list[str]:

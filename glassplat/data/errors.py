@@ -11,12 +11,16 @@ class InputError(ValueError):
 
 
 @contextmanager
-def input_checked() -> Iterator[None]:
-    """Turns the ValueError of a reader or an edit, whose message already says what is wrong, into an InputError."""
+def input_checked(where: object = None) -> Iterator[None]:
+    """Turns the ValueError of a reader or an edit, whose message says what is wrong, into an InputError.
+
+    Args:
+        where: what to name before the message, such as a file, where that does not name it.
+    """
     try:
         yield
     except ValueError as error:
-        raise InputError(str(error)) from error
+        raise InputError(str(error) if where is None else f"{where}: {error}") from error
 
 
 def first_names(names: list[str], limit: int = 5) -> str:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 from PIL import Image
 
+from glassplat.data.colmap_library import pycolmap
 from glassplat.data.errors import InputError
 
 Interpolation = Literal["BILINEAR", "NEAREST_NEIGHBOR"]
@@ -18,6 +19,18 @@ Interpolation = Literal["BILINEAR", "NEAREST_NEIGHBOR"]
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 PERSPECTIVE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Models that are a pinhole when all their distortion coefficients are zero; a fisheye never is."""
+LARGEST_SIDE = 2**17
+"""Of an image, in pixels; no format that is read holds more."""
+SHORTEST_FOCAL, LONGEST_FOCAL = 1e-3, 1e5
+"""In sizes of the image; beyond lies no lens, and float32 cannot resolve what such a camera shows."""
+FARTHEST_CENTER = 1e3
+"""Of the principal point from the image, in sizes of the image; cropped photographs have it outside."""
+LARGEST_COEFFICIENT = 1e6
+"""Of distortion; those of a calibration are below 100."""
+LEAST_SIDE = 8
+"""Of a photograph, in pixels; smaller ones are what a failed download or export leaves."""
+MOST_SKEW = 0.05
+"""Relative deviation of a photograph's side from a scaled copy's, however few pixels that is."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +75,11 @@ def area_resize(pixels: NDArray[np.uint8], width: int, height: int) -> NDArray[n
     """[H, W, 3] averaged over the area of each new pixel; rounded once, so that no bias builds up."""
     if pixels.shape[:2] == (height, width):
         return pixels
-    channels = [Image.fromarray(channel.astype(np.float32)) for channel in np.moveaxis(pixels, 2, 0)]
-    reduced = [np.asarray(channel.resize((width, height), Image.Resampling.BOX)) for channel in channels]
-    return np.clip(np.round(np.stack(reduced, axis=2)), 0, 255).astype(np.uint8)
+    reduced = np.empty((height, width, 3), dtype=np.uint8)
+    for index in range(3):  # One after the other: as floats a channel takes more memory than the photograph.
+        channel = Image.fromarray(pixels[:, :, index].astype(np.float32)).resize((width, height), Image.Resampling.BOX)
+        reduced[:, :, index] = np.clip(np.round(np.asarray(channel)), 0, 255)
+    return reduced
 
 
 def nearest_resize(labels: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
@@ -83,23 +98,41 @@ def make_lens(model: str, parameters: list[float], size: tuple[int, int]) -> Any
         size: width and height in pixels.
 
     Raises:
-        InputError: unknown model, wrong number of parameters, a focal length that is not positive, or no pixels.
+        InputError: unknown model, wrong number of parameters, or a size or a parameter that no lens has.
     """
     if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
         known = ", ".join(name for name in pycolmap.CameraModelId.__members__ if name != "INVALID")
         raise InputError(f"unknown camera model {model!r}; expected one of {known}")
+    if not all(1 <= side <= LARGEST_SIDE for side in size):
+        raise InputError(f"the camera is {_size_text(size)} pixels large; expected sides from 1 to {LARGEST_SIDE}")
     lens = pycolmap.Camera.create_from_model_id(0, getattr(pycolmap.CameraModelId, model), 1.0, *size)
     if len(parameters) != len(lens.params):
         raise InputError(f"camera model {model} takes {len(lens.params)} parameters, got {len(parameters)}")
-    if min(size) < 1:
-        raise InputError(f"the camera is {size[0]}x{size[1]} pixels large; expected a positive size")
-    focal_lengths = [parameters[i] for i in lens.focal_length_idxs()]
-    if not np.isfinite(parameters).all() or not all(focal > 0 for focal in focal_lengths):
-        raise InputError(
-            f"camera model {model} with parameters {parameters}; expected finite numbers, focal length > 0"
-        )
+    _check_parameters(lens, parameters, size)
     lens.params = parameters
     return lens
+
+
+def _check_parameters(lens: Any, parameters: list[float], size: tuple[int, int]) -> None:
+    """Refuse what no lens has; comparisons with NaN are false."""
+    longer = max(size)
+    bounds: list[tuple[float, float]] = [(-LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)] * len(parameters)
+    for index in lens.focal_length_idxs():
+        bounds[index] = SHORTEST_FOCAL * longer, LONGEST_FOCAL * longer
+    for index in lens.principal_point_idxs():
+        bounds[index] = -FARTHEST_CENTER * longer, FARTHEST_CENTER * longer
+    for value, (least, most) in zip(parameters, bounds, strict=True):
+        if not least <= value <= most:
+            found = ", ".join(f"{one:g}" for one in parameters)
+            raise InputError(
+                f"camera model {lens.model_name} of {_size_text(size)} pixels has the parameters {found}; expected a "
+                f"finite number from {least:g} to {most:g} instead of {value:g}"
+            )
+
+
+def _size_text(size: tuple[int, int]) -> str:
+    """Sizes of thousands of digits, which a text file may hold, cannot be printed."""
+    return "x".join(str(side) if abs(side) < 10**9 else "huge" for side in size)
 
 
 def lens_for_image(lens: Any, size: tuple[int, int], name: str) -> Any:
@@ -109,11 +142,16 @@ def lens_for_image(lens: Any, size: tuple[int, int], name: str) -> Any:
         InputError: the two sizes differ in aspect by more than rounding.
     """
     width, height = size
+    if min(size) < LEAST_SIDE:
+        raise InputError(
+            f"{name} is {width}x{height} pixels large; expected a photograph, {LEAST_SIDE} pixels at least"
+        )
     if (lens.width, lens.height) == (width, height):
         return lens
     scale = (width * lens.width + height * lens.height) / (lens.width**2 + lens.height**2)
-    tolerance = max(1.0, scale)
-    if abs(scale * lens.width - width) > tolerance or abs(scale * lens.height - height) > tolerance:
+    rounding = max(1.0, scale)
+    skew = max(_skew(scale * lens.width, width, rounding), _skew(scale * lens.height, height, rounding))
+    if skew > MOST_SKEW:
         raise InputError(
             f"{name} is {width}x{height} pixels large, but its camera {lens.width}x{lens.height}; expected the "
             "same size or a scaled copy; photographs rotated or cropped after calibration cannot be used"
@@ -121,6 +159,12 @@ def lens_for_image(lens: Any, size: tuple[int, int], name: str) -> Any:
     rescaled = pycolmap.Camera(lens.todict())
     rescaled.rescale(width, height)
     return rescaled
+
+
+def _skew(expected: float, side: int, rounding: float) -> float:
+    """Relative deviation of a side of the photograph; infinite where it is more than rounding."""
+    deviation = abs(expected - side)
+    return math.inf if deviation > rounding else deviation / side
 
 
 def pinhole_of(lens: Any) -> tuple[Pinhole, bool]:

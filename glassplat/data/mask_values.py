@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from glassplat.data.errors import InputError, first_names, input_checked
-from glassplat.files.images import open_image
+from glassplat.files.images import SHADES_16, open_image
 
 HIGHEST_LABEL = 64
 """Grey values up to this one are labels when nothing brighter occurs; no one paints masks for the eye that dark."""
@@ -72,14 +72,27 @@ def _read_shades(path: Path) -> NDArray[np.uint8]:
     """[H, W] grey values, or the indices of a palette."""
     with input_checked():
         image = open_image(path)
+    image.info.pop("transparency", None)  # It says nothing about panes, and Pillow warns of some ways to store it.
     if image.mode == "1" or (image.mode == "P" and not _is_black_and_white(image)):
         return np.array(image).astype(np.uint8)
-    if image.mode.startswith("I"):
-        values = np.array(image)
-        return (values if values.max() <= WHITE else values // SIXTEEN_TO_EIGHT).astype(np.uint8)
+    if image.mode in SHADES_16:
+        return _in_eight_bits(np.array(image), path)
     if image.mode in ("L", "LA", "P"):
         return np.array(image.convert("L"))
     return _one_colour(np.array(image.convert("RGB")), path)
+
+
+def _in_eight_bits(values: NDArray[np.integer], path: Path) -> NDArray[np.uint8]:
+    """Labels as they are, and shades of sixteen bits as those of eight that they stand for."""
+    most = int(values.max())
+    if most <= WHITE:
+        return values.astype(np.uint8)
+    if most // SIXTEEN_TO_EIGHT <= HIGHEST_LABEL and (values % SIXTEEN_TO_EIGHT).any():
+        raise InputError(
+            f"{path} holds the value {most}, which is neither a pane label (0..{HIGHEST_LABEL}) nor white of 16 bits "
+            "(65535); write 0 for no pane and 1..K for the panes"
+        )
+    return (values // SIXTEEN_TO_EIGHT).astype(np.uint8)
 
 
 def _is_black_and_white(image: Image.Image) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from os.path import lexists
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -153,13 +154,21 @@ def _match(folder: Path, photographs: Mapping[str, Path]) -> dict[str, Path]:
 
 
 def _image_files(folder: Path) -> Iterator[Path]:
-    """Image files below a folder, hidden ones left out."""
-    if folder.is_dir():
-        yield from (p for p in sorted(folder.rglob("*")) if _is_image(p) and not p.name.startswith("."))
+    """Image files below a folder, hidden ones left out.
 
-
-def _is_image(path: Path) -> bool:
-    return path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
+    Raises:
+        InputError: something else goes by the folder's or by an image's name, such as a link to nowhere.
+    """
+    if not folder.is_dir():
+        if lexists(folder):
+            raise InputError(f"{folder} is no folder that can be read; expected one of mask images, or none")
+        return
+    for path in sorted(folder.rglob("*")):
+        if path.suffix.lower() not in IMAGE_SUFFIXES or path.name.startswith(".") or path.is_dir():
+            continue
+        if not path.is_file():
+            raise InputError(f"mask {path} is no file that can be read; replace or remove it")
+        yield path
 
 
 def _beside(photograph: Path) -> list[Path]:

@@ -89,13 +89,13 @@ def _is_mirror_nerf(root: Path) -> bool:
 
 def _shots(root: Path, settings: Settings, file_name: str) -> tuple[Shot, ...]:
     """The photographs of one part, with the intrinsics in the spelling that the lens knows."""
-    frames = [_plain_frame(root, settings, frame, file_name) for frame in settings["frames"]]
+    frames = [_plain_frame(root, settings, frame) for frame in settings["frames"]]
     return tuple(shots_of(root, {**settings, "frames": frames}, file_name).values())
 
 
-def _plain_frame(root: Path, settings: Settings, frame: Settings, file_name: str) -> dict[str, Any]:
+def _plain_frame(root: Path, settings: Settings, frame: Settings) -> dict[str, Any]:
     """One frame with its photograph where it lies and with `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h` in its pixels."""
-    path = image_path(root, frame, file_name)
+    path = image_path(root, frame)
     in_images = root / "images" / path.name
     if not path.is_file() and in_images.is_file():
         path = in_images

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from glassplat.data.errors import InputError
+from glassplat.files.fields import LARGEST_COORDINATE
 
 ORTHOGONALITY_TOLERANCE = 1e-2
 """Largest entry of R R^T - I that passes as rounding in the file."""
@@ -19,12 +20,17 @@ def rigid_pose(matrix: NDArray[np.float64], name: str) -> NDArray[np.float64]:
         name: photograph, for the message.
 
     Raises:
-        InputError: not finite, not a rotation (scaled, sheared or mirrored), or of another shape.
+        InputError: not finite or absurdly far away, not a rotation (scaled, sheared or mirrored), or of another shape.
     """
     if matrix.shape not in ((3, 4), (4, 4)):
         raise InputError(f"the pose of {name} has shape {list(matrix.shape)}; expected a 4x4 or 3x4 matrix")
     if not np.isfinite(matrix).all():
         raise InputError(f"the pose of {name} holds values that are not finite; remove this photograph from the model")
+    if not (np.abs(matrix) <= LARGEST_COORDINATE).all():
+        raise InputError(
+            f"the pose of {name} holds the value {np.abs(matrix).max():g}; expected world units of at most "
+            f"{LARGEST_COORDINATE:g}"
+        )
     if matrix.shape == (4, 4) and not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
         raise InputError(f"the last row of the pose of {name} is {matrix[3].tolist()}; expected [0, 0, 0, 1]")
     pose = np.eye(4)

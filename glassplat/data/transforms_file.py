@@ -5,9 +5,8 @@ Their poses are camera-to-world in OpenGL axes (+y up, -z forward); they are con
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Mapping
+from os.path import isfile, lexists, normpath
 from pathlib import Path
 from typing import Any
 
@@ -19,31 +18,46 @@ from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.data.poses import rigid_pose
 from glassplat.data.random_points import GREY
 from glassplat.data.transforms_lens import lens_from_settings
+from glassplat.files.fields import COORDINATE, Field, Items, Optional, Text, checked
 from glassplat.files.images import IMAGE_SUFFIXES
+from glassplat.files.json_text import read_json
 from glassplat.files.ply_table import read_table
 
 POINT_FILES = ("points3d.ply", "points3D.ply", "sparse_pc.ply")
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 Settings = Mapping[str, Any]
+FRAME: dict[str, Field] = {"file_path": Text(), "transform_matrix": Items(Items(COORDINATE, 4))}
+FILE: dict[str, Field] = {
+    "ply_file_path": Optional(Text()),
+    "train_filenames": Optional(Items(Text())),
+    "val_filenames": Optional(Items(Text())),
+    "test_filenames": Optional(Items(Text())),
+}
+"""What is read beside the lens (`transforms_lens`); more may be in the file."""
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """The contents of one file, with at least one frame."""
-    try:
-        settings = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InputError(f"{path} is no valid JSON ({error}); write it again") from error
-    frames = settings.get("frames") if isinstance(settings, dict) else None
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise InputError(f"{path} lists no frames; expected an object with a list `frames` of at least one photograph")
+    """The contents of one file, with at least one frame; every frame names a photograph and has a matrix.
+
+    Raises:
+        InputError: no valid JSON, no frames, or one that is not as `FRAME` says; names the file.
+    """
+    with input_checked():
+        settings = read_json(path)
+        frames = settings.get("frames") if isinstance(settings, dict) else None
+        if not isinstance(frames, list) or not frames:
+            raise ValueError(f"{path} lists no frames; expected a list `frames` of at least one photograph")
+        for index, frame in enumerate(frames, start=1):
+            checked(frame, FRAME, f"frame {index} of {path}")
+        checked(settings, FILE, str(path))
     return settings
 
 
 def shots_of(root: Path, settings: Settings, file_name: str) -> dict[str, Shot]:
     """Every frame by its `file_path`, with an error that lists the photographs that are missing."""
-    paths = [image_path(root, frame, file_name) for frame in settings["frames"]]
-    missing = [path.name for path in paths if not path.is_file()]
+    paths = [image_path(root, frame) for frame in settings["frames"]]
+    missing = [path.name for path in paths if not isfile(path)]
     if missing:
         raise InputError(
             f"{len(missing)} of {len(paths)} photographs of {root / file_name} are missing: {first_names(missing)}; "
@@ -59,19 +73,16 @@ def shots_of(root: Path, settings: Settings, file_name: str) -> dict[str, Shot]:
     return shots
 
 
-def image_path(root: Path, frame: Settings, file_name: str) -> Path:
+def image_path(root: Path, frame: Settings) -> Path:
     """The photograph of one frame; Blender leaves its suffix out."""
-    file_path = frame.get("file_path")
-    if not isinstance(file_path, str) or not file_path:
-        raise InputError(f"a frame of {root / file_name} has no file_path; expected the path of a photograph")
-    path = Path(os.path.normpath(root / file_path.replace("\\", "/")))
-    candidates = [path, *(path.with_name(path.name + suffix) for suffix in IMAGE_SUFFIXES)]
-    return next((candidate for candidate in candidates if candidate.is_file()), path)
+    path = normpath(root / frame["file_path"].replace("\\", "/"))
+    candidates = [path, *(path + suffix for suffix in IMAGE_SUFFIXES)]
+    return Path(next((candidate for candidate in candidates if isfile(candidate)), path))
 
 
 def _name(root: Path, path: Path) -> str:
     """The photograph's name, relative to the folder of images, or to the capture, where it lies in there."""
-    plain_root = Path(os.path.normpath(root))
+    plain_root = Path(normpath(root))
     for folder in (plain_root / "images", plain_root):
         if path.is_relative_to(folder):
             return path.relative_to(folder).as_posix()
@@ -80,11 +91,7 @@ def _name(root: Path, path: Path) -> str:
 
 def _cam_from_world(frame: Settings, name: str) -> NDArray[np.float64]:
     """[4, 4] in OpenCV axes, from camera-to-world in OpenGL axes."""
-    try:
-        matrix = np.array(frame.get("transform_matrix"), dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"the transform_matrix of {name} is no table of numbers ({error})") from error
-    world_from_opengl = rigid_pose(matrix, name)
+    world_from_opengl = rigid_pose(np.array(frame["transform_matrix"], dtype=np.float64), name)
     rotation = (world_from_opengl[:3, :3] @ OPENCV_FROM_OPENGL[:3, :3]).T
     pose = np.eye(4)
     pose[:3, :3] = rotation
@@ -95,14 +102,14 @@ def _cam_from_world(frame: Settings, name: str) -> NDArray[np.float64]:
 def read_points(root: Path, settings: Settings) -> PointCloud | None:
     """The points of the file that the settings name, or of one that usually holds them."""
     named = settings.get("ply_file_path")
-    if named is not None and not (root / str(named)).is_file():
-        raise InputError(
-            f"ply_file_path names {root / str(named)}, which does not exist; copy it there or delete the entry"
-        )
-    candidates = [named] if named is not None else [name for name in POINT_FILES if (root / name).is_file()]
+    if named is not None and not isfile(root / named):
+        raise InputError(f"ply_file_path names {root / named}, which does not exist; copy it there or delete the entry")
+    candidates = [named] if named is not None else [name for name in POINT_FILES if lexists(root / name)]
     if not candidates:
         return None
-    path = root / str(candidates[0])
+    path = root / candidates[0]
+    if not isfile(path):
+        raise InputError(f"{path} is no file that can be read; replace or remove it")
     with input_checked():
         columns = read_table(path).columns
     lacking = [axis for axis in "xyz" if axis not in columns]
@@ -117,4 +124,5 @@ def read_points(root: Path, settings: Settings) -> PointCloud | None:
         if any(c is None for c in rgb)
         else np.stack([c for c in rgb if c is not None], 1)
     )
-    return PointCloud.from_arrays(positions, colors) if len(positions) else None
+    with input_checked(path):
+        return PointCloud.from_arrays(positions, colors) if len(positions) else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from glassplat.data.capture import Shot
 from glassplat.data.errors import InputError, input_checked
-from glassplat.data.lens import PixelMap, lens_for_image, nearest_resize, pinhole_of
+from glassplat.data.lens import MOST_SKEW, Pinhole, PixelMap, lens_for_image, nearest_resize, pinhole_of
 from glassplat.data.masks import PaneMask
 from glassplat.data.poses import rigid_pose
 from glassplat.files.images import image_size, read_image
@@ -22,6 +22,8 @@ from glassplat.scene.camera import Camera
 
 Rgb = tuple[float, float, float]
 WHITE: Rgb = (1.0, 1.0, 1.0)
+LEAST_SIDE = 8
+"""Pixels along the side of a photograph that was reduced; below that are no edges to tell panes or details by."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class View:
         name: unique within the data set, with suffix; `/` between folders.
         camera: float32 pinhole camera of `photo`.
         image_path: the file.
-        read_photo: returns `photo`; called once.
+        read_photo: returns `photo`.
         read_pane_labels: returns `pane_labels`; None where the view is not annotated.
     """
 
@@ -41,15 +43,21 @@ class View:
     image_path: Path
     read_photo: Callable[[], Tensor]
     read_pane_labels: Callable[[], Tensor] | None = None
+    _read: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
-    @cached_property
+    @property
     def photo(self) -> Tensor:
         """[H, W, 3] uint8 sRGB, undistorted and reduced; stays in memory once read.
+
+        Threads may ask at once: without a lock, which `cached_property` has for all views together, none waits for the
+        photograph of another.
 
         Raises:
             InputError: the file cannot be read; names it.
         """
-        return self.read_photo()
+        if "photo" not in self._read:
+            self._read["photo"] = self.read_photo()
+        return self._read["photo"]
 
     @cached_property
     def pane_labels(self) -> Tensor | None:
@@ -126,7 +134,7 @@ def prepare_view(shot: Shot, mask: PaneMask | None, options: ViewOptions) -> Pre
         width, height = image_size(shot.image_path)
     lens = lens_for_image(shot.lens, (width, height), shot.name)
     pinhole, distorted = pinhole_of(lens)
-    small = max(1, round(pinhole.width / options.downscale)), max(1, round(pinhole.height / options.downscale))
+    small = _reduced_size(pinhole, options.downscale, shot.name)
     pixel_map = PixelMap(lens if distorted else None, *small)
     pose = torch.from_numpy(rigid_pose(shot.cam_from_world, shot.name)).float()
     camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.width, pinhole.height)
@@ -138,6 +146,22 @@ def prepare_view(shot: Shot, mask: PaneMask | None, options: ViewOptions) -> Pre
         read_pane_labels=None if mask is None else _mask_file(mask, (width, height), pixel_map),
     )
     return PreparedView(view, lens is not shot.lens)
+
+
+def _reduced_size(pinhole: Pinhole, downscale: float, name: str) -> tuple[int, int]:
+    """Width and height of a photograph that is reduced by a factor.
+
+    Raises:
+        InputError: that makes it too small to learn from.
+    """
+    width, height = (max(1, round(side / downscale)) for side in (pinhole.width, pinhole.height))
+    if downscale > 1 and min(width, height) < LEAST_SIDE:
+        most = max(min(pinhole.width, pinhole.height) / LEAST_SIDE, 1)
+        raise InputError(
+            f"{name} is {pinhole.width}x{pinhole.height} pixels large, and reduced by {downscale:g} {width}x{height}; "
+            f"expected at least {LEAST_SIDE} pixels along each side: use --downscale {int(10 * most) / 10:g} or less"
+        )
+    return width, height
 
 
 def _mask_file(mask: PaneMask, size: tuple[int, int], pixel_map: PixelMap) -> MaskFile:
@@ -156,7 +180,8 @@ def _is_multiple(large: tuple[int, int], small: tuple[int, int]) -> bool:
     """Whether one size is an integer multiple of the other, up to the rounding of the smaller one."""
     factor = round(large[0] / small[0])
     return factor >= 1 and all(
-        abs(a / factor - b) < 1 and (factor > 1 or a == b) for a, b in zip(large, small, strict=True)
+        abs(a / factor - b) < min(1, MOST_SKEW * b) and (factor > 1 or a == b)
+        for a, b in zip(large, small, strict=True)
     )
 
 
@@ -166,6 +191,9 @@ def _opaque(pixels: NDArray[np.uint8], background: Rgb) -> NDArray[np.uint8]:
         return np.repeat(pixels, 3, axis=2)
     if pixels.shape[2] == 3:
         return np.ascontiguousarray(pixels)
-    alpha = pixels[:, :, 3:].astype(np.float32) / 255
     behind = np.asarray(background, dtype=np.float32) * 255
-    return np.round(pixels[:, :, :3] * alpha + behind * (1 - alpha)).astype(np.uint8)
+    opaque = np.empty((*pixels.shape[:2], 3), dtype=np.uint8)
+    for row, seen in enumerate(pixels):  # Row by row: as floats a photograph takes four times its memory.
+        alpha = seen[:, 3:].astype(np.float32) / 255
+        opaque[row] = np.round(seen[:, :3] * alpha + behind * (1 - alpha))
+    return opaque

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
 
+from glassplat.data.ranges import ESSENTIAL, Ascending, Count, NotNegative, Positive, PositiveShare, Several, Share
 from glassplat.densify.edit import Edit, Moments, apply_edit, clone, forget, keep, split
 from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.transfer import constant
 
 
 @dataclass(frozen=True)
@@ -83,12 +86,13 @@ def accumulate(
         direct: whether the views see the Gaussians themselves, and not their mirror images.
     """
     visible = (radii > 0).all(dim=-1)
-    pixels_per_unit = means2d_gradient.new_tensor([width / 2, height / 2])
+    like = means2d_gradient.dtype, means2d_gradient.device
+    pixels_per_unit = constant((width / 2, height / 2), *like)
 
     def norms(gradient: Tensor) -> Tensor:
         return torch.where(visible, (gradient * pixels_per_unit).norm(dim=-1), 0).sum(dim=0)
 
-    rows = means2d_gradient.new_tensor([[1.0], [float(direct)]])
+    rows = constant(((1.0,), (float(direct),)), *like)
     shares = torch.where(visible, radii.amax(dim=-1) / max(width, height), 0)
     return ScreenStatistics(
         gradient_sum=statistics.gradient_sum + rows * norms(means2d_gradient),
@@ -107,13 +111,17 @@ class DefaultDensify:
     3DGS, which looks at the gradient here too, lets it be. Nearly transparent ones are removed.
 
     Attributes:
-        interval: steps between densifications; at least about one pass over the views, so that
+        split_by: what tells that a large Gaussian is too large: the `pull` of single pixels, or as in 3DGS the
+            `gradient` that clones small ones.
+        interval: steps between densifications.
+        whole_passes: wait at least for about one pass over the views, twice the interval at the most, so that
             every Gaussian has been seen when it is judged.
+        adapt_to_size: raise the thresholds where photographs are smaller than a megapixel, for which they were found.
         start: share of the run after which densification begins.
         stop: share of the run after which it ends.
         gradient_threshold: mean gradient norm, in normalised device coordinates, above which a small Gaussian is
             cloned.
-        pull_threshold: mean pull of single pixels, in the same unit, above which a large Gaussian is split.
+        pull_threshold: mean pull of single pixels, in the same unit, above which a large Gaussian is split by `pull`.
         dense_fraction: Gaussians whose longest axis is above this share of the scene extent are
             split, smaller ones cloned.
         prune_opacity: Gaussians less opaque than this are removed.
@@ -130,19 +138,33 @@ class DefaultDensify:
             once more when nothing is perturbed any longer.
     """
 
-    interval: int = 100
-    start: float = 500 / 30_000
-    stop: float = 15_000 / 30_000
-    gradient_threshold: float = 2e-4
-    pull_threshold: float = 1.2e-3
-    dense_fraction: float = 0.01
-    prune_opacity: float = 0.005
-    prune_large_start: float = 1.0
-    prune_scale_fraction: float = 0.1
-    prune_radius_fraction: float | None = None
-    cap: int | None = None
-    least_contribution: float = 0.2
-    contribution_moments: tuple[float, ...] = (0.5, 0.8)
+    split_by: Literal["pull", "gradient"] = "pull"
+    interval: Several = 100
+    whole_passes: bool = True
+    adapt_to_size: bool = True
+    start: Share = 500 / 30_000
+    stop: Share = 15_000 / 30_000
+    gradient_threshold: Positive = 2e-4
+    pull_threshold: Positive = 1.2e-3
+    dense_fraction: Positive = 0.01
+    prune_opacity: Share = 0.005
+    prune_large_start: Share = 1.0
+    prune_scale_fraction: Positive = 0.1
+    prune_radius_fraction: PositiveShare | None = None
+    cap: Annotated[Count | None, ESSENTIAL] = None
+    least_contribution: NotNegative = 0.2
+    contribution_moments: Annotated[tuple[Share, ...], Ascending()] = (0.5, 0.8)
+
+    @staticmethod
+    def published() -> DefaultDensify:
+        """As 3DGS does it, which removes what is too large once the opacities have been reset."""
+        return DefaultDensify(
+            split_by="gradient",
+            whole_passes=False,
+            adapt_to_size=False,
+            prune_large_start=3000 / 30_000,
+            least_contribution=0.0,
+        )
 
     @torch.no_grad()
     def densify(
@@ -184,8 +206,10 @@ class DefaultDensify:
         self, gaussians: Gaussians, statistics: ScreenStatistics, *, extent: float, generator: torch.Generator
     ) -> Edit:
         large = gaussians.log_scales.amax(dim=1) > math.log(self.dense_fraction * extent)
-        gradients, pulls = statistics.mean_gradient, statistics.mean_pull
-        chosen = self._within_cap(torch.where(large, pulls / self.pull_threshold, gradients / self.gradient_threshold))
+        needs = statistics.mean_gradient / self.gradient_threshold
+        if self.split_by == "pull":
+            needs = torch.where(large, statistics.mean_pull / self.pull_threshold, needs)
+        chosen = self._within_cap(needs)
         halved = split(gaussians, (chosen & large).nonzero().squeeze(1), generator=generator)
         # What was not split moved forward by as many rows as were split before it.
         row_after_split = (~(chosen & large)).cumsum(dim=0) - 1

@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 import tyro
 from torch import Tensor
 
+from glassplat.data.ranges import ESSENTIAL, Count, InnerShare, NotNegative, Positive, Range, Several, Share
 from glassplat.densify.edit import Edit, Moments, apply_edit
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.pose import rotation_from_quat
@@ -39,28 +40,36 @@ class McmcDensify:
         growth: factor by which the number grows in every three hundredth of the run, until the cap: with the published
             30,000 iterations at every relocation. A single relocation at most doubles it.
         dead_opacity: Gaussians at most this opaque are relocated.
-        noise_rate: noise on the positions of what a view shows, as a multiple of their learning rate; 0 switches it
+        noise_rate: noise on the positions, as a multiple of their learning rate; 0 switches it
             off.
         noise_sharpness: how fast the noise fades above `dead_opacity`.
-        opacity_weight: lambda_o, weight of the mean opacity in the objective, over what a view shows directly.
-        scale_weight: lambda_Sigma, weight of the mean standard deviation in the objective, likewise.
+        opacity_weight: lambda_o, weight of the mean opacity in the objective.
+        scale_weight: lambda_Sigma, weight of the mean standard deviation in the objective.
+        reach: what noise and regularisers act on at a step: what its view shows (`shown`; the regularisers on what it
+            shows directly), or as published on `all` Gaussians.
         initial_opacity: opacity of the first Gaussians.
         initial_spread: standard deviation of the first Gaussians, as a share of the distance to their neighbours. The
             published 0.1 takes a thousand steps or more to grow over the gaps (docs/experiments.md).
     """
 
-    cap: Annotated[int | None, tyro.conf.arg(aliases=("--cap",))] = None
-    interval: int = 100
-    start: float = 500 / 30_000
-    stop: float = 25_000 / 30_000
-    growth: float = 1.05
-    dead_opacity: float = 0.005
-    noise_rate: float = 5e5
-    noise_sharpness: float = 100.0
-    opacity_weight: float = 0.01
-    scale_weight: float = 0.01
-    initial_opacity: float = 0.5
-    initial_spread: float = 1.0
+    cap: Annotated[Count | None, ESSENTIAL, tyro.conf.arg(aliases=("--cap",))] = None
+    interval: Several = 100
+    start: Share = 500 / 30_000
+    stop: Share = 25_000 / 30_000
+    growth: Annotated[float, Range(1, 100)] = 1.05
+    dead_opacity: InnerShare = 0.005
+    noise_rate: NotNegative = 5e5
+    noise_sharpness: NotNegative = 100.0
+    opacity_weight: NotNegative = 0.01
+    scale_weight: NotNegative = 0.01
+    reach: Literal["shown", "all"] = "shown"
+    initial_opacity: InnerShare = 0.5
+    initial_spread: Positive = 1.0
+
+    @staticmethod
+    def published() -> McmcDensify:
+        """As 3DGS-MCMC does it."""
+        return McmcDensify(reach="all", initial_spread=0.1)
 
     @torch.no_grad()
     def densify(

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
-from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.plane import Planes
-from glassplat.scene.sight import behind_panes
 
 
 @torch.no_grad()
 def perturb_opacities(
     gaussians: Gaussians,
-    planes: Planes,
-    cameras: Sequence[Camera],
+    selected: Tensor,
     *,
     generator: torch.Generator,
     amplitude: float = 0.4,
     bounds: tuple[float, float] = (0.01, 0.99),
-) -> tuple[Gaussians, Tensor]:
+) -> Gaussians:
     """Adds uniform noise to the opacity of the Gaussians that are seen through a pane.
 
     Where the transmission image still holds part of the reflection, the depth loss and the gradient
@@ -30,8 +24,7 @@ def perturb_opacities(
 
     Args:
         gaussians: the primary Gaussians.
-        planes: the panes.
-        cameras: the training views.
+        selected: [N] bool, which of them are seen through a pane (`behind_panes`).
         generator: source of the noise, on the device of `gaussians`.
         amplitude: the noise is uniform in [-amplitude, amplitude] and acts on the activated opacity.
         bounds: range the new opacities are clamped to. The paper does not give it; the lower bound
@@ -39,11 +32,10 @@ def perturb_opacities(
             those that were wrongly lowered can return.
 
     Returns:
-        The Gaussians and the mask [N] of those selected; forget their opacity moments.
+        The Gaussians; forget the opacity moments of those selected.
     """
-    selected = behind_panes(gaussians.means, planes, cameras)
     opacities = torch.sigmoid(gaussians.logit_opacities)
     unit = torch.rand(opacities.shape, generator=generator, dtype=opacities.dtype, device=opacities.device)
     noisy = (opacities + amplitude * (2 * unit - 1)).clamp(*bounds)
     logit_opacities = torch.where(selected, torch.logit(noisy), gaussians.logit_opacities)
-    return gaussians.with_tensors({"logit_opacities": logit_opacities}), selected
+    return gaussians.with_tensors({"logit_opacities": logit_opacities})

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
+from glassplat.data.ranges import InnerShare, Range, Share
 from glassplat.densify.edit import Moments, forget
 from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import SH_ZERO, Gaussians
@@ -26,17 +28,18 @@ class NormalPropagation:
         least_strength: every reflection strength is raised to this, so that it has a gradient.
         reflective: Gaussians of at least this strength grow (paper: 0.1; its code: 0.02).
         growth: factor on their two longer axes; the shortest is the normal and stays.
-        sabotage: half width of the uniform noise on the constant colour (paper: 0.1); 0 switches it off (ablation).
+        sabotage: half width of the uniform noise on the constant colour (paper: 0.1; its code: 0.4 on the constant
+            coefficient, which is 0.113); 0 switches it off (ablation).
         sabotaged: Gaussians of at most this strength are disturbed (paper: 0.1; its code: 0.05).
     """
 
     propagates: bool = True
-    least_opacity: float = 0.9
-    least_strength: float = 1e-3
-    reflective: float = 0.02
-    growth: float = 1.5
-    sabotage: float = 0.1
-    sabotaged: float = 0.05
+    least_opacity: InnerShare = 0.9
+    least_strength: InnerShare = 1e-3
+    reflective: InnerShare = 0.02
+    growth: Annotated[float, Range(1, 100)] = 1.5
+    sabotage: Share = 0.1
+    sabotaged: InnerShare = 0.05
 
     @torch.no_grad()
     def propagate(self, gaussians: Gaussians, moments: Moments) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:

@@ -4,50 +4,30 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from glassplat.data.dataset import Dataset
 from glassplat.evaluate.evaluate import EvaluatedView
+from glassplat.evaluate.metric_names import (
+    METRICS,
+    PLANE_COLUMNS,
+    SURFACE_METRICS,
+    Metric,
+    missing_reasons,
+    shown_metrics,
+    written,
+)
 from glassplat.evaluate.overview_style import SCRIPT, STYLE
 from glassplat.evaluate.sheet import comparison_sheet
 from glassplat.evaluate.uses import Uses
 from glassplat.files.atomic import atomic_write
 from glassplat.files.images import write_image
+from glassplat.files.picture_paths import flat_picture_names
 from glassplat.render.glazing import Blend
 
-METRICS = {
-    "psnr": ("PSNR", "{:.2f} dB"),
-    "ssim": ("SSIM", "{:.4f}"),
-    "lpips": ("LPIPS", "{:.4f}"),
-    "pane_psnr": ("PSNR, pane", "{:.2f} dB"),
-    "transmission_psnr": ("PSNR, transmission", "{:.2f} dB"),
-    "reflection_psnr": ("PSNR, reflection", "{:.2f} dB"),
-}
-SURFACE_METRICS = {
-    "normal_error_deg": ("normal error", "{:.2f}°"),
-    "reflective_normal_error_deg": ("normal error, reflective", "{:.2f}°"),
-    "strength_error": ("strength error", "{:.3f}"),
-    "environment_psnr": ("PSNR, environment", "{:.2f} dB"),
-    "environment_lpips": ("LPIPS, environment", "{:.4f}"),
-}
-"""Shown where they are known: only synthetic captures of objects have the truth they need."""
-FACTS = {
-    "num_gaussians": ("Gaussians", "{:,}"),
-    "train_seconds": ("training", "{:.0f} s"),
-    "seconds_per_frame": ("per frame", "{:.3f} s"),
-    "reflection_gain": ("reflection gain", "{:.2f}"),
-}
-SURFACE_FACTS = {"environment_gain": ("environment gain", "{:.2f}")}
 USES_FILE = "uses.png"
 SETTINGS = ("iterations", "seed", "resolution", "split", "lpips_backbone", "pane_region")
-PLANE_COLUMNS = {
-    "label": ("pane", "{}"),
-    "base_reflectance": ("R0", "{:.3f}"),
-    "normal_error_deg": ("normal error", "{:.2f}°"),
-    "offset_error": ("offset error / extent", "{:.3%}"),
-    "base_reflectance_error": ("R0 error", "{:.3f}"),
-}
 
 
 class Report:
@@ -97,10 +77,7 @@ class Report:
 
 def sheet_names(names: list[str]) -> dict[str, str]:
     """File of each view's sheet, relative to the run; distinct also for `a.jpg` and `a.png`."""
-    flat = {name: name.replace("/", "_") for name in names}
-    stems = {name: PurePosixPath(file).stem for name, file in flat.items()}
-    chosen = stems if len(set(stems.values())) == len(names) else flat
-    return {name: f"sheets/{file}.png" for name, file in chosen.items()}
+    return {name: f"sheets/{file}" for name, file in flat_picture_names(names).items()}
 
 
 def overview_page(
@@ -116,10 +93,12 @@ def overview_page(
         f"<h1>{_escaped(title)}</h1>",
         f'<p class="settings">{_settings_line(results)}</p>',
         _cards(results),
+        _missing(results),
         _figure("uses", uses, "photographs without reflections, and panes as mirrors") if uses else "",
         _plane_table(results.get("planes") or []),
         _view_table(per_view, sheets),
         *(_figure(name, path, f"comparison sheet of {name}") for name, path in sheets.items()),
+        _meanings(results),
         '<dialog id="large"><img alt=""></dialog>',
     ]
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{_escaped(title)}</title>'
@@ -137,29 +116,52 @@ def _settings_line(results: Mapping[str, Any]) -> str:
 
 def _cards(results: Mapping[str, Any]) -> str:
     cards = []
-    known = {name for name in SURFACE_METRICS | SURFACE_FACTS if results.get(name) is not None}
-    for name, (label, pattern) in (METRICS | SURFACE_METRICS | FACTS | SURFACE_FACTS).items():
-        if name in known or (name in METRICS | FACTS and name in results):
-            value, reason = _formatted(results[name], pattern), results.get(f"{name}_reason") or ""
-            cards.append(f'<div title="{_escaped(reason)}"><b>{value}</b><span>{label}</span></div>')
+    for name, metric in shown_metrics(results).items():
+        told = metric.meaning if results[name] is not None else results.get(f"{name}_reason") or ""
+        value = _formatted(results[name], metric.pattern)
+        cards.append(f'<div title="{_escaped(told)}"><b>{value}</b><span>{metric.label}</span></div>')
     return f'<div class="cards">{"".join(cards)}</div>'
+
+
+def _missing(results: Mapping[str, Any]) -> str:
+    """Why some metrics are dashes."""
+    metrics = shown_metrics(results)
+    lines = [
+        f"<p>Not measured: <b>{_escaped('; '.join(metrics[name].label for name in names))}</b>: {_escaped(reason)}</p>"
+        for reason, names in missing_reasons(results).items()
+    ]
+    return f'<div class="settings">{"".join(lines)}</div>' if lines else ""
+
+
+def _meanings(results: Mapping[str, Any]) -> str:
+    """What the numbers are, at the end of the page."""
+    planes = PLANE_COLUMNS if results.get("planes") else {}
+    parts = [f"<dl>{_defined(shown_metrics(results))}</dl>"]
+    if planes:
+        parts.append(f"<p>Of each pane:</p><dl>{_defined(planes)}</dl>")
+    return f'<section class="meanings"><h2>What the numbers mean</h2>{"".join(parts)}</section>'
+
+
+def _defined(metrics: Mapping[str, Metric]) -> str:
+    return "".join(f"<dt>{_escaped(m.label)}</dt><dd>{_escaped(m.meaning)}</dd>" for m in metrics.values())
 
 
 def _plane_table(planes: list[Mapping[str, Any]]) -> str:
     if not planes:
         return ""
-    rows = [[_formatted(plane.get(name), pattern) for name, (_, pattern) in PLANE_COLUMNS.items()] for plane in planes]
-    return _table([label for label, _ in PLANE_COLUMNS.values()], rows)
+    columns = PLANE_COLUMNS.items()
+    rows = [[_formatted(plane.get(name), column.pattern) for name, column in columns] for plane in planes]
+    return _table([column.label for _, column in columns], rows)
 
 
 def _view_table(per_view: Mapping[str, Mapping[str, Any]], sheets: Mapping[str, str]) -> str:
     columns = METRICS | SURFACE_METRICS
     shown = {n: column for n, column in columns.items() if any(row.get(n) is not None for row in per_view.values())}
     rows = [
-        [_link(name, sheets), *(_formatted(row.get(metric), pattern) for metric, (_, pattern) in shown.items())]
+        [_link(name, sheets), *(_formatted(row.get(metric), column.pattern) for metric, column in shown.items())]
         for name, row in per_view.items()
     ]
-    return _table(["view", *(label for label, _ in shown.values())], rows)
+    return _table(["view", *(column.label for column in shown.values())], rows)
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:
@@ -180,13 +182,12 @@ def _figure(name: str, path: str, description: str) -> str:
 
 
 def _metrics_line(metrics: Mapping[str, Any]) -> str:
-    shown = (METRICS | SURFACE_METRICS).items()
-    known = [(label, _formatted(metrics[n], pattern)) for n, (label, pattern) in shown if metrics.get(n) is not None]
-    return "    ".join(f"{label} {value}" for label, value in known)
+    known = {n: metric for n, metric in (METRICS | SURFACE_METRICS).items() if metrics.get(n) is not None}
+    return "    ".join(f"{metric.label} {_formatted(metrics[n], metric.pattern)}" for n, metric in known.items())
 
 
 def _formatted(value: object, pattern: str) -> str:
-    return "-" if value is None else _escaped(pattern.format(value))
+    return _escaped(written(value, pattern))
 
 
 def _escaped(value: object) -> str:

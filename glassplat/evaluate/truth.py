@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,8 +13,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from glassplat.data.errors import InputError
+from glassplat.data.errors import InputError, input_checked
+from glassplat.files.fields import COORDINATE, Field, Flag, Items, Number, Whole, checked, shown
 from glassplat.files.images import read_image, read_image_float
+from glassplat.files.json_text import read_json
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,15 @@ class TruePlane:
     half_v: tuple[float, ...]
     mirror: bool
     base_reflectance: float
+
+
+VECTOR = Items(COORDINATE, 3)
+TRUE_PLANE: dict[str, Field] = {
+    "label": Whole(1, 255),
+    **dict.fromkeys(("center", "normal", "half_u", "half_v"), VECTOR),
+    "mirror": Flag(),
+    "base_reflectance": Number(0, 1),
+}
 
 
 @dataclass(frozen=True)
@@ -85,12 +94,13 @@ class GroundTruth:
                 f"ground truth for {image_name} is incomplete: {', '.join(missing)} missing; add or remove all"
             )
         size = (width, height)
-        return TrueView(
-            transmission=torch.from_numpy(_resized_color(read_image(paths["transmission"]), size)),
-            reflection=torch.from_numpy(_resized_color(read_image(paths["reflection"]), size)),
-            strength=torch.from_numpy(resized_float(read_image_float(paths["strength"])[..., 0], size)),
-            labels=torch.from_numpy(_resized_labels(read_image(paths["labels"])[..., 0], size)),
-        )
+        with input_checked():
+            return TrueView(
+                transmission=torch.from_numpy(_resized_color(read_image(paths["transmission"]), size)),
+                reflection=torch.from_numpy(_resized_color(read_image(paths["reflection"]), size)),
+                strength=torch.from_numpy(resized_float(read_image_float(paths["strength"])[..., 0], size)),
+                labels=torch.from_numpy(_resized_labels(read_image(paths["labels"])[..., 0], size)),
+            )
 
 
 def load_truth(folder: Path | None) -> GroundTruth | None:
@@ -104,30 +114,24 @@ def load_truth(folder: Path | None) -> GroundTruth | None:
     path = folder / "planes.json"
     if not path.is_file():
         return GroundTruth(folder, ())
-    try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-        return GroundTruth(folder, tuple(_true_plane(entry) for entry in entries))
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"cannot read {path} ({error!r}); expected a list of planes with label, center, normal, half_u, half_v, "
-            "mirror and base_reflectance"
-        ) from error
+    with input_checked():
+        entries = read_json(path)
+        if not isinstance(entries, list):
+            raise ValueError(f"{path} holds {shown(entries)}; expected a list with one object per plane")
+        planes = tuple(_true_plane(entry, f"plane {i} in {path}") for i, entry in enumerate(entries, start=1))
+        return GroundTruth(folder, planes)
 
 
-def _true_plane(entry: Mapping[str, Any]) -> TruePlane:
-    vectors = {key: tuple(float(value) for value in entry[key]) for key in ("center", "normal", "half_u", "half_v")}
-    if any(len(vector) != 3 for vector in vectors.values()) or not math.hypot(*vectors["normal"]) > 0:
-        raise ValueError("vectors must have three components, and the normal a length")
-    return TruePlane(
-        label=int(entry["label"]),
-        mirror=bool(entry["mirror"]),
-        base_reflectance=float(entry["base_reflectance"]),
-        **vectors,
-    )
+def _true_plane(entry: Any, where: str) -> TruePlane:
+    plane = TruePlane(**checked(entry, TRUE_PLANE, where))
+    if not math.hypot(*plane.normal) > 0:
+        raise ValueError(f"normal of {where} has length 0; expected a direction")
+    return plane
 
 
 def _resized_color(pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    return np.array(Image.fromarray(pixels[..., :3]).resize(size, Image.Resampling.BOX))
+    colors = np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else np.ascontiguousarray(pixels[..., :3])
+    return np.array(Image.fromarray(colors).resize(size, Image.Resampling.BOX))
 
 
 def resized_float(pixels: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:

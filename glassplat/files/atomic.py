@@ -24,8 +24,9 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
     Raises:
         OSError: the target cannot be written; the message names it. Keeps the subclass, such as PermissionError.
     """
-    target = Path(path).resolve()
-    temporary = target.with_name(f".{target.stem}.{uuid4().hex[:12]}.tmp{target.suffix}")
+    target = Path(os.path.realpath(path))
+    # Shortened, because a name that is as long as names may be leaves no room for more.
+    temporary = target.with_name(f".{target.stem[:32]}.{uuid4().hex[:12]}.tmp{target.suffix[:32]}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         yield temporary

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from os.path import isfile
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ def read_equirect(path: Path | str) -> Tensor:
     """
     path = Path(path)
     _check_suffix(path)
-    if not path.is_file():
+    if not isfile(path):
         raise FileNotFoundError(f"no panorama at {path}; expected an equirectangular image, {EXR} or {PNG}")
     if path.suffix.lower() == EXR:
         image = srgb_from_linear(torch.from_numpy(_read_exr(path)))

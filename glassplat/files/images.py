@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import zlib
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,8 +15,16 @@ from torch import Tensor
 from glassplat.files.atomic import atomic_write
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF", "PPM", "TGA", "JPEG2000")
+"""What a photograph or a mask may be, whatever its suffix; not PostScript and others that start programs."""
+MOST_PIXELS = 2**27
+"""Of one image; decoding takes about ten bytes a pixel."""
+SHADES_16 = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 _FULL_SCALE_16 = 65535
-_SHADES_16 = ("I", "I;16", "I;16B", "I;16L", "I;16N")
+
+# Damaged tags that do not matter end in warnings that name no file; those that do matter raise errors.
+warnings.filterwarnings("ignore", module=r"PIL\.")
+Image.MAX_IMAGE_PIXELS = None  # `opened` sets the bound, and says which file is too large; Pillow warns and names none.
 
 
 def open_image(path: Path) -> Image.Image:
@@ -24,10 +32,11 @@ def open_image(path: Path) -> Image.Image:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is no image, or is cut off; the message names it.
+        ValueError: the file is no image, is cut off or too large, or its values are no colours; the message names it.
     """
-    with _readable(path), Image.open(path) as image:
+    with opened(path) as image:
         image.load()
+        _check_shades(image)
         return image
 
 
@@ -36,9 +45,9 @@ def image_size(path: Path) -> tuple[int, int]:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is no image.
+        ValueError: the file is no image, or too large.
     """
-    with _readable(path), Image.open(path) as image:
+    with opened(path) as image:
         return image.width, image.height
 
 
@@ -47,12 +56,14 @@ def is_transparent(path: Path) -> bool:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is no image, or is cut off.
+        ValueError: the file is no image, is cut off or too large.
     """
-    with _readable(path), Image.open(path) as image:
+    with opened(path) as image:
         if not image.has_transparency_data:
             return False
-        return bool((np.asarray(image.convert("RGBA").getchannel("A")) < 255).any())
+        with_alpha = image if "A" in image.getbands() else image.convert("RGBA")
+        least, _ = with_alpha.getchannel("A").getextrema()
+        return bool(least < 255)  # type: ignore[operator]
 
 
 def read_image(path: Path | str) -> NDArray[np.uint8]:
@@ -62,13 +73,12 @@ def read_image(path: Path | str) -> NDArray[np.uint8]:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is no image, or is cut off.
+        ValueError: the file is no image, is cut off or too large, or its values are no colours.
     """
-    image = open_image(Path(path))
-    if image.mode in _SHADES_16:
-        return np.round(_shades(image) * 255).astype(np.uint8)[:, :, None]
-    pixels = np.array(image.convert(_plain_mode(image)))
-    return pixels[:, :, None] if pixels.ndim == 2 else pixels
+    with opened(Path(path)) as image:
+        if image.mode in SHADES_16:
+            return np.round(_shades(image) * 255).astype(np.uint8)[:, :, None]
+        return _pixels(image)
 
 
 def read_image_float(path: Path | str) -> NDArray[np.float32]:
@@ -76,13 +86,12 @@ def read_image_float(path: Path | str) -> NDArray[np.float32]:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is no image, or is cut off.
+        ValueError: the file is no image, is cut off or too large, or its values are no colours.
     """
-    image = open_image(Path(path))
-    if image.mode in _SHADES_16:
-        return _shades(image)[:, :, None]
-    pixels = np.asarray(image.convert(_plain_mode(image)), dtype=np.float32) / np.float32(255)
-    return pixels[:, :, None] if pixels.ndim == 2 else pixels
+    with opened(Path(path)) as image:
+        if image.mode in SHADES_16:
+            return _shades(image)[:, :, None]
+        return _pixels(image).astype(np.float32) / np.float32(255)
 
 
 def write_image(path: Path | str, image: Tensor | NDArray[np.generic]) -> None:
@@ -105,26 +114,48 @@ def write_image(path: Path | str, image: Tensor | NDArray[np.generic]) -> None:
 
 
 @contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    """Turn all that Pillow raises about a bad file into one error that names it; a missing file stays one."""
+def opened(path: Path) -> Iterator[Image.Image]:
+    """An image whose size is checked; all that Pillow raises about a bad file becomes one error that names it.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is no image, is cut off or too large.
+    """
     try:
-        yield
-    except (FileNotFoundError, PermissionError):
-        raise
-    except (OSError, SyntaxError, ValueError, zlib.error, Image.DecompressionBombError) as error:
-        raise ValueError(f"cannot read {path} as an image ({error}); replace the file or remove it") from error
+        with Image.open(path, formats=FORMATS) as image:
+            if image.width * image.height > MOST_PIXELS:
+                size = f"{image.width}x{image.height} pixels large"
+                raise ValueError(f"it is {size}; expected at most {MOST_PIXELS / 1e6:.0f} megapixels: reduce it")
+            yield image
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"no image {path}; expected it there") from error
+    except Exception as error:  # Its parsers raise whatever damaged bytes lead to, from KeyError to struct.error.
+        reason = str(error) or type(error).__name__
+        raise ValueError(f"cannot read {path} as an image ({reason}); replace the file or remove it") from error
 
 
-def _plain_mode(image: Image.Image) -> str:
-    """The eight-bit mode that keeps what the image shows."""
-    if image.has_transparency_data:
-        return "RGBA"
-    return "L" if image.mode in ("1", "L") else "RGB"
+def _pixels(image: Image.Image) -> NDArray[np.uint8]:
+    """[H, W, C] in the eight-bit mode that keeps what the image shows."""
+    _check_shades(image)
+    mode = "RGBA" if image.has_transparency_data else "L" if image.mode in ("1", "L") else "RGB"
+    pixels = np.array(image if image.mode == mode else image.convert(mode))
+    return pixels[:, :, None] if pixels.ndim == 2 else pixels
+
+
+def _check_shades(image: Image.Image) -> None:
+    """Raises ValueError for values of which nothing says what is white."""
+    if image.mode == "F":
+        raise ValueError("it holds floating-point numbers; expected colours of 8 or 16 bits")
+    if image.mode == "I":
+        least, most = image.getextrema()
+        if least < 0 or most > _FULL_SCALE_16:  # type: ignore[operator]
+            raise ValueError(f"it holds values from {least} to {most}; expected colours of 8 or 16 bits")
 
 
 def _shades(image: Image.Image) -> NDArray[np.float32]:
     """Sixteen-bit grey as [H, W] in [0, 1]."""
-    return np.clip(np.asarray(image).astype(np.float32) / np.float32(_FULL_SCALE_16), 0, 1)
+    _check_shades(image)
+    return np.asarray(image).astype(np.float32) / np.float32(_FULL_SCALE_16)
 
 
 def _to_uint8(pixels: NDArray[np.generic]) -> NDArray[np.uint8]:

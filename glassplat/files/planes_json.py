@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,42 @@ import torch
 from torch import Tensor
 
 from glassplat.files.atomic import atomic_write
+from glassplat.files.fields import (
+    COORDINATE,
+    LARGEST_COORDINATE,
+    Field,
+    Flag,
+    Items,
+    Number,
+    Optional,
+    Whole,
+    checked,
+    shown,
+)
+from glassplat.files.json_text import read_json
 from glassplat.scene.plane import Planes
 
 EDIT_TOLERANCE = 1e-5
 """Above this difference the readable value has been edited by hand, and wins over the raw one."""
 REFLECTANCE_MARGIN = 1e-6
-VECTORS = {"center": 3, "normal": 3, "tangent": 3, "half_sizes": 2}
+LEAST_LENGTH = 1e-6
+LEAST_ANGLE = 1e-3
+"""Between tangent and normal, in radians: below it the rectangle's sides have no direction."""
+LEAST_HALF_SIZE = 1e-9
+HIGHEST_LABEL = 255
+VECTOR = Items(COORDINATE, 3)
+LOGIT = Number(-1e3, 1e3)
+PLANE: dict[str, Field] = {
+    "label": Whole(1, HIGHEST_LABEL),
+    "mirror": Optional(Flag(), default=False),
+    "center": VECTOR,
+    "normal": VECTOR,
+    "tangent": VECTOR,
+    "half_sizes": Items(Number(LEAST_HALF_SIZE, LARGEST_COORDINATE), 2),
+    "base_reflectance": Number(0, 1),
+    "raw_normal": Optional(VECTOR),
+    "logit_reflectance": Optional(LOGIT),
+}
 
 
 def write_planes(path: Path | str, planes: Planes) -> None:
@@ -52,21 +83,20 @@ def read_planes(path: Path | str) -> Planes:
         ValueError: not a list of planes, a missing or malformed value, or a label that appears twice.
     """
     path = Path(path)
-    entries = _load_entries(path)
+    entries = [_checked_entry(entry, index, path) for index, entry in enumerate(_load_entries(path), start=1)]
     if not entries:
         return Planes.empty()
-    labels = tuple(_label(entry, path) for entry in entries)
+    labels = tuple(entry["label"] for entry in entries)
     if len(set(labels)) != len(labels):
         raise ValueError(f"{path} has plane labels {list(labels)}; expected every label once")
-    vectors = {key: torch.stack([_vector(entry, key, path) for entry in entries]) for key in VECTORS}
     return Planes(
-        centers=vectors["center"],
-        raw_normals=torch.stack([_raw_normal(entry, path) for entry in entries]),
-        logit_reflectances=torch.stack([_logit_reflectance(entry, path) for entry in entries]),
-        tangents=vectors["tangent"],
-        half_sizes=vectors["half_sizes"],
+        centers=_column(entries, "center"),
+        raw_normals=torch.stack([_raw_normal(entry) for entry in entries]),
+        logit_reflectances=torch.stack([_logit_reflectance(entry) for entry in entries]),
+        tangents=_column(entries, "tangent"),
+        half_sizes=_column(entries, "half_sizes"),
         labels=labels,
-        mirrors=tuple(label for label, entry in zip(labels, entries, strict=True) if _is_mirror(entry, path)),
+        mirrors=tuple(entry["label"] for entry in entries if entry["mirror"]),
     )
 
 
@@ -89,69 +119,45 @@ def _finite(value: float | list[float]) -> bool:
     return all(math.isfinite(number) for number in (value if isinstance(value, list) else [value]))
 
 
-def _load_entries(path: Path) -> list[Mapping[str, Any]]:
-    if not path.is_file():
+def _load_entries(path: Path) -> list[Any]:
+    if not os.path.isfile(path):
         raise FileNotFoundError(f"no planes file at {path}; expected the planes.json of a run")
-    try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(
-            f"{path} is not valid JSON ({error}); it is damaged or cut off: restore or write it again"
-        ) from error
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise ValueError(f"{path} must hold a JSON list with one object per plane; found {type(entries).__name__}")
+    entries = read_json(path)
+    if not isinstance(entries, list):
+        raise ValueError(f"{path} holds {shown(entries)}; expected a list with one object per plane")
     return entries
 
 
-def _label(entry: Mapping[str, Any], path: Path) -> int:
-    label = entry.get("label")
-    if not isinstance(label, int) or isinstance(label, bool) or label < 1:
-        raise ValueError(f"a plane in {path} has the label {label!r}; expected a whole number of at least 1")
-    return label
+def _checked_entry(entry: Any, index: int, path: Path) -> dict[str, Any]:
+    """One plane whose rectangle has a direction and an area."""
+    where = f"plane {index} in {path}"
+    plane = checked(entry, PLANE, where)
+    normal, tangent = (torch.tensor(plane[key], dtype=torch.float64) for key in ("normal", "tangent"))
+    for key, vector in (("normal", normal), ("tangent", tangent)):
+        if float(vector.norm()) < LEAST_LENGTH:
+            raise ValueError(f"{key} of {where} has length 0; expected a direction")
+    if float(torch.linalg.cross(normal, tangent).norm() / (normal.norm() * tangent.norm())) < LEAST_ANGLE:
+        raise ValueError(f"tangent of {where} lies along its normal; expected the direction of a side of the rectangle")
+    return plane
 
 
-def _is_mirror(entry: Mapping[str, Any], path: Path) -> bool:
-    mirror = entry.get("mirror", False)
-    if not isinstance(mirror, bool):
-        raise ValueError(f"plane {entry['label']} in {path} has mirror = {mirror!r}; expected true or false")
-    return mirror
+def _column(entries: list[dict[str, Any]], key: str) -> Tensor:
+    return torch.tensor([entry[key] for entry in entries], dtype=torch.float32)
 
 
-def _vector(entry: Mapping[str, Any], key: str, path: Path) -> Tensor:
-    """A finite vector of the length that `key` has."""
-    length = VECTORS[key.removeprefix("raw_")]
-    value = entry.get(key)
-    is_vector = isinstance(value, list) and len(value) == length
-    if not is_vector or not all(_is_number(number) for number in value or ()):
-        raise ValueError(f"plane {entry['label']} in {path} has {key} = {value!r}; expected {length} finite numbers")
-    return torch.tensor(value, dtype=torch.float32)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _raw_normal(entry: Mapping[str, Any], path: Path) -> Tensor:
-    normal = _vector(entry, "normal", path)
-    if normal.norm() < 1e-6:
-        raise ValueError(f"plane {entry['label']} in {path} has a normal of length 0; expected a direction")
-    if "raw_normal" not in entry:
+def _raw_normal(entry: Mapping[str, Any]) -> Tensor:
+    normal = torch.tensor(entry["normal"], dtype=torch.float32)
+    if entry["raw_normal"] is None:
         return normal
-    raw = _vector(entry, "raw_normal", path)
+    raw = torch.tensor(entry["raw_normal"], dtype=torch.float32)
     unit, raw_unit = (torch.nn.functional.normalize(vector, dim=0) for vector in (normal, raw))
     return raw if (unit - raw_unit).abs().max() <= EDIT_TOLERANCE else normal
 
 
-def _logit_reflectance(entry: Mapping[str, Any], path: Path) -> Tensor:
-    reflectance = entry.get("base_reflectance")
-    if not _is_number(reflectance) or not 0 <= float(reflectance or 0) <= 1:
-        raise ValueError(
-            f"plane {entry['label']} in {path} has base_reflectance = {reflectance!r}; expected a number from 0 to 1"
-        )
-    readable = torch.tensor(reflectance, dtype=torch.float32)
-    raw = entry.get("logit_reflectance")
-    if _is_number(raw):
-        logit = torch.tensor(raw, dtype=torch.float32)
+def _logit_reflectance(entry: Mapping[str, Any]) -> Tensor:
+    readable = torch.tensor(entry["base_reflectance"], dtype=torch.float32)
+    if entry["logit_reflectance"] is not None:
+        logit = torch.tensor(entry["logit_reflectance"], dtype=torch.float32)
         if (torch.sigmoid(logit) - readable).abs() <= EDIT_TOLERANCE:
             return logit
     return torch.logit(readable, eps=REFLECTANCE_MARGIN)

@@ -122,7 +122,8 @@ def _check_is_splat(table: PlyTable, path: Path) -> None:
 
 
 def _as_float32(values: NDArray) -> NDArray[np.float32]:
-    return np.ascontiguousarray(values, dtype=np.float32)
+    with np.errstate(over="ignore"):  # A double may be beyond float32; it becomes infinite.
+        return np.ascontiguousarray(values, dtype=np.float32)
 
 
 def _stacked(columns: Mapping[str, Tensor], names: tuple[str, ...]) -> Tensor:

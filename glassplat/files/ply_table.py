@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from glassplat.files.atomic import atomic_write
+from glassplat.files.reading import reading
 
 SCALAR_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -73,9 +74,9 @@ def read_table(path: Path, name: str = "vertex") -> PlyTable:
         FileNotFoundError: there is no such file.
         ValueError: not a PLY file, a damaged header, no such element, or fewer bytes than announced.
     """
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise FileNotFoundError(f"no PLY file at {path}; check the path")
-    with path.open("rb") as stream:
+    with reading(path), path.open("rb") as stream:
         header = read_header(stream, path)
         element = header.element(name)
         if element is None:
@@ -83,9 +84,10 @@ def read_table(path: Path, name: str = "vertex") -> PlyTable:
             raise ValueError(
                 f"{path} has no element {name!r}; expected one, found {found}. Is it another kind of PLY file?"
             )
-        if element.has_lists:
+        if element.has_lists or not element.properties:
+            found_kind = "list properties" if element.has_lists else "no properties"
             raise ValueError(
-                f"element {name!r} of {path} has list properties; expected plain numbers. Export it without them"
+                f"element {name!r} of {path} has {found_kind}; expected plain numbers. Export it with nothing else"
             )
         earlier = header.elements[: header.elements.index(element)]
         if header.format == "ascii":
@@ -152,9 +154,8 @@ def _header_lines(stream: BinaryIO, path: Path) -> list[list[str]]:
 
 
 def _with_property(element: PlyElement, words: list[str], path: Path) -> PlyElement:
-    kind = None if words[1:2] == ["list"] else SCALAR_TYPES.get(words[1])
-    is_list = len(words) == 5 and kind is None
-    is_scalar = len(words) == 3 and kind is not None
+    is_list = len(words) == 5 and words[1] == "list"
+    is_scalar = len(words) == 3 and words[1] in SCALAR_TYPES
     if not (is_list or is_scalar):
         raise ValueError(
             f"cannot read the property line {' '.join(words)!r} in the header of {path}; the file is damaged"
@@ -163,6 +164,7 @@ def _with_property(element: PlyElement, words: list[str], path: Path) -> PlyElem
         raise ValueError(
             f"property {words[-1]!r} appears twice in element {element.name!r} of {path}; expected each once"
         )
+    kind = SCALAR_TYPES[words[1]] if is_scalar else None
     return PlyElement(element.name, element.count, (*element.properties, (words[-1], kind)))
 
 
@@ -200,7 +202,24 @@ def _read_ascii(
         values = np.array(rows, dtype=np.float64).reshape(element.count, width)
     except ValueError as error:
         raise ValueError(f"{path} holds something that is not a number ({error}); the file is damaged") from error
-    return {name: values[:, i].astype(str(kind)) for i, (name, kind) in enumerate(element.properties)}
+    return {
+        name: _in_declared_type(values[:, i], str(kind), name, path)
+        for i, (name, kind) in enumerate(element.properties)
+    }
+
+
+def _in_declared_type(values: NDArray[np.float64], kind: str, name: str, path: Path) -> NDArray:
+    """A column of a text file; what is beyond a float becomes infinite, what is no such whole number is refused."""
+    if not kind.startswith("f"):
+        limits = np.iinfo(kind)
+        inside = (values >= limits.min) & (values <= limits.max)
+        if not inside.all():
+            raise ValueError(
+                f"property {name!r} of {path} is {values[~inside][0]:g} somewhere; expected whole numbers from "
+                f"{limits.min} to {limits.max}, as the header says"
+            )
+    with np.errstate(over="ignore"):
+        return values.astype(kind)
 
 
 def _truncated(path: Path, element: PlyElement, complete: int) -> ValueError:

@@ -3,17 +3,32 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
 from glassplat.files.atomic import atomic_write
 from glassplat.files.environment_file import read_environment, write_environment
+from glassplat.files.fields import LARGEST_COORDINATE, Choice, Field, Items, Number, Optional, Whole, checked
+from glassplat.files.json_text import read_json
 from glassplat.files.planes_json import read_planes, write_planes
 from glassplat.files.ply import read_gaussians, write_gaussians
+from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
 PRIMARY, GLASS, PLANES, SCENE = "point_cloud.ply", "glass.ply", "planes.json", "scene.json"
 ENVIRONMENT = "environment.safetensors"
+LARGEST_COLOR = 1e6
+LARGEST_LOG = 40.0
+"""Of a logarithm: its exponential, squared, fits float32."""
+EXTENT = Number(above=0, most=4 * LARGEST_COORDINATE)
+SH_DEGREE = Whole(0, 3)
+HEADER: dict[str, Field] = {
+    "extent": EXTENT,
+    "active_sh_degree": SH_DEGREE,
+    "files": Optional(Items(Choice((PRIMARY, GLASS, PLANES, ENVIRONMENT)))),
+}
+"""`files` is what the scene consists of, so that one that is lost is missed; folders of earlier versions lack it."""
 
 
 def write_scene(folder: Path, scene: Scene) -> None:
@@ -24,13 +39,16 @@ def write_scene(folder: Path, scene: Scene) -> None:
     texels of the environment's cube map. Each is there only where the scene has it.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    files = [PRIMARY]
     write_gaussians(folder / PRIMARY, scene.primary)
     if len(scene.planes):
         write_gaussians(folder / GLASS, scene.glass)
         write_planes(folder / PLANES, scene.planes)
+        files += [GLASS, PLANES]
     if not scene.environment.is_empty:
         write_environment(folder / ENVIRONMENT, scene.environment)
-    header = {"extent": scene.extent, "active_sh_degree": scene.primary.active_sh_degree}
+        files += [ENVIRONMENT]
+    header = {"extent": scene.extent, "active_sh_degree": scene.primary.active_sh_degree, "files": files}
     with atomic_write(folder / SCENE) as temporary:
         temporary.write_text(json.dumps(header, indent=2) + "\n", encoding="utf-8")
 
@@ -41,11 +59,47 @@ def read_scene(folder: Path) -> Scene:
     Raises:
         FileNotFoundError, ValueError: a file is missing, truncated or foreign.
     """
-    header = json.loads((folder / SCENE).read_text(encoding="utf-8"))
-    primary = replace(read_gaussians(folder / PRIMARY), active_sh_degree=header["active_sh_degree"])
-    scene = Scene(primary, header["extent"])
+    header = checked(read_json(folder / SCENE), HEADER, str(folder / SCENE))
+    for name in header["files"] or ():
+        if not os.path.isfile(folder / name):
+            raise FileNotFoundError(f"no {name} in {folder}; {SCENE} says that the scene has one: export it again")
+    scene = Scene(_primary(folder, header["active_sh_degree"]), header["extent"])
     if (folder / PLANES).is_file():
-        scene = replace(scene, glass=read_gaussians(folder / GLASS), planes=read_planes(folder / PLANES))
+        scene = replace(scene, glass=_glass(folder / GLASS), planes=read_planes(folder / PLANES))
     if (folder / ENVIRONMENT).is_file():
         scene = replace(scene, environment=read_environment(folder / ENVIRONMENT))
     return scene
+
+
+def _primary(folder: Path, active_sh_degree: int) -> Gaussians:
+    gaussians = _drawable(folder / PRIMARY)
+    try:
+        return replace(gaussians, active_sh_degree=active_sh_degree)
+    except ValueError as error:
+        raise ValueError(f"{folder / SCENE} and {folder / PRIMARY} do not belong together: {error}") from error
+
+
+def _glass(path: Path) -> Gaussians:
+    """Glass with its marks, without which nothing tells where it reflects."""
+    glass = _drawable(path)
+    if "logit_mark" not in glass.channels:
+        raise ValueError(f"{path} has no property logit_mark; expected glass as `planar` exports it")
+    return glass
+
+
+def _drawable(path: Path) -> Gaussians:
+    """Gaussians whose colours and channels leave images finite; where one cannot be, it is left out by the renderers.
+
+    Raises:
+        ValueError: a value that training does not come to.
+    """
+    gaussians = read_gaussians(path)
+    bounds = {"sh": LARGEST_COLOR} | {
+        name: LARGEST_LOG if name.startswith("log_") else LARGEST_COLOR for name in gaussians.channels
+    }
+    for name, most in bounds.items():
+        values = gaussians.tensors()[name]
+        broken = ~(values.abs() <= most)  # NaN is not.
+        if bool(broken.any()):
+            raise ValueError(f"{path} holds the value {values[broken][0]:g} of {name}; expected at most {most:g}")
+    return gaussians

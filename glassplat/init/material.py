@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -53,18 +53,24 @@ def mirror_labels(scene: Scene, views: Sequence[View]) -> tuple[int, ...]:
         scene: primary Gaussians after the first stage, with fitted planes and glass.
         views: training views; those without pane labels are passed over.
     """
-    annotated = [view for view in views if view.is_annotated]
-    pairs = [pane_pixels(scene, view) for view in annotated]
+    return mirrors_among(scene.planes.labels, [pane_pixels(scene, view) for view in views if view.is_annotated])
+
+
+def mirrors_among(labels: Sequence[int], pairs: Sequence[PanePixels]) -> tuple[int, ...]:
+    """Labels of the panes that are mirrors, by the `pane_pixels` of the annotated views."""
     found = []
-    for label in scene.planes.labels:
+    for label in labels:
         mirrored, photographed = (torch.cat([pair[label][side] for pair in pairs]) for side in (0, 1))
         if len(mirrored) >= FEWEST_PIXELS and likeness(mirrored, photographed).is_mirror:
             found.append(label)
     return tuple(found)
 
 
+PanePixels = Mapping[int, tuple[Tensor, Tensor]]
+
+
 @torch.no_grad()
-def pane_pixels(scene: Scene, view: View) -> dict[int, tuple[Tensor, Tensor]]:
+def pane_pixels(scene: Scene, view: View) -> PanePixels:
     """Mirrored and photographed colours [P, 3] of each pane's pixels in one view, by label, about their local means."""
     mirrored, coverage, _ = mirrored_image(scene, view.camera)
     photo = view.photo.to(mirrored.device).to(mirrored.dtype) / 255
@@ -98,23 +104,32 @@ def mirrored_image(scene: Scene, camera: Camera) -> MirroredImage:
 
 
 @torch.no_grad()
-def mirrored_coverage(scene: Scene, pane: Planes, cameras: Sequence[Camera]) -> float:
-    """Share of what a pane could mirror, over all views, that Gaussians cover; 1 where no view shows the pane."""
-    covered, whole = 0.0, 0
-    for camera in cameras:
-        mirrored = mirrored_image(replace(scene, planes=pane), camera)
-        covered += float(mirrored.coverage.sum())
-        whole += int(mirrored.seen.sum())
-    return covered / whole if whole else 1.0
+def mirrored_coverage(scene: Scene, pane: Planes, camera: Camera) -> tuple[float, int]:
+    """How much of what a pane could mirror in a view is covered by Gaussians, and how much it is; pixels."""
+    mirrored = mirrored_image(replace(scene, planes=pane), camera)
+    return float(mirrored.coverage.sum()), int(mirrored.seen.sum())
 
 
 def about_local_mean(image: Tensor, region: Tensor) -> Tensor:
     """An image [H, W, 3] minus its mean over the part of a square window that lies in the region [H, W]."""
-    side = 2 * max(round(WINDOW * image.shape[1] / 2), 1) + 1
+    reach = max(round(WINDOW * image.shape[1] / 2), 1)
     inside = region.to(image.dtype)[..., None]
-    stacked = torch.cat([image * inside, inside], dim=-1).permute(2, 0, 1)[None]
-    sums = torch.nn.functional.avg_pool2d(stacked, side, stride=1, padding=side // 2)[0].permute(1, 2, 0)
-    return image - sums[..., :3] / sums[..., 3:].clamp(min=1e-6)
+    sums = window_sums(torch.cat([image * inside, inside], dim=-1), reach)
+    return image - (sums[..., :3] / sums[..., 3:].clamp(min=1)).to(image.dtype)
+
+
+def window_sums(image: Tensor, reach: int) -> Tensor:
+    """[H, W, D] float64 sums over the square of pixels up to `reach` away, cut off at the image's border.
+
+    Differences of running sums, one axis after the other: as much work for a window of any size.
+    """
+    sums = image.double()
+    for axis in (0, 1):
+        running = torch.cat([torch.zeros_like(sums.narrow(axis, 0, 1)), sums.cumsum(axis)], dim=axis)
+        places = torch.arange(image.shape[axis], device=image.device)
+        after, before = (places + reach + 1).clamp(max=len(places)), (places - reach).clamp(min=0)
+        sums = running.index_select(axis, after) - running.index_select(axis, before)
+    return sums
 
 
 def likeness(mirrored: Tensor, photographed: Tensor) -> Likeness:

@@ -56,22 +56,20 @@ class Objective:
     Attributes:
         views: annotated views of the pane, at least two.
         points: [N, 3] points along its edge; there may be none.
-        weights: [N] positive weights.
         extent: radius of the capture in world units.
         distance: of a point from its plane at which its loss is one half, world units.
     """
 
     views: Sequence[PaneView]
     points: Array
-    weights: Array
     extent: float
     distance: float
 
     def support(self, planes: PlaneEquations) -> Array:
-        """[H] share of the points' weight near each plane; 0 where there are no points."""
+        """[H] share of the points near each plane; 0 where there are no points."""
         if not len(self.points):
             return np.zeros(len(planes))
-        return support(planes, self.points, self.weights, distance=self.distance)
+        return support(planes, self.points, distance=self.distance)
 
     def anchors(self, planes: PlaneEquations) -> Array:
         """[H, 3] a point near the middle of the pane on each plane."""
@@ -100,12 +98,12 @@ class Objective:
         each = 1 / np.maximum(known + unknown, 1)
         met = matches.residuals(planes.frames, tolerance).swapaxes(0, 1).reshape(hypotheses, -1)
         away = planes.planes.distances(self.points) / self.distance
-        shares = self.weights / max(self.weights.sum(), np.finfo(np.float64).tiny)
         frames = planes.frames[:, None] / (USUAL_FRAME * self.extent)
         residuals = (met, matches.turns / OUTLINE_TOLERANCE, away, frames)
-        weights = (each, OUTLINE_WEIGHT / matches.turns.shape[1], POINTS_WEIGHT * shares, FRAME_WEIGHT)
+        of_turns, of_points = OUTLINE_WEIGHT / matches.turns.shape[1], POINTS_WEIGHT / max(len(self.points), 1)
+        weights = (each, of_turns, of_points, FRAME_WEIGHT)
         spread = [
-            np.broadcast_to(np.reshape(weight, (len(each), 1) if weight is each else (1, -1)), block.shape)
+            np.broadcast_to(np.reshape(weight, (-1, 1)), block.shape)
             for weight, block in zip(weights, residuals, strict=True)
         ]
         return Terms(np.concatenate(residuals, axis=1), np.concatenate(spread, axis=1), unknown * each)

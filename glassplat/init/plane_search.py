@@ -58,7 +58,7 @@ def _hypotheses(objective: Objective, count: int, rng: np.random.Generator) -> F
     """The planes, of those drawn through points and masks, on which the masks agree best."""
     drawn = [planes_through_masks(objective.views, count, rng)]
     if len(objective.points) >= 3:
-        through = random_planes(objective.points, objective.weights, count, rng)
+        through = random_planes(objective.points, count, rng)
         drawn.append(through.select(np.argsort(-objective.support(through), kind="stable")[: count // 4]))
     usual = USUAL_FRAME * objective.extent
     planes = joined([FramedPlanes(part, np.full(len(part), usual)) for part in drawn])

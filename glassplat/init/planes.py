@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from glassplat.data.ranges import ESSENTIAL, InnerShare, PaneLabel, PositiveShare, Range, Seed, Share
 from glassplat.init.annotation import PaneView, pane_views, plane_candidates
 from glassplat.init.consistency import mask_agreement
 from glassplat.init.footprint import pane_rectangle
@@ -54,17 +56,17 @@ class PlaneFit:
         seed: of RANSAC.
     """
 
-    mirror_labels: tuple[int, ...] = ()
-    glass_reflectance: float = 0.2
-    mirror_reflectance: float = 0.999
-    band: float = 20 / 1200
-    inlier_distance: float = 0.01
-    hypotheses: int = 1000
-    refined: int = 4
-    most_views: int = 12
-    least_agreement: float = 0.5
-    margin: float = 1.08
-    seed: int = 0
+    mirror_labels: Annotated[tuple[PaneLabel, ...], ESSENTIAL] = ()
+    glass_reflectance: InnerShare = 0.2
+    mirror_reflectance: InnerShare = 0.999
+    band: PositiveShare = 20 / 1200
+    inlier_distance: PositiveShare = 0.01
+    hypotheses: Annotated[int, Range(1, 1_000_000)] = 1000
+    refined: Annotated[int, Range(1, 1000)] = 4
+    most_views: Annotated[int, Range(2, 1000)] = 12
+    least_agreement: Share = 0.5
+    margin: Annotated[float, Range(0.1, 10)] = 1.08
+    seed: Seed = 0
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,6 @@ def fit_planes(
     annotations: Sequence[tuple[Camera, Tensor]],
     *,
     extent: float,
-    weights: Tensor | None = None,
     labels: Sequence[int] | None = None,
     options: PlaneFit | None = None,
 ) -> Planes:
@@ -98,7 +99,6 @@ def fit_planes(
         centers: [N, 3] centres of the primary Gaussians, or SfM points.
         annotations: cameras and their label images [H, W]; 0 is no pane.
         extent: radius of the capture in world units.
-        weights: [N] how much each centre counts, such as its opacity; all the same if None.
         labels: the panes to fit; all that the masks name if None.
         options: how to fit; the defaults if None.
 
@@ -117,19 +117,14 @@ def fit_planes(
             f"none of the {len(annotations)} masks names a pane; expected pixels with labels 1, 2, ... in at least two"
         )
     points = centers.detach().cpu().double().numpy()
-    shares = np.ones(len(points)) if weights is None else weights.detach().cpu().double().numpy()
-    usable = np.isfinite(points).all(axis=1) & (shares > 0)
-    panes = [
-        _fit_pane(label, points[usable], shares[usable], annotations, extent=extent, options=options)
-        for label in labels
-    ]
+    usable = points[np.isfinite(points).all(axis=1)]
+    panes = [_fit_pane(label, usable, annotations, extent=extent, options=options) for label in labels]
     return _planes(panes, labels, options).to(centers.device)
 
 
 def _fit_pane(
     label: int,
     points: Array,
-    weights: Array,
     annotations: Sequence[tuple[Camera, Tensor]],
     *,
     extent: float,
@@ -146,7 +141,7 @@ def _fit_pane(
     _check_places(label, views, extent)
     _check_outline(label, views)
     chosen = plane_candidates(points, views, band=options.band)
-    objective = Objective(views, points[chosen], weights[chosen], extent, options.inlier_distance * extent)
+    objective = Objective(views, points[chosen], extent, options.inlier_distance * extent)
     rng = np.random.default_rng((options.seed, label))
     try:
         found = best_plane(objective, hypotheses=options.hypotheses, refine=options.refined, rng=rng)

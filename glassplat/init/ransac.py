@@ -69,16 +69,15 @@ def in_plane_axes(planes: PlaneEquations) -> tuple[Array, Array]:
     return first, np.cross(planes.normals, first)
 
 
-def random_planes(points: Array, weights: Array, count: int, rng: np.random.Generator) -> PlaneEquations:
+def random_planes(points: Array, count: int, rng: np.random.Generator) -> PlaneEquations:
     """Planes through random triplets of points [N, 3]; up to `count`, since flat triplets are dropped.
 
     Args:
         points: [N, 3] at least three positions.
-        weights: [N] how likely each point is drawn, not necessarily normalised.
         count: number of triplets.
         rng: source of randomness.
     """
-    a, b, c = points[rng.choice(len(points), size=(3, count), p=weights / weights.sum())]
+    a, b, c = points[(len(points) * rng.random((3, count))).astype(np.int64)]
     normals = np.cross(b - a, c - a)
     area = np.linalg.norm(normals, axis=1)
     # A triplet close to a line says nothing about the tilt of a plane around that line.
@@ -88,6 +87,7 @@ def random_planes(points: Array, weights: Array, count: int, rng: np.random.Gene
     return PlaneEquations(normals, np.einsum("hd,hd->h", normals, a[usable]))
 
 
-def support(planes: PlaneEquations, points: Array, weights: Array, *, distance: float) -> Array:
-    """[H] share of the points' weight within `distance` of each plane."""
-    return (np.abs(planes.distances(points)) <= distance) @ (weights / weights.sum())
+def support(planes: PlaneEquations, points: Array, *, distance: float) -> Array:
+    """[H] share of the points within `distance` of each plane."""
+    near: Array = (np.abs(planes.distances(points)) <= distance).mean(axis=1)
+    return near

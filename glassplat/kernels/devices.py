@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import functools
 import importlib
-import importlib.util
 import logging
 import os
 import warnings
 from typing import Any, Literal
 
 import torch
+
+from glassplat.kernels.cuda.toolchain import has_numba_cuda, install_hint, toolchain_problem
 
 log = logging.getLogger("glassplat.kernels")
 
@@ -39,8 +40,8 @@ def kernels_for(operation: str, device: torch.device) -> Any:
 
 @functools.cache
 def _module(operation: str, folder: str) -> Any:
-    if folder == "cuda" and not _has_numba_cuda():
-        raise CudaUnavailableError(_install())
+    if folder == "cuda" and not has_numba_cuda():
+        raise CudaUnavailableError(install_hint())
     return importlib.import_module(f"glassplat.kernels.{operation}.{folder}")
 
 
@@ -77,17 +78,7 @@ def cuda_problem() -> str | None:
             f"{reason.strip()}; `nvidia-smi` should list the GPU. Install or update the NVIDIA driver (CUDA "
             f"{torch.version.cuda} is needed) or use --device cpu"
         )
-    if not _has_numba_cuda():
-        return _install()
     major, minor = torch.cuda.get_device_capability()
     if (major, minor) < (7, 5):
         return f"the GPU has compute capability {major}.{minor}; 7.5 or newer is needed. Use --device cpu"
-    return None
-
-
-def _has_numba_cuda() -> bool:
-    return importlib.util.find_spec("numba_cuda") is not None
-
-
-def _install() -> str:
-    return "the CUDA kernels need numba-cuda; run `pip install 'glassplat[cuda]'` or use --device cpu"
+    return toolchain_problem()

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -9,7 +12,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from glassplat.data.dataset import View
+from glassplat.losses.term import LossFunction
 from glassplat.render.frame import Frame
+from glassplat.scene import transfer
 from glassplat.scene.scene import Scene
 
 
@@ -20,8 +25,7 @@ def mean_opacity(frame: Frame, view: View, scene: Scene) -> Tensor:
     does not show are left out, unlike in the papers: what few views show would fade in all the others. Mirror images
     do not count: what a pane shows at a tenth of its strength would fade as fast as what is seen directly.
     """
-    opacities = _direct(scene.primary.logit_opacities, frame).sigmoid()
-    return opacities.sum() / max(opacities.numel(), 1)
+    return _direct_mean(scene.primary.logit_opacities, torch.sigmoid, frame)
 
 
 def mean_scale(frame: Frame, view: View, scene: Scene) -> Tensor:
@@ -30,8 +34,12 @@ def mean_scale(frame: Frame, view: View, scene: Scene) -> Tensor:
     Those roots are the standard deviations. Divided by the scene extent, so that the weight does not depend on the
     capture's units. Differentiable in the raw scales. Of what the view shows directly, as `mean_opacity`.
     """
-    scales = _direct(scene.primary.log_scales, frame).exp()
-    return scales.sum() / max(scales.numel(), 1) / scene.extent
+    return _direct_mean(scene.primary.log_scales, torch.exp, frame) / scene.extent
+
+
+def of_all(term: LossFunction) -> LossFunction:
+    """A term of what the view shows directly, as one of all Gaussians."""
+    return lambda frame, view, scene: term(replace(frame, direct=None), view, scene)
 
 
 def view_dependence(frame: Frame, view: View, scene: Scene) -> Tensor:
@@ -44,9 +52,15 @@ def view_dependence(frame: Frame, view: View, scene: Scene) -> Tensor:
     return _SquaresBeyondFirst.apply(sh) / max(sh.shape[0], 1)
 
 
-def _direct(values: Tensor, frame: Frame) -> Tensor:
-    """The rows of `values` [N, ...] of the Gaussians that the frame shows directly; all if it does not say."""
-    return values if frame.direct is None else values[frame.direct]
+def _direct_mean(values: Tensor, activation: Callable[[Tensor], Tensor], frame: Frame) -> Tensor:
+    """Mean of the activated `values` [N, ...] of what the frame shows directly; of all if it does not say."""
+    if frame.direct is None or not transfer.waits(values.device):
+        chosen = activation(values if frame.direct is None else values[frame.direct])
+        return chosen.sum() / max(chosen.numel(), 1)
+    # How many there are, only the GPU knows: they are not gathered but all others left out.
+    shown = frame.direct.reshape(-1, *[1] * (values.dim() - 1))
+    total = torch.where(shown, activation(torch.where(shown, values, 0)), 0).sum()
+    return total / (frame.direct.sum() * math.prod(values.shape[1:])).clamp(min=1)
 
 
 class _SquaresBeyondFirst(torch.autograd.Function):
@@ -65,5 +79,5 @@ class _SquaresBeyondFirst(torch.autograd.Function):
     def backward(ctx: Any, v_total: Tensor) -> Tensor:
         (values,) = ctx.saved_tensors
         gradient = (2 * v_total) * values
-        gradient[:, 0] = 0
+        gradient[:, 0].zero_()
         return gradient

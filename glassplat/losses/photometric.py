@@ -10,6 +10,7 @@ from glassplat.data.dataset import View
 from glassplat.kernels.photometric import photometric
 from glassplat.render.frame import Frame
 from glassplat.scene.scene import Scene
+from glassplat.scene.transfer import moved
 
 
 @dataclass(frozen=True)
@@ -24,5 +25,5 @@ class PhotometricLoss:
 
     def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor:
         """The loss of a view; scalar."""
-        found = photometric(frame.rgb, view.photo.to(frame.rgb.device))
+        found = photometric(frame.rgb, moved(view.photo, frame.rgb.device))
         return (1 - self.ssim_weight) * found.l1 + self.ssim_weight * (1 - found.ssim)

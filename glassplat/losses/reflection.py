@@ -8,6 +8,7 @@ from glassplat.data.dataset import View
 from glassplat.kernels.gradient_conflict import gradient_conflict as shared_edges
 from glassplat.render.frame import Frame
 from glassplat.scene.scene import Scene
+from glassplat.scene.transfer import moved
 
 
 def gradient_conflict(frame: Frame, view: View, scene: Scene) -> Tensor:
@@ -25,7 +26,7 @@ def mask_loss(frame: Frame, view: View, scene: Scene) -> Tensor | None:
     """Reflection mask loss L_m (TR-Gaussians, Eq. 16), on annotated views only."""
     if view.pane_labels is None:
         return None
-    annotated = (view.pane_labels > 0).to(frame.rgb.device).to(frame.rgb.dtype)
+    annotated = moved(view.pane_labels > 0, frame.rgb.device).to(frame.rgb.dtype)
     return (frame.layers["mask"] - annotated).abs().mean()
 
 

@@ -32,10 +32,9 @@ def contributions(scene: Scene, camera: Camera) -> Tensor:
     # Colours do not matter here.
     primary, near = replace(detached(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
     most = _weight_sums(project_gaussians(primary, camera, near=near), camera)
-    hits = nearest_hits(scene.planes, camera)
-    if not hits.tiles.any():
+    seen = seen_panes(scene.planes, camera, nearest_hits(scene.planes, camera))
+    if seen is None:
         return most
-    seen = seen_panes(scene.planes, camera, hits)
     mirrored = project_mirrored(primary, camera, seen, near=near)
     return torch.maximum(most, _weight_sums(mirrored, camera, seen.tiles))
 

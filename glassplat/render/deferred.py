@@ -19,6 +19,7 @@ from glassplat.kernels.surface_channels import surface_channels
 from glassplat.render.frame import Frame
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
+    check_colored,
     joined_probe,
     joined_splats,
     mean_depth,
@@ -81,6 +82,11 @@ class Deferred:
         if self.environment:
             layers["environment"] = torch.sigmoid(cube_lookup(scene.environment.raw, view_directions(camera)))
         return Frame(rgb, layers, direct=shown(projected), screen=screen)
+
+    def check(self, scene: Scene) -> None:
+        """Raises ValueError where a scene lacks colours, or what reflection needs."""
+        check_colored(scene.primary)
+        check_reflective(scene)
 
     def _channels_of(self, gaussians: Gaussians, camera: Camera, projected: Projected) -> Tensor:
         """[N, D] what each Gaussian adds to the image: as `shade_environment` reads it, then depth, if asked for."""

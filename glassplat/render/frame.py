@@ -73,3 +73,11 @@ class Renderer(Protocol):
             probed: also prepare `Frame.screen`, the statistics of densification; they make the backward pass slower.
         """
         ...
+
+    def check(self, scene: Scene) -> None:
+        """Looks whether a scene that was read from files has all that this draws.
+
+        Raises:
+            ValueError: it lacks something; says what.
+        """
+        ...

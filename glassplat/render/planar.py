@@ -16,6 +16,7 @@ from glassplat.render.frame import Frame, ScreenPass
 from glassplat.render.glazing import Blend, Glazed, glazed, layer_slopes, own_masks, visibilities
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
+    check_colored,
     joined_probe,
     joined_splats,
     mean_depth,
@@ -25,6 +26,7 @@ from glassplat.render.rasterize import (
     shown,
 )
 from glassplat.render.seen_panes import SeenPanes, glass_owners, nearest_hits, seen_panes
+from glassplat.scene import transfer
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
@@ -84,6 +86,9 @@ class Planar:
         deviation: also compute the depth deviation where a pane is hit (Eq. 14), for training.
         deviation_depth_gradient: let the deviation's gradient pass through the mean depth D_t.
         blend: space in which Eqs. 1 and 13 hold: linear radiance, where light adds up, or sRGB as in the paper.
+        nearest_only: of panes that are seen through one another, show the nearest only, as the paper does.
+        tells_mirrored: whether the records of a probed frame tell mirror images from what is seen directly, and how
+            much is left of either; if not, all of them count alike.
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -93,6 +98,8 @@ class Planar:
     deviation: bool = False
     deviation_depth_gradient: bool = False
     blend: Blend = "linear"
+    nearest_only: bool = False
+    tells_mirrored: bool = True
 
     def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are."""
@@ -104,12 +111,12 @@ class Planar:
         layers["hit"] = hit
         if first.deviation is not None:
             layers["deviation"] = first.deviation
-        if not hits.tiles.any():
+        seen = seen_panes(scene.planes, camera, hits, first.mask, most=1 if self.nearest_only else None)
+        if seen is None:
             nothing = torch.zeros_like(hit)
             layers |= {"transmission": first.image, "reflection": torch.zeros_like(first.image)}
             layers |= {"strength": nothing, "share": nothing}
             return Frame(first.image, layers, direct=first.direct, screen=first.screen)
-        seen = seen_panes(scene.planes, camera, hits, first.mask)
         second = self._second_pass(scene, camera, seen, probed)
         masks = self._visibilities(scene, camera, seen, first)
         result = glazed(
@@ -123,8 +130,19 @@ class Planar:
             blend=self.blend,
         )
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
-        screen = weighted_screen(first, second, hits, result, self.blend) if probed else ()
+        screen = self._screen(first, second, hits, result) if probed else ()
         return Frame(result.rgb, layers, first.direct, second.mirrored, screen)
+
+    def check(self, scene: Scene) -> None:
+        """Raises ValueError where a scene lacks colours, or its panes what they need; there may be no panes."""
+        check_colored(scene.primary)
+        if len(scene.planes) and "log_intensity" not in scene.primary.channels:
+            raise ValueError(
+                f"the Gaussians have the channels {sorted(scene.primary.channels)}; expected log_intensity, as "
+                "`planar` trains it"
+            )
+        if "logit_mark" not in scene.glass.channels:
+            raise ValueError(f"the glass has the channels {sorted(scene.glass.channels)}; expected logit_mark")
 
     def _first_pass(self, scene: Scene, camera: Camera, probed: bool) -> FirstPass:
         near = NEAR_PER_EXTENT * scene.extent
@@ -171,11 +189,15 @@ class Planar:
         channels = torch.cat([projected.colors, intensity[..., None]], dim=-1)
         screen = (screen_pass("primary", projected, direct=False),) if probed else ()
         result = composite(splats, channels, bins, probe=joined_probe(screen))
-        reflections = result.image
-        if any(self.background):
-            colors = over_background(reflections[..., :3], result.alpha, self.background)
-            reflections = torch.cat([colors, reflections[..., 3:]], dim=-1)
+        # The background, too, is as bright in a pane as it is: with no intensity of its own it would be black there.
+        reflections = over_background(result.image, result.alpha, (*self.background, 1.0))
         return SecondPass(reflections, shown(projected), screen)
+
+    def _screen(self, first: FirstPass, second: SecondPass, hits: PaneHits, result: Glazed) -> tuple[ScreenPass, ...]:
+        """The records of both passes."""
+        if self.tells_mirrored:
+            return weighted_screen(first, second, hits, result, self.blend)
+        return (*first.screen, *(replace(record, direct=True) for record in second.screen))
 
     def _visibilities(self, scene: Scene, camera: Camera, seen: SeenPanes, first: FirstPass) -> list[Tensor]:
         """[H, W] for each of `seen.order`: how much of that pane is visible."""
@@ -203,7 +225,8 @@ def weighted_screen(
     pixels = rows.clamp(0, height - 1), columns.clamp(0, width - 1)
     behind = first.splats.depths[:, : primary.means2d.shape[1]] > hits.depth[pixels]
     primary = replace(primary, weight=torch.where(behind, through[pixels], 1.0))
-    weight = float(mirrored[hit].mean())
+    weight: float | Tensor
+    weight = mirrored.sum() / hit.sum().clamp(min=1) if transfer.waits(hit.device) else float(mirrored[hit].mean())
     return (primary, glass, *(replace(record, weight=weight) for record in second.screen))
 
 

@@ -12,6 +12,7 @@ from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians, Splat
 from glassplat.render.frame import ScreenPass
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.transfer import constant
 
 NEAR_PER_EXTENT = 0.01
 """Distance of the near plane as a share of the scene extent."""
@@ -74,14 +75,19 @@ def joined_probe(screen: Sequence[ScreenPass]) -> Tensor | None:
     return torch.cat([record.probe for record in screen], dim=1) if screen else None
 
 
-def over_background(image: Tensor, alpha: Tensor, background: tuple[float, float, float]) -> Tensor:
-    """Adds the light of a constant background [3] behind an image [..., 3] with coverage alpha [...]."""
+def over_background(image: Tensor, alpha: Tensor, background: tuple[float, ...]) -> Tensor:
+    """Adds a constant background [D] behind an image [..., D] with coverage alpha [...]."""
     if not any(background):
         return image
-    color = torch.tensor(background, dtype=image.dtype, device=image.device)
-    return image + (1 - alpha)[..., None] * color
+    return image + (1 - alpha)[..., None] * constant(tuple(background), image.dtype, image.device)
 
 
 def mean_depth(depth_sum: Tensor, alpha: Tensor) -> Tensor:
     """Blended depth (TR-Gaussians, Eq. 4): weighted depth sum over total weight; 0 where nothing is."""
     return torch.where(alpha > 1e-6, depth_sum / alpha.clamp(min=1e-6), 0)
+
+
+def check_colored(gaussians: Gaussians) -> None:
+    """Raises ValueError where a set that is seen has no colours."""
+    if gaussians.max_sh_degree < 0:
+        raise ValueError("the Gaussians have no colours; expected f_dc_0 to f_dc_2, as every trained splat has them")

@@ -12,6 +12,7 @@ from glassplat.kernels.panes import PaneHits, Panes
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
+from glassplat.scene.transfer import constant
 
 
 @dataclass(frozen=True)
@@ -53,31 +54,45 @@ def nearest_hits(
     return pane_hits(rectangles, camera.intrinsics, camera.width, camera.height, mask, beyond=beyond)
 
 
-def seen_panes(planes: Planes, camera: Camera, first: PaneHits, mask: Tensor | None = None) -> SeenPanes:
-    """All panes on the ray of each pixel; the planes keep their gradient.
+def seen_panes(
+    planes: Planes, camera: Camera, first: PaneHits, mask: Tensor | None = None, *, most: int | None = None
+) -> SeenPanes | None:
+    """The panes on the ray of each pixel, None where no tile shows any; the planes keep their gradient.
 
     Args:
         planes: the scene's.
         camera: of the view.
-        first: `nearest_hits` of these, of which some tile shows a pane.
+        first: `nearest_hits` of these.
         mask: [H, W] as given to `nearest_hits`.
+        most: how many of them on one ray, the nearest ones; all if None.
     """
-    hits = [first]
-    while len(hits) < len(planes):
+    hits, seen = [first], _shown(first)
+    if not any(seen):
+        return None
+    while len(hits) < (len(planes) if most is None else most):
         further = nearest_hits(planes, camera, mask, beyond=hits[-1])
-        if not further.tiles.any():
+        shown = _shown(further)
+        if not any(shown):
             break
         hits.append(further)
+        seen = [a or b for a, b in zip(seen, shown, strict=True)]
     tiles = torch.stack([h.tiles for h in hits]).any(dim=0)
     windows = first.windows if len(hits) == 1 else _joined_windows(hits)
-    seen = tiles.flatten(1).any(dim=1)
-    rows = seen.nonzero().flatten()
-    if len(rows) == len(planes):
+    positions = tuple(k for k, is_seen in enumerate(seen) if is_seen)
+    rows = constant(positions, torch.int64, tiles.device)
+    if len(positions) == len(planes):
         return SeenPanes(planes, rows, tuple(h.pane for h in hits), tiles, windows)
     # The last entry is for index -1, pixels without a pane.
-    position = torch.where(torch.cat([seen, seen.new_zeros(1)]), torch.cat([seen.cumsum(0) - 1, seen.new_ones(1)]), -1)
-    order = tuple(position[h.pane.long()].to(torch.int32) for h in hits)
-    return SeenPanes(planes.select(rows.tolist()), rows, order, tiles[seen], windows[seen])
+    found = (*(positions.index(k) if is_seen else -1 for k, is_seen in enumerate(seen)), -1)
+    position = constant(found, torch.int32, tiles.device)
+    order = tuple(position[h.pane.long()] for h in hits)
+    return SeenPanes(planes.select(positions), rows, order, tiles[rows], windows[rows])
+
+
+def _shown(hits: PaneHits) -> list[bool]:
+    """Which panes some tile shows. The one thing that the program asks of a GPU here, and waits for."""
+    found: list[bool] = hits.tiles.flatten(1).any(dim=1).tolist()
+    return found
 
 
 def _joined_windows(hits: list[PaneHits]) -> Tensor:

@@ -11,6 +11,7 @@ from glassplat.kernels.composite import composite
 from glassplat.render.frame import Frame
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
+    check_colored,
     joined_probe,
     joined_splats,
     mean_depth,
@@ -56,3 +57,7 @@ class Splat:
             layers["depth"] = mean_depth(image[..., 3], alpha)
         rgb = over_background(image[..., :3], alpha, self.background)
         return Frame(rgb, layers, direct=shown(projected), screen=screen)
+
+    def check(self, scene: Scene) -> None:
+        """Raises ValueError where the Gaussians have no colours."""
+        check_colored(scene.primary)

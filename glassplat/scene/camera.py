@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from glassplat.scene.transfer import constant, moved
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -31,7 +33,7 @@ class Camera:
     def intrinsics(self) -> Tensor:
         """[4] tensor (fx, fy, cx, cy)."""
         matrix = self.cam_from_world
-        return torch.tensor([self.fx, self.fy, self.cx, self.cy], dtype=matrix.dtype, device=matrix.device)
+        return constant((self.fx, self.fy, self.cx, self.cy), matrix.dtype, matrix.device)
 
     @property
     def center(self) -> Tensor:
@@ -40,7 +42,7 @@ class Camera:
 
     def to(self, device: torch.device | str) -> Camera:
         """The same camera on another device."""
-        pose = self.cam_from_world.to(device)
+        pose = moved(self.cam_from_world, device)
         return self if pose is self.cam_from_world else replace(self, cam_from_world=pose)
 
     def resized(self, width: int, height: int) -> Camera:

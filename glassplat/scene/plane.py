@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from glassplat.scene.transfer import constant
+
 TRAINABLE = ("centers", "raw_normals", "logit_reflectances")
 
 
@@ -59,7 +61,7 @@ class Planes:
         """[K] reflectance at normal incidence R0, in (0, 1)."""
         logits = self.logit_reflectances
         if self.mirrors:
-            fixed = torch.tensor([label in self.mirrors for label in self.labels], device=logits.device)
+            fixed = constant(tuple(label in self.mirrors for label in self.labels), torch.bool, logits.device)
             logits = torch.where(fixed, logits.detach(), logits)
         return torch.sigmoid(logits)
 
@@ -83,7 +85,8 @@ class Planes:
 
     def select(self, rows: Sequence[int]) -> Planes:
         """The planes at the given positions, in that order."""
-        chosen = {name: tensor[list(rows)] for name, tensor in self.tensors().items()}
+        index = constant(tuple(rows), torch.int64, self.centers.device)
+        chosen = {name: tensor[index] for name, tensor in self.tensors().items()}
         labels = tuple(self.labels[k] for k in rows)
         return Planes(**chosen, labels=labels, mirrors=tuple(label for label in self.mirrors if label in labels))
 

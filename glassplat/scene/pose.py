@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from glassplat.scene.transfer import constant
+
 
 def rotation_from_quat(quats: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of quaternions [..., 4] in `wxyz` order, normalised here."""
@@ -40,5 +42,5 @@ def mirror_matrices(centers: Tensor, normals: Tensor) -> Tensor:
     linear = torch.eye(3, dtype=normals.dtype, device=normals.device) - 2 * outer
     offset = 2 * (centers * normals).sum(-1, keepdim=True) * normals
     top = torch.cat([linear, offset[:, :, None]], dim=2)
-    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=normals.dtype, device=normals.device)
+    bottom = constant((0.0, 0.0, 0.0, 1.0), normals.dtype, normals.device)
     return torch.cat([top, bottom.expand(normals.shape[0], 1, 4)], dim=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import dataclass, replace
 
@@ -17,8 +16,10 @@ from glassplat.densify.order import in_morton_order
 from glassplat.densify.perturb import perturb_opacities
 from glassplat.render.contribution import contributions
 from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.sight import behind_panes
+from glassplat.train.messages import Working
 from glassplat.train.optimizer import Rate
-from glassplat.train.stage import Clock, Every
+from glassplat.train.stage import Clock, Every, Work
 from glassplat.train.state import TrainState
 
 MEGAPIXEL = 1e6
@@ -76,8 +77,10 @@ class Densify:
         return f"densify {self.part}"
 
     def due(self, clock: Clock) -> bool:
-        """Whether to act after this step; never more often than about once per pass over the views."""
-        least = max(self.densifier.interval, min(clock.views, 2 * self.densifier.interval))
+        """Whether to act after this step."""
+        least = self.densifier.interval
+        if self.densifier.whole_passes:
+            least = max(least, min(clock.views, 2 * least))
         return Every(0.0, self.densifier.start, self.densifier.stop, least).due(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
@@ -86,7 +89,7 @@ class Densify:
         gaussians = state.scene.gaussian_sets()[self.part]
         if statistics is None or len(gaussians) == 0:
             return False
-        factor = threshold_factor(dataset)
+        factor = threshold_factor(dataset) if self.densifier.adapt_to_size else 1.0
         densifier = replace(
             self.densifier,
             gradient_threshold=self.densifier.gradient_threshold * factor,
@@ -120,9 +123,12 @@ class PruneIdle:
         return self.densifier.least_contribution > 0 and clock.is_at(self.densifier.contribution_moments)
 
     @torch.no_grad()
-    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Edits `state`, if there is anything to edit."""
-        most = functools.reduce(torch.maximum, (contributions(state.scene, view.camera) for view in dataset.train))
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
+        """Edits `state`, if there is anything to edit, and tells how far it is."""
+        most = torch.zeros_like(state.scene.primary.logit_opacities)
+        for done, view in enumerate(dataset.train):
+            yield Working("looking for Gaussians that no view needs", done, len(dataset.train))
+            most = torch.maximum(most, contributions(state.scene, view.camera))
         busy = most >= self.densifier.least_contribution
         if bool(busy.all()):
             return False
@@ -183,11 +189,11 @@ class Relocate:
 class Explore:
     """Moves the primary Gaussians that a step's view shows at random, the transparent ones most (3DGS-MCMC).
 
-    The paper moves all of them in every step. Those that the view does not show have nothing to pull them back, and
-    what few views show would wander off.
+    The paper moves all of them in every step, as `densifier.reach` may ask for. Those that the view does not show have
+    nothing to pull them back, and what few views show would wander off.
 
     Attributes:
-        densifier: holds how strong the noise is.
+        densifier: holds how strong the noise is, and what it reaches.
         rate: learning rate of the positions, which the noise follows.
     """
 
@@ -199,7 +205,7 @@ class Explore:
         primary, extent = state.scene.primary, state.scene.extent
         rate = self.rate.at(clock.progress, 1.0, clock.iterations)
         offsets = self.densifier.noise(primary, rate=rate, extent=extent, generator=state.generator("explore"))
-        if visible is not None:
+        if visible is not None and self.densifier.reach == "shown":
             offsets *= visible[:, None]
         state.scene = replace(state.scene, primary=primary.with_tensors({"means": primary.means + offsets}))
 
@@ -231,19 +237,26 @@ class PerturbOpacity:
 
     when: Every
     amplitude: float = 0.4
+    bounds: tuple[float, float] = (0.01, 0.99)
     name: str = "perturb opacity"
 
     def due(self, clock: Clock) -> bool:
         """Whether to act after this step."""
         return self.amplitude > 0 and self.when.due(clock)
 
-    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Edits `state`, if there is anything to edit."""
-        perturbed, selected = perturb_opacities(
+    @torch.no_grad()
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
+        """Edits `state`, if there is anything to edit, and tells how far it is."""
+        means, planes = state.scene.primary.means, state.scene.planes
+        selected = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+        for done, view in enumerate(dataset.train):
+            yield Working("looking for what is seen through panes", done, len(dataset.train))
+            selected |= behind_panes(means, planes, [view.camera])
+        perturbed = perturb_opacities(
             state.scene.primary,
-            state.scene.planes,
-            [view.camera for view in dataset.train],
+            selected,
             amplitude=self.amplitude,
+            bounds=self.bounds,
             generator=state.generator(self.name),
         )
         state.scene = replace(state.scene, primary=perturbed)

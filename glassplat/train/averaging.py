@@ -34,7 +34,7 @@ class AverageLast:
             return
         parameters = state.scene.parameters()
         shapes, known = ({name: t.shape for name, t in tensors.items()} for tensors in (parameters, state.means))
-        if shapes != known:
+        if shapes != known or STEPS not in state.records:
             state.means = {name: tensor.detach().clone() for name, tensor in parameters.items()}
             state.records[STEPS] = 0
         state.records[STEPS] += 1

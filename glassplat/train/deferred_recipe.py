@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 
 from glassplat.data.dataset import Dataset
+from glassplat.data.ranges import (
+    ESSENTIAL,
+    Ascending,
+    Color,
+    Finite,
+    InnerShare,
+    LearningRate,
+    NotNegative,
+    Positive,
+    Range,
+    Several,
+    Share,
+    ShDegree,
+)
 from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
 from glassplat.densify.propagate import NormalPropagation
@@ -18,11 +33,14 @@ from glassplat.losses.term import LossTerm, weighted
 from glassplat.render.deferred import INVISIBLE, Deferred, Shading
 from glassplat.render.splat import Splat
 from glassplat.scene.activations import logit
+from glassplat.scene.gaussians import SH_ZERO
 from glassplat.scene.scene import Scene
+from glassplat.train.actions import Densify, ResetOpacity
 from glassplat.train.background import BLACK
 from glassplat.train.environment_entry import AddEnvironment
 from glassplat.train.optimizer import Rate
 from glassplat.train.propagation import (
+    DensifyWhilePropagating,
     GrowShAfterPropagation,
     Propagate,
     PropagationSchedule,
@@ -30,8 +48,12 @@ from glassplat.train.propagation import (
     ResetRaised,
 )
 from glassplat.train.splat_recipe import GaussianRates, image_terms
-from glassplat.train.stage import Every, Stage
+from glassplat.train.stage import Action, Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
+
+CODE_ITERATIONS = 61_000
+"""Length of the runs of the public code on synthetic scenes."""
+Texels = Annotated[int, Range(1, 2048)]
 
 
 @dataclass(frozen=True)
@@ -43,8 +65,8 @@ class ReflectionRates:
         environment: raw texels of the environment.
     """
 
-    strength: float = 2e-2
-    environment: float = 5e-2
+    strength: LearningRate = 2e-2
+    environment: LearningRate = 5e-2
 
     def of(self) -> dict[str, Rate]:
         """The rates by dotted parameter name."""
@@ -64,16 +86,22 @@ class DeferredRecipe:
         bootstrap: share of the run without reflection (paper: a few thousand iterations).
         texels: edge length of the environment's cube faces in the end.
         first_texels: edge length at the start.
-        refinements: shares of the run at which the edge length doubles, until it is `texels`.
+        refinements: shares of the run at which the edge length doubles for the first and for the last time on the way
+            from `first_texels` to `texels`; other doublings are spread evenly in between.
         first_strength: reflection strength of every Gaussian at the start.
-        region: only what lies in this sphere may reflect: centre and radius, world units. None finds the place that
-            the cameras stand around, if there is one.
+        region: only what lies in this sphere may reflect: centre and radius, world units. None leaves it to
+            `find_region`.
+        find_region: look for the place that the cameras stand around; if not, everything may reflect unless `region`
+            says otherwise, as in the paper.
         outside_weight: weight of the mean strength outside of the region in the objective.
         strength_weight: of the mean strength of all Gaussians in the objective, which the paper does not have: a matte
             thing would learn to reflect a little.
         consistency_weight: weight of the difference between normals and the slope of the depths, while normals spread.
         propagation: how normals spread and colours are sabotaged.
         schedule: when they do.
+        hurry_matte: raise the learning rates to those of `splat` until the first reset of opacities, and for the rest
+            of a run in which nothing was found that reflects.
+        propagation_interval: steps between densifications while normals spread; None keeps `densify.interval`.
         rates: learning rates of the Gaussians; they do not rise in short runs, which costs a mirror ball its normals
             (docs/experiments.md).
         reflection_rates: learning rates of strength and environment.
@@ -85,28 +113,64 @@ class DeferredRecipe:
 
     method: ClassVar[str] = "deferred"
 
-    sh_degree: int = 3
-    ssim_weight: float = 0.2
-    view_dependence_weight: float = 0.0
-    background: tuple[float, float, float] | None = None
+    sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
+    ssim_weight: Share = 0.2
+    view_dependence_weight: NotNegative = 0.0
+    background: Annotated[Color | None, ESSENTIAL] = None
     shading: Shading = "deferred"
-    bootstrap: float = 0.043
-    texels: int = 64
-    first_texels: int = 16
-    refinements: tuple[float, ...] = (0.45, 0.65)
-    first_strength: float = 1e-3
-    region: tuple[float, float, float, float] | None = None
-    outside_weight: float = 0.4
-    strength_weight: float = 0.005
-    consistency_weight: float = 0.3
+    bootstrap: Share = 0.043
+    texels: Annotated[Texels, ESSENTIAL] = 64
+    first_texels: Texels = 16
+    refinements: Annotated[tuple[Share, Share], Ascending()] = (0.45, 0.65)
+    first_strength: InnerShare = 1e-3
+    region: Annotated[tuple[Finite, Finite, Finite, Positive] | None, ESSENTIAL] = None
+    find_region: bool = True
+    outside_weight: NotNegative = 0.4
+    strength_weight: NotNegative = 0.005
+    consistency_weight: NotNegative = 0.3
     propagation: NormalPropagation = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
+    hurry_matte: bool = True
+    propagation_interval: Several | None = None
     rates: GaussianRates = field(default_factory=partial(GaussianRates, short_run_power=0.0))
     reflection_rates: ReflectionRates = field(default_factory=ReflectionRates)
     rhythm: Rhythm = field(default_factory=lambda: Rhythm(beat=0.0214, least=150))
-    strategy: Strategy = "default"
+    strategy: Annotated[Strategy, ESSENTIAL] = "default"
     densify: DefaultDensify = field(default_factory=DefaultDensify)
     mcmc: McmcDensify = field(default_factory=McmcDensify)
+
+    @classmethod
+    def paper(cls) -> DeferredRecipe:
+        """As published; where paper and public code disagree, with the constants of the code (docs/deferred.md)."""
+        published = DefaultDensify.published()
+        return cls(
+            bootstrap=3000 / CODE_ITERATIONS,
+            texels=128,
+            first_texels=128,
+            find_region=False,
+            strength_weight=0.0,
+            consistency_weight=0.0,
+            propagation=NormalPropagation(sabotage=0.4 * SH_ZERO),
+            schedule=PropagationSchedule(end="fixed", stop=24_000 / CODE_ITERATIONS, pause=200, last_reset=False),
+            hurry_matte=False,
+            propagation_interval=500,
+            rates=GaussianRates(decay=30_000 / CODE_ITERATIONS, short_run_power=0.0),
+            reflection_rates=ReflectionRates(strength=6e-3),
+            rhythm=Rhythm(
+                beat=1000 / CODE_ITERATIONS,
+                least=150,
+                reset_stop=29_000 / CODE_ITERATIONS,
+                sh=1000 / CODE_ITERATIONS,
+                averaged_passes=0.0,
+            ),
+            densify=replace(
+                published,
+                start=500 / CODE_ITERATIONS,
+                stop=30_000 / CODE_ITERATIONS,
+                prune_large_start=3000 / CODE_ITERATIONS,
+            ),
+            mcmc=McmcDensify.published(),
+        )
 
     def initialise(self, dataset: Dataset) -> Scene:
         """The first scene: one Gaussian per point that hardly reflects, and no environment yet."""
@@ -128,8 +192,7 @@ class DeferredRecipe:
             share=self.bootstrap,
             renderer=Splat(self.background or BLACK, depth=False),
             losses=(*image, *population.terms),
-            # No normal means anything yet that higher rates could spoil.
-            rates=replace(self.rates, short_run_power=GaussianRates().short_run_power).of("primary"),
+            rates=(self._hurried_rates() if self.hurry_matte else self.rates).of("primary"),
             actions=population.edits,
             motions=population.motions,
             densify_until=population.densify_until,
@@ -148,15 +211,15 @@ class DeferredRecipe:
             losses=(*image, *guidance, *population.terms),
             rates=self.rates.of("primary") | self.reflection_rates.of(),
             actions=(
-                *population.edits,
+                *self._edits(population),
                 # Before the resets: it looks at what is seen, also at the beats that it leaves to them.
                 Propagate(beat, self.propagation, self.schedule, renderer, matte_rates=self._matte_rates()),
                 GrowShAfterPropagation(Every(self.rhythm.sh)),
-                *(ResetRaised.instead_of(reset) for reset in population.resets),
-                RefineEnvironment(self.refinements, self.texels),
+                *self._resets(population),
+                RefineEnvironment(self._doublings(), self.texels),
             ),
             motions=population.motions,
-            entry=AddEnvironment(min(self.first_texels, self.texels), self.region),
+            entry=AddEnvironment(min(self.first_texels, self.texels), self.region, self.find_region),
             densify_until=population.densify_until,
         )
         refinement = replace(
@@ -169,8 +232,45 @@ class DeferredRecipe:
         )
         return bootstrap, reflection, refinement
 
+    def contradiction(self) -> str | None:
+        """What is wrong with the options together, if anything."""
+        if self.schedule.stop <= self.bootstrap:
+            return (
+                f"--schedule.stop is {self.schedule.stop} and --bootstrap {self.bootstrap}; normals spread in between, "
+                "so expected --schedule.stop to be larger"
+            )
+        return None
+
+    def _doublings(self) -> tuple[float, ...]:
+        """The shares of the run at which the environment's edge length doubles."""
+        count = max(math.ceil(math.log2(self.texels / self.first_texels)), 0)
+        first, last = self.refinements
+        return tuple(first + (last - first) * number / max(count - 1, 1) for number in range(count))
+
+    def _edits(self, population: Population) -> tuple[Action, ...]:
+        """What changes the number of Gaussians once they reflect."""
+        if self.propagation_interval is None or self.strategy == "mcmc":
+            return population.edits
+        slow = replace(self.densify, interval=self.propagation_interval)
+        return tuple(
+            DensifyWhilePropagating(slow, regular=edit) if isinstance(edit, Densify) else edit
+            for edit in population.edits
+        )
+
+    def _resets(self, population: Population) -> tuple[ResetOpacity, ...]:
+        """The resets during and after propagation."""
+        if not self.schedule.last_reset:
+            return population.resets
+        return tuple(ResetRaised.instead_of(reset) for reset in population.resets)
+
+    def _hurried_rates(self) -> GaussianRates:
+        """Those of `splat`, where no normal means anything that they would spoil."""
+        return replace(self.rates, short_run_power=GaussianRates().short_run_power)
+
     def _matte_rates(self) -> dict[str, Rate]:
         """What brings the learning rates to those of `splat`, where nothing reflects that higher ones would spoil."""
+        if not self.hurry_matte:
+            return {}
         missing = GaussianRates().short_run_power - self.rates.short_run_power
         return {
             name: Rate(1.0, short_run_power=missing)

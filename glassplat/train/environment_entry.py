@@ -16,15 +16,18 @@ class AddEnvironment:
 
     Attributes:
         texels: along the edge of a face.
-        region: centre and radius of the sphere that holds all that may reflect, world units; None finds the place that
-            the cameras stand around, if there is one.
+        region: centre and radius of the sphere that holds all that may reflect, world units; None for everywhere.
+        find_region: without a region, take the place that the cameras stand around, if there is one.
     """
 
     texels: int
     region: tuple[float, float, float, float] | None = None
+    find_region: bool = True
 
     def __call__(self, state: TrainState, dataset: Dataset) -> None:
         """Edits `state`."""
         environment = Environment.random(self.texels, generator=state.generator("environment"))
-        region = self.region or reflective_region([view.camera for view in dataset.train])
+        region = self.region
+        if region is None and self.find_region:
+            region = reflective_region([view.camera for view in dataset.train])
         state.scene = replace(state.scene, environment=replace(environment, region=region))

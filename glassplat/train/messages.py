@@ -7,6 +7,21 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
+class RunBegun:
+    """A run begins, or goes on from a checkpoint.
+
+    Attributes:
+        step: iterations done so far.
+        iterations: length of the whole run.
+        anew: it replaces one in the same folder that was begun and never saved.
+    """
+
+    step: int
+    iterations: int
+    anew: bool = False
+
+
+@dataclass(frozen=True)
 class StageEntered:
     """A stage begins."""
 
@@ -35,4 +50,26 @@ class ActionDone:
     counts: Mapping[str, int]
 
 
-Message = StageEntered | StepDone | ActionDone
+@dataclass(frozen=True)
+class Working:
+    """Something between two steps takes its time; the state is in the middle of a change and must not be saved.
+
+    Attributes:
+        what: is being done, as a gerund: "fitting planes".
+        done: parts that are finished.
+        total: parts in all.
+    """
+
+    what: str
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
+class CheckpointWritten:
+    """The run can go on from this step whatever happens."""
+
+    step: int
+
+
+Message = RunBegun | StageEntered | StepDone | ActionDone | Working | CheckpointWritten

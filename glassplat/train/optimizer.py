@@ -24,7 +24,8 @@ class Rate:
 
     Attributes:
         start: rate at the first iteration.
-        end: rate at the last one, reached exponentially; None keeps `start`.
+        end: rate that it decays to exponentially; None keeps `start`.
+        decay: share of the run at which `end` is reached.
         per_extent: multiply by the scene extent (for positions).
         rest: factor for every SH coefficient but the constant one; only for `sh`.
         short_run_power: a run of fewer iterations than the published 30,000 multiplies the rate by their ratio to this
@@ -34,6 +35,7 @@ class Rate:
 
     start: float
     end: float | None = None
+    decay: float = 1.0
     per_extent: bool = False
     rest: float | None = None
     short_run_power: float = 0.0
@@ -44,9 +46,10 @@ class Rate:
         scale = (PUBLISHED_ITERATIONS / length) ** self.short_run_power
         if self.per_extent:
             scale *= extent
-        if self.end is None:
+        if self.end is None or self.start == 0:
             return self.start * scale
-        return float(self.start ** (1 - progress) * self.end**progress * scale)
+        decayed = min(progress / self.decay, 1.0)
+        return float(self.start ** (1 - decayed) * self.end**decayed * scale)
 
 
 @dataclass
@@ -107,5 +110,5 @@ def rate_tensor(rate: Rate, parameter: Tensor, progress: float, extent: float, i
     if rate.rest is None:
         return value
     columns = torch.full(parameter.shape[1:], value * rate.rest, dtype=parameter.dtype, device=parameter.device)
-    columns[:1] = value
+    columns[:1].fill_(value)
     return columns.flatten()

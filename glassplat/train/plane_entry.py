@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 
 from torch import Tensor
@@ -10,13 +11,16 @@ from torch import Tensor
 from glassplat.data.dataset import Dataset
 from glassplat.densify.edit import append, apply_edit, keep
 from glassplat.init.glass import glass_gaussians
-from glassplat.init.material import mirror_labels, mirrored_coverage
+from glassplat.init.material import mirrored_coverage, mirrors_among, pane_pixels
 from glassplat.init.planes import PlaneFit, fit_planes, with_mirrors
 from glassplat.init.points import gaussians_from_points
 from glassplat.init.virtual_scene import virtual_points
 from glassplat.scene.camera import Camera
 from glassplat.scene.mirrored import mirrored_gaussians
 from glassplat.scene.plane import Planes
+from glassplat.scene.scene import Scene
+from glassplat.train.messages import Working
+from glassplat.train.stage import Work
 from glassplat.train.state import TrainState
 
 log = logging.getLogger("glassplat.train")
@@ -34,6 +38,8 @@ class PlaneEntry:
         glass_count: glass Gaussians on each pane.
         seed: of the glass Gaussians' places.
         detect_mirrors: tell mirrors from glass, unless `fit` names the mirrors.
+        fixed_mirrors: mirrors keep their reflectance, and what is behind them moves to their front; if not, they only
+            start at that reflectance.
         seed_reflections: start what no photograph shows directly from the virtual points behind the panes.
     """
 
@@ -41,30 +47,56 @@ class PlaneEntry:
     glass_count: int
     seed: int
     detect_mirrors: bool = True
+    fixed_mirrors: bool = True
     seed_reflections: bool = True
 
-    def __call__(self, state: TrainState, dataset: Dataset) -> None:
-        """Edits `state`."""
+    def __call__(self, state: TrainState, dataset: Dataset) -> Work:
+        """Edits `state`, and tells how far it is."""
+        yield Working("fitting planes to the masks", 0, 1)
         means, extent = state.scene.primary.means, state.scene.extent
         planes = fit_planes(means, annotations_of(dataset), extent=extent, options=self.fit)
         glass = glass_gaussians(planes, count=self.glass_count, seed=self.seed)
         scene = replace(state.scene, planes=planes, glass=glass)
         if self.detect_mirrors and not self.fit.mirror_labels:
-            found = mirror_labels(scene, dataset.train)
+            found = yield from mirrors_found(scene, dataset)
             log.info("mirrors among the panes: %s", ", ".join(map(str, found)) or "none")
             planes = with_mirrors(planes, found, self.fit.mirror_reflectance)
+        if not self.fixed_mirrors:
+            planes = replace(planes, mirrors=())
         state.scene = replace(scene, planes=planes)
         state.statistics.clear()
         for row, label in enumerate(planes.labels):
             if label in planes.mirrors:
+                yield Working(f"moving what was built behind mirror {label}", 0, 1)
                 turn_virtual_scene_round(state, dataset, planes.select([row]))
             elif self.seed_reflections:
-                seed_reflection(state, dataset, planes.select([row]))
+                yield from seed_reflection(state, dataset, planes.select([row]))
+        return True
 
 
 def annotations_of(dataset: Dataset) -> list[tuple[Camera, Tensor]]:
     """Cameras and pane labels [H, W] of the annotated training views."""
     return [(view.camera, view.pane_labels) for view in dataset.train if view.pane_labels is not None]
+
+
+def mirrors_found(scene: Scene, dataset: Dataset) -> Generator[Working, None, tuple[int, ...]]:
+    """Labels of the panes that look like mirrors in the annotated views."""
+    annotated = [view for view in dataset.train if view.is_annotated]
+    pairs = []
+    for done, view in enumerate(annotated):
+        yield Working("telling mirrors from glass", done, len(annotated))
+        pairs.append(pane_pixels(scene, view))
+    return mirrors_among(scene.planes.labels, pairs)
+
+
+def reflects_little(scene: Scene, pane: Planes, cameras: Sequence[Camera]) -> Work:
+    """Whether Gaussians cover hardly anything of what a pane could mirror; False where no view shows the pane."""
+    covered, whole = 0.0, 0
+    for done, camera in enumerate(cameras):
+        yield Working(f"looking for what pane {pane.labels[0]} reflects", done, len(cameras))
+        of_view, pixels = mirrored_coverage(scene, pane, camera)
+        covered, whole = covered + of_view, whole + pixels
+    return covered < LEAST_COVERAGE * whole
 
 
 def turn_virtual_scene_round(state: TrainState, dataset: Dataset, mirror: Planes) -> None:
@@ -80,7 +112,7 @@ def turn_virtual_scene_round(state: TrainState, dataset: Dataset, mirror: Planes
     log.info("%d Gaussians behind mirror %d moved to its front", int(virtual.sum()), mirror.labels[0])
 
 
-def seed_reflection(state: TrainState, dataset: Dataset, pane: Planes) -> None:
+def seed_reflection(state: TrainState, dataset: Dataset, pane: Planes) -> Work:
     """Adds the mirror images of the measured points behind a pane, if the pane has hardly anything to reflect.
 
     Structure from motion places points on reflected things where they seem to be, behind the pane. In a capture from
@@ -89,13 +121,13 @@ def seed_reflection(state: TrainState, dataset: Dataset, pane: Planes) -> None:
     """
     cameras = [view.camera for view in dataset.train]
     # The coverage is rendered over all views, so it comes last.
-    if not dataset.measured_points or mirrored_coverage(state.scene, pane, cameras) >= LEAST_COVERAGE:
-        return
+    if not dataset.measured_points or not (yield from reflects_little(state.scene, pane, cameras)):
+        return False
     points = dataset.points
     device = pane.centers.device
     virtual = virtual_points(points.positions.to(device), pane, cameras).cpu()
     if not bool(virtual.any()):
-        return
+        return False
     behind = replace(points, positions=points.positions[virtual], colors=points.colors[virtual])
     primary = state.scene.primary
     seeds = gaussians_from_points(behind, sh_degree=primary.max_sh_degree).to(device)
@@ -104,3 +136,4 @@ def seed_reflection(state: TrainState, dataset: Dataset, pane: Planes) -> None:
     primary, state.optimizer.moments = append(primary, state.optimizer.moments, seeds)
     state.scene = replace(state.scene, primary=primary)
     log.info("pane %d reflects what no photograph shows: %d points behind it mirrored", pane.labels[0], len(seeds))
+    return True

@@ -10,11 +10,12 @@ from typing import Literal
 import torch
 
 from glassplat.data.dataset import Dataset
+from glassplat.data.ranges import Count, Several, Share
 from glassplat.densify.propagate import NormalPropagation
 from glassplat.densify.reflectors import Search
 from glassplat.render.deferred import Deferred
 from glassplat.render.environment import resized
-from glassplat.train.actions import GrowSh, ResetOpacity
+from glassplat.train.actions import Densify, GrowSh, ResetOpacity
 from glassplat.train.optimizer import Rate
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
@@ -51,12 +52,15 @@ class PropagationSchedule:
         patience: beats without growth after which it counts as settled; a strength needs some hundred steps to be seen,
             however short the run. None is needed where nothing reflects nor looks as if it did.
         pause: steps for which raised opacities are held.
+        last_reset: after the end, reset opacities only if they have been raised since the last time; if not, regular
+            resets go on as if nothing had been propagated.
     """
 
     end: Literal["settled", "fixed"] = "settled"
-    stop: float = 0.75
-    patience: int = 5
-    pause: int = 100
+    stop: Share = 0.75
+    patience: Several = 5
+    pause: Count = 100
+    last_reset: bool = True
 
 
 @dataclass(frozen=True)
@@ -213,8 +217,28 @@ class ResetRaised(ResetOpacity):
 
 
 @dataclass(frozen=True)
+class DensifyWhilePropagating(Densify):
+    """Densifies at an interval of its own while normals are propagated, and as at any other time once that has ended.
+
+    Attributes:
+        regular: what densifies then.
+    """
+
+    regular: Densify = field(kw_only=True)
+
+    def due(self, clock: Clock) -> bool:
+        """Whether to act after this step, before or after the end."""
+        return super().due(clock) or self.regular.due(clock)
+
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`, if this is a moment of the interval that holds."""
+        turn: Densify = self.regular if has_ended(state) else Densify(self.densifier, self.part)
+        return turn.due(clock) and turn.apply(state, dataset, clock)
+
+
+@dataclass(frozen=True)
 class RefineEnvironment:
-    """Doubles the environment's texels at certain moments.
+    """Doubles the environment's texels at certain moments, twice where two fall on one step.
 
     A normal has a gradient only as far as the texels that its reflection meets reach. Large texels at first let normals
     find their way from farther off; small ones make the reflection sharp in the end.
@@ -238,7 +262,8 @@ class RefineEnvironment:
         environment = state.scene.environment
         if environment.size >= self.largest:
             return False
-        finer = resized(environment, min(2 * environment.size, self.largest))
+        doublings = sum(round(moment * clock.iterations) == clock.step for moment in self.moments)
+        finer = resized(environment, min(2**doublings * environment.size, self.largest))
         state.scene = replace(state.scene, environment=finer)
         return True
 

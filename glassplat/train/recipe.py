@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import types
-import typing
-from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from glassplat.data.dataset import Dataset
-from glassplat.data.errors import InputError
+from glassplat.data.errors import InputError, input_checked
+from glassplat.data.options import options_from_json, shown
 from glassplat.data.view import Rgb
+from glassplat.files.json_text import parse_json
 from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
 from glassplat.train.deferred_recipe import DeferredRecipe
@@ -46,7 +45,15 @@ class Recipe(Protocol):
         ...
 
 
+REMEDY = "Train again, or use the version that wrote it"
+Preset = Literal["glassplat", "paper"]
 RECIPES: dict[str, type] = {recipe.method: recipe for recipe in (SplatRecipe, PlanarRecipe, DeferredRecipe)}
+
+
+def recipe_of(method: str, preset: Preset = "glassplat") -> Any:
+    """The recipe of a method: as this project found it best, or as it was published."""
+    kind: Any = RECIPES[method]
+    return kind.paper() if preset == "paper" else kind()
 
 
 def recipe_to_json(recipe: Any) -> str:
@@ -54,43 +61,18 @@ def recipe_to_json(recipe: Any) -> str:
     return json.dumps({"method": recipe.method, **dataclasses.asdict(recipe)}, indent=2)
 
 
-def recipe_from_json(text: str) -> Any:
-    """The recipe that `recipe_to_json` wrote.
+def recipe_from_json(text: str, where: str = "the recipe") -> Any:
+    """The recipe that `recipe_to_json` wrote; `where` names the text in messages.
 
     Raises:
-        InputError: not a recipe, or written by a version with other fields.
+        InputError: not a recipe, or written by a version with other fields; says which value is wrong.
     """
+    with input_checked():
+        fields = parse_json(text, where)
+    method = fields.pop("method", None) if isinstance(fields, dict) else None
+    if not isinstance(method, str) or method not in RECIPES:
+        raise InputError(f"{where}: the method is {shown(method)}; expected one of {', '.join(RECIPES)}. {REMEDY}")
     try:
-        fields = json.loads(text)
-        method = fields.pop("method")
-        return built(RECIPES[method], fields)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"this is not a recipe this version can read ({error!r}); expected JSON with a method out of "
-            f"{sorted(RECIPES)} and that recipe's fields. Train again, or use the version that wrote it"
-        ) from error
-
-
-def built(kind: type, fields: Mapping[str, Any]) -> Any:
-    """An instance of a dataclass from plain fields, nested dataclasses included."""
-    hints = typing.get_type_hints(kind)
-    known = {field.name for field in dataclasses.fields(kind)}
-    unknown = set(fields) - known
-    if unknown:
-        raise KeyError(f"unknown fields {sorted(unknown)} of {kind.__name__}")
-    return kind(**{name: restored(hints[name], value) for name, value in fields.items()})
-
-
-def restored(hint: Any, value: Any) -> Any:
-    """One field's value in the type that its annotation names."""
-    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        return built(hint, value)
-    origin = typing.get_origin(hint)
-    if origin in (typing.Union, types.UnionType):
-        inner = next(option for option in typing.get_args(hint) if option is not type(None))
-        return None if value is None else restored(inner, value)
-    if origin is typing.Literal and value not in typing.get_args(hint):
-        raise ValueError(f"{value!r} where one of {typing.get_args(hint)} is expected")
-    if origin is tuple:
-        return tuple(value)
-    return value
+        return options_from_json(RECIPES[method], fields)
+    except InputError as error:
+        raise InputError(f"{where} is not one that this version can read: {error}. {REMEDY}") from error

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from glassplat.data.dataset import Dataset
-from glassplat.data.errors import InputError
+from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.data.masks import Polarity
+from glassplat.data.options import options_from_json
+from glassplat.data.ranges import Downscale, Seed, Several
 from glassplat.files.atomic import atomic_write
 from glassplat.files.cameras_json import write_cameras
 from glassplat.files.environment_image import write_equirect
+from glassplat.files.folders import make_folder
+from glassplat.files.json_text import parse_json, read_json
+from glassplat.files.reading import read_text
 from glassplat.files.scene_folder import read_scene, write_scene
 from glassplat.render.environment import equirect_from_environment
 from glassplat.scene.scene import Scene
@@ -34,11 +41,26 @@ class RunSettings:
     """
 
     data: str
-    iterations: int
-    downscale: float = 1.0
-    seed: int = 0
+    iterations: Several
+    downscale: Downscale = 1.0
+    seed: Seed = 0
     device: str = "cpu"
     mask_polarity: Polarity = "auto"
+
+
+FILES = (
+    "recipe.json",
+    "settings.json",
+    "log.jsonl",
+    "cameras.json",
+    "per_view.json",
+    "sheets",
+    "uses.png",
+    "index.html",
+)
+"""What a run writes beside its checkpoint, scene and metrics."""
+NUMBERED = re.compile(r"iteration_([0-9]{1,18})")
+"""The folder of a scene; people keep copies under other names beside it."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +70,7 @@ class RunDirectory:
     ```
     recipe.json  settings.json         what was run
     log.jsonl                          one line per logged step
+    train.lock                         held while a training writes here
     checkpoint.safetensors             to resume from
     cameras.json                       all cameras
     point_cloud/iteration_N/           point_cloud.ply, glass.ply, environment.safetensors, scene.json
@@ -73,16 +96,64 @@ class RunDirectory:
         """Where the metrics are."""
         return self.path / "results.json"
 
+    @property
+    def is_saved(self) -> bool:
+        """Whether there is something in it that took training to make."""
+        return any((self.path / name).exists() for name in (self.checkpoint.name, self.results.name, "point_cloud"))
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether a run was begun here, whatever has become of it."""
+        try:
+            self.recipe()
+        except InputError:
+            return False
+        return True
+
+    def check_vacant(self) -> None:
+        """Refuse to begin a run where something would be lost by it.
+
+        Raises:
+            InputError: the directory holds a run, or files of somebody else that have the names of a run's.
+        """
+        if self.checkpoint.exists():
+            raise InputError(
+                f"{self.path} already holds a run; pass --resume to go on with it, or choose another --output"
+            )
+        if self.is_saved:
+            raise InputError(f"{self.path} already holds a trained scene; choose another --output, or move it away")
+        found = [name for name in FILES if os.path.lexists(self.path / name)]
+        if found and not self.is_begun:
+            raise InputError(
+                f"{self.path} holds {first_names(found)}, which is not from a run of this version and would be "
+                "overwritten; choose another --output"
+            )
+
+    def check_saved(self) -> None:
+        """Refuse to go on with a run of which there is no checkpoint.
+
+        Raises:
+            InputError: there is none.
+        """
+        if self.checkpoint.is_file():
+            return
+        if self.is_saved:
+            raise InputError(
+                f"{self.path} holds a trained scene, but no {self.checkpoint.name} to go on from; train it again with "
+                "another --output"
+            )
+        raise InputError(f"nothing was saved yet in {self.path}; begin again without --resume")
+
     def begin(self, recipe: Any, settings: RunSettings, dataset: Dataset) -> None:
         """Creates the directory and records what is about to run."""
-        self.path.mkdir(parents=True, exist_ok=True)
+        make_folder(self.path)
         write_text(self.path / "recipe.json", recipe_to_json(recipe))
         write_text(self.path / "settings.json", json.dumps(dataclasses.asdict(settings), indent=2))
         write_cameras(self.path / "cameras.json", [(v.name, v.camera) for v in (*dataset.train, *dataset.test)])
 
     def recipe(self) -> Any:
         """The recorded recipe."""
-        return recipe_from_json(self._read("recipe.json"))
+        return recipe_from_json(self._read("recipe.json"), str(self.path / "recipe.json"))
 
     def was_begun_with(self, recipe: Any) -> bool:
         """Whether `begin` recorded just this recipe.
@@ -91,14 +162,24 @@ class RunDirectory:
         with which the run was not made.
         """
         written = self._read("recipe.json")
-        return recipe_from_json(written) == recipe and json.loads(written) == json.loads(recipe_to_json(recipe))
+        return self.recipe() == recipe and parse_json(written, "recipe.json") == json.loads(recipe_to_json(recipe))
 
     def settings(self) -> RunSettings:
         """The recorded settings."""
+        path = self.path / "settings.json"
+        with input_checked():
+            written = parse_json(self._read(path.name), str(path))
         try:
-            return RunSettings(**json.loads(self._read("settings.json")))
-        except (ValueError, TypeError) as error:
-            raise InputError(f"{self.path / 'settings.json'} cannot be read ({error}); train again") from error
+            return options_from_json(RunSettings, written)
+        except InputError as error:
+            raise InputError(f"{path} cannot be read: {error}; train again") from error
+
+    def photographs(self) -> set[str] | None:
+        """Names of the photographs that the run was begun with; None where that is not recorded legibly."""
+        try:
+            return {entry["img_name"] for entry in read_json(self.path / "cameras.json")}
+        except (OSError, ValueError, TypeError, KeyError):
+            return None
 
     def export(self, scene: Scene, step: int) -> Path:
         """Writes the scene in the formats that others read; returns its folder."""
@@ -111,7 +192,8 @@ class RunDirectory:
 
     def latest_scene(self) -> tuple[Scene, int]:
         """The exported scene of the highest iteration, and that iteration."""
-        folders = {int(f.name.rpartition("_")[2]): f for f in self.path.glob("point_cloud/iteration_*")}
+        named = {NUMBERED.fullmatch(folder.name): folder for folder in self.path.glob("point_cloud/*")}
+        folders = {int(match[1]): folder for match, folder in named.items() if match and folder.is_dir()}
         if not folders:
             raise InputError(
                 f"{self.path} holds no point_cloud/iteration_N; expected a finished run. Train first, or --resume it"
@@ -119,7 +201,7 @@ class RunDirectory:
         step = max(folders)
         try:
             return read_scene(folders[step]), step
-        except ValueError as error:
+        except (ValueError, FileNotFoundError) as error:
             raise InputError(f"the scene in {folders[step]} cannot be read: {error}") from error
 
     def _read(self, name: str) -> str:
@@ -128,7 +210,8 @@ class RunDirectory:
             raise InputError(
                 f"{self.path} is not a run directory: no {name} in it; expected what `glassplat train --output` wrote"
             )
-        return file.read_text(encoding="utf-8")
+        with input_checked():
+            return read_text(file)
 
 
 def write_text(path: Path, text: str) -> None:

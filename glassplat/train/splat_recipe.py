@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from glassplat.data.dataset import Dataset
+from glassplat.data.ranges import ESSENTIAL, Color, LearningRate, NotNegative, PositiveShare, Range, Share, ShDegree
 from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
 from glassplat.losses.parsimony import view_dependence
@@ -26,6 +27,7 @@ class GaussianRates:
 
     Attributes:
         means: position, per scene extent, at the start of the run; decays to `means_end`.
+        decay: share of the run at which it has done so.
         sh: constant SH coefficient; the others get a twentieth.
         opacity, scale, rotation: of the raw values.
         intensity: of the reflection intensity's logarithm.
@@ -34,20 +36,21 @@ class GaussianRates:
             (docs/experiments.md).
     """
 
-    means: float = 1.6e-4
-    means_end: float = 1.6e-6
-    sh: float = 2.5e-3
-    opacity: float = 5e-2
-    scale: float = 5e-3
-    rotation: float = 1e-3
-    intensity: float = 5e-3
-    short_run_power: float = 0.5
+    means: LearningRate = 1.6e-4
+    means_end: PositiveShare = 1.6e-6
+    decay: PositiveShare = 1.0
+    sh: LearningRate = 2.5e-3
+    opacity: LearningRate = 5e-2
+    scale: LearningRate = 5e-3
+    rotation: LearningRate = 1e-3
+    intensity: LearningRate = 5e-3
+    short_run_power: Annotated[float, Range(0, 2)] = 0.5
 
     def of(self, part: str) -> dict[str, Rate]:
         """The rates by dotted parameter name."""
         power = self.short_run_power
         return {
-            f"{part}.means": Rate(self.means, self.means_end, per_extent=True, short_run_power=power),
+            f"{part}.means": Rate(self.means, self.means_end, decay=self.decay, per_extent=True, short_run_power=power),
             f"{part}.sh": Rate(self.sh, rest=1 / 20, short_run_power=power),
             f"{part}.logit_opacities": Rate(self.opacity),
             f"{part}.log_scales": Rate(self.scale, short_run_power=power),
@@ -81,15 +84,25 @@ class SplatRecipe:
 
     method: ClassVar[str] = "splat"
 
-    sh_degree: int = 3
-    ssim_weight: float = 0.2
-    view_dependence_weight: float = 0.0
-    background: tuple[float, float, float] | None = None
+    sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
+    ssim_weight: Share = 0.2
+    view_dependence_weight: NotNegative = 0.0
+    background: Annotated[Color | None, ESSENTIAL] = None
     rates: GaussianRates = field(default_factory=GaussianRates)
     rhythm: Rhythm = field(default_factory=Rhythm)
-    strategy: Strategy = "default"
+    strategy: Annotated[Strategy, ESSENTIAL] = "default"
     densify: DefaultDensify = field(default_factory=DefaultDensify)
     mcmc: McmcDensify = field(default_factory=McmcDensify)
+
+    @classmethod
+    def paper(cls) -> SplatRecipe:
+        """As published: 3DGS, or 3DGS-MCMC with that strategy (docs/splat.md)."""
+        return cls(
+            rates=GaussianRates(short_run_power=0.0),
+            rhythm=Rhythm(averaged_passes=0.0),
+            densify=DefaultDensify.published(),
+            mcmc=McmcDensify.published(),
+        )
 
     def initialise(self, dataset: Dataset) -> Scene:
         """The first scene: one Gaussian per point."""

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import itertools
+import math
+from collections.abc import Generator, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
 from torch import Tensor
 
 from glassplat.data.dataset import Dataset
+from glassplat.data.errors import InputError
 from glassplat.losses.term import LossTerm
 from glassplat.render.frame import Renderer
+from glassplat.train.messages import Working
 from glassplat.train.optimizer import Rate
 from glassplat.train.state import TrainState
 
@@ -72,6 +76,18 @@ class Every:
         return not self.only_multiples_of or count % self.only_multiples_of == 0
 
 
+MOST_TRIED = 1000
+"""Lengths that are tried when one is looked for in which every stage has a step."""
+
+Work = Generator[Working, None, bool]
+"""An edit that tells how far it is, and whether there was anything to edit in the end."""
+
+
+def carried_out(edit: Work | bool | None) -> Work:
+    """Follows an edit of the state that may tell how far it is, as long ones do, or be done at once."""
+    return (yield from edit) if isinstance(edit, Generator) else bool(edit)
+
+
 class Action(Protocol):
     """An edit of the training state at certain moments (opacity reset, perturbation, SH growth)."""
 
@@ -84,8 +100,8 @@ class Action(Protocol):
         """Whether to act after this step."""
         ...
 
-    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Edits `state`; False where there was nothing to edit."""
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work | bool:
+        """Edits `state`; False where there was nothing to edit. What may take seconds tells how far it is."""
         ...
 
 
@@ -106,8 +122,8 @@ class Motion(Protocol):
 class Entry(Protocol):
     """Prepares the state when a stage begins (fitting planes, adding an environment)."""
 
-    def __call__(self, state: TrainState, dataset: Dataset) -> None:
-        """Edits `state`."""
+    def __call__(self, state: TrainState, dataset: Dataset) -> Work | None:
+        """Edits `state`; what may take seconds tells how far it is."""
         ...
 
 
@@ -146,3 +162,27 @@ def stage_starts(stages: tuple[Stage, ...], iterations: int) -> list[int]:
         starts.append(round(passed / total * iterations))
         passed += stage.share
     return [*starts, iterations]
+
+
+def check_length(stages: tuple[Stage, ...], iterations: int) -> None:
+    """Refuse a run in which a stage falls out, because it is too short or the stage has no share of it.
+
+    Raises:
+        InputError: names the stage, and how many iterations do.
+    """
+    missed = missed_stages(stages, iterations)
+    if not missed:
+        return
+    name, share = missed[0].name, missed[0].share / sum(stage.share for stage in stages)
+    if share <= 0:
+        raise InputError(f"the stage {name!r} has no share of the run, but begins with what the next ones need")
+    likely = itertools.islice(itertools.count(max(iterations, math.ceil(0.5 / share))), MOST_TRIED)
+    enough = next((length for length in likely if not missed_stages(stages, length)), math.ceil(2 / share))
+    raise InputError(f"{iterations} iterations leave no room for the stage {name!r}; expected at least {enough}")
+
+
+def missed_stages(stages: tuple[Stage, ...], iterations: int) -> list[Stage]:
+    """The stages without a single step; one without a share that begins with nothing is meant to have none."""
+    starts = stage_starts(stages, iterations)
+    spans = zip(stages, starts[:-1], starts[1:], strict=True)
+    return [stage for stage, start, end in spans if start >= end and (stage.share > 0 or stage.entry is not None)]

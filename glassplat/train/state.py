@@ -26,6 +26,7 @@ class TrainState:
         seconds: time spent training so far, over all sittings.
         records: numbers that an action keeps from one turn to the next, by name.
         means: running means of the parameters over the last steps of the run, see `AverageLast`.
+        method: the name of what is trained, so that a checkpoint tells whose it is; None where nobody said.
     """
 
     scene: Scene
@@ -36,6 +37,7 @@ class TrainState:
     seconds: float = 0.0
     records: dict[str, float] = field(default_factory=dict)
     means: dict[str, Tensor] = field(default_factory=dict)
+    method: str | None = None
 
     def generator(self, purpose: str) -> torch.Generator:
         """A random generator for one purpose at this step.

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 from glassplat.data.capture import PointCloud
+from glassplat.data.ranges import PositiveShare, Range, Several, Share
 from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
 from glassplat.init.points import gaussians_from_points
-from glassplat.losses.parsimony import mean_opacity, mean_scale
+from glassplat.losses.parsimony import mean_opacity, mean_scale, of_all
 from glassplat.losses.term import LossTerm, weighted
 from glassplat.scene.gaussians import Gaussians
 from glassplat.train.actions import Densify, Explore, PruneIdle, Relocate, ResetOpacity
@@ -38,11 +39,11 @@ class Rhythm:
             last step.
     """
 
-    beat: float = 1 / 30
-    least: int = 250
-    reset_stop: float = 0.45
-    sh: float = 1 / 30
-    averaged_passes: float = 1.0
+    beat: PositiveShare = 1 / 30
+    least: Several = 250
+    reset_stop: Share = 0.45
+    sh: PositiveShare = 1 / 30
+    averaged_passes: Annotated[float, Range(0, 1000)] = 1.0
 
 
 @dataclass(frozen=True)
@@ -102,12 +103,13 @@ def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
 
     The regularisers are those of TR-Gaussians, Eq. 20, which adds them to whatever the objective is otherwise. They
     act on what a step's view shows directly, and the noise on what it shows, also as mirror images. The papers' act on
-    everything, which hardly differs where every view shows most of the scene; what a few of many views show, such as a
-    room photographed all around, fades and wanders.
+    everything (`reach`), which hardly differs where every view shows most of the scene; what a few of many views show,
+    such as a room photographed all around, fades and wanders.
     """
+    everywhere = densifier.reach == "all"
     terms = weighted(
-        LossTerm("opacity", densifier.opacity_weight, mean_opacity),
-        LossTerm("scale", densifier.scale_weight, mean_scale),
+        LossTerm("opacity", densifier.opacity_weight, of_all(mean_opacity) if everywhere else mean_opacity),
+        LossTerm("scale", densifier.scale_weight, of_all(mean_scale) if everywhere else mean_scale),
     )
     return Population(
         opacity=densifier.initial_opacity,

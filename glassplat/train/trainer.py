@@ -15,12 +15,22 @@ from glassplat.render.frame import Frame, ScreenPass
 from glassplat.scene.scene import Scene
 from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
 from glassplat.train.optimizer import rate_tensor
-from glassplat.train.stage import Clock, Stage, stage_starts
+from glassplat.train.stage import Clock, Stage, carried_out, stage_starts
 from glassplat.train.state import TrainState
 
 
 class TrainingDivergedError(FloatingPointError):
     """A loss term became NaN or infinite."""
+
+
+class NoGaussiansError(TrainingDivergedError):
+    """There is nothing to train: no Gaussians, or none that a view shows."""
+
+
+WHERE_TO_LOOK = (
+    "Expected cameras that look at the points: check their poses and focal lengths, and whether the points are those "
+    "of this capture; photographs of a few pixels (--downscale) or high learning rates end like this too"
+)
 
 
 class Differentiated(NamedTuple):
@@ -38,8 +48,8 @@ class Differentiated(NamedTuple):
 def train(stages: tuple[Stage, ...], dataset: Dataset, state: TrainState, iterations: int) -> Iterator[Message]:
     """Trains until `iterations`, from wherever `state` stands.
 
-    `state` is edited in place and is consistent whenever a message is out, so a consumer may save it or
-    stop iterating at any message; training goes on later from a saved state with the same result.
+    `state` is edited in place and is consistent whenever `StepDone` or an `ActionDone` after it is out, so a consumer
+    may save it or stop iterating there; training goes on later from a saved state with the same result.
 
     Args:
         stages: the recipe's stages.
@@ -48,43 +58,96 @@ def train(stages: tuple[Stage, ...], dataset: Dataset, state: TrainState, iterat
         iterations: length of the whole run, over which all schedules stretch.
 
     Yields:
-        `StageEntered`, `StepDone` and `ActionDone` messages.
+        `StageEntered`, `StepDone`, `ActionDone` and `Working` messages.
 
     Raises:
         TrainingDivergedError: a loss is not finite; names the term, the step and the view.
+        NoGaussiansError: nothing is left, or nothing is in sight of any view.
     """
+    check_population(state)
+    sight = Sight(len(dataset.train))
     starts = stage_starts(stages, iterations)
     for stage, start, end in zip(stages, starts, starts[1:], strict=False):
         if state.step >= end:
             continue
         if state.step == start:
             if stage.entry is not None:
-                stage.entry(state, dataset)
+                yield from carried_out(stage.entry(state, dataset))
             yield StageEntered(state.step, stage.name, counts_of(state.scene))
         while state.step < end:
-            yield from advance(stage, dataset, state, iterations)
+            yield from advance(stage, dataset, state, iterations, sight)
 
 
-def advance(stage: Stage, dataset: Dataset, state: TrainState, iterations: int) -> Iterator[Message]:
+def advance(stage: Stage, dataset: Dataset, state: TrainState, iterations: int, sight: Sight) -> Iterator[Message]:
     """One optimisation step and the actions that are due after it."""
     view = scheduled_view(dataset, state)
     result = differentiate(stage, state.scene, view, probed=state.step < stage.densify_until * iterations)
-    for name, value in result.losses.items():
-        if not math.isfinite(value):
-            raise TrainingDivergedError(
-                f"loss term {name!r} is {value} at step {state.step + 1} in view {view.name!r}; expected a finite "
-                "number. Lower the learning rates, or look for broken poses or images near that view"
-            )
+    check_losses(result.losses, state.step + 1, view)
+    sight.note(result.visible, state.step)
     update(stage, state, result.gradients, iterations)
     collect_statistics(state, result.screen, view)
     state.step += 1
     clock = Clock(state.step, iterations, len(dataset.train))
     for motion in stage.motions:
         motion(state, clock, result.visible)
-    done = [action for action in stage.actions if action.due(clock) and action.apply(state, dataset, clock)]
+    done = []
+    for action in stage.actions:
+        if action.due(clock) and (yield from carried_out(action.apply(state, dataset, clock))):
+            done.append(action)
+    check_population(state)
     yield StepDone(state.step, view.name, sum(result.losses.values()), result.losses, counts_of(state.scene))
     for action in done:
         yield ActionDone(state.step, action.name, counts_of(state.scene))
+
+
+def check_losses(losses: Mapping[str, float], step: int, view: View) -> None:
+    """Ends training at the first loss that is not finite."""
+    for name, value in losses.items():
+        if not math.isfinite(value):
+            raise TrainingDivergedError(
+                f"loss term {name!r} is {value} at step {step} in view {view.name!r}; expected a finite number. Lower "
+                "the learning rates, or look for broken poses or images near that view"
+            )
+
+
+def check_population(state: TrainState) -> None:
+    """Ends training when there is nothing left to train."""
+    if not len(state.scene.primary):
+        raise NoGaussiansError(
+            f"no Gaussians are left after step {state.step}: all have become transparent, or lie where no view shows "
+            f"them. {WHERE_TO_LOOK}"
+        )
+
+
+class Sight:
+    """Whether the views show anything at all.
+
+    One view that shows no Gaussian learns nothing, and the run goes on; a whole pass of them is a broken capture. That
+    is asked once a pass, so that no step has to wait for a GPU's answer.
+    """
+
+    def __init__(self, views: int) -> None:
+        self._views, self._watched = views, 0
+        self._seen: Tensor | bool = False
+
+    def note(self, visible: Tensor | None, step: int) -> None:
+        """Notes what the view of a step showed.
+
+        Args:
+            visible: [N] bool, which primary Gaussians it showed; None if that is not known.
+            step: iterations done before it, from which follows where a pass begins.
+
+        Raises:
+            NoGaussiansError: no view of a whole pass showed any.
+        """
+        if step % self._views == 0:
+            self._watched, self._seen = 0, False
+        self._watched += 1
+        self._seen = self._seen | (True if visible is None else visible.any())
+        if self._watched == self._views and not bool(self._seen):
+            raise NoGaussiansError(
+                f"none of the {self._views} training views shows a Gaussian, up to step {step + 1}. {WHERE_TO_LOOK}"
+            )
 
 
 def scheduled_view(dataset: Dataset, state: TrainState) -> View:
@@ -108,7 +171,8 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Di
     learning = scene.with_parameters(leaves)
     frame = stage.renderer(learning, view.camera, probed=probed)
     terms = weighted_terms(stage, frame, view, learning)
-    total = torch.stack(list(terms.values())).sum()
+    stacked = torch.stack(list(terms.values()))
+    total = stacked.sum()
     tracked = [record for record in frame.screen if record.means2d.requires_grad and record.means2d.numel() > 0]
     centers, probes = [record.means2d for record in tracked], [record.probe for record in tracked]
     found = torch.autograd.grad(total, [*leaves.values(), *centers, *probes], allow_unused=True)
@@ -116,7 +180,7 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Di
     on_screen = found[len(leaves) :]
     pulls = zip(tracked, on_screen[: len(tracked)], on_screen[len(tracked) :], strict=True)
     screen = [(s, v_means, v_probe) for s, v_means, v_probe in pulls if v_means is not None and v_probe is not None]
-    losses = {name: float(value.detach()) for name, value in terms.items()}
+    losses = dict(zip(terms, stacked.tolist(), strict=True))
     return Differentiated(losses, gradients, screen, frame.visible)
 
 

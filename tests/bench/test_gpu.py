@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from bench import gpu
 from bench.gpu_roofline import Counts, Peaks, backward_demand, forward_demand
 from bench.gpu_training import beside_the_cpu
 from glassplat.kernels.devices import SIMULATED
@@ -78,3 +83,57 @@ def test_the_peak_is_measured_with_multiply_adds() -> None:
     (text,) = ptx_of(multiply_adds(np.float32), [(9, 0)])
     assert text.count("fma.rn.f32") >= CHAINS
     assert "mul.f32" not in text
+
+
+def test_a_part_that_fails_or_hangs_leaves_the_others(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    ran: list[list[str]] = []
+
+    def run(command: list[str], **options: object) -> subprocess.CompletedProcess[str]:
+        ran.append(command)
+        part = command[command.index("--part") + 1]
+        if part == "frames":
+            raise subprocess.TimeoutExpired(command, 1)
+        return subprocess.CompletedProcess(command, -11 if part == "parity" else 0)
+
+    monkeypatch.setattr(gpu.subprocess, "run", run)
+    monkeypatch.setattr(gpu, "cuda_problem", lambda: None)
+    monkeypatch.setattr(gpu.torch.cuda, "get_device_name", lambda: "A GPU")
+    monkeypatch.setattr(sys, "argv", ["bench.gpu", "--count", "1000"])
+    assert gpu.main() == 1
+    assert [command[4] for command in ran] == ["launch", "parity", "frames", "operations", "training"]
+    assert all(command[-2:] == ["--count", "1000"] for command in ran)
+    said = capfd.readouterr()
+    assert "parity: failed with status -11" in said.err
+    assert "frames: stopped after" in said.err
+    assert said.err.splitlines()[-1] == "failed: parity, frames"
+
+
+def test_all_parts_together_stay_below_ten_minutes() -> None:
+    assert set(gpu.LIMITS) == set(gpu.PARTS)
+    assert sum(gpu.LIMITS.values()) < 9 * 60
+
+
+ONLY_PYTORCH = """
+import sys
+for name in ("pycolmap", "OpenEXR", "tyro", "rich", "numba_cuda"):
+    sys.modules[name] = None
+import bench.gpu
+"""
+
+
+def test_the_command_itself_needs_pytorch_alone() -> None:
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    subprocess.run([sys.executable, "-c", ONLY_PYTORCH], cwd=ROOT, env=environment, check=True)
+
+
+def test_the_first_launch_is_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The optimiser's kernel of the CPU stands in for that of the GPU.
+    monkeypatch.setattr(torch, "ones", partial(made_on_the_cpu, torch.ones))
+    assert "launched" in gpu.launch(argparse.Namespace())
+
+
+def made_on_the_cpu(make: Callable[..., torch.Tensor], *size: int, device: str) -> torch.Tensor:
+    assert device == "cuda"
+    return make(*size)

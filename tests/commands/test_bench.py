@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 
 from glassplat.cli import main
 from glassplat.commands import bench
-from glassplat.commands.bench_runs import FinishedRun, PlannedRun, RunClock, in_words, scene_names
+from glassplat.commands.bench_runs import FinishedRun, PlannedRun, RunClock, scene_names
 from glassplat.commands.train import Train, TrainingProgress
 from glassplat.data.errors import InputError
 from glassplat.init.planes import PlaneFitError
@@ -86,7 +87,7 @@ def test_an_interrupted_bench_goes_on(
     assert bench_scenes(capture) == 130
     captured = capsys.readouterr()
     assert "stopped in run 2 of 2" in captured.out
-    assert "bench command, goes on" in " ".join(captured.err.split())
+    assert "repeat the command to go on" in " ".join(captured.err.split())
     output = capture.parent / "bench"
     assert [run["variant"] for run in json.loads((output / "scenes.json").read_text())["runs"]] == ["splat"]
     interrupted = output / "runs" / "tiny" / "planar-seed0"
@@ -98,6 +99,44 @@ def test_an_interrupted_bench_goes_on(
     after = written(output)
     assert {p: f for p, f in after.items() if "splat-seed0" in p} == {p: f for p, f in before.items() if "splat-" in p}
     assert len(json.loads((output / "scenes.json").read_text())["differences"]) == 1
+
+
+def rows_of(capture: Path) -> list[tuple[str, str]]:
+    contents = json.loads((capture.parent / "bench" / "scenes.json").read_text())
+    return [(row["scene"], row["title"]) for row in contents["means"]]
+
+
+def test_commands_for_one_scene_each_share_their_tables(capture: Path, tmp_path: Path) -> None:
+    other = write_tiny_capture(tmp_path / "other")
+    assert bench_scenes(capture, "--methods", "splat") == 0
+    assert bench_scenes(capture, "--data", str(other), "--methods", "splat") == 0
+    assert rows_of(capture) == [("other", "splat"), ("tiny", "splat")]
+    shutil.rmtree(other)
+    assert bench_scenes(capture, "--methods", "planar", "--seeds", "0") == 0
+    assert rows_of(capture) == [("tiny", "splat"), ("tiny", "planar"), ("other", "splat")]
+    table = (capture.parent / "bench" / "scenes.md").read_text()
+    assert "| tiny | planar - splat |" in table and "| other | splat |" in table
+
+
+def test_runs_that_cannot_stand_in_one_table_are_told_apart(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = write_tiny_capture(tmp_path / "other")
+    assert bench_scenes(capture, "--methods", "splat") == 0
+    before = (capture.parent / "bench" / "scenes.md").read_bytes()
+    for options in (("--iterations", "9"), ("--downscale", "2")):
+        assert bench_scenes(capture, "--data", str(other), "--methods", "splat", *options) == 2
+        assert "because one table holds both" in " ".join(capsys.readouterr().err.split())
+    assert (capture.parent / "bench" / "scenes.md").read_bytes() == before
+    assert not (capture.parent / "bench" / "runs" / "other").exists()
+
+
+def test_a_bench_too_short_for_a_method_ends_before_the_first_run(
+    capture: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert bench_scenes(capture, "--iterations", "5") == 2
+    assert "leave no room for the stage" in " ".join(capsys.readouterr().err.split())
+    assert not (capture.parent / "bench").exists()
 
 
 def test_another_run_in_the_way_is_not_overwritten(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -152,6 +191,9 @@ def test_the_ablation_tables_differences_to_the_full_method(capture: Path) -> No
     before = written(output)
     assert main([*arguments, "--switches", "fresnel", "mask"]) == 0
     assert written(output) == before
+    table = (output / "ablation.md").read_bytes()
+    assert main([*arguments, "--switches", "mask"]) == 0
+    assert written(output) == before and (output / "ablation.md").read_bytes() == table
 
 
 @pytest.mark.parametrize("method", sorted(ABLATIONS))
@@ -224,4 +266,14 @@ def test_the_time_left_is_judged_by_the_most_similar_runs() -> None:
     clock = RunClock(finished)
     assert clock.left([planned("room", "planar")]) == "about 5 min left"
     assert clock.left([planned("yard", "planar"), planned("hall", "splat")]) == "about 7 min left"
-    assert (in_words(20), in_words(90), in_words(5400)) == ("20 s", "2 min", "1 h 30 min")
+
+
+def test_the_recipes_of_the_papers_are_compared_by_name(capture: Path) -> None:
+    assert bench_scenes(capture, "--methods", "splat", "--presets", "glassplat", "paper") == 0
+    output = capture.parent / "bench"
+    contents = json.loads((output / "scenes.json").read_text())
+    runs = contents["runs"]
+    assert [row["title"] for row in contents["differences"]] == ["splat - splat-paper"]
+    assert [run["variant"] for run in runs] == ["splat", "splat-paper"]
+    recorded = [json.loads((Path(run["directory"]) / "recipe.json").read_text()) for run in runs]
+    assert [recipe["densify"]["split_by"] for recipe in recorded] == ["pull", "gradient"]

@@ -97,7 +97,9 @@ def test_bad_input_ends_with_one_message(tmp_path: Path, capsys: pytest.CaptureF
     empty = tmp_path / "empty"
     empty.mkdir()
     fails_with(["train", "splat", "--data", str(empty), *output], capsys, "error:", "Looked for")
-    fails_with(["train", "splat", "--data", str(SCENE), *output, "--iterations", "0"], capsys, "expected at least 1")
+    fails_with(
+        ["train", "splat", "--data", str(SCENE), *output, "--iterations", "0"], capsys, "--iterations is 0; expected"
+    )
     fails_with(["eval", str(empty)], capsys, "is not a run directory")
     assert not (tmp_path / "run").exists()
 
@@ -106,7 +108,9 @@ def test_planar_without_masks_says_what_to_annotate(tmp_path: Path, capsys: pyte
     capture = tmp_path / "capture"
     shutil.copytree(SCENE, capture, ignore=shutil.ignore_patterns("masks", "gt"))
     options = ["--output", str(tmp_path / "run"), "--downscale", "4", "--iterations", "20"]
-    fails_with(["train", "planar", "--data", str(capture), *options], capsys, "error:", "mask")
+    words = ("error:", "has no masks", "capture/masks", "`glassplat train splat` needs none")
+    fails_with(["train", "planar", "--data", str(capture), *options], capsys, *words)
+    assert not (tmp_path / "run").exists()
 
 
 def test_an_unknown_option_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
@@ -158,4 +162,4 @@ def test_a_full_gpu_is_explained(
     monkeypatch.setattr("glassplat.commands.train.run_training", full)
     assert train("splat", tmp_path / "run", "--iterations", "3") == 1
     said = " ".join(capsys.readouterr().err.split())
-    assert "CUDA out of memory; pass a larger --downscale" in said
+    assert "stopped: CUDA out of memory; " in said and "--downscale" in said and "--device cpu" in said

@@ -153,15 +153,32 @@ def test_cut_off_binary_file_is_named(capture, name: str, share: float) -> None:
     [
         ("cameras", "1 BANANA 32 24 1 2 3", "unknown camera model 'BANANA'"),
         ("cameras", "1 PINHOLE 32 24 30 30 16", "takes 4 parameters, got 3"),
-        ("cameras", "1 PINHOLE 32 24 0 30 16 12", "focal length > 0"),
+        ("cameras", "1 PINHOLE 32 24 0 30 16 12", r"expected a finite number from 0.032 to 3.2e\+06 instead of 0"),
         ("cameras", "1 PINHOLE 32 24 nan 30 16 12", "finite"),
-        ("cameras", "1 PINHOLE 0 24 30 30 16 12", "expected a positive size"),
+        ("cameras", "1 PINHOLE 0 24 30 30 16 12", "expected sides from 1 to 131072"),
+        ("cameras", "1 PINHOLE -200 24 30 30 16 12", "the camera is -200x24 pixels large"),
+        ("cameras", f"1 PINHOLE {10**30} 24 30 30 16 12", "the camera is hugex24 pixels large"),
+        ("cameras", f"1 PINHOLE {10**308} 24 30 30 16 12", "the camera is hugex24 pixels large"),
+        ("cameras", f"1 PINHOLE {10**400} 24 30 30 16 12", "the camera is hugex24 pixels large"),
+        ("cameras", "1 PINHOLE 32 24 1e300 30 16 12", r"instead of 1e\+300"),
+        ("cameras", "1 PINHOLE 32 24 1e-300 30 16 12", r"instead of 1e-300"),
+        ("cameras", "1 PINHOLE 32 24 30 30 1e308 12", r"instead of 1e\+308"),
+        ("cameras", "1 PINHOLE 32 24 30 30 16 12\n1 PINHOLE 32 24 40 40 16 12", "two cameras of one id"),
         ("cameras", "1 PINHOLE 32", r"cameras\.txt is cut off or damaged"),
         ("cameras", "2 PINHOLE 32 24 30 30 16 12", "camera is not in the COLMAP model"),
         ("images", "1 nan 0 0 0 1 2 3 1 0000.png\n", "rotation of 0000.png"),
         ("images", "1 2 0 0 0 1 2 3 1 0000.png\n", "expected a finite unit quaternion"),
         ("images", "1 1 0 0 0 inf 2 3 1 0000.png\n", "pose of 0000.png holds values that are not finite"),
+        ("images", "1 1e300 1e300 0 0 1 2 3 1 0000.png\n", "rotation of 0000.png"),
+        ("images", "1 1 0 0 0 1e300 2 3 1 0000.png\n", r"the pose of 0000.png holds the value 1e\+300"),
+        ("images", "", r"images\.txt registers no photograph"),
+        ("images", "1 1 0 0 0 1 2 3 1 0000.png\n2 1 0 0 0 1 2 3 1 0001.png", "line after 0000.png is no list of obser"),
         ("images", "1 1 0 0 0 1 2", r"images\.txt is cut off or damaged"),
+        ("points3D", f"1 0 0 0 {10**400} 2 3 0", r"points3D\.txt is cut off or damaged"),
+        ("points3D", "1 0 0 0 1 2 3 0\n2 0.5 0.5 0", r"points3D\.txt is cut off or damaged"),
+        ("points3D", "1 0 0 0 256 2 3 0", "colour value 256; expected 0 to 255"),
+        ("points3D", "1 0 0 0 1 2 -3 0", "colour value -3; expected 0 to 255"),
+        ("points3D", "1 1e38 0 0 1 2 3 0", r"no point of the capture is finite and within 1e\+12"),
         ("points3D", "1 0.5 0.5 zero 1 2 3 0", r"points3D\.txt is cut off or damaged"),
     ],
 )
@@ -176,7 +193,7 @@ def test_points_that_are_not_finite_are_left_out(capture) -> None:
     path.write_text(path.read_text() + "99 nan 0 0 1 2 3 0\n")
     data = load_dataset(capture.root)
     assert len(data.points) == len(capture.points)
-    assert any("1 points that are not finite" in warning for warning in data.warnings)
+    assert any("1 points that are not finite or beyond 1e+12" in warning for warning in data.warnings)
 
 
 def test_model_without_points_gets_random_ones(capture) -> None:
@@ -193,6 +210,33 @@ def test_photographs_reduced_after_calibration_rescale_the_camera(capture) -> No
     data = load_dataset(capture.root)
     assert (data.train[0].camera.width, data.train[0].camera.fx, data.train[0].camera.cx) == (16, 15.0, 8.0)
     assert any("scaled copies" in warning for warning in data.warnings)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 7), (9, 8)])
+def test_photographs_of_a_few_pixels_are_no_scaled_copies(capture, size: tuple[int, int]) -> None:
+    capture.write_colmap()
+    capture.size = size
+    capture.write_images()
+    with pytest.raises(InputError, match=rf"0000.png is {size[0]}x{size[1]} pixels large"):
+        load_dataset(capture.root)
+
+
+def test_a_text_model_may_come_from_another_system(capture) -> None:
+    folder = capture.write_colmap(binary=False)
+    before = load_dataset(capture.root)
+    for path in folder.glob("*.txt"):
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    after = load_dataset(capture.root)
+    assert [view.name for view in after.train] == [view.name for view in before.train]
+    assert torch.equal(after.points.positions, before.points.positions)
+
+
+def test_a_model_without_photographs_beside_masks_is_named(capture) -> None:
+    folder = capture.write_colmap()
+    capture.write_mask("masks/0001.png", np.ones((24, 32), dtype=np.uint8))
+    (folder / "images.bin").write_bytes(bytes(8))
+    with pytest.raises(InputError, match=r"images\.bin registers no photograph"):
+        load_dataset(capture.root)
 
 
 def test_photographs_of_another_aspect_are_refused(capture) -> None:

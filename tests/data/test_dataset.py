@@ -162,3 +162,8 @@ def test_view_in_memory(capture) -> None:
     assert view.pane_labels is labels
     assert view.is_annotated
     assert View.in_memory("rendered.png", camera, photo=photo).pane_labels is None
+
+
+def test_a_folder_whose_name_is_too_long_is_not_there() -> None:
+    with pytest.raises(FileNotFoundError, match="no folder"):
+        load_dataset("a" * 5000)

@@ -116,6 +116,58 @@ def test_colour_table_keeps_labels(capture) -> None:
     np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), INSIDE * 2)
 
 
+@pytest.mark.parametrize(
+    ("pixels", "message"),
+    [
+        (np.full((HEIGHT, WIDTH), np.nan, dtype=np.float32), "floating-point numbers"),
+        (INSIDE.astype(np.float32), "floating-point numbers"),
+        (INSIDE.astype(np.int32) * 300, "holds the value 300, which is neither a pane label"),
+        (INSIDE.astype(np.uint16) * 16000, "holds the value 16000, which is neither a pane label"),
+        (INSIDE.astype(np.int32) * -1, "values from -1 to 0"),
+        (INSIDE.astype(np.int32) * 10**6, "values from 0 to 1000000"),
+    ],
+)
+def test_values_that_are_neither_labels_nor_white_are_refused(capture, pixels: np.ndarray, message: str) -> None:
+    capture.write_colmap()
+    capture.write_mask("masks/0001.tif", pixels)
+    with pytest.raises(InputError, match=message) as caught:
+        load_dataset(capture.root)
+    assert "0001.tif" in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["masks", "masks/0001.png"])
+def test_a_link_to_nowhere_is_named(capture, name: str) -> None:
+    capture.write_colmap()
+    (capture.root / name).parent.mkdir(exist_ok=True)
+    (capture.root / name).symlink_to("/nowhere")
+    with pytest.raises(InputError, match=f"{name} is no f.* that can be read"):
+        load_dataset(capture.root)
+
+
+def test_a_mask_of_one_pixel_is_no_reduced_mask(capture) -> None:
+    capture.write_colmap()
+    capture.write_mask("masks/0001.png", np.ones((1, 1), dtype=np.uint8))
+    with pytest.raises(InputError, match="is 1x1 pixels large, its photograph 32x24"):
+        load_dataset(capture.root)
+
+
+def test_transparency_of_a_colour_table_says_nothing_about_panes(capture) -> None:
+    capture.write_colmap()
+    image = Image.new("P", (WIDTH, HEIGHT))
+    image.putpalette([0, 0, 0, 255, 255, 255])
+    image.paste(1, (8, 6, 20, 18))
+    (capture.root / "masks").mkdir()
+    image.save(capture.root / "masks" / "0001.png", transparency=bytes([0, 128]))
+    np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), INSIDE)
+
+
+@pytest.mark.parametrize("pixels", [INSIDE.astype(np.uint16) * 3, INSIDE.astype(np.uint16) * 3 * 257])
+def test_labels_may_be_stored_in_sixteen_bits(capture, pixels: np.ndarray) -> None:
+    capture.write_colmap()
+    capture.write_mask("masks/0001.png", pixels)
+    np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), INSIDE * 3)
+
+
 def test_soft_edges_are_cut_at_the_middle(capture) -> None:
     capture.write_colmap()
     soft = (INSIDE * 255).astype(np.uint8)

@@ -180,11 +180,30 @@ def test_missing_photographs_are_named(capture) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"fl_x": 0, "fl_y": 0}, "no focal length above zero"),
-        ({"fl_x": -5.0}, "focal length > 0"),
-        ({"w": float("inf")}, "intrinsics of 0000.png cannot be read"),
-        ({"fl_x": "wide"}, "intrinsics of 0000.png cannot be read"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model of 0000.png is 'EQUIRECTANGULAR'; expected one of"),
+        ({"fl_x": 0, "fl_y": 0}, "fl_x of the lens of 0000.png is 0; expected a finite number above 0"),
+        ({"fl_x": 0}, "fl_x of the lens of 0000.png is 0; expected a finite number above 0"),
+        ({"fl_x": 1e-300}, "the lens of 0000.png: .* expected a finite number from 0.032"),
+        ({"fl_x": 1e300}, "the lens of 0000.png: .* expected a finite number from 0.032"),
+        ({"fl_x": 10**400}, "fl_x of the lens of 0000.png is inf; expected a finite number above 0"),
+        ({"cx": 1e308}, r"the lens of 0000.png: .* instead of 1e\+308"),
+        ({"k1": 1e30}, r"the lens of 0000.png: .* instead of 1e\+30"),
+        ({"w": -200}, "w of the lens of 0000.png is -200; expected a finite number from 1 to 131072"),
+        ({"h": 1e30}, r"h of the lens of 0000.png is 1e\+30; expected a finite number from 1 to 131072"),
+        ({"is_fisheye": "false"}, "is_fisheye of the lens of 0000.png is 'false'; expected true or false"),
+        ({"train_filenames": 5}, r"train_filenames of .*transforms\.json is 5; expected a list of values"),
+        ({"train_filenames": [{}]}, r"entry 1 of train_filenames of .* is \{\}; expected a text"),
+        ({"test_filenames": ["a", 5]}, "entry 2 of test_filenames of .* is 5; expected a text"),
+        ({"ply_file_path": 3}, r"ply_file_path of .*transforms\.json is 3; expected a text"),
+        ({"frames": [3]}, r"frame 1 of .* is 3; expected an object with file_path, transform_matrix"),
+        ({"frames": [{"file_path": "/", "transform_matrix": [[0] * 4] * 4}]}, "1 of 1 photographs .* are missing"),
+        ({"frames": [{"file_path": "a" * 999, "transform_matrix": [[0] * 4] * 4}]}, "1 of 1 photographs .* missing"),
+        ({"fl_x": -5.0}, "fl_x of the lens of 0000.png is -5.0; expected a finite number above 0"),
+        ({"w": float("inf")}, "w of the lens of 0000.png is inf; expected"),
+        ({"fl_x": "wide"}, "fl_x of the lens of 0000.png is 'wide'; expected"),
+        (
+            {"camera_model": "EQUIRECTANGULAR"},
+            "camera_model of .* is 'EQUIRECTANGULAR'; expected one of",
+        ),
         ({"frames": []}, "lists no frames"),
         ({"frames": [{"transform_matrix": []}]}, "has no file_path"),
         ({"ply_file_path": "lost.ply"}, "ply_file_path names .*lost.ply, which does not exist"),
@@ -198,13 +217,16 @@ def test_settings_that_cannot_be_used(capture, change: dict[str, Any], message: 
 @pytest.mark.parametrize(
     ("matrix", "message"),
     [
-        (np.full((4, 4), np.nan), "values that are not finite"),
+        (np.full((4, 4), np.nan), "entry 1 of entry 1 of transform_matrix of frame 1 of .* is nan; expected a finite"),
+        ([*np.eye(4).tolist()[:3], [0, 0, 10**400, 1]], "entry 3 of entry 4 of .* is inf; expected"),
+        (np.eye(4) * 1e300, r"entry 1 of entry 1 of transform_matrix .* is 1e\+300; expected a finite number from"),
         (np.diag([2.0, 2, 2, 1]), "is not rigid"),
         (np.diag([1.0, 1, -1, 1]), "determinant -1"),
         (np.diag([1.0, 1, 1, 2]), "last row"),
-        (np.eye(2), "shape"),
-        (["a"], "no table of numbers"),
-        (None, "shape|not finite"),
+        (np.eye(2), r"entry 1 of transform_matrix .* is \[1.0, 0.0\]; expected a list of 4 values"),
+        (["a"], "entry 1 of transform_matrix .* is 'a'; expected a list of 4 values"),
+        (np.eye(4).tolist()[:2], r"shape \[2, 4\]"),
+        (None, "transform_matrix of frame 1 of .* is None; expected a list"),
     ],
 )
 def test_poses_that_cannot_be_used(capture, matrix: Any, message: str) -> None:
@@ -246,3 +268,17 @@ def test_distorted_photograph_is_undistorted(capture) -> None:
     view = load_dataset(capture.root).train[0]
     assert (view.camera.width, view.camera.height) == (pinhole.width, pinhole.height)
     assert tuple(view.photo.shape) == (pinhole.height, pinhole.width, 3)
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_points_that_are_a_link_to_nowhere_are_not_replaced_by_random_ones(capture, binary: bool) -> None:
+    capture.write_images()
+    capture.write_transforms({**LENS, "frames": capture.frames()})
+    (capture.root / "points3d.ply").symlink_to("/nowhere")
+    with pytest.raises(InputError, match=r"points3d\.ply is no file that can be read"):
+        load_dataset(capture.root)
+    points = capture.write_colmap(binary=binary) / f"points3D.{'bin' if binary else 'txt'}"
+    points.unlink()
+    points.mkdir()
+    with pytest.raises(InputError, match=r"points3D\.\w+ cannot be read \(it is a folder"):
+        load_dataset(capture.root)

@@ -79,7 +79,8 @@ def make_gaussians(count: int) -> Gaussians:
 
 def test_noise_is_uniform_on_the_activated_opacity_of_the_selected() -> None:
     gaussians = make_gaussians(20_000)
-    after, selected = perturb_opacities(gaussians, PANE, [FRONT], generator=torch.Generator().manual_seed(0))
+    selected = behind_panes(gaussians.means, PANE, [FRONT])
+    after = perturb_opacities(gaussians, selected, generator=torch.Generator().manual_seed(0))
     assert torch.equal(selected, torch.arange(20_000) % 2 == 0)
     noise = torch.sigmoid(after.logit_opacities)[selected] - 0.5
     assert noise.abs().max() <= 0.4 + 1e-6
@@ -91,9 +92,10 @@ def test_noise_is_uniform_on_the_activated_opacity_of_the_selected() -> None:
 def test_opacities_stay_within_bounds_and_finite() -> None:
     gaussians = make_gaussians(1000)
     extreme = gaussians.with_tensors({"logit_opacities": torch.linspace(-60, 60, 1000)})
-    after, selected = perturb_opacities(extreme, PANE, [FRONT], generator=torch.Generator().manual_seed(0))
+    selected = behind_panes(extreme.means, PANE, [FRONT])
+    after = perturb_opacities(extreme, selected, generator=torch.Generator().manual_seed(0))
     opacities = torch.sigmoid(after.logit_opacities)[selected]
     assert opacities.min() >= 0.01 - 1e-6
     assert opacities.max() <= 0.99 + 1e-6
-    again, _ = perturb_opacities(extreme, PANE, [FRONT], generator=torch.Generator().manual_seed(0))
+    again = perturb_opacities(extreme, selected, generator=torch.Generator().manual_seed(0))
     assert torch.equal(again.logit_opacities, after.logit_opacities)

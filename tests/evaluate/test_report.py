@@ -1,3 +1,4 @@
+import html
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -7,6 +8,14 @@ import torch
 
 from glassplat.evaluate.colormap import depth_colors, heat_colors, label_colors, normal_colors
 from glassplat.evaluate.evaluate import evaluate
+from glassplat.evaluate.metric_names import (
+    FACTS,
+    METRICS,
+    PLANE_COLUMNS,
+    SURFACE_FACTS,
+    SURFACE_METRICS,
+    written,
+)
 from glassplat.evaluate.report import Report, overview_page, sheet_names
 from glassplat.evaluate.sheet import BACKGROUND, CAPTION_HEIGHT, MARGIN, TITLE_HEIGHT, comparison_sheet
 from glassplat.evaluate.surface_truth import TrueSurface
@@ -154,6 +163,30 @@ def test_a_method_without_layers_is_reported_too(case, tmp_path: Path) -> None:
 def test_missing_values_are_dashes_with_their_reason() -> None:
     page = overview_page({"lpips": None, "lpips_reason": 'no "weights"'}, {}, {})
     assert '<div title="no &quot;weights&quot;"><b>-</b><span>LPIPS</span></div>' in page
+
+
+def test_the_page_says_why_a_number_is_missing_and_what_the_others_mean() -> None:
+    reason = "no weights in <folder>"
+    results = {"psnr": 30.0, "lpips": None, "lpips_reason": reason, "reflection_gain": 1.25, "planes": [{"label": 1}]}
+    page = overview_page(results, {}, {})
+    assert "Not measured: <b>LPIPS</b>: no weights in &lt;folder&gt;" in page
+    for name in ("psnr", "reflection_gain"):
+        metric = METRICS.get(name) or FACTS[name]
+        assert f"<dt>{metric.label}</dt><dd>{html.escape(metric.meaning)}</dd>" in page
+    assert "<dt>offset error, of the extent</dt><dd>distance of the true pane" in page
+    assert "<dt>normal error, reflective</dt>" not in page
+    assert "of the extent" not in overview_page(results | {"planes": []}, {}, {})
+    assert "Not measured" not in overview_page({"psnr": 30.0}, {}, {})
+
+
+def test_every_metric_is_written_with_its_unit_and_explained() -> None:
+    columns = METRICS | SURFACE_METRICS | FACTS | SURFACE_FACTS | PLANE_COLUMNS
+    assert all(column.label and len(column.meaning) > 10 for column in columns.values())
+    units = {"psnr": " dB", "seconds": " s", "frame": " s", "deg": "°", "offset_error": "%"}
+    for name, column in columns.items():
+        unit = next((unit for end, unit in units.items() if name.endswith(end)), "")
+        assert written(1, column.pattern).endswith(unit), name
+        assert written(None, column.pattern) == "-"
 
 
 def test_names_of_sheets_are_distinct() -> None:

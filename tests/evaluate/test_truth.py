@@ -60,6 +60,24 @@ def test_a_view_may_be_absent_but_not_incomplete(tmp_path: Path) -> None:
         truth.view("0008.jpg", 6, 2)
 
 
+def test_a_broken_layer_is_named(tmp_path: Path) -> None:
+    write_view(tmp_path, "0008", LABELS)
+    (tmp_path / "refl" / "0008.png").write_bytes(b"no image")
+    truth = load_truth(tmp_path)
+    assert truth is not None
+    with pytest.raises(InputError, match=r"cannot read .*refl.0008\.png as an image"):
+        truth.view("0008.jpg", 6, 2)
+
+
+def test_a_layer_may_be_grey(tmp_path: Path) -> None:
+    write_view(tmp_path, "0008", LABELS)
+    Image.fromarray(np.full((2, 6), 30, np.uint8)).save(tmp_path / "refl" / "0008.png")
+    truth = load_truth(tmp_path)
+    assert truth is not None
+    view = truth.view("0008.jpg", 6, 2)
+    assert view is not None and view.reflection.tolist() == np.full((2, 6, 3), 30).tolist()
+
+
 PLANE = {"label": 3, "center": [0, 1, 2], "normal": [0, 0, 1], "half_u": [1, 0, 0], "half_v": [0, 1, 0], "ior": 1.5}
 PLANE |= {"mirror": True, "base_reflectance": 1.0}
 
@@ -73,9 +91,19 @@ def test_planes_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", ["[{]", "[[1]]", json.dumps([{"label": 1}]), json.dumps([PLANE | {"normal": [0, 0, 0]}])]
+    ("content", "message"),
+    [
+        ("[{]", r"planes\.json is not valid JSON"),
+        ("[" * 10**5, r"planes\.json is nested more than"),
+        ("{}", r"planes\.json holds \{\}; expected a list with one object per plane"),
+        ("[[1]]", r"plane 1 in .*planes\.json is \[1\]; expected an object with label, center"),
+        (json.dumps([{"label": 1}]), "plane 1 in .* has no center; expected a list of 3 values"),
+        (json.dumps([PLANE | {"label": 1e30}]), r"label of plane 1 in .* is 1e\+30; expected a whole number"),
+        (json.dumps([PLANE | {"half_u": [0, 0, 10**400]}]), "entry 3 of half_u of plane 1 in .* is inf; expected"),
+        (json.dumps([PLANE | {"normal": [0, 0, 0]}]), "normal of plane 1 in .* has length 0; expected a direction"),
+    ],
 )
-def test_broken_planes_are_refused(tmp_path: Path, content: str) -> None:
+def test_broken_planes_are_refused(tmp_path: Path, content: str, message: str) -> None:
     (tmp_path / "planes.json").write_text(content)
-    with pytest.raises(InputError, match=r"cannot read .*planes\.json .*expected a list of planes with label, center"):
+    with pytest.raises(InputError, match=message):
         load_truth(tmp_path)

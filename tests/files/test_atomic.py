@@ -53,3 +53,10 @@ def test_follows_a_symbolic_link(tmp_path: Path) -> None:
         temporary.write_text("new")
     assert (tmp_path / "link.json").is_symlink()
     assert (tmp_path / "real.json").read_text() == "new"
+
+
+def test_a_name_may_be_as_long_as_names_may_be(tmp_path: Path) -> None:
+    target = tmp_path / f"{'x' * 251}.png"
+    with atomic_write(target) as temporary:
+        temporary.write_text("content")
+    assert target.read_text() == "content"

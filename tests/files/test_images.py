@@ -85,6 +85,46 @@ def test_header_of_absurd_size_is_named(tmp_path: Path) -> None:
         read_image(path)
 
 
+def test_an_image_too_large_to_decode_is_named_with_its_size(tmp_path: Path) -> None:
+    path = tmp_path / "a.bmp"
+    Image.new("RGB", (4, 3)).save(path)
+    content = bytearray(path.read_bytes())
+    content[18:26] = (12_000).to_bytes(4, "little") * 2
+    path.write_bytes(content)
+    for read in (image_size, read_image, is_transparent):
+        with pytest.raises(ValueError, match=r"a\.bmp as an image \(it is 12000x12000 .* at most 134 megapixels"):
+            read(path)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (np.full((3, 4), np.nan, dtype=np.float32), "floating-point numbers; expected colours"),
+        (np.full((3, 4), 10**6, dtype=np.int32), "values from 1000000 to 1000000; expected colours"),
+        (np.full((3, 4), -1, dtype=np.int32), "values from -1 to -1; expected colours"),
+    ],
+)
+def test_values_of_which_nothing_says_what_is_white_are_refused(
+    tmp_path: Path, values: np.ndarray, message: str
+) -> None:
+    Image.fromarray(values).save(tmp_path / "a.tif")
+    for read in (open_image, read_image, read_image_float):
+        with pytest.raises(ValueError, match=rf"a\.tif as an image \(it holds {message}"):
+            read(tmp_path / "a.tif")
+
+
+def test_a_program_in_an_image_is_not_run(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 4 3\nshowpage\n")
+    with pytest.raises(ValueError, match=r"a\.png as an image"):
+        read_image(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "YCbCr", "LAB", "I", "I;16"])
+def test_every_way_to_store_colours_is_read(tmp_path: Path, mode: str) -> None:
+    Image.new(mode, (5, 4)).save(tmp_path / "a.tif")
+    assert read_image(tmp_path / "a.tif").shape[:2] == read_image_float(tmp_path / "a.tif").shape[:2] == (4, 5)
+
+
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
 def test_cut_off_file_is_named(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a.{suffix}"

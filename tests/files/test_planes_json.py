@@ -77,13 +77,25 @@ def test_raw_values_may_be_left_out(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"center": [0, 1]}, r"center = \[0, 1\]; expected 3 finite numbers"),
-        ({"half_sizes": None}, "half_sizes = None; expected 2 finite numbers"),
-        ({"normal": [0, 0, 0]}, "normal of length 0"),
-        ({"label": "left"}, "label 'left'; expected a whole number"),
+        ({"center": [0, 1]}, r"center of plane 1 in .*planes\.json is \[0, 1\]; expected a list of 3 values"),
+        ({"center": [0, 1, 1e300]}, r"entry 3 of center of plane 1 in .* is 1e\+300; expected a finite number from"),
+        ({"center": [0, 1, 10**400]}, "entry 3 of center of plane 1 in .* is inf; expected a finite number"),
+        ({"center": [0, 1, math.nan]}, "entry 3 of center of plane 1 in .* is nan; expected a finite number"),
+        ({"half_sizes": None}, "plane 1 in .* has no half_sizes; expected a list of 2 values"),
+        ({"half_sizes": [-1, 1]}, "entry 1 of half_sizes of plane 1 in .* is -1; expected a finite number from 1e-09"),
+        ({"half_sizes": [0, 0]}, "entry 1 of half_sizes of plane 1 in .* is 0; expected a finite number from 1e-09"),
+        ({"half_sizes": [1, 1e300]}, r"entry 2 of half_sizes of plane 1 in .* is 1e\+300"),
+        ({"normal": [0, 0, 0]}, "normal of plane 1 in .* has length 0; expected a direction"),
+        ({"tangent": [0, 0, 0]}, "tangent of plane 1 in .* has length 0; expected a direction"),
+        ({"normal": [0, 2, 0], "tangent": [0, -1, 0]}, "tangent of plane 1 in .* lies along its normal"),
+        ({"label": "left"}, "label of plane 1 in .* is 'left'; expected a whole number from 1 to 255"),
+        ({"label": 1e30}, r"label of plane 1 in .* is 1e\+30; expected a whole number from 1 to 255"),
+        ({"label": True}, "label of plane 1 in .* is True; expected a whole number"),
         ({"label": 3}, "expected every label once"),
-        ({"mirror": "yes"}, "mirror = 'yes'; expected true or false"),
-        ({"base_reflectance": 1.5}, "base_reflectance = 1.5; expected a number from 0 to 1"),
+        ({"mirror": "yes"}, "mirror of plane 1 in .* is 'yes'; expected true or false"),
+        ({"base_reflectance": 1.5}, "base_reflectance of plane 1 in .* is 1.5; expected a finite number from 0 to 1"),
+        ({"logit_reflectance": "much"}, "logit_reflectance of plane 1 in .* is 'much'; expected a finite number"),
+        ({"raw_normal": [[0], 1, 2]}, r"entry 1 of raw_normal of plane 1 in .* is \[0\]; expected a finite number"),
     ],
 )
 def test_a_malformed_plane_is_named(tmp_path: Path, changes: dict[str, object], message: str) -> None:
@@ -98,6 +110,13 @@ def test_a_cut_off_file_is_refused(tmp_path: Path) -> None:
     text = (tmp_path / "planes.json").read_text()
     (tmp_path / "planes.json").write_text(text[: len(text) // 2])
     with pytest.raises(ValueError, match="not valid JSON"):
+        read_planes(tmp_path / "planes.json")
+
+
+@pytest.mark.parametrize("text", ["null", "{}", "3", '"planes"'])
+def test_anything_but_a_list_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "planes.json").write_text(text)
+    with pytest.raises(ValueError, match=r"planes\.json holds .*; expected a list with one object per plane"):
         read_planes(tmp_path / "planes.json")
 
 

@@ -165,6 +165,15 @@ def test_a_mesh_is_called_a_mesh(tmp_path: Path) -> None:
         (b"ply\nelement vertex 0\nend_header\n", "no 'format' line"),
         (b"ply\nformat ascii 1.0\nelement vertex -1\nend_header\n", "cannot read the line 'element vertex -1'"),
         (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty half x\nend_header\n", "cannot read the property line"),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty\nend_header\n",
+            "the property line 'property'",
+        ),
+        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list\nend_header\n", "cannot read the property line"),
+        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float\nend_header\n", "cannot read the property line"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 10000000\nend_header\n", "has no properties"),
+        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty uchar x\nend_header\n300\n", "'x' of .* is 300 somewhere"),
+        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty uchar x\nend_header\nnan\n", "'x' of .* is nan somewhere"),
         (b"ply\nformat ascii 1.0\nend_header\n", "has no element 'vertex'"),
         (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\nabc\n", "not a number"),
     ],
@@ -173,6 +182,13 @@ def test_a_damaged_file_ends_in_one_message(tmp_path: Path, content: bytes, mess
     (tmp_path / "a.ply").write_bytes(content)
     with pytest.raises(ValueError, match=message):
         read_gaussians(tmp_path / "a.ply")
+
+
+def test_numbers_beyond_single_precision_become_infinite(tmp_path: Path) -> None:
+    header = "ply\nformat ascii 1.0\nelement vertex 1\n"
+    header += "".join(f"property double {name}\n" for name in PLAIN) + "end_header\n"
+    (tmp_path / "a.ply").write_text(header + "1e300 -1e300 0 0 0 0 0 1 0 0 0\n")
+    assert read_gaussians(tmp_path / "a.ply").means.tolist() == [[float("inf"), -float("inf"), 0.0]]
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:

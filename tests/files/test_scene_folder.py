@@ -36,7 +36,7 @@ def test_a_scene_survives_bit_for_bit(tmp_path: Path, panes: bool, environment: 
 def test_a_damaged_environment_is_named(tmp_path: Path) -> None:
     write_scene(tmp_path, replace(in_single_precision(showcase()), environment=lit()))
     (tmp_path / "environment.safetensors").write_bytes(b"cut")
-    with pytest.raises(ValueError, match=r"environment\.safetensors is truncated or no environment"):
+    with pytest.raises(ValueError, match=r"environment\.safetensors is truncated or not an environment"):
         read_scene(tmp_path)
 
 
@@ -48,3 +48,18 @@ def test_an_exported_environment_can_be_looked_at(tmp_path: Path) -> None:
     assert torch.equal(RunDirectory(tmp_path).latest_scene()[0].environment.raw, scene.environment.raw)
     bare = RunDirectory(tmp_path).export(replace(scene, environment=Environment.empty()), step=8)
     assert not (bare / "environment.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value"),
+    [("point_cloud", "sh", torch.nan), ("point_cloud", "log_intensity", 100.0), ("glass", "logit_mark", torch.inf)],
+)
+def test_values_that_no_image_survives_are_named(tmp_path: Path, part: str, name: str, value: float) -> None:
+    scene = in_single_precision(showcase())
+    gaussians = scene.primary if part == "point_cloud" else scene.glass
+    broken = gaussians.tensors()[name].clone()
+    broken[1] = value
+    changed = gaussians.with_tensors({name: broken})
+    write_scene(tmp_path, replace(scene, **{"primary" if part == "point_cloud" else "glass": changed}))
+    with pytest.raises(ValueError, match=rf"{part}\.ply holds the value {value:g} of {name}; expected at most"):
+        read_scene(tmp_path)

@@ -38,7 +38,7 @@ def test_a_frame_explains_edges_that_do_not_meet() -> None:
 
 def test_refinement_measures_the_frame() -> None:
     views = pane_views(framed_scene_of(FRONT, HEIGHT, BEYOND), 1)
-    objective = Objective(views, np.zeros((0, 3)), np.zeros(0), 3.0, 0.03)
+    objective = Objective(views, np.zeros((0, 3)), 3.0, 0.03)
     start = FramedPlanes(PlaneEquations(TRUTH.normals, TRUTH.offsets + 0.01), np.array([0.06]))
     found = refined(start, objective, (0.01, 0.004))
     assert found.frames[0] == pytest.approx(HEIGHT, rel=0.15)
@@ -55,7 +55,7 @@ def upper(view: PaneView) -> np.ndarray:
 def test_doubt_is_small_where_all_sides_are_seen_and_large_where_one_is() -> None:
     views = pane_views(scene_of([FRONT]), 1)
     planes = FramedPlanes(TRUTH, np.zeros(1))
-    nothing = (np.zeros((0, 3)), np.zeros(0), 3.0, 0.03)
+    nothing = (np.zeros((0, 3)), 3.0, 0.03)
     assert doubt(planes, Objective(views, *nothing), 0.004)[0] < np.radians(1)
     level = [
         replace(view, edge=view.edge[sides], outward=view.outward[sides]) for view in views for sides in [upper(view)]

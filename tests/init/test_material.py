@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from glassplat.data.dataset import View
 from glassplat.init.glass import glass_gaussians
-from glassplat.init.material import about_local_mean, likeness, mirror_labels
+from glassplat.init.material import WINDOW, about_local_mean, likeness, mirror_labels, window_sums
 from glassplat.render.planar import Planar
 from glassplat.scene.scene import Scene
 from tests.render.tiny_scene import camera_at, in_single_precision, pane, showcase, shown_panes
@@ -65,3 +67,46 @@ def test_local_means_ignore_what_lies_outside_the_region() -> None:
     region[:, :15] = True
     image[:, 15:] = 100.0
     torch.testing.assert_close(about_local_mean(image, region)[region], torch.zeros(300, 3), atol=1e-6, rtol=0)
+
+
+def mean_by_pooling(image: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
+    """The definition: every window by itself."""
+    side = 2 * max(round(WINDOW * image.shape[1] / 2), 1) + 1
+    inside = region.to(image.dtype)[..., None]
+    stacked = torch.cat([image * inside, inside], dim=-1).permute(2, 0, 1)[None]
+    sums = torch.nn.functional.avg_pool2d(stacked, side, stride=1, padding=side // 2)[0].permute(1, 2, 0)
+    return sums[..., :3] / sums[..., 3:].clamp(min=1e-6)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (31, 48), (90, 7), (20, 200)])
+def test_local_means_are_those_of_every_window_by_itself(size: tuple[int, int]) -> None:
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(*size, 3, generator=generator)
+    region = torch.rand(size, generator=generator) < 0.3
+    expected = image - mean_by_pooling(image, region)
+    torch.testing.assert_close(about_local_mean(image, region), expected, atol=1e-6, rtol=0)
+
+
+def test_a_large_window_is_no_more_work_than_a_small_one() -> None:
+    """On photographs of 3000 pixels the window has 450 x 450 of them: summed one by one, hours for ten views."""
+
+    def work(reach: int) -> int:
+        with CountedElements() as counted:
+            window_sums(torch.ones(60, 400, 4), reach)
+        return counted.elements
+
+    assert work(1) == work(30) == work(350)
+
+
+class CountedElements(TorchDispatchMode):
+    """Counts the elements that all operations return; none of them may read more for each."""
+
+    elements = 0
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        assert "pool" not in func.name() and "conv" not in func.name(), "work that grows with the window"
+        result = func(*args, **(kwargs or {}))
+        self.elements += result.numel()
+        return result

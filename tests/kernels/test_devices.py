@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import tomllib
 import warnings
+from pathlib import Path
 
 import pytest
 import torch
 
 from glassplat.kernels import devices
+from glassplat.kernels.cuda import toolchain
 from glassplat.kernels.devices import CudaUnavailableError, chosen_device, cuda_problem, kernels_for
 
 
@@ -21,7 +24,9 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (9, 0))
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "A GPU")
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
-    monkeypatch.setattr(devices, "_has_numba_cuda", lambda: True)
+    for name, value in {"has_numba_cuda": True, "bindings_major": 13, "driver_version": 13000}.items():
+        monkeypatch.setattr(toolchain, name, lambda value=value: value)
+    monkeypatch.setattr(toolchain, "has_library", lambda name: True)
     return monkeypatch
 
 
@@ -61,7 +66,7 @@ def test_a_driver_that_is_too_old_is_explained(gpu: pytest.MonkeyPatch) -> None:
 
 
 def test_missing_kernels_are_explained(gpu: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    gpu.setattr(devices, "_has_numba_cuda", lambda: False)
+    gpu.setattr(toolchain, "has_numba_cuda", lambda: False)
     with pytest.raises(CudaUnavailableError, match=r"pip install 'glassplat\[cuda\]'"):
         chosen_device("cuda")
     with caplog.at_level(logging.INFO):
@@ -75,8 +80,63 @@ def test_a_gpu_that_is_too_old_is_explained(gpu: pytest.MonkeyPatch) -> None:
         chosen_device("cuda")
 
 
+@pytest.mark.parametrize("driver", [13000, 13040, 14010])
+def test_a_driver_of_the_compilers_version_or_newer_will_do(gpu: pytest.MonkeyPatch, driver: int) -> None:
+    gpu.setattr(toolchain, "driver_version", lambda: driver)
+    assert cuda_problem() is None
+
+
+def test_a_compiler_newer_than_the_driver_is_explained(
+    gpu: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    gpu.setattr(torch.version, "cuda", "12.8")
+    gpu.setattr(toolchain, "driver_version", lambda: 12040)
+    with pytest.raises(CudaUnavailableError, match=r"knows CUDA 12\.4, but the kernels' compiler is that of CUDA 13"):
+        chosen_device("cuda")
+    assert "pip install 'glassplat[cuda12]'" in str(cuda_problem())
+    with caplog.at_level(logging.INFO):
+        assert chosen_device("auto") == torch.device("cpu")
+    assert "the NVIDIA driver knows CUDA 12.4" in caplog.text
+    gpu.setattr(toolchain, "bindings_major", lambda: 12)
+    assert cuda_problem() is None
+
+
+@pytest.mark.parametrize(("major", "extra"), [(12, "glassplat[cuda12]"), (13, "glassplat[cuda]")])
+@pytest.mark.parametrize("absent", ["nvvm", "nvrtc"])
+def test_a_library_that_the_compiler_lacks_is_named(
+    gpu: pytest.MonkeyPatch, absent: str, major: int, extra: str
+) -> None:
+    gpu.setattr(toolchain, "bindings_major", lambda: major)
+    gpu.setattr(toolchain, "has_library", lambda name: name != absent)
+    problem = str(cuda_problem())
+    assert f"the kernels' compiler lacks lib{absent}; " in problem
+    assert f"pip install '{extra}'" in problem
+
+
+def test_missing_bindings_are_explained(gpu: pytest.MonkeyPatch) -> None:
+    gpu.setattr(toolchain, "bindings_major", lambda: None)
+    assert "not cuda-bindings" in str(cuda_problem())
+
+
+@pytest.mark.skipif(importlib.util.find_spec("numba_cuda") is None, reason="numba-cuda is not installed")
+def test_what_is_installed_is_seen() -> None:
+    assert toolchain.bindings_major() in (12, 13)
+    assert not toolchain.has_library("nvfatbin") or toolchain.has_library("nvvm")
+
+
+def test_the_extras_are_bounded_and_pair_each_pytorch_with_its_cuda() -> None:
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    extras = {name: " ".join(needs) for name, needs in project["optional-dependencies"].items()}
+    for extra, cuda in (("cuda", "cu13"), ("cuda12", "cu12")):
+        assert f"numba-cuda[{cuda}]>=0.30.2,<0.31" in extras[extra]
+        assert "cuda-core>=1.2,<2" in extras[extra]
+    # PyTorch 2.10 pins bindings of CUDA 12, with which the extra for CUDA 13 cannot be installed.
+    assert "torch>=2.11" in extras["cuda"]
+    assert "numba-cuda>=0.30.2,<0.31" in extras["dev"] and "cuda-core>=1.2,<2" in extras["dev"]
+
+
 def test_tensors_on_a_gpu_without_its_kernels_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(devices, "_has_numba_cuda", lambda: False)
+    monkeypatch.setattr(devices, "has_numba_cuda", lambda: False)
     devices._module.cache_clear()
     with pytest.raises(CudaUnavailableError, match="pip install"):
         kernels_for("adam", torch.device("cuda"))

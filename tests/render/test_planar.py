@@ -11,6 +11,7 @@ from glassplat.kernels.blend_panes.reference import REFLECTANCE
 from glassplat.kernels.color_space import linear_from_srgb
 from glassplat.kernels.maths.pane import LAWS
 from glassplat.kernels.panes import Fresnel
+from glassplat.render.glazing import Blend
 from glassplat.render.planar import Planar, detached
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
@@ -50,13 +51,14 @@ def test_the_reflection_shows_the_room_and_not_what_is_behind_the_pane() -> None
 
 
 @pytest.mark.parametrize("fresnel", ["pane", "none"])
-def test_zero_reflectance_is_splat_bit_for_bit(fresnel: Fresnel) -> None:
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0)])
+def test_zero_reflectance_is_splat_bit_for_bit(fresnel: Fresnel, background: tuple[float, float, float]) -> None:
     scene = in_single_precision(showcase())
     scene = replace(scene, planes=scene.planes.with_tensors({"logit_reflectances": torch.tensor([-200.0])}))
     camera = replace(CAMERA, cam_from_world=CAMERA.cam_from_world.float())
-    planar = Planar(fresnel=fresnel)(scene, camera)
-    assert torch.equal(planar.rgb, Splat()(scene, camera).rgb)
-    assert torch.equal(planar.layers["depth"], Splat()(scene, camera).layers["depth"])
+    planar, splat = Planar(background, fresnel=fresnel)(scene, camera), Splat(background)(scene, camera)
+    assert torch.equal(planar.rgb, splat.rgb)
+    assert torch.equal(planar.layers["depth"], splat.layers["depth"])
 
 
 def test_a_scene_without_planes_is_splat_bit_for_bit() -> None:
@@ -70,6 +72,33 @@ def test_a_perfect_mirror_hides_what_is_behind_it() -> None:
     expected = frame.layers["mask"][..., None] * frame.layers["reflection"]
     expected = expected + (1 - frame.layers["mask"][..., None]) * frame.layers["transmission"]
     torch.testing.assert_close(frame.rgb, expected)
+
+
+BACKGROUNDS = [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.2, 0.5, 0.0)]
+
+
+@pytest.mark.parametrize("blend", ["srgb", "linear"])
+@pytest.mark.parametrize("background", BACKGROUNDS)
+def test_a_pane_with_nothing_before_it_reflects_the_background(
+    background: tuple[float, float, float], blend: Blend
+) -> None:
+    scene = showcase()
+    bare = replace(scene, primary=scene.primary.select(scene.primary.means[:, 2] > 1.5))
+    layers = Planar(background, blend=blend)(bare, CAMERA).layers
+    reflection = layers["reflection"][layers["strength"] > 0]
+    assert len(reflection) > 100
+    torch.testing.assert_close(reflection, torch.tensor(background).double().expand_as(reflection), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("blend", ["srgb", "linear"])
+@pytest.mark.parametrize("background", BACKGROUNDS)
+def test_things_of_intensity_one_are_mirrored_as_they_are(background: tuple[float, float, float], blend: Blend) -> None:
+    scene = showcase()
+    plain = scene.primary.with_tensors({"log_intensity": torch.zeros_like(scene.primary.means[:, 0])})
+    scene = replace(scene, primary=plain)
+    with_intensity = Planar(background, blend=blend)(scene, CAMERA).rgb
+    without = Planar(background, blend=blend, intensity=False)(scene, CAMERA).rgb
+    torch.testing.assert_close(with_intensity, without, atol=1e-5, rtol=1e-5)
 
 
 def test_moving_everything_together_changes_nothing() -> None:

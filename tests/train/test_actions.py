@@ -12,6 +12,7 @@ from glassplat.train.actions import PruneIdle
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Clock
 from glassplat.train.state import TrainState
+from tests.train.progress_of import finished
 from tests.train.tiny_capture import tiny_capture
 
 
@@ -28,11 +29,11 @@ def state_with_one_out_of_sight() -> TrainState:
 def test_what_no_view_needs_is_removed_with_its_moments() -> None:
     state, action = state_with_one_out_of_sight(), PruneIdle(DefaultDensify(least_contribution=1e-3))
     before = state.scene.primary.means
-    assert action.apply(state, tiny_capture(), Clock(50, 100, 5))
+    assert finished(action.apply(state, tiny_capture(), Clock(50, 100, 5)))
     kept = state.optimizer.moments["primary.means"][0][:, 0].long()
     assert 0 < len(kept) < len(before) and 3 not in kept.tolist()
     assert torch.equal(state.scene.primary.means, before[kept])
-    assert not action.apply(state, tiny_capture(), Clock(80, 100, 5))
+    assert not finished(action.apply(state, tiny_capture(), Clock(80, 100, 5)))
 
 
 def test_idle_gaussians_are_looked_for_at_the_moments_that_were_asked_for() -> None:

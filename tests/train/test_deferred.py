@@ -21,7 +21,14 @@ from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.messages import ActionDone, Message, StepDone
 from glassplat.train.optimizer import Rate
-from glassplat.train.propagation import ENDED, RAISED, Propagate, PropagationSchedule, ResetRaised
+from glassplat.train.propagation import (
+    ENDED,
+    RAISED,
+    Propagate,
+    PropagationSchedule,
+    RefineEnvironment,
+    ResetRaised,
+)
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Clock, Every
@@ -35,7 +42,7 @@ RECIPE = DeferredRecipe(
     bootstrap=0.2,
     texels=4,
     first_texels=2,
-    refinements=(0.4, 0.6, 0.8),
+    refinements=(0.4, 0.6),
     region=(0.0, 0.0, 3.5, 1.0),
     rhythm=Rhythm(beat=0.1, least=2, sh=0.1),
     schedule=PropagationSchedule(end="fixed", stop=0.7, pause=2),
@@ -44,6 +51,14 @@ RECIPE = DeferredRecipe(
 
 def fresh_state(recipe: DeferredRecipe = RECIPE) -> TrainState:
     return TrainState(recipe.initialise(tiny_capture()), seed=0)
+
+
+def surrounded_state(recipe: DeferredRecipe) -> TrainState:
+    """As the second stage begins."""
+    state, entry = fresh_state(recipe), recipe.stages(seed=0)[1].entry
+    assert entry is not None
+    entry(state, tiny_capture())
+    return state
 
 
 def run(state: TrainState, recipe: DeferredRecipe = RECIPE, until: int | None = None) -> list[Message]:
@@ -84,7 +99,8 @@ def test_the_first_environment_depends_on_the_seed() -> None:
 def test_colours_turn_with_the_view_only_after_propagation() -> None:
     state, degrees = fresh_state(), {}
     for message in train(RECIPE.stages(seed=0), tiny_capture(), state, iterations=20):
-        degrees[message.step] = state.scene.primary.active_sh_degree
+        if isinstance(message, StepDone):
+            degrees[message.step] = state.scene.primary.active_sh_degree
     assert degrees[13] == 0 and degrees[20] == 1
 
 
@@ -291,9 +307,50 @@ def test_a_reset_leaves_the_steps_to_recover(iterations: int, end: Literal["sett
 def test_the_environment_is_refined_up_to_its_size() -> None:
     state, sizes = fresh_state(), {}
     for message in train(RECIPE.stages(seed=0), tiny_capture(), state, iterations=20):
-        sizes[message.step] = state.scene.environment.size
-    assert [sizes[step] for step in (4, 7, 8, 12, 20)] == [2, 2, 4, 4, 4]
+        if isinstance(message, StepDone):
+            sizes[message.step] = state.scene.environment.size
+    assert [sizes[step] for step in (4, 5, 7, 8, 12, 20)] == [0, 2, 2, 4, 4, 4]
     assert state.scene.environment.region == RECIPE.region
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "sizes"),
+    [
+        (16, 256, [16, 32, 64, 128, 256]),
+        (16, 64, [16, 32, 64]),
+        (16, 32, [16, 32]),
+        (16, 40, [16, 32, 40]),
+        (64, 64, [64]),
+        (64, 16, [16]),
+        (1, 1000, [1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000]),
+    ],
+)
+def test_the_environment_reaches_any_size_between_its_first_and_last_refinement(
+    first: int, last: int, sizes: list[int]
+) -> None:
+    recipe = DeferredRecipe(first_texels=first, texels=last)
+    state, reached = surrounded_state(recipe), {}
+    (action,) = [a for a in recipe.stages(seed=0)[1].actions if isinstance(a, RefineEnvironment)]
+    for step in range(1, 101):
+        clock = Clock(step, 100, views=6)
+        if action.due(clock):
+            action.apply(state, tiny_capture(), clock)
+        reached.setdefault(state.scene.environment.size, step)
+    assert list(reached) == sizes
+    assert len(sizes) == 1 or list(reached.values())[1] == 45
+    assert len(sizes) < 3 or list(reached.values())[-1] == 65
+
+
+@pytest.mark.parametrize("iterations", [1, 3, 10])
+def test_the_shortest_run_refines_its_environment_in_full(iterations: int) -> None:
+    recipe = DeferredRecipe(texels=256)
+    state = surrounded_state(recipe)
+    (action,) = [a for a in recipe.stages(seed=0)[1].actions if isinstance(a, RefineEnvironment)]
+    for step in range(iterations + 1):
+        clock = Clock(step, iterations, views=6)
+        if action.due(clock):
+            action.apply(state, tiny_capture(), clock)
+    assert state.scene.environment.size == 256
 
 
 @pytest.mark.parametrize("iterations", [20, 23, 7001])

@@ -12,6 +12,7 @@ from glassplat.scene.scene import Scene
 from glassplat.train.plane_entry import seed_reflection, turn_virtual_scene_round
 from glassplat.train.state import TrainState
 from tests.render.tiny_scene import in_single_precision, joined, pane, showcase
+from tests.train.progress_of import finished
 from tests.train.tiny_capture import tiny_capture, true_scene
 
 PANE = true_scene().planes
@@ -49,7 +50,7 @@ def test_a_capture_that_shows_the_room_needs_no_seeds() -> None:
     room = scene.primary.with_tensors({"logit_opacities": torch.full((len(scene.primary),), 6.0)})
     room = room.with_tensors({"log_scales": torch.full((len(room), 3), 0.5)})
     state = state_of(replace(scene, primary=room))
-    seed_reflection(state, tiny_capture(), PANE)
+    assert not finished(seed_reflection(state, tiny_capture(), PANE))
     assert len(state.scene.primary) == len(scene.primary)
 
 
@@ -57,7 +58,7 @@ def test_a_capture_from_the_front_gets_the_mirrored_points() -> None:
     scene = true_scene()
     case = scene.primary.select(scene.primary.means[:, 2] > 1.5)
     state = state_of(replace(scene, primary=case))
-    seed_reflection(state, tiny_capture(), PANE)
+    assert finished(seed_reflection(state, tiny_capture(), PANE))
     added = state.scene.primary.means[len(case) :]
     assert len(added) > 5
     assert bool((added[:, 2] < 2.0).all())

@@ -7,8 +7,14 @@ from typing import Any
 
 import pytest
 
+from glassplat.data.errors import InputError
+from glassplat.train.deferred_recipe import DeferredRecipe
+from glassplat.train.messages import Working
 from glassplat.train.optimizer import Rate
-from glassplat.train.stage import Clock, Every, stage_starts
+from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.splat_recipe import SplatRecipe
+from glassplat.train.stage import Clock, Every, Work, check_length, missed_stages, stage_starts
+from tests.train.progress_of import followed
 
 
 def moments(every: Every, iterations: int) -> list[int]:
@@ -51,3 +57,47 @@ def test_short_runs_raise_the_rates_that_say_so() -> None:
         assert rate.at(progress, 1.0, 7500) == pytest.approx(2 * rate.at(progress, 1.0, 30_000))
     assert rate.at(0.4, 1.0, 30_000) == rate.at(0.4, 1.0, 90_000) == Rate(1e-2, 1e-4).at(0.4, 1.0, 300)
     assert rate.at(0.4, 1.0, 300) == rate.at(0.4, 1.0, 3000)
+
+
+@pytest.mark.parametrize("recipe", [SplatRecipe(), PlanarRecipe(), DeferredRecipe()], ids=lambda recipe: recipe.method)
+def test_a_run_has_room_for_every_stage_from_the_length_that_is_asked_for(recipe: Any) -> None:
+    stages = recipe.stages(seed=0)
+    for iterations in range(1, 40):
+        if not missed_stages(stages, iterations):
+            check_length(stages, iterations)
+            continue
+        with pytest.raises(InputError, match=f"^{iterations} iterations leave no room") as caught:
+            check_length(stages, iterations)
+        least = int(str(caught.value).rpartition(" ")[2])
+        check_length(stages, least)
+        assert all(missed_stages(stages, shorter) for shorter in range(iterations, least))
+
+
+def test_a_stage_without_a_share_is_missed_only_for_what_it_begins_with() -> None:
+    def stages(entry: Any) -> Any:
+        shares = (0.5, 0.0, 0.5)
+        return tuple(SimpleNamespace(name=f"{k}", share=s, entry=k == 1 and entry) for k, s in enumerate(shares))
+
+    check_length(stages(None), 2)
+    with pytest.raises(InputError, match="the stage '1' has no share"):
+        check_length(stages(print), 2)
+
+
+def test_a_stage_with_hardly_any_share_is_not_looked_for_for_ever() -> None:
+    stages: Any = tuple(SimpleNamespace(name=f"{share}", share=share, entry=None) for share in (0.5, 1e-12, 0.5))
+    with pytest.raises(InputError, match="no room for the stage '1e-12'; expected at least") as caught:
+        check_length(stages, 1000)
+    assert int(str(caught.value).rpartition(" ")[2]) > 1e11
+
+
+def slow_edit(found: bool) -> Work:
+    yield Working("editing", 0, 2)
+    yield Working("editing", 1, 2)
+    return found
+
+
+@pytest.mark.parametrize("found", [True, False])
+def test_an_edit_tells_how_far_it_is_or_is_done_at_once(found: bool) -> None:
+    assert followed(slow_edit(found)) == ([Working("editing", 0, 2), Working("editing", 1, 2)], found)
+    assert followed(found) == ([], found)
+    assert followed(None) == ([], False)

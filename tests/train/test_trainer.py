@@ -20,6 +20,7 @@ from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Stage
 from glassplat.train.state import TrainState
 from glassplat.train.trainer import TrainingDivergedError, differentiate, train
+from tests.train.progress_of import finished
 from tests.train.tiny_capture import tiny_capture, true_scene
 
 
@@ -158,4 +159,4 @@ def test_plane_entry_needs_annotated_views() -> None:
     bare = replace(dataset, train=tuple(replace(view, read_pane_labels=None) for view in dataset.train))
     entry = PlaneEntry(PlanarRecipe().plane_fit, 10, 0)
     with pytest.raises(ValueError, match="mask"):
-        entry(TrainState(Scene(gaussians_from_points(dataset.points), dataset.extent), 0), bare)
+        finished(entry(TrainState(Scene(gaussians_from_points(dataset.points), dataset.extent), 0), bare))

@@ -22,7 +22,7 @@ def adam(
 ) -> None:  # fmt: skip
     """As `glassplat.kernels.adam.cpu.adam`."""
     parameter = flat[0]
-    rates, rate = parameter.new_empty(0), 0.0
+    rates, rate = None, 0.0
     if isinstance(lr, Tensor):
         rates = (lr.detach().to(parameter.device, torch.float64) * corrections[0]).to(parameter.dtype).contiguous()
     else:

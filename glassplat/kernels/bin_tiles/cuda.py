@@ -1,8 +1,10 @@
-"""Binning on the GPU: one pass over the splats to count their tiles, one over the pairs; torch scans and sorts.
+"""Binning on the GPU: one pass over the splats to count their tiles, one to list their rows of tiles, one over the
+pairs; torch scans and sorts.
 
 Splats are sorted by depth first. Their pairs are written in that order, so that one stable sort of the pairs by tile,
 an integer of 16 bits for all but very large images, leaves each tile's splats nearest first. Each pair has a thread,
-which searches the sums of the counts for its splat: no thread waits for one that covers the whole image.
+which searches the sums of the counts for its splat, then those of the splat's rows: no thread waits for one that covers
+the whole image. Only the passes over the splats compute in float64, which most GPUs do 32 or 64 times slower.
 """
 
 from __future__ import annotations
@@ -32,30 +34,49 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
     num_tiles = num_cameras * -(-height // TILE) * -(-width // TILE)
     shapes = (splats.means2d.view(count, 2), splats.conics.view(count, 3), splats.opacities.view(count))
     radii = splats.radii.view(count, 2)
-    mask = radii.new_zeros(0, 0, 0, dtype=torch.bool) if active_tiles is None else active_tiles
-    counts = torch.empty(count, dtype=torch.int32, device=device)
-    count_tiles(real)(blocks_for(count, THREADS), THREADS, *shapes, radii, mask, per_camera, width, height, counts)
-    splat_offsets = torch.zeros(count + 1, dtype=torch.int64, device=device)
-    torch.cumsum(counts, 0, out=splat_offsets[1:])
-    num_pairs = int(splat_offsets[-1])
+    counts = torch.empty(2, count, dtype=torch.int32, device=device)
+    count_tiles(real)(
+        blocks_for(count, THREADS), THREADS, *shapes, radii, active_tiles, per_camera, width, height, counts
+    )
+    offsets = torch.zeros(2, count + 1, dtype=torch.int64, device=device)
+    torch.cumsum(counts, 1, out=offsets[:, 1:])
+    splat_offsets, span_offsets = offsets
+    active, num_active = _active(active_tiles, num_tiles, device)
+    # The one thing that the program asks of the GPU, and waits for.
+    num_pairs, num_spans, num_active = torch.cat([offsets[:, -1], num_active]).tolist()
     check_pair_count(num_pairs)
+    spans = torch.empty(num_spans, 3, dtype=torch.int32, device=device)
+    list_spans(real)(
+        blocks_for(count, THREADS), THREADS, *shapes, radii, active_tiles, per_camera, width, height, span_offsets,
+        spans,
+    )  # fmt: skip
     narrow = num_tiles < np.iinfo(np.int16).max
     tiles = torch.empty(num_pairs, dtype=torch.int16 if narrow else torch.int32, device=device)
     members, slots = torch.empty(2, num_pairs, dtype=torch.int32, device=device)
-    emit_tiles(real, np.int16 if narrow else np.int32)(
-        blocks_for(num_pairs, THREADS), THREADS, *shapes, radii, mask, per_camera, width, height, num_tiles,
-        *_sequence(splats.depths, counts), splat_offsets, tiles, members, slots,
+    emit_tiles(np.int16 if narrow else np.int32)(
+        blocks_for(num_pairs, THREADS), THREADS, active_tiles, per_camera, -(-height // TILE), -(-width // TILE),
+        num_tiles, *_sequence(splats.depths, counts[0]), splat_offsets, span_offsets, spans, tiles, members, slots,
     )  # fmt: skip
     by_tile, order = torch.sort(tiles, stable=True)
     edges = torch.arange(num_tiles + 1, dtype=tiles.dtype, device=device)
     pair_slots = torch.empty_like(slots)
     pair_slots[slots[order].long()] = torch.arange(num_pairs, dtype=torch.int32, device=device)
-    if active_tiles is None:
-        active = torch.arange(num_tiles, dtype=torch.int32, device=device)
-    else:
-        active = active_tiles.flatten().nonzero()[:, 0].to(torch.int32)
     tile_offsets = torch.searchsorted(by_tile, edges)
-    return TileBins(members[order], tile_offsets, pair_slots, splat_offsets, active, width, height, num_cameras)
+    return TileBins(
+        members[order], tile_offsets, pair_slots, splat_offsets, active[:num_active], width, height, num_cameras
+    )
+
+
+def _active(active_tiles: Tensor | None, num_tiles: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """The active tiles in order, in the front of a longer list, and how many they are [1]."""
+    every = torch.arange(num_tiles, dtype=torch.int32, device=device)
+    if active_tiles is None:
+        return every, torch.full((1,), num_tiles, device=device)
+    flags = active_tiles.flatten()
+    counted = flags.cumsum(0)
+    # All that are not active are written to the place behind the last.
+    places = torch.where(flags, counted - 1, num_tiles)
+    return every.new_empty(num_tiles + 1).scatter_(0, places, every), flags.sum()[None]
 
 
 def _sequence(depths: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
@@ -67,7 +88,7 @@ def _sequence(depths: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
     return order, in_order.cumsum(0) - in_order
 
 
-def _spans(real: type) -> tuple[Scalar, Scalar]:
+def _spans(real: type) -> tuple[Scalar, Scalar, Scalar]:
     half_height, outline, band = ellipse_maths()
     pixel_range = pixel_ranges()
     zero, endless = real(0.0), real(np.inf)
@@ -85,44 +106,85 @@ def _spans(real: type) -> tuple[Scalar, Scalar]:
         return first, last, reach
 
     @inlined
-    def columns_of(means2d, conics, s, row, rows, width):
-        """First and last tile that a splat touches in a row of tiles, last < first where it touches none."""
+    def shape_of(means2d, conics, s, rows):
+        """What `columns_of` needs of a splat."""
         x, y = np.float64(means2d[s, 0]), np.float64(means2d[s, 1])
-        first, last, reach = rows
-        shape = outline(conics[s, 0], conics[s, 1], conics[s, 2], reach)
+        return x, y, rows[0], rows[1], outline(conics[s, 0], conics[s, 1], conics[s, 2], rows[2])
+
+    @inlined
+    def columns_of(shape, row, width):
+        """First and last tile that a splat touches in a row of tiles, last < first where it touches none."""
+        x, y, first, last, ellipse = shape
         low, high = max(first, row * TILE) + 0.5 - y, min(last, row * TILE + TILE - 1) + 0.5 - y
-        left, right = band(shape, low, high)
+        left, right = band(ellipse, low, high)
         first_pixel, last_pixel = pixel_range(x + left, x + right, width)
         if first_pixel > last_pixel:
             return 0, -1
         return first_pixel // TILE, last_pixel // TILE
 
-    return rows_of, columns_of
+    return rows_of, shape_of, columns_of
+
+
+def _active_between() -> Scalar:
+    @inlined
+    def active_between(active_tiles, camera, row, left, right):
+        """How many active tiles there are from one column to another, both included."""
+        found = right - left + 1
+        if active_tiles.size > 0:
+            for column in range(left, right + 1):
+                if not active_tiles[camera, row, column]:
+                    found -= 1
+        return found
+
+    return active_between
 
 
 @cache
 def count_tiles(real: type) -> Kernel:
-    """Counts the active tiles that each splat touches."""
-    rows_of, columns_of = _spans(real)
+    """Counts the active tiles that each splat touches, and the rows of tiles that it may touch any in [2, S]."""
+    rows_of, shape_of, columns_of = _spans(real)
+    active_between = _active_between()
 
-    @kernel("count_tiles", real, "real2 real2 real1 real2 bool3 int int int int1")
+    @kernel("count_tiles", real, "real2 real2 real1 real2 bool3 int int int int2")
     def count(means2d, conics, opacities, radii, active_tiles, per_camera, width, height, counts):
         s = cuda.grid(1)
-        if s >= counts.size:
+        if s >= opacities.size:
             return
-        found, masked, camera = 0, active_tiles.size > 0, s // per_camera
+        found, spans = 0, 0
         rows = rows_of(means2d, conics, opacities, radii, s, height)
         if rows[0] <= rows[1]:
-            for row in range(rows[0] // TILE, rows[1] // TILE + 1):
-                left, right = columns_of(means2d, conics, s, row, rows, width)
-                found += right - left + 1
-                if masked:
-                    for column in range(left, right + 1):
-                        if not active_tiles[camera, row, column]:
-                            found -= 1
-        counts[s] = found
+            shape, first, last = shape_of(means2d, conics, s, rows), rows[0] // TILE, rows[1] // TILE
+            spans = last - first + 1
+            for row in range(first, last + 1):
+                left, right = columns_of(shape, row, width)
+                found += active_between(active_tiles, s // per_camera, row, left, right)
+        counts[0, s], counts[1, s] = found, spans
 
     return count
+
+
+@cache
+def list_spans(real: type) -> Kernel:
+    """Lists the rows of tiles of each splat: the row, its first column, and the pairs of the splat up to its end."""
+    rows_of, shape_of, columns_of = _spans(real)
+    active_between = _active_between()
+
+    @kernel("list_spans", real, "real2 real2 real1 real2 bool3 int int int long1 int2")
+    def fill(means2d, conics, opacities, radii, active_tiles, per_camera, width, height, span_offsets, spans):
+        s = cuda.grid(1)
+        if s >= opacities.size or span_offsets[s] == span_offsets[s + 1]:
+            return
+        rows = rows_of(means2d, conics, opacities, radii, s, height)
+        shape, first, found = shape_of(means2d, conics, s, rows), rows[0] // TILE, 0
+        for i in range(span_offsets[s], span_offsets[s + 1]):
+            row, left, right = first + i - span_offsets[s], 0, -1
+            # Should the passes ever round differently, a row that only the first one saw is empty.
+            if row * TILE <= rows[1]:
+                left, right = columns_of(shape, row, width)
+            found += active_between(active_tiles, s // per_camera, row, left, right)
+            spans[i, 0], spans[i, 1], spans[i, 2] = row, left, found
+
+    return fill
 
 
 def _search() -> Scalar:
@@ -142,20 +204,15 @@ def _search() -> Scalar:
 
 
 @cache
-def emit_tiles(real: type, key: type = np.int16) -> Kernel:
+def emit_tiles(key: type = np.int16) -> Kernel:
     """Writes the tile, the splat and the slot of every pair."""
-    rows_of, columns_of = _spans(real)
     search = _search()
     keys = "short1" if key is np.int16 else "int1"
 
-    @kernel(
-        f"emit_tiles_{np.dtype(key).name}",
-        real,
-        f"real2 real2 real1 real2 bool3 int int int int long1 long1 long1 {keys} int1 int1",
-    )
+    @kernel("emit_tiles", key, f"bool3 int int int int long1 long1 long1 long1 int2 {keys} int1 int1")
     def emit(
-        means2d, conics, opacities, radii, active_tiles, per_camera, width, height, num_tiles,
-        order, starts, splat_offsets, tiles, members, slots,
+        active_tiles, per_camera, grid_rows, grid_columns, num_tiles,
+        order, starts, splat_offsets, span_offsets, spans, tiles, members, slots,
     ):  # fmt: skip
         pair = cuda.grid(1)
         if pair >= tiles.size:
@@ -163,24 +220,25 @@ def emit_tiles(real: type, key: type = np.int16) -> Kernel:
         place = search(starts, pair)
         s, left_over = order[place], pair - starts[place]
         members[pair], slots[pair] = s, splat_offsets[s] + left_over
-        masked, camera = active_tiles.size > 0, s // per_camera
-        grid_rows, grid_columns = (height + TILE - 1) // TILE, (width + TILE - 1) // TILE
-        rows = rows_of(means2d, conics, opacities, radii, s, height)
-        for row in range(rows[0] // TILE, rows[1] // TILE + 1):
-            left, right = columns_of(means2d, conics, s, row, rows, width)
-            if masked:
-                for column in range(left, right + 1):
-                    if active_tiles[camera, row, column]:
-                        if left_over == 0:
-                            tiles[pair] = key((camera * grid_rows + row) * grid_columns + column)
-                            return
-                        left_over -= 1
-            elif left_over <= right - left:
-                tiles[pair] = key((camera * grid_rows + row) * grid_columns + left + left_over)
-                return
+        low, high = span_offsets[s], span_offsets[s + 1]
+        while low < high:
+            middle = (low + high) // 2
+            if spans[middle, 2] <= left_over:
+                low = middle + 1
             else:
-                left_over -= right - left + 1
-        # Should the two passes ever round differently, what is left over goes behind the last tile, where none looks.
-        tiles[pair] = key(num_tiles)
+                high = middle
+        if low == span_offsets[s + 1]:
+            # Should the passes ever round differently, what is left over goes behind the last tile, where none looks.
+            tiles[pair] = key(num_tiles)
+            return
+        if low > span_offsets[s]:
+            left_over -= spans[low - 1, 2]
+        camera, row, column = s // per_camera, spans[low, 0], spans[low, 1] + left_over
+        if active_tiles.size > 0:
+            column = spans[low, 1]
+            while left_over > 0 or not active_tiles[camera, row, column]:
+                left_over -= active_tiles[camera, row, column]
+                column += 1
+        tiles[pair] = key((camera * grid_rows + row) * grid_columns + column)
 
     return emit

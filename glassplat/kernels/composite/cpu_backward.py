@@ -1,318 +1,346 @@
 """Gradients of blending, tile by tile and back to front.
 
-One gradient row is written per (tile, splat) pair; the rows of each splat are summed afterwards in a fixed order, so
-that the result has the same bits for any number of threads. Transmittances come back by division from their final
-values.
+A splat is taken off the blocks that it reached, with the sums over its pixels in registers. One row of sums is written
+per (tile, splat) pair; the rows of each splat are summed afterwards in a fixed order, so that the result has the same
+bits for any number of threads. Transmittances come back by division from their final values.
 """
 
 from __future__ import annotations
 
 import functools
 import math
+from typing import Any
 
 import numpy as np
 from numba import prange
 
 from glassplat.kernels.composite import cpu_tile as tile
+from glassplat.kernels.composite.cpu_pair_rows import PAIR_VALUES
+from glassplat.kernels.composite.cpu_tile import exponent, lane_of
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
 from glassplat.kernels.cpu.schedule import even_stride
-from glassplat.kernels.maths.blending import ALPHA_MAX, Scalar, blend_maths
+from glassplat.kernels.cpu.vector import (
+    absolute,
+    item,
+    lowest_bit,
+    minimum,
+    select,
+    sorted_apart,
+    store,
+    sums_of,
+    vector_kind,
+)  # fmt: skip
+from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar
 from glassplat.kernels.splats import LEAST_ALPHA
 
-# Planes of the backward pass; V_IMAGE has one per channel. BEHIND and BEHIND_GLASS hold what lies behind the current
-# splat, weighted by the incoming gradients; DOT the current splat's deviation and its channels beyond the first group,
-# so weighted; V_DEVIATION and CENTER the gradient of the deviation and the mean it is measured from. LANES is rows of
-# 16 column sums: g, g dy and g dy^2 as `geometry_gradient` takes them, the probe's two, then one per channel.
-BEHIND, BEHIND_GLASS, V_MASK, DOT = 5 * tile.PLANE, 6 * tile.PLANE, 7 * tile.PLANE, 8 * tile.PLANE
-V_DEVIATION, CENTER = 9 * tile.PLANE, 10 * tile.PLANE
-LANES, V_IMAGE = 11 * tile.PLANE, 14 * tile.PLANE
-LANE_PROBE, LANE_VALUES = LANES + 48, LANES + 80
+# Planes of the backward pass; V_IMAGE has one per channel. T and T_GLASS are transmittances in front of the current
+# splat, BEHIND and BEHIND_GLASS what lies behind it, weighted by the incoming gradients, WEIGHT how much of it shows.
+T, T_GLASS, BEHIND, BEHIND_GLASS, V_MASK, V_DEVIATION, CENTER, WEIGHT, V_IMAGE = (
+    plane * tile.PIXELS for plane in range(9)
+)
 
 
 def _unblend_primary(real: type, probed: bool) -> Scalar:
-    clipped_alpha = blend_maths(real).clipped_alpha
-    zero, half, one, alpha_max = real(0.0), real(0.5), real(1.0), real(ALPHA_MAX)
-    T, LAST, COVERAGE, PLANE, VALUES = tile.T, tile.LAST, tile.COVERAGE, tile.PLANE, tile.VALUES
-    MEAN_Y, probe = tile.MEAN_Y, _probe(real)
+    full, load = vector_kind(real, tile.LANES)
+    x_centers, y_centers = tile.pixel_centers(real)
+    exp2, dot_more = tile.tile_functions(real).exp2, _dot_more(real)
+    zero, one, two, alpha_max = real(0.0), real(1.0), real(2.0), real(ALPHA_MAX)
+    least = real(math.log2(ALPHA_MIN))
+    BLOCK, ACROSS, LANES, PIXELS, LAST = tile.BLOCK, tile.ACROSS, tile.LANES, tile.PIXELS, tile.LAST
+    MEAN_X, MEAN_Y, FORM_XX, FORM_XY, FORM_YY = tile.MEAN_X, tile.MEAN_Y, tile.FORM_XX, tile.FORM_XY, tile.FORM_YY
+    ORDER, VALUES = tile.ORDER, tile.VALUES
 
     @inlined
-    def unblend_primary(scratch, splat, order, x0, y0, first, last):
-        """Takes a splat off the pixels of its rows and adds up its lane sums."""
-        c0, c1, c2, c3 = splat[VALUES], splat[VALUES + 1], splat[VALUES + 2], splat[VALUES + 3]
-        mean_y = splat[MEAN_Y] - real(y0)
-        for row in range(first, last):
-            base = (row & 15) * 16
-            dy = real(row) + half - mean_y
-            for i in range(16):
-                coverage = scratch[COVERAGE + base + i]
-                a = clipped_alpha(coverage) if order <= scratch[LAST + base + i] else zero
-                inverse = one / (one - a)
-                t = scratch[T + base + i] * inverse
-                weight = a * t
-                v0, v1 = scratch[V_IMAGE + base + i], scratch[V_IMAGE + PLANE + base + i]
-                v2, v3 = scratch[V_IMAGE + 2 * PLANE + base + i], scratch[V_IMAGE + 3 * PLANE + base + i]
-                dot = scratch[DOT + base + i] + v0 * c0 + v1 * c1 + v2 * c2 + v3 * c3
-                behind = scratch[BEHIND + base + i]
-                v_alpha = t * dot - behind * inverse
-                scratch[BEHIND + base + i] = behind + weight * dot
-                scratch[T + base + i] = t
-                gain = v_alpha * a if coverage < alpha_max else zero
-                scratch[LANES + i] += gain
-                scratch[LANES + 16 + i] += gain * dy
-                scratch[LANES + 32 + i] += gain * dy * dy
-                if probed:
-                    probe(scratch, splat, gain, i, x0, dy)
-                scratch[LANE_VALUES + i] += weight * v0
-                scratch[LANE_VALUES + 16 + i] += weight * v1
-                scratch[LANE_VALUES + 32 + i] += weight * v2
-                scratch[LANE_VALUES + 48 + i] += weight * v3
-                # From here on the plane holds weights, for the channels of `sum_more`.
-                scratch[COVERAGE + base + i] = weight
+    def unblend_primary(planes, state, at, batch, splat, blocks, groups, deviating, row, row_at):
+        """Takes a splat off the pixels of its blocks and writes its sums, of channels beyond the first four zero."""
+        none, most = full(zero), full(alpha_max)
+        g, g_x, g_y, g_xx, g_xy, g_yy = none, none, none, none, none, none
+        pull_x, pull_y, s0, s1, s2, s3 = none, none, none, none, none, none
+        while blocks != 0:
+            b = lowest_bit(blocks)
+            blocks &= blocks - 1
+            i = b * LANES
+            dx = x_centers() + (real(b % ACROSS * BLOCK) - item(batch, splat + MEAN_X))
+            dy = y_centers() + (real(b // ACROSS * BLOCK) - item(batch, splat + MEAN_Y))
+            bits = exponent(batch, splat, dx, dy)
+            coverage = exp2(bits)
+            shown = (bits >= least) & (load(state, at + LAST + i) >= item(batch, splat + ORDER))
+            alpha = select(shown, minimum(coverage, most), none)
+            inverse = one / (one - alpha)
+            t = load(planes, T + i) * inverse
+            weight = alpha * t
+            v0, v1 = load(planes, V_IMAGE + i), load(planes, V_IMAGE + PIXELS + i)
+            v2, v3 = load(planes, V_IMAGE + 2 * PIXELS + i), load(planes, V_IMAGE + 3 * PIXELS + i)
+            dot = v0 * item(batch, splat + VALUES) + v1 * item(batch, splat + VALUES + 1)
+            dot = dot + (v2 * item(batch, splat + VALUES + 2) + v3 * item(batch, splat + VALUES + 3))
+            if groups > 1 or deviating >= 0:
+                dot = dot_more(dot, planes, i, batch, splat, groups, deviating)
+                store(planes, WEIGHT + i, weight)
+            behind = load(planes, BEHIND + i)
+            v_alpha = t * dot - behind * inverse
+            store(planes, BEHIND + i, behind + weight * dot)
+            store(planes, T + i, t)
+            gain = select(coverage < most, v_alpha * alpha, none)
+            gain_x, gain_y = gain * dx, gain * dy
+            g, g_x, g_y = g + gain, g_x + gain_x, g_y + gain_y
+            g_xx, g_xy, g_yy = g_xx + gain_x * dx, g_xy + gain_x * dy, g_yy + gain_y * dy
+            if probed:
+                across = item(batch, splat + FORM_XY)
+                pull_x = pull_x + absolute(gain_x * (two * item(batch, splat + FORM_XX)) + gain_y * across)
+                pull_y = pull_y + absolute(gain_y * (two * item(batch, splat + FORM_YY)) + gain_x * across)
+            s0, s1, s2, s3 = s0 + weight * v0, s1 + weight * v1, s2 + weight * v2, s3 + weight * v3
+        sums = (g, g_x, g_y, g_xx, g_xy, g_yy, pull_x, pull_y, s0, s1, s2, s3, none, none, none, none)
+        store(row, row_at, sums_of(sums))
 
     return unblend_primary
 
 
-def _probe(real: type) -> Scalar:
-    half, nats, half_nats = real(0.5), real(-math.log(2.0)), real(-2.0 * math.log(2.0))
-    MEAN_X, FORM_XX, FORM_XY, FORM_YY = tile.MEAN_X, tile.FORM_XX, tile.FORM_XY, tile.FORM_YY
+def _dot_more(real: type) -> Scalar:
+    load = vector_kind(real, tile.LANES).load
+    PIXELS, VALUES = tile.PIXELS, tile.VALUES
 
     @inlined
-    def probe(scratch, splat, gain, i, x0, dy):
-        """Adds to the probe's lanes what one pixel's `gain` pulls at the mean, as `geometry_gradient` has it."""
-        xx, xy, yy = half_nats * splat[FORM_XX], nats * splat[FORM_XY], half_nats * splat[FORM_YY]
-        dx = real(np.int32(i)) + (half - (splat[MEAN_X] - real(x0)))
-        scratch[LANE_PROBE + i] += abs(gain * (xx * dx + xy * dy))
-        scratch[LANE_PROBE + 16 + i] += abs(gain * (xy * dx + yy * dy))
+    def dot_more(dot, planes, i, batch, splat, groups, deviating):
+        """Adds channels beyond the first four, and the deviation of one of them."""
+        for d in range(4, groups * 4, 4):
+            v, value = V_IMAGE + d * PIXELS + i, splat + VALUES + d
+            dot = dot + (load(planes, v) * item(batch, value) + load(planes, v + PIXELS) * item(batch, value + 1))
+            v, value = v + 2 * PIXELS, value + 2
+            dot = dot + (load(planes, v) * item(batch, value) + load(planes, v + PIXELS) * item(batch, value + 1))
+        if deviating >= 0:
+            difference = item(batch, splat + VALUES + deviating) - load(planes, CENTER + i)
+            dot = dot + load(planes, V_DEVIATION + i) * absolute(difference)
+        return dot
 
-    return probe
+    return dot_more
 
 
-def _more_channels(real: type) -> tuple[Scalar, Scalar]:
-    COVERAGE, PLANE, VALUES = tile.COVERAGE, tile.PLANE, tile.VALUES
-
-    @inlined
-    def dot_more(scratch, splat, groups, first, last):
-        """Adds to DOT, before `unblend_primary`."""
-        for row in range(first, last):
-            base = (row & 15) * 16
-            for group in range(1, groups):
-                at, v = VALUES + 4 * group, V_IMAGE + (group & 7) * 4 * PLANE + base
-                c0, c1, c2, c3 = splat[at], splat[at + 1], splat[at + 2], splat[at + 3]
-                for i in range(16):
-                    front = c0 * scratch[v + i] + c1 * scratch[v + PLANE + i]
-                    back = c2 * scratch[v + 2 * PLANE + i] + c3 * scratch[v + 3 * PLANE + i]
-                    scratch[DOT + base + i] += front + back
+def _sum_more(real: type) -> Scalar:
+    full, load = vector_kind(real, tile.LANES)
+    zero, LANES, PIXELS, VALUES = real(0.0), tile.LANES, tile.PIXELS, tile.VALUES
 
     @inlined
-    def sum_more(scratch, groups, first, last):
-        """Adds up the lane sums of channels beyond the first group, after `unblend_primary`."""
-        for row in range(first, last):
-            base = (row & 15) * 16
-            for group in range(1, groups):
-                v, lanes = V_IMAGE + (group & 7) * 4 * PLANE + base, LANE_VALUES + (group & 7) * 64
-                for i in range(16):
-                    weight = scratch[COVERAGE + base + i]
-                    scratch[lanes + i] += weight * scratch[v + i]
-                    scratch[lanes + 16 + i] += weight * scratch[v + PLANE + i]
-                    scratch[lanes + 32 + i] += weight * scratch[v + 2 * PLANE + i]
-                    scratch[lanes + 48 + i] += weight * scratch[v + 3 * PLANE + i]
+    def sum_more(planes, batch, splat, blocks, groups, deviating, rows, row, sums):
+        """Adds to a row of sums what `unblend_primary` leaves out, with the weights it kept; `sums` is scratch."""
+        none = full(zero)
+        for d in range(4, groups * 4, 4):
+            s0, s1, s2, s3, left = none, none, none, none, blocks
+            while left != 0:
+                i = lowest_bit(left) * LANES
+                left &= left - 1
+                v, weight = V_IMAGE + d * PIXELS + i, load(planes, WEIGHT + i)
+                s0, s1 = s0 + weight * load(planes, v), s1 + weight * load(planes, v + PIXELS)
+                s2, s3 = s2 + weight * load(planes, v + 2 * PIXELS), s3 + weight * load(planes, v + 3 * PIXELS)
+            four = (s0, s1, s2, s3, none, none, none, none, none, none, none, none, none, none, none, none)
+            store(sums, 0, sums_of(four))
+            for i in range(4):
+                rows[row + PAIR_VALUES + d + i] = sums[i]
+        if deviating >= 0:
+            s0, left = none, blocks
+            while left != 0:
+                i = lowest_bit(left) * LANES
+                left &= left - 1
+                difference = item(batch, splat + VALUES + deviating) - load(planes, CENTER + i)
+                slope = load(planes, WEIGHT + i) * load(planes, V_DEVIATION + i)
+                s0 = s0 + select(difference > zero, slope, select(difference < zero, -slope, none))
+            one = (s0, none, none, none, none, none, none, none, none, none, none, none, none, none, none, none)
+            store(sums, 0, sums_of(one))
+            rows[row + PAIR_VALUES + deviating] += sums[0]
 
-    return dot_more, sum_more
+    return sum_more
 
 
-def _deviation(real: type) -> tuple[Scalar, Scalar]:
-    zero = real(0.0)
-    COVERAGE = tile.COVERAGE
+def _unblend_glass(real: type, probed: bool) -> Scalar:
+    full, load = vector_kind(real, tile.LANES)
+    x_centers, y_centers = tile.pixel_centers(real)
+    exp2 = tile.tile_functions(real).exp2
+    zero, one, two, alpha_max = real(0.0), real(1.0), real(2.0), real(ALPHA_MAX)
+    least = real(math.log2(ALPHA_MIN))
+    BLOCK, ACROSS, LANES, LAST_GLASS = tile.BLOCK, tile.ACROSS, tile.LANES, tile.LAST_GLASS
+    MEAN_X, MEAN_Y, FORM_XX, FORM_XY, FORM_YY = tile.MEAN_X, tile.MEAN_Y, tile.FORM_XX, tile.FORM_XY, tile.FORM_YY
+    ORDER, VALUES = tile.ORDER, tile.VALUES
 
     @inlined
-    def dot_deviation(scratch, value, first, last):
-        """Adds to DOT, before `unblend_primary`."""
-        for row in range(first, last):
-            base = (row & 15) * 16
-            for i in range(16):
-                scratch[DOT + base + i] += scratch[V_DEVIATION + base + i] * abs(value - scratch[CENTER + base + i])
+    def unblend_glass(planes, state, at, batch, splat, blocks, row, row_at):
+        """As `unblend_primary`; the sum of the first channel is the gradient of the mark."""
+        none, most, mark = full(zero), full(alpha_max), item(batch, splat + VALUES)
+        g, g_x, g_y, g_xx, g_xy, g_yy = none, none, none, none, none, none
+        pull_x, pull_y, s0 = none, none, none
+        while blocks != 0:
+            b = lowest_bit(blocks)
+            blocks &= blocks - 1
+            i = b * LANES
+            dx = x_centers() + (real(b % ACROSS * BLOCK) - item(batch, splat + MEAN_X))
+            dy = y_centers() + (real(b // ACROSS * BLOCK) - item(batch, splat + MEAN_Y))
+            bits = exponent(batch, splat, dx, dy)
+            coverage = exp2(bits)
+            shown = (bits >= least) & (load(state, at + LAST_GLASS + i) >= item(batch, splat + ORDER))
+            alpha = select(shown, minimum(coverage, most), none)
+            inverse = one / (one - alpha)
+            t_glass = load(planes, T_GLASS + i) * inverse
+            v_mark = load(planes, V_MASK + i) * load(planes, T + i) * t_glass
+            behind = load(planes, BEHIND_GLASS + i)
+            v_alpha = v_mark * mark - behind * inverse
+            seen = alpha * v_mark * mark
+            store(planes, BEHIND_GLASS + i, behind + seen)
+            store(planes, BEHIND + i, load(planes, BEHIND + i) + seen)
+            store(planes, T_GLASS + i, t_glass)
+            gain = select(coverage < most, v_alpha * alpha, none)
+            gain_x, gain_y = gain * dx, gain * dy
+            g, g_x, g_y = g + gain, g_x + gain_x, g_y + gain_y
+            g_xx, g_xy, g_yy = g_xx + gain_x * dx, g_xy + gain_x * dy, g_yy + gain_y * dy
+            if probed:
+                across = item(batch, splat + FORM_XY)
+                pull_x = pull_x + absolute(gain_x * (two * item(batch, splat + FORM_XX)) + gain_y * across)
+                pull_y = pull_y + absolute(gain_y * (two * item(batch, splat + FORM_YY)) + gain_x * across)
+            s0 = s0 + alpha * v_mark
+        sums = (g, g_x, g_y, g_xx, g_xy, g_yy, pull_x, pull_y, s0, none, none, none, none, none, none, none)
+        store(row, row_at, sums_of(sums))
+
+    return unblend_glass
+
+
+def _load_gradients(real: type) -> Scalar:
+    load, load_row = vector_kind(real, tile.LANES).load, vector_kind(real, tile.BLOCK).load
+    BLOCK, ACROSS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.LANES, tile.PIXELS
 
     @inlined
-    def sum_deviation(scratch, value, lanes, first, last):
-        """Adds to the lane sums of the channel, after `unblend_primary`."""
-        lanes = lanes & 0xFFFF
-        for row in range(first, last):
-            base = (row & 15) * 16
-            for i in range(16):
-                difference = value - scratch[CENTER + base + i]
-                slope = scratch[COVERAGE + base + i] * scratch[V_DEVIATION + base + i]
-                slope = slope if difference > zero else -slope
-                scratch[lanes + i] += slope if difference != zero else zero
+    def load_whole_block(planes, i, v_image, v_alpha, first, width):
+        """A block of four channels that lies within the image; `first` is its first pixel."""
+        rows = load(v_image, first * 4), load(v_image, (first + width) * 4)
+        more = load(v_image, (first + 2 * width) * 4), load(v_image, (first + 3 * width) * 4)
+        v0, v1, v2, v3 = sorted_apart(rows + more)
+        store(planes, V_IMAGE + i, v0)
+        store(planes, V_IMAGE + PIXELS + i, v1)
+        store(planes, V_IMAGE + 2 * PIXELS + i, v2)
+        store(planes, V_IMAGE + 3 * PIXELS + i, v3)
+        for y in range(BLOCK):
+            store(planes, BEHIND + i + y * BLOCK, load_row(v_alpha, first + y * width))
 
-    return dot_deviation, sum_deviation
+    @inlined
+    def load_gradients(planes, v_image, v_alpha, first, width, columns, rows, channels):
+        """Fills V_IMAGE and BEHIND, elsewhere zero."""
+        for b in range(tile.BLOCKS):
+            x0, y0 = b % ACROSS * BLOCK, b // ACROSS * BLOCK
+            corner = first + y0 * width + x0
+            if channels == 4 and x0 + BLOCK <= columns and y0 + BLOCK <= rows:
+                load_whole_block(planes, b * LANES, v_image, v_alpha, corner, width)
+                continue
+            for y in range(min(BLOCK, rows - y0)):
+                for x in range(min(BLOCK, columns - x0)):
+                    pixel, i = corner + y * width + x, b * LANES + y * BLOCK + x
+                    planes[BEHIND + i] = v_alpha[pixel]
+                    for d in range(channels):
+                        planes[V_IMAGE + d * PIXELS + i] = v_image[pixel * channels + d]
+        # alpha = 1 - T: its gradient acts like something behind every splat.
+        for i in range(0, PIXELS, LANES):
+            store(planes, BEHIND + i, -load(planes, BEHIND + i) * load(planes, T + i))
+
+    return load_gradients
 
 
 def _load_deviation(real: type) -> Scalar:
     one, zero, least_alpha = real(1.0), real(0.0), real(LEAST_ALPHA)
-    T, PLANE = tile.T, tile.PLANE
+    PIXELS = tile.PIXELS
 
     @inlined
-    def load_deviation(scratch, channel, through_mean, center, lean, v_deviation, camera, x0, y0, columns, rows):
+    def load_deviation(planes, spread, keep, channel, through_mean, v_deviation, first, width, columns, rows):
         """Fills V_DEVIATION and CENTER, after the other gradients; False where the tile has no such gradient."""
         wanted = False
         for y in range(rows):
             for x in range(columns):
-                i, middle = (y & 15) * 16 + (x & 15), center[camera, y0 + y, x0 + x]
-                v = v_deviation[camera, y0 + y, x0 + x]
+                i, v = lane_of(x, y), v_deviation[first + y * width + x]
                 wanted |= v != zero
-                scratch[V_DEVIATION + i], scratch[CENTER + i] = v, middle
-                covered = one - scratch[T + i]
-                if through_mean and covered > least_alpha:
+                middle, lean = spread[keep + i], spread[keep + PIXELS + i]
+                covered = one - planes[T + i]
+                planes[V_DEVIATION + i], planes[CENTER + i] = v, middle
+                if v != zero and through_mean and covered > least_alpha:
                     # The mean is the channel's sum over the coverage; alpha's gradient acts as in `load_gradients`.
-                    v_sum = -v * lean[camera, y0 + y, x0 + x] / covered
-                    scratch[V_IMAGE + (channel & 31) * PLANE + i] += v_sum
-                    scratch[BEHIND + i] += v_sum * middle * scratch[T + i]
+                    v_sum = -v * lean / covered
+                    planes[V_IMAGE + channel * PIXELS + i] += v_sum
+                    planes[BEHIND + i] += v_sum * middle * planes[T + i]
         return wanted
 
     return load_deviation
 
 
-def _unblend_glass(real: type, probed: bool) -> Scalar:
-    clipped_alpha = blend_maths(real).clipped_alpha
-    zero, half, one, alpha_max = real(0.0), real(0.5), real(1.0), real(ALPHA_MAX)
-    T, T_GLASS, LAST_GLASS, COVERAGE = tile.T, tile.T_GLASS, tile.LAST_GLASS, tile.COVERAGE
-    MEAN_Y, probe = tile.MEAN_Y, _probe(real)
+def _begin(real: type) -> Scalar:
+    load, zero, LANES, PIXELS = vector_kind(real, tile.LANES).load, real(0.0), tile.LANES, tile.PIXELS
 
     @inlined
-    def unblend_glass(scratch, splat, mark, order, x0, y0, first, last):
-        """As `unblend_primary`; the first row of value lanes gets the gradient of the mark."""
-        mean_y = splat[MEAN_Y] - real(y0)
-        for row in range(first, last):
-            base = (row & 15) * 16
-            dy = real(row) + half - mean_y
-            for i in range(16):
-                coverage = scratch[COVERAGE + base + i]
-                a = clipped_alpha(coverage) if order <= scratch[LAST_GLASS + base + i] else zero
-                inverse = one / (one - a)
-                t_glass = scratch[T_GLASS + base + i] * inverse
-                v_mark = scratch[V_MASK + base + i] * scratch[T + base + i] * t_glass
-                behind = scratch[BEHIND_GLASS + base + i]
-                v_alpha = v_mark * mark - behind * inverse
-                shown = a * v_mark * mark
-                scratch[BEHIND_GLASS + base + i] = behind + shown
-                scratch[BEHIND + base + i] += shown
-                scratch[T_GLASS + base + i] = t_glass
-                gain = v_alpha * a if coverage < alpha_max else zero
-                scratch[LANES + i] += gain
-                scratch[LANES + 16 + i] += gain * dy
-                scratch[LANES + 32 + i] += gain * dy * dy
-                if probed:
-                    probe(scratch, splat, gain, i, x0, dy)
-                scratch[LANE_VALUES + i] += a * v_mark
+    def begin(planes, state, at, v_mask, first, width, columns, rows, with_glass):
+        """Transmittances behind everything; returns how many pairs of the tile any pixel has looked at."""
+        planes[:] = zero
+        for i in range(0, PIXELS, LANES):
+            store(planes, T + i, load(state, at + tile.T + i))
+            store(planes, T_GLASS + i, load(state, at + tile.T_GLASS + i))
+        if with_glass:
+            for y in range(rows):
+                for x in range(columns):
+                    planes[V_MASK + lane_of(x, y)] = v_mask[first + y * width + x]
+        most = state[at + tile.LAST]
+        for i in range(PIXELS):
+            most = max(most, state[at + tile.LAST + i], state[at + tile.LAST_GLASS + i])
+        return int(most) + 1
 
-    return unblend_glass
+    return begin
 
 
 @functools.cache
 def composite_backward(real: type, probed: bool) -> Kernel:
-    """Builds the kernel that fills one gradient row per pair, given the final state of each tile."""
-    _, place, _, _, _, load_state, fetch, cover, geometry_gradient = tile.tile_functions(real)
+    """Builds the kernel that fills one row of sums per pair, given the final state of each tile."""
+    _, place, fetch, _, _ = tile.tile_functions(real)
     unblend_primary, unblend_glass = _unblend_primary(real, probed), _unblend_glass(real, probed)
-    dot_more, sum_more = _more_channels(real)
-    dot_deviation, sum_deviation = _deviation(real)
-    load_deviation = _load_deviation(real)
+    begin, sum_more = _begin(real), _sum_more(real)
+    load_gradients, load_deviation = _load_gradients(real), _load_deviation(real)
     zero = real(0.0)
-    T, LAST_GLASS, PLANE, VALUES, V_VALUES, BATCH = (
-        tile.T,
-        tile.LAST_GLASS,
-        tile.PLANE,
-        tile.VALUES,
-        tile.V_VALUES,
-        tile.BATCH,
-    )
-
-    @inlined
-    def load_gradients(scratch, v_image, v_alpha, v_mask, camera, x0, y0, columns, rows):
-        for y in range(rows):
-            base = (y & 15) * 16
-            image_row = v_image[camera, y0 + y, x0 : x0 + columns]
-            alpha_row, mask_row = v_alpha[camera, y0 + y, x0 : x0 + columns], v_mask[camera, y0 + y, x0 : x0 + columns]
-            for x in range(alpha_row.size):
-                # alpha = 1 - T: its gradient acts like something behind every splat.
-                scratch[BEHIND + base + x] = -alpha_row[x] * scratch[T + base + x]
-                scratch[V_MASK + base + x] = mask_row[x]
-            for d in range(image_row.shape[1]):
-                for x in range(image_row.shape[0]):
-                    scratch[V_IMAGE + (d & 31) * PLANE + base + x] = image_row[x, d]
-
-    @inlined
-    def last_glass_of(scratch):
-        """Position of the last glass splat that any pixel of the tile looked at."""
-        last = scratch[LAST_GLASS]
-        for i in range(tile.PIXELS):
-            last = max(last, scratch[LAST_GLASS + i])
-        return last
+    LANES, PIXELS, STATE, CHUNK, GLASS = tile.LANES, tile.PIXELS, tile.STATE, tile.CHUNK, tile.GLASS
+    ORDER, REACHED = tile.ORDER, (1 << tile.BLOCKS) - 1
 
     @kernel("composite_backward_probed" if probed else "composite_backward", real)
     def backward(
-        marks, splats_per_camera, num_primary, num_channels, channel, through_mean,
-        pair_splats, tile_offsets, active, packed, state, center, lean, v_image, v_alpha, v_mask, v_deviation, out,
+        num_splats, with_glass, num_channels, image_width, height, channel, through_mean,
+        pair_splats, tile_offsets, active, packed, pairs, state, spread,
+        v_image, v_alpha, v_mask, v_deviation, rows,
     ):  # fmt: skip
-        groups = (num_channels + 3) // 4
+        groups, width = (num_channels + 3) // 4, packed.size // max(1, num_splats)
+        row_width = rows.size // max(1, pair_splats.size)
         stride = even_stride(active.size)
         for task in prange(active.size):
             n = task * stride % active.size
-            camera, x0, y0, columns, rows = place(active[n], v_image.shape[2], v_image.shape[1])
-            scratch = np.empty(V_IMAGE + groups * 4 * PLANE, real)
-            scratch[:] = zero
-            looked_at = load_state(state, n, scratch)
-            last_glass = last_glass_of(scratch)
-            load_gradients(scratch, v_image, v_alpha, v_mask, camera, x0, y0, columns, rows)
-            deviates = channel >= 0
-            if deviates:
-                deviates = load_deviation(
-                    scratch, channel, through_mean, center, lean, v_deviation, camera, x0, y0, columns, rows
-                )
             start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
-            out[start + looked_at : stop] = zero
-            batch = np.empty((BATCH, packed.shape[1]), real)
-            for behind in range(0, looked_at, BATCH):
+            if start == stop:
+                continue
+            camera, x0, y0, columns, lines = place(active[n], image_width, height)
+            corner, at = (camera * height + y0) * image_width + x0, n * STATE
+            planes = np.empty(V_IMAGE + groups * 4 * PIXELS, real)
+            sums: Any = np.empty(LANES, real)
+            batch = np.empty(CHUNK * width, real)
+            looked_at = begin(planes, state, at, v_mask, corner, image_width, columns, lines, with_glass)
+            load_gradients(planes, v_image, v_alpha, corner, image_width, columns, lines, num_channels)
+            deviating = channel
+            if channel >= 0 and not load_deviation(
+                planes, spread, n * 2 * PIXELS, channel, through_mean, v_deviation, corner, image_width, columns, lines
+            ):
+                deviating = -1
+            rows[(start + looked_at) * row_width : stop * row_width] = zero
+            for behind in range(0, looked_at, CHUNK):
                 last = start + looked_at - behind
-                first = max(last - BATCH, start)
-                fetch(batch, packed, pair_splats, first, last)
+                first = max(last - CHUNK, start)
+                fetch(batch, packed, pair_splats, first, last, width, x0, y0)
                 for k in range(last - first):
                     p = last - 1 - k
-                    order, splat = real(np.int32(p - start)), batch[p - first]
-                    glass = pair_splats[p] - camera * splats_per_camera - num_primary
-                    top, bottom = 0, 0
-                    if glass < 0 or order <= last_glass:
-                        top, bottom = cover(scratch, splat, x0, y0, rows)
-                    if top >= bottom:
-                        out[p, :] = zero
-                        continue
-                    for i in range(80 + groups * 64):
-                        scratch[LANES + i] = zero
-                    if glass < 0:
-                        if groups > 1 or deviates:
-                            scratch[DOT + top * 16 : DOT + bottom * 16] = zero
-                        if groups > 1:
-                            dot_more(scratch, splat, groups, top, bottom)
-                        if deviates:
-                            dot_deviation(scratch, splat[VALUES + channel], top, bottom)
-                        unblend_primary(scratch, splat, order, x0, y0, top, bottom)
-                        if groups > 1:
-                            sum_more(scratch, groups, top, bottom)
-                        if deviates:
-                            lanes = LANE_VALUES + channel * 16
-                            sum_deviation(scratch, splat[VALUES + channel], lanes, top, bottom)
+                    splat, row = (p - first) * width, p * row_width
+                    batch[splat + ORDER] = real(np.int32(p - start))
+                    blocks = np.int64(pairs[p]) & REACHED
+                    if blocks == 0:
+                        rows[row : row + row_width] = zero
+                    elif (pairs[p] >> GLASS) & 1:
+                        unblend_glass(planes, state, at, batch, splat, blocks, rows, row)
+                        rows[row + LANES : row + row_width] = zero
                     else:
-                        unblend_glass(scratch, splat, marks[camera, glass], order, x0, y0, top, bottom)
-                    geometry_gradient(out, p, scratch, LANES, splat, x0)
-                    for d in range(num_channels):
-                        total = zero
-                        for i in range(16):
-                            total += scratch[LANE_VALUES + (d & 31) * 16 + i]
-                        out[p, V_VALUES + d] = total
-                    if probed:
-                        for d in range(2):
-                            total = zero
-                            for i in range(16):
-                                total += scratch[LANE_PROBE + d * 16 + i]
-                            out[p, V_VALUES + num_channels + d] = total
+                        unblend_primary(planes, state, at, batch, splat, blocks, groups, deviating, rows, row)
+                        if groups > 1 or deviating >= 0:
+                            sum_more(planes, batch, splat, blocks, groups, deviating, rows, row, sums)
 
     return backward

@@ -1,9 +1,8 @@
-"""What the blending kernels share: a tile's scratch memory, the packed splats, and sums of gradients.
+"""What the blending kernels share: the blocks of a tile, the packed splats, and which blocks a splat reaches.
 
-A tile keeps one value per pixel in a *plane* of 16 x 16, and all planes in one flat buffer at offsets known to the
-compiler. That is what lets it see that planes never overlap, and turn every loop over the 16 pixels of a row into
-vector instructions without checks. For the same reason rows and channels enter offsets through `row & 15` and
-`channel & 31`: the compiler then knows that they are not negative.
+A tile of 16 x 16 pixels is traversed in *blocks* of 4 x 4, each one vector. A trained splat covers 5 to 40 pixels of a
+tile; in blocks that is half as many lanes as in rows, and what is not reached costs nothing. A *plane* holds one value
+for every pixel of a tile, block after block.
 """
 
 from __future__ import annotations
@@ -15,30 +14,51 @@ import numpy as np
 import torch
 
 from glassplat.kernels.cpu.jit import inlined
-from glassplat.kernels.maths.blending import Scalar, blend_maths
+from glassplat.kernels.cpu.vector import (
+    bits_of,
+    constant,
+    exp,
+    fraction,
+    item,
+    maximum,
+    minimum,
+    store,
+    times_power_of_2,
+    vector_kind,
+)
+from glassplat.kernels.maths.blending import ALPHA_MIN, EXP2_COEFFICIENTS, Scalar, blend_maths
 from glassplat.kernels.splats import TILE, Splats
 
 PIXELS = TILE * TILE
-PLANE = PIXELS + TILE
-"""Floats from one plane to the next; the extra row keeps planes from competing for the same cache sets."""
+BLOCK = 4
+"""Edge of a block in pixels."""
+LANES = BLOCK * BLOCK
+BLOCKS = PIXELS // LANES
+ACROSS = TILE // BLOCK
+"""Blocks in a row of a tile."""
 
-# Planes that forward and backward share. T and T_GLASS are negative where the pixel has stopped; LAST and LAST_GLASS
-# hold the position in the tile's list of the last splat that the pixel looked at before it stopped.
-# COVERAGE holds opacity times falloff of the current splat, in the rows that it reaches.
-T, LAST, T_GLASS, LAST_GLASS, COVERAGE = 0, PLANE, 2 * PLANE, 3 * PLANE, 4 * PLANE
-STATE_PLANES, SHARED_PLANES = 4, 5
+# Planes of a tile's state, which the backward pass starts from. LAST and LAST_GLASS hold the position in the tile's
+# list of the last splat that the pixel looked at before it stopped. While the forward pass runs, T and T_GLASS are
+# negative where the pixel has stopped.
+T, LAST, T_GLASS, LAST_GLASS, STATE = 0, PIXELS, 2 * PIXELS, 3 * PIXELS, 4 * PIXELS
 
 GROUP = 4
 """Channels are blended four at a time."""
 
-BATCH = 16
-"""Splats that a tile fetches at once. They lie anywhere in memory: fetched one at a time, each would be waited for."""
+CHUNK = 128
+"""Pairs that a tile fetches at once; they lie anywhere in memory."""
 
-# Columns of a packed splat.
-MEAN_X, MEAN_Y, FORM_XX, FORM_XY, FORM_YY, OPACITY, REACH, VALUES = 0, 1, 2, 3, 4, 5, 6, 8
+# Columns of a packed splat. It falls off as 2^(BITS + quadratic form of the offset); along a line of constant x, the
+# form is largest at SLOPE_Y times the offset in x.
+MEAN_X, MEAN_Y, FORM_XX, FORM_XY, FORM_YY, BITS, SLOPE_X, SLOPE_Y, VALUES = range(9)
+ORDER = SLOPE_X
+"""Of a fetched splat whose blocks are known: its position in the tile's list."""
 
-# Columns of the gradient of one (tile, splat) pair.
-V_MEAN, V_CONIC, V_OPACITY, V_VALUES = 0, 2, 5, 6
+SLACK = 0.02
+"""By how much the logarithm of a coverage may be rounded where a block is left out."""
+
+GLASS = BLOCKS
+"""In what is known of a pair, the bits below tell which blocks it reaches, this one that its splat is glass."""
 
 
 class TileFunctions(NamedTuple):
@@ -47,44 +67,31 @@ class TileFunctions(NamedTuple):
     Attributes:
         pack: copies one splat's geometry into its packed row.
         place: camera, first column, first row, columns and rows of a tile.
-        begin: fresh transmittances; pixels beyond the image's edge start as stopped.
-        is_finished: whether every pixel has stopped, for all splats and for glass.
-        save_state, load_state: the planes that the backward pass starts from.
-        fetch: copies the packed splats of consecutive pairs next to each other.
-        cover: fills COVERAGE; first and one-past-last row that the splat reaches. A loop of its own, because the
-            processor overlaps more rows of a short computation than of a long one.
-        geometry_gradient: gradient of one pair's mean, conic and opacity from three rows of lane sums.
+        fetch: copies the packed splats of consecutive pairs next to each other, their means relative to the tile.
+        reached: bits of the blocks of a tile that a fetched splat reaches.
+        exp2: 2^t of a vector for -100 < t < 1; elsewhere anything.
     """
 
     pack: Scalar
     place: Scalar
-    begin: Scalar
-    is_finished: Scalar
-    save_state: Scalar
-    load_state: Scalar
     fetch: Scalar
-    cover: Scalar
-    geometry_gradient: Scalar
+    reached: Scalar
+    exp2: Scalar
 
 
 def tile_functions(real: type) -> TileFunctions:
     """Builds the functions for `real`, np.float32 or np.float64."""
-    return TileFunctions(
-        _pack(real),
-        _place(),
-        _begin(real),
-        _is_finished(real),
-        _save_state(),
-        _load_state(),
-        _fetch(),
-        _cover(real),
-        _geometry_gradient(real),
-    )
+    return TileFunctions(_pack(real), _place(), _fetch(real), _reached(real), _exp2(real))
+
+
+def groups_of(num_values: int) -> int:
+    """Groups of channels that hold `num_values`."""
+    return (num_values + GROUP - 1) // GROUP
 
 
 def packed_width(num_values: int) -> int:
-    """Columns of a packed splat that carries `num_values` channels, filled up to whole groups."""
-    return VALUES + GROUP * ((num_values + GROUP - 1) // GROUP)
+    """Columns of a packed splat that carries `num_values` channels in whole groups: whole vectors."""
+    return LANES * ((VALUES + GROUP * groups_of(num_values) + LANES - 1) // LANES)
 
 
 def real_of(splats: Splats) -> type:
@@ -92,17 +99,29 @@ def real_of(splats: Splats) -> type:
     return np.float64 if splats.means2d.dtype == torch.float64 else np.float32
 
 
+def pixel_centers(real: type) -> tuple[Scalar, Scalar]:
+    """Functions that give the pixel centres of a tile's first block, x and y."""
+    xs = constant(real, tuple(i % BLOCK + 0.5 for i in range(LANES)))
+    ys = constant(real, tuple(i // BLOCK + 0.5 for i in range(LANES)))
+    return xs, ys
+
+
 def _pack(real: type) -> Scalar:
-    maths = blend_maths(real)
-    screen_form, vertical_reach = maths.screen_form, maths.vertical_reach
+    screen_form = blend_maths(real).screen_form
+    half, zero, nothing, endless = real(0.5), real(0.0), real(-np.inf), real(np.inf)
+    alpha_min, bits = real(ALPHA_MIN), 1.0 / math.log(2.0)
 
     @inlined
-    def pack(packed, s, means, conics, opacities):
-        xx, xy, yy = conics[s, 0], conics[s, 1], conics[s, 2]
-        packed[s, MEAN_X], packed[s, MEAN_Y] = means[s, 0], means[s, 1]
-        packed[s, FORM_XX], packed[s, FORM_XY], packed[s, FORM_YY] = screen_form(xx, xy, yy)
-        packed[s, OPACITY] = opacities[s]
-        packed[s, REACH] = vertical_reach(xx, xy, yy, opacities[s])
+    def pack(packed, at, mean, conic, opacity):
+        xx, xy, yy = screen_form(conic[0], conic[1], conic[2])
+        packed[at + MEAN_X], packed[at + MEAN_Y] = mean[0], mean[1]
+        packed[at + FORM_XX], packed[at + FORM_XY], packed[at + FORM_YY] = xx, xy, yy
+        packed[at + SLOPE_X], packed[at + SLOPE_Y] = -half * xy / xx, -half * xy / yy
+        # In double precision, because the determinant of a needle's conic is a small difference of large products.
+        determinant = np.float64(conic[0]) * np.float64(conic[2]) - np.float64(conic[1]) * np.float64(conic[1])
+        # Written so that NaN anywhere ends in "reaches nothing".
+        drawn = 0.0 < determinant < np.inf and conic[0] > zero and alpha_min < opacity < endless
+        packed[at + BITS] = real(bits * math.log(np.float64(opacity))) if drawn else nothing
 
     return pack
 
@@ -118,122 +137,78 @@ def _place() -> Scalar:
     return place
 
 
-def _begin(real: type) -> Scalar:
-    zero, one, never = real(0.0), real(1.0), real(-1.0)
+def _fetch(real: type) -> Scalar:
+    load = vector_kind(real, LANES).load
 
     @inlined
-    def begin(scratch, columns, rows):
-        for i in range(PIXELS):
-            inside = i % TILE < columns and i // TILE < rows
-            scratch[T + i] = one if inside else zero
-            scratch[T_GLASS + i] = one
-            scratch[LAST + i] = never
-            scratch[LAST_GLASS + i] = never
-
-    return begin
-
-
-def _is_finished(real: type) -> Scalar:
-    zero = real(0.0)
-
-    @inlined
-    def is_finished(scratch):
-        left, left_for_glass = zero, zero
-        for i in range(PIXELS):
-            t, t_glass = scratch[T + i], scratch[T_GLASS + i]
-            t = t if t > zero else zero
-            left += t
-            left_for_glass += t if t_glass > zero else zero
-        return left == zero, left_for_glass == zero
-
-    return is_finished
-
-
-def _save_state() -> Scalar:
-    @inlined
-    def save_state(state, n, scratch):
-        for plane in range(STATE_PLANES):
-            for i in range(PIXELS):
-                state[n, plane, i] = abs(scratch[plane * PLANE + i]) if plane % 2 == 0 else scratch[plane * PLANE + i]
-
-    return save_state
-
-
-def _load_state() -> Scalar:
-    @inlined
-    def load_state(state, n, scratch):
-        """Returns how many pairs of the tile any pixel has looked at."""
-        most = state[n, 1, 0]
-        for plane in range(STATE_PLANES):
-            for i in range(PIXELS):
-                value = state[n, plane, i]
-                scratch[plane * PLANE + i] = value
-                if plane % 2 == 1:
-                    most = max(most, value)
-        return int(most) + 1
-
-    return load_state
-
-
-def _fetch() -> Scalar:
-    @inlined
-    def fetch(batch, packed, pair_splats, first, last):
+    def fetch(batch, packed, pair_splats, first, last, width, x0, y0):
         for p in range(first, last):
-            row, to = packed[pair_splats[p]], batch[p - first]
-            for column in range(row.size):
-                to[column] = row[column]
+            source, target = pair_splats[p] * np.int64(width), (p - first) * width
+            for column in range(0, width, LANES):
+                store(batch, target + column, load(packed, source + column))
+        for k in range(last - first):
+            batch[k * width + MEAN_X] -= real(x0)
+            batch[k * width + MEAN_Y] -= real(y0)
 
     return fetch
 
 
-def _cover(real: type) -> Scalar:
-    maths = blend_maths(real)
-    exp2, row_range = maths.exp2, maths.row_range
-    half = real(0.5)
+def _reached(real: type) -> Scalar:
+    full = vector_kind(real, LANES).full
+    lefts = constant(real, tuple(b % ACROSS * BLOCK + 0.5 for b in range(BLOCKS)))
+    tops = constant(real, tuple(b // ACROSS * BLOCK + 0.5 for b in range(BLOCKS)))
+    zero, last, least = real(0.0), real(BLOCK - 1), real(math.log2(ALPHA_MIN) - SLACK)
 
     @inlined
-    def cover(scratch, splat, x0, y0, num_rows):
-        mean_x, mean_y = splat[MEAN_X] - real(x0), splat[MEAN_Y] - real(y0)
-        xx, xy, yy, opacity = splat[FORM_XX], splat[FORM_XY], splat[FORM_YY], splat[OPACITY]
-        first, last = row_range(mean_y, splat[REACH], num_rows)
-        for row in range(first, last):
-            base = COVERAGE + (row & 15) * TILE
-            dy = real(row) + half - mean_y
-            linear, constant = xy * dy, yy * dy * dy
-            for i in range(TILE):
-                dx = real(np.int32(i)) + half - mean_x
-                scratch[base + i] = opacity * exp2((xx * dx + linear) * dx + constant)
-        return first, last
+    def reached(batch, at):
+        left, top = lefts() - item(batch, at + MEAN_X), tops() - item(batch, at + MEAN_Y)
+        right, bottom, nowhere = left + last, top + last, full(zero)
+        # The largest coverage within a block is at the centre or on one of the two edges nearest to it.
+        near_x = maximum(left, minimum(right, nowhere))
+        near_y = maximum(top, minimum(bottom, nowhere))
+        far_x = maximum(left, minimum(right, near_y * item(batch, at + SLOPE_X)))
+        far_y = maximum(top, minimum(bottom, near_x * item(batch, at + SLOPE_Y)))
+        most = maximum(exponent(batch, at, near_x, far_y), exponent(batch, at, far_x, near_y))
+        return bits_of(most >= least)
 
-    return cover
+    return reached
 
 
-def _geometry_gradient(real: type) -> Scalar:
-    zero, half = real(0.0), real(0.5)
-    nats, half_nats = real(-math.log(2.0)), real(-2.0 * math.log(2.0))
+@inlined
+def lane_of(x, y):
+    """Where a plane holds the pixel in column x and row y of the tile."""
+    return (y // BLOCK * ACROSS + x // BLOCK) * LANES + y % BLOCK * BLOCK + x % BLOCK
+
+
+@inlined
+def list_block(entries, pairs, first, last, block):
+    """Lists which of the fetched splats reach a block, glass as the complement; returns how many there are."""
+    count = 0
+    for p in range(first, last):
+        k, pair = np.int32(p - first), item(pairs, p)
+        entries[count] = k ^ -((pair >> GLASS) & 1)
+        count += (pair >> block) & 1
+    return count
+
+
+@inlined
+def exponent(batch, at, dx, dy):
+    """The logarithm to base 2 of a fetched splat's coverage at offsets from its mean."""
+    along = dx * item(batch, at + FORM_XX) + dy * item(batch, at + FORM_XY)
+    return along * dx + (dy * item(batch, at + FORM_YY) * dy + item(batch, at + BITS))
+
+
+def _exp2(real: type) -> Scalar:
+    c0, c1, c2, c3, c4, c5 = (real(c) for c in EXP2_COEFFICIENTS)
+    natural = real(math.log(2.0))
 
     @inlined
-    def geometry_gradient(out, p, scratch, lanes, splat, x0):
-        """`lanes`: 3 x 16 column sums of g, g dy and g dy^2, with g = v_alpha alpha and dy the row's offset."""
-        lanes = lanes & 0xFFFF
-        offset = half - (splat[MEAN_X] - real(x0))
-        g_0, g_x, g_xx, g_y, g_xy, g_yy = zero, zero, zero, zero, zero, zero
-        for i in range(TILE):
-            dx = real(np.int32(i)) + offset
-            g, gy = scratch[lanes + i], scratch[lanes + TILE + i]
-            g_0 += g
-            g_x += g * dx
-            g_xx += g * dx * dx
-            g_y += gy
-            g_xy += gy * dx
-            g_yy += scratch[lanes + 2 * TILE + i]
-        # alpha = opacity exp(-q / 2), q = xx dx^2 + 2 xy dx dy + yy dy^2, and g = v_q * -2.
-        xx, xy, yy = half_nats * splat[FORM_XX], nats * splat[FORM_XY], half_nats * splat[FORM_YY]
-        out[p, V_MEAN] = xx * g_x + xy * g_y
-        out[p, V_MEAN + 1] = xy * g_x + yy * g_y
-        out[p, V_CONIC] = -half * g_xx
-        out[p, V_CONIC + 1] = -g_xy
-        out[p, V_CONIC + 2] = -half * g_yy
-        out[p, V_OPACITY] = g_0 / splat[OPACITY]
+    def fast_exp2(t):
+        f = fraction(t)
+        return times_power_of_2(((((f * c5 + c4) * f + c3) * f + c2) * f + c1) * f + c0, t)
 
-    return geometry_gradient
+    @inlined
+    def exact_exp2(t):
+        return exp(t * natural)
+
+    return fast_exp2 if real is np.float32 else exact_exp2

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from glassplat.kernels.composite.cuda_backward import PULLS, THREADS, WARPS, composite_backward, composite_pulls
 from glassplat.kernels.composite.cuda_pair_rows import new_pair_rows, sum_pair_rows
-from glassplat.kernels.composite.cuda_tile import BUCKET, GEOMETRY, MEMBER, MEMBERSHIP, PIXELS, tile_steps
+from glassplat.kernels.composite.cuda_tile import ALIGNMENT, BUCKET, COLUMNS, PIXELS, at, tile_steps
 from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
-from glassplat.kernels.maths.blending import TRANSMITTANCE_MIN, blend_maths
+from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from glassplat.kernels.splats import LEAST_ALPHA, TILE, Deviation, Splats, TileBins
 from glassplat.kernels.tensor_checks import REAL_OF
 
@@ -77,13 +77,14 @@ def composite(
     geometry = flat_geometry(splats)
     values = channels.view(-1, num_channels)
     composite_forward(real, num_channels)(
-        tiles, PIXELS, *geometry, values, marks, count, num_primary, *lists, *saved[:5], image, alpha, mask
-    )
+        tiles, PIXELS, *geometry, values.view(-1), marks.view(-1), count, num_primary, *lists, *saved[:5],
+        image, alpha, mask,
+    )  # fmt: skip
     if deviation:
         where = deviation.where.detach().contiguous()
         composite_deviation(real)(
-            tiles, PIXELS, *geometry, values, count, num_primary, deviation.channel, where, *lists, *saved[1:3],
-            saved.kept_spread, image, alpha, center, lean, deviated,
+            tiles, PIXELS, *geometry, values.view(-1), num_channels, count, num_primary, deviation.channel, where,
+            *lists, *saved[1:3], saved.kept_spread, image, alpha, center, lean, deviated,
         )  # fmt: skip
     return image, alpha, mask, deviated, saved
 
@@ -142,76 +143,86 @@ def flat_geometry(splats: Splats) -> tuple[Tensor, Tensor, Tensor]:
 def composite_forward(real: type, num_channels: int = 4) -> Kernel:
     """Fills image, alpha and mask of the active tiles, and what the backward pass needs."""
     place, load, coverage = tile_steps(real)
-    clipped_alpha = blend_maths(real).clipped_alpha
     zero, one, t_min = real(0.0), real(1.0), real(TRANSMITTANCE_MIN)
+    alpha_min, alpha_max, stopped = real(ALPHA_MIN), real(ALPHA_MAX), np.int32(PIXELS)
 
     @kernel(
         f"composite_forward_{num_channels}",
         real,
-        "real2 real2 real1 real2 real2 int int int1 long1 int1 real3 int3 int1 int1 real3 real4 real3 real3",
+        "real2 real2 real1 real1 real1 int int int1 long1 int1 real3 int3 int1 int1 real3 real4 real3 real3",
     )
     def forward(
         means, conics, opacities, channels, marks, splats_per_camera, num_primary, pair_splats, tile_offsets, active,
         final, last, looked_at, bucket_tiles, kept, image, alpha, mask,
     ):  # fmt: skip
-        geometry = cuda.shared.array((GEOMETRY, PIXELS), real)
-        membership = cuda.shared.array((MEMBERSHIP, PIXELS), np.int32)
+        geometry = cuda.shared.array((PIXELS, COLUMNS), real, alignment=ALIGNMENT)
+        reached = cuda.shared.array(PIXELS, np.int32)
+        members = cuda.shared.array(PIXELS, np.int32)
         most = cuda.shared.array(1, np.int32)
         sums = cuda.local.array(num_channels, real)
         n, pixel = cuda.blockIdx.x, cuda.threadIdx.x
         camera, x0, y0, columns, num_rows = place(active[n], image.shape[2], image.shape[1])
         column, row = pixel % TILE, pixel // TILE
+        x, y, bit = real(np.int32(column)), real(np.int32(row)), np.int32(1 << row)
         inside = column < columns and row < num_rows
-        running, glass_running = inside, inside
-        t, t_glass, shown, last_order, last_glass = one, one, zero, -1, -1
+        # Numbers, because a truth that changes in a loop takes the machine three instructions more.
+        running, glass_running = np.int32(inside), np.int32(inside)
+        t, t_glass, shown, last_order, last_glass = one, one, zero, np.int32(-1), np.int32(-1)
         for d in range(num_channels):
             sums[d] = zero
         if pixel == 0:
             most[0] = 0
         start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
+        first_bucket, first_glass = start // BUCKET + n, np.int32(camera * splats_per_camera + num_primary)
         keeps, keeps_glass = bucket_tiles.size > 0, num_primary < splats_per_camera
-        for first in range(start, stop, PIXELS):
-            if not cuda.syncthreads_or(1 if running else 0):
+        # What stands before the first mark of this camera, counted from the number of its first glass splat.
+        before_marks = camera * (splats_per_camera - num_primary) - first_glass
+        for first in range(0, stop - start, PIXELS):
+            if not cuda.syncthreads_or(running):
                 break
-            if first + pixel < stop:
+            if start + first + pixel < stop:
                 if keeps and pixel % BUCKET == 0:
-                    bucket_tiles[start // BUCKET + n + (first + pixel - start) // BUCKET] = n
-                load(
-                    geometry, membership, pixel, pair_splats[first + pixel], means, conics, opacities, x0, y0, num_rows
-                )
+                    bucket_tiles[first_bucket + (first + pixel) // BUCKET] = n
+                s = pair_splats[start + first + pixel]
+                reached[pixel] = load(geometry, pixel, s, means, conics, opacities, x0, y0, num_rows)
+                members[pixel] = s
             cuda.syncthreads()
-            for i in range(min(PIXELS, stop - first)):
-                if not running:
-                    break
-                if keeps and i % BUCKET == 0:
-                    bucket = start // BUCKET + n + (first + i - start) // BUCKET
+            here, group = np.int32(min(PIXELS, stop - start - first)), np.int32(0)
+            while running != 0 and group < here:
+                if keeps:
+                    bucket = first_bucket + (first + group) // BUCKET
                     kept[bucket, 0, pixel] = t
                     for d in range(num_channels):
                         kept[bucket, 1 + d, pixel] = sums[d]
                     if keeps_glass:
                         kept[bucket, num_channels + 1, pixel], kept[bucket, num_channels + 2, pixel] = t_glass, shown
-                a = clipped_alpha(coverage(geometry, membership, i, column, row))
-                if not a > zero:
-                    continue
-                s, order = membership[MEMBER, i], first + i - start
-                glass = s - camera * splats_per_camera - num_primary
-                if glass < 0:
-                    weight = a * t
-                    if t - weight >= t_min:
-                        t -= weight
-                        last_order = order
-                        for d in range(num_channels):
-                            sums[d] += weight * channels[s, d]
-                    else:
-                        running = False
-                elif glass_running:
-                    weight = a * t_glass
-                    if t_glass - weight >= t_min:
-                        t_glass -= weight
-                        last_glass = order
-                        shown += weight * t * marks[camera, glass]
-                    else:
-                        glass_running = False
+                i = group
+                group = np.int32(min(group + BUCKET, here))
+                while i < group:
+                    k = np.uint32(i)
+                    covered = coverage(geometry, k, x, y) if np.int32(reached[k] & bit) != 0 else zero
+                    if covered >= alpha_min:
+                        a, s = min(covered, alpha_max), members[k]
+                        if s < first_glass:
+                            weight = a * t
+                            left = t - weight
+                            if left >= t_min:
+                                t, last_order = left, np.int32(first + i)
+                                for d in range(num_channels):
+                                    sums[d] += weight * channels[at(s * num_channels + d)]
+                            else:
+                                i = stopped
+                        elif glass_running != 0:
+                            weight = a * t_glass
+                            left = t_glass - weight
+                            if not left >= t_min:
+                                glass_running = np.int32(0)
+                            else:
+                                t_glass, last_glass = left, np.int32(first + i)
+                                shown += weight * t * marks[at(before_marks + s)]
+                    i = np.int32(i + 1)
+                if i > stopped:
+                    running = np.int32(0)
         cuda.syncthreads()
         cuda.atomic.max(most, 0, np.int32(max(last_order, last_glass) + 1))
         cuda.syncthreads()
@@ -232,23 +243,25 @@ def composite_forward(real: type, num_channels: int = 4) -> Kernel:
 def composite_deviation(real: type) -> Kernel:
     """The second traversal: fills the mean of a channel, and the deviation and lean from it, of the active tiles."""
     place, load, coverage = tile_steps(real)
-    clipped_alpha = blend_maths(real).clipped_alpha
     zero, one, least_alpha = real(0.0), real(1.0), real(LEAST_ALPHA)
+    alpha_min, alpha_max = real(ALPHA_MIN), real(ALPHA_MAX)
 
     @kernel(
         "composite_deviation",
         real,
-        "real2 real2 real1 real2 int int int real3 int1 long1 int1 int3 int1 real2 real4 real3 real3 real3 real3",
+        "real2 real2 real1 real1 int int int int real3 int1 long1 int1 int3 int1 real2 real4 real3 real3 real3 real3",
     )
     def deviate(
-        means, conics, opacities, channels, splats_per_camera, num_primary, channel, where,
+        means, conics, opacities, channels, num_channels, splats_per_camera, num_primary, channel, where,
         pair_splats, tile_offsets, active, last, looked_at, kept_spread, image, alpha, center, lean, deviation,
     ):  # fmt: skip
-        geometry = cuda.shared.array((GEOMETRY, PIXELS), real)
-        membership = cuda.shared.array((MEMBERSHIP, PIXELS), np.int32)
+        geometry = cuda.shared.array((PIXELS, COLUMNS), real, alignment=ALIGNMENT)
+        reached = cuda.shared.array(PIXELS, np.int32)
+        members = cuda.shared.array(PIXELS, np.int32)
         n, pixel = cuda.blockIdx.x, cuda.threadIdx.x
         camera, x0, y0, columns, num_rows = place(active[n], image.shape[2], image.shape[1])
         column, row = pixel % TILE, pixel // TILE
+        x, y, bit = real(np.int32(column)), real(np.int32(row)), np.int32(1 << row)
         inside = column < columns and row < num_rows
         factor, middle = zero, zero
         if inside:
@@ -259,27 +272,37 @@ def composite_deviation(real: type) -> Kernel:
         if not cuda.syncthreads_or(1 if factor != zero else 0):
             return
         t, spread, leaning = one, zero, zero
-        start = tile_offsets[active[n]]
-        stop, last_order = start + looked_at[n], last[n, 0, pixel]
-        for first in range(start, stop, PIXELS):
+        start, first_glass = tile_offsets[active[n]], np.int32(camera * splats_per_camera + num_primary)
+        count, last_order = looked_at[n], last[n, 0, pixel]
+        for first in range(0, count, PIXELS):
             cuda.syncthreads()
-            if first + pixel < stop:
-                load(
-                    geometry, membership, pixel, pair_splats[first + pixel], means, conics, opacities, x0, y0, num_rows
-                )
+            if first + pixel < count:
+                s = pair_splats[start + first + pixel]
+                reached[pixel] = load(geometry, pixel, s, means, conics, opacities, x0, y0, num_rows)
+                members[pixel] = s
             cuda.syncthreads()
-            for i in range(min(PIXELS, stop - first)):
-                if kept_spread.shape[0] > 0 and i % BUCKET == 0:
-                    kept_spread[start // BUCKET + n + (first + i - start) // BUCKET, pixel] = spread
-                s = membership[MEMBER, i]
-                if first + i - start > last_order or s - camera * splats_per_camera >= num_primary:
-                    continue
-                weight = clipped_alpha(coverage(geometry, membership, i, column, row)) * t
-                t -= weight
-                difference = channels[s, channel] - middle
-                spread += weight * abs(difference)
-                if difference != zero:
-                    leaning += weight if difference > zero else -weight
+            here, group = np.int32(min(PIXELS, count - first)), np.int32(0)
+            while group < here:
+                if kept_spread.shape[0] > 0:
+                    kept_spread[start // BUCKET + n + (first + group) // BUCKET, pixel] = spread
+                i = group
+                group = np.int32(min(group + BUCKET, here))
+                # Behind the last splat that the pixel blended, it has stopped.
+                end = np.int32(min(group, last_order + 1 - first))
+                while i < end:
+                    k = np.uint32(i)
+                    i = np.int32(i + 1)
+                    if reached[k] & bit == 0:
+                        continue
+                    a = coverage(geometry, k, x, y)
+                    if not a >= alpha_min or members[k] >= first_glass:
+                        continue
+                    weight = min(a, alpha_max) * t
+                    t -= weight
+                    difference = channels[at(members[k] * num_channels + channel)] - middle
+                    spread += weight * abs(difference)
+                    if difference != zero:
+                        leaning += weight if difference > zero else -weight
         if inside:
             center[camera, y0 + row, x0 + column] = middle
             lean[camera, y0 + row, x0 + column] = leaning

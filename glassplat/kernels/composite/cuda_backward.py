@@ -15,16 +15,21 @@ import numpy as np
 from numba import cuda
 
 from glassplat.kernels.composite.cuda_pair_rows import MOMENTS
-from glassplat.kernels.composite.cuda_tile import BUCKET, GEOMETRY, MEAN_X, MEAN_Y, MEMBERSHIP, PIXELS, tile_steps
+from glassplat.kernels.composite.cuda_tile import BUCKET, COLUMNS, MEAN_X, MEAN_Y, PIXELS, at, tile_steps
 from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.cuda.fast_maths import reciprocal_maths
 from glassplat.kernels.cuda.launch import Kernel, kernel
 from glassplat.kernels.devices import SIMULATED
-from glassplat.kernels.maths.blending import ALPHA_MAX, Scalar, blend_maths
+from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar
 from glassplat.kernels.splats import TILE
 
 WARPS = 2
 """Buckets of a block; they have nothing to do with each other."""
 THREADS, SLOTS = WARPS * BUCKET, WARPS * PIXELS
+
+BEHIND, LAST, T_GLASS, BEHIND_GLASS, LAST_GLASS, STATES = (*(at(i * SLOTS) for i in range(1, 6)), 6 * SLOTS)
+"""Where what follows the transmittances begins in shared memory: what lies behind each pixel, and the last lane whose
+splat it blended; all three of glass; and the end."""
 
 PULLS = 5
 """Planes of a tile's pulls beyond those of its channels."""
@@ -70,19 +75,15 @@ def composite_pulls(real: type, num_channels: int = 4) -> Kernel:
     return gather
 
 
-# Indices are unsigned, because Numba lets signed ones count from the end, which costs three instructions each.
-at = np.uint64
-
-
 def _enter(real: type, num_channels: int) -> Scalar:
     shown, spread, _, total, total_glass = _planes(num_channels)
     kept_t, kept_shown = PIXELS * (num_channels + 1), PIXELS * (num_channels + 2)
+    behinds, last, glass_ts, glass_behinds, glass_lasts = BEHIND, LAST, T_GLASS, BEHIND_GLASS, LAST_GLASS
     zero = real(0.0)
 
     @inlined
     def enter(
-        mine, pulled, had, had_spread, channel, has_glass, pulls, kept, kept_spread,
-        ts, glass_ts, behinds, glass_behinds,
+        mine, pulled, had, had_spread, lasts, channel, has_glass, pulls, kept, kept_spread, state,
     ):  # fmt: skip
         """Puts what a pixel is before a bucket's first pair into shared memory."""
         behind = pulls[at(pulled + total)]
@@ -93,8 +94,9 @@ def _enter(real: type, num_channels: int) -> Scalar:
         if has_glass:
             of_glass = pulls[at(pulled + shown)] * kept[at(had + kept_shown)]
             behind -= of_glass
-            glass_ts[mine], glass_behinds[mine] = kept[at(had + kept_t)], pulls[at(pulled + total_glass)] - of_glass
-        ts[mine], behinds[mine] = kept[at(had)], behind
+            state[mine + glass_ts], state[mine + glass_lasts] = kept[at(had + kept_t)], lasts[1]
+            state[mine + glass_behinds] = pulls[at(pulled + total_glass)] - of_glass
+        state[mine], state[mine + behinds], state[mine + last] = kept[at(had)], behind, lasts[0]
 
     return enter
 
@@ -128,8 +130,10 @@ def _planes(num_channels: int) -> tuple[int, ...]:
 def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -> Kernel:
     """Fills one gradient row per pair that any pixel blended; all rows start at zero."""
     place, load, coverage = tile_steps(real)
-    clipped_alpha = blend_maths(real).clipped_alpha
-    zero, one, half, alpha_max = real(0.0), real(1.0), real(0.5), real(ALPHA_MAX)
+    reciprocal = reciprocal_maths(real)
+    zero, one = real(0.0), real(1.0)
+    alpha_min, alpha_max = real(ALPHA_MIN), real(ALPHA_MAX)
+    behinds, lasts, glass_ts, glass_behinds, glass_lasts = BEHIND, LAST, T_GLASS, BEHIND_GLASS, LAST_GLASS
     shown, spread, middle, _, _ = _planes(num_channels)
     enter, write = _enter(real, num_channels), _write(num_channels, probed)
 
@@ -142,12 +146,8 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
         means, conics, opacities, channels, marks, splats_per_camera, num_primary, channel, width, height,
         pair_splats, tile_offsets, active, last, looked_at, bucket_tiles, kept, kept_spread, pulls, out,
     ):  # fmt: skip
-        ts = cuda.shared.array(SLOTS, real)
-        glass_ts = cuda.shared.array(SLOTS, real)
-        behinds = cuda.shared.array(SLOTS, real)
-        glass_behinds = cuda.shared.array(SLOTS, real)
-        geometry = cuda.local.array((GEOMETRY, 1), real)
-        membership = cuda.local.array((MEMBERSHIP, 1), np.int32)
+        state = cuda.shared.array(STATES, real)
+        geometry = cuda.local.array((1, COLUMNS), real)
         value = cuda.local.array(num_channels, real)
         v_value = cuda.local.array(num_channels, real)
         warp, lane = cuda.threadIdx.x // BUCKET, cuda.threadIdx.x % BUCKET
@@ -165,21 +165,23 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
         entry, tile_pulls, tile_last = bucket * planes * PIXELS, n * (num_channels + PULLS) * PIXELS, n * 2 * PIXELS
         for pixel in range(lane, PIXELS, BUCKET):
             # A pixel that had stopped before stored nothing, and no lane will look at it.
-            if last[at(tile_last + pixel)] < first and last[at(tile_last + PIXELS + pixel)] < first:
+            own_last, own_glass = last[at(tile_last + pixel)] - first, last[at(tile_last + PIXELS + pixel)] - first
+            if own_last < 0 and own_glass < 0:
+                state[at(warp * PIXELS + pixel) + lasts] = state[at(warp * PIXELS + pixel) + glass_lasts] = -one
                 continue
             enter(
                 at(warp * PIXELS + pixel), tile_pulls + pixel, entry + pixel, bucket * PIXELS + pixel,
-                channel, has_glass, pulls, kept, kept_spread, ts, glass_ts, behinds, glass_behinds,
+                (real(own_last), real(own_glass)), channel, has_glass, pulls, kept, kept_spread, state,
             )  # fmt: skip
-        order = first + lane
-        inside, glass, mark, apart, own_last = order < looked_at[n], False, zero, zero, tile_last
-        xx, xy, yy, pull_x, pull_y = zero, zero, zero, zero, zero
+        order, tile, place_in_bucket = first + lane, np.uint32(n), real(np.int32(lane))
+        inside, glass, mark, apart, own_lasts = order < looked_at[n], False, zero, zero, lasts
+        xx, xy, yy, pull_x, pull_y, reached = zero, zero, zero, zero, zero, np.int32(0)
         if inside:
             s = pair_splats[start + order]
-            load(geometry, membership, 0, s, means, conics, opacities, x0, y0, rows)
+            reached = load(geometry, 0, s, means, conics, opacities, x0, y0, rows)
             xx, xy, yy, glass = conics[s, 0], conics[s, 1], conics[s, 2], s >= first_glass
             if glass:
-                mark, own_last = marks[camera, s - first_glass], tile_last + PIXELS
+                mark, own_lasts = marks[camera, s - first_glass], glass_lasts
             else:
                 apart = channels[s, max(channel, 0)]
                 for d in range(num_channels):
@@ -187,58 +189,56 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
         for d in range(num_channels):
             v_value[d] = zero
         g_x, g_y, g_xx, g_xy, g_yy, g_0, v_mark, v_apart = zero, zero, zero, zero, zero, zero, zero, zero
-        for step in range(rows * TILE + BUCKET - 1):
+        own_pulls, step = at(tile) * at((num_channels + PULLS) * PIXELS), np.int32(0)
+        while step < PIXELS + BUCKET - 1:
             # The lanes of a warp wait for each other; the simulator knows no warps, but blocks.
             if SIMULATED:
                 cuda.syncthreads()
             else:
                 cuda.syncwarp()
-            pixel = step - lane
-            if not inside or pixel < 0 or pixel >= rows * TILE:
-                continue
-            # None was blended where the tile reaches beyond the image.
-            column, row = pixel & (TILE - 1), pixel >> 4
-            covered = coverage(geometry, membership, 0, column, row)
-            a = clipped_alpha(covered)
-            if not a > zero or order > last[at(own_last + pixel)]:
-                continue
-            mine, pulled = at(warp * PIXELS + pixel), tile_pulls + pixel
-            t, inverse = ts[mine], one / (one - a)
-            if glass:
-                t_glass = glass_ts[mine]
-                pull = pulls[at(pulled + shown)] * t * t_glass
-                weight = a * pull
-                of_glass = glass_behinds[mine] - weight * mark
-                gain = (pull * mark - of_glass * inverse) * a
-                v_mark += weight
-                glass_ts[mine], glass_behinds[mine] = t_glass - a * t_glass, of_glass
-                behinds[mine] -= weight * mark
-            else:
-                weight, dot = a * t, zero
-                for d in range(num_channels):
-                    pull = pulls[at(pulled + d * PIXELS)]
-                    dot += pull * value[d]
-                    v_value[d] += weight * pull
-                if channel >= 0:
-                    difference, pull = apart - pulls[at(pulled + middle)], pulls[at(pulled + spread)]
-                    dot += pull * abs(difference)
-                    if difference != zero:
-                        v_apart += weight * pull if difference > zero else -weight * pull
-                behind = behinds[mine] - weight * dot
-                gain = (t * dot - behind * inverse) * a
-                ts[mine], behinds[mine] = t - weight, behind
-            if covered < alpha_max:
-                dx = real(np.int32(column)) + half - geometry[MEAN_X, 0]
-                dy = real(np.int32(row)) + half - geometry[MEAN_Y, 0]
-                g_0 += gain
-                g_x += gain * dx
-                g_y += gain * dy
-                g_xx += gain * dx * dx
-                g_xy += gain * dx * dy
-                g_yy += gain * dy * dy
-                if probed:
-                    pull_x += abs(gain * (xx * dx + xy * dy))
-                    pull_y += abs(gain * (xy * dx + yy * dy))
+            p = np.int32(step - lane)
+            step = np.int32(step + 1)
+            # A splat that is not there reaches no row, and none was blended where the tile reaches beyond the image.
+            if 0 <= p < PIXELS and np.int32(reached & np.int32(1 << (p >> 4))) != 0:
+                x, y = real(np.int32(p & (TILE - 1))), real(np.int32(p >> 4))
+                covered, mine = coverage(geometry, 0, x, y), at(warp * PIXELS + p)
+                if covered >= alpha_min and place_in_bucket <= state[mine + own_lasts]:
+                    a = min(covered, alpha_max)
+                    pulled, t, inverse = own_pulls + at(np.uint32(p)), state[mine], reciprocal(one - a)
+                    if glass:
+                        t_glass = state[mine + glass_ts]
+                        pull = pulls[pulled + at(shown)] * t * t_glass
+                        weight = a * pull
+                        of_glass = state[mine + glass_behinds] - weight * mark
+                        gain = (pull * mark - of_glass * inverse) * a
+                        v_mark += weight
+                        state[mine + glass_ts], state[mine + glass_behinds] = t_glass - a * t_glass, of_glass
+                        state[mine + behinds] -= weight * mark
+                    else:
+                        weight, dot = a * t, zero
+                        for d in range(num_channels):
+                            pull = pulls[pulled + at(d * PIXELS)]
+                            dot += pull * value[d]
+                            v_value[d] += weight * pull
+                        if channel >= 0:
+                            difference, pull = apart - pulls[pulled + at(middle)], pulls[pulled + at(spread)]
+                            dot += pull * abs(difference)
+                            if difference != zero:
+                                v_apart += weight * pull if difference > zero else -weight * pull
+                        behind = state[mine + behinds] - weight * dot
+                        gain = (t * dot - behind * inverse) * a
+                        state[mine], state[mine + behinds] = t - weight, behind
+                    if covered < alpha_max:
+                        dx, dy = x - geometry[0, MEAN_X], y - geometry[0, MEAN_Y]
+                        g_0 += gain
+                        g_x += gain * dx
+                        g_y += gain * dy
+                        g_xx += gain * dx * dx
+                        g_xy += gain * dx * dy
+                        g_yy += gain * dy * dy
+                        if probed:
+                            pull_x += abs(gain * (xx * dx + xy * dy))
+                            pull_y += abs(gain * (xy * dx + yy * dy))
         if inside:
             write(
                 out, start + order, g_x, g_y, g_xx, g_xy, g_yy, g_0, v_value, channel, v_apart,

@@ -8,6 +8,8 @@ import numpy as np
 
 from glassplat.kernels.composite.cpu_tile import tile_functions
 from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.cuda.fast_maths import exp2_maths, fused_maths
+from glassplat.kernels.devices import SIMULATED
 from glassplat.kernels.maths.blending import Scalar, blend_maths
 from glassplat.kernels.splats import TILE
 
@@ -20,10 +22,15 @@ Bucket `k` of the n-th active tile, whose pairs begin at `start`, has the number
 other bucket has.
 """
 
-# Rows of a splat's geometry in shared memory; the mean is relative to the tile's corner.
-MEAN_X, MEAN_Y, FORM_XX, FORM_XY, FORM_YY, OPACITY, GEOMETRY = 0, 1, 2, 3, 4, 5, 6
-FIRST, LAST, MEMBER, MEMBERSHIP = 0, 1, 2, 3
-"""Rows of what is an integer: first and one-past-last row of pixels that a splat reaches, and its index."""
+MEAN_X, MEAN_Y, FORM_XX, FORM_XY, FORM_YY, OPACITY, COLUMNS = 0, 1, 2, 3, 4, 5, 8
+"""Columns of a splat's geometry; the mean is relative to the centre of the tile's first pixel. Eight, so that one load
+fetches four."""
+
+# Indices are unsigned, because Numba lets signed ones count from the end, which costs three instructions each.
+at = np.uint64
+
+ALIGNMENT = None if SIMULATED else 16
+"""Bytes that one load fetches of shared memory; the simulator takes none."""
 
 
 class TileFunctions(NamedTuple):
@@ -31,8 +38,9 @@ class TileFunctions(NamedTuple):
 
     Attributes:
         place: camera, first column, first row, columns and rows of a tile.
-        load: copies one splat into column `i` of the shared arrays.
-        coverage: opacity times falloff of splat `i` at a pixel of the tile; 0 in rows that it does not reach.
+        load: copies one splat's geometry into row `i` of an array, and returns the rows of pixels that it reaches, a
+            bit for each.
+        coverage: opacity times falloff of the splat in row `i` at the pixel in column x and row y of the tile.
     """
 
     place: Scalar
@@ -49,30 +57,31 @@ def _load(real: type) -> Scalar:
     maths = blend_maths(real)
     screen_form, vertical_reach, row_range = maths.screen_form, maths.vertical_reach, maths.row_range
 
+    half = real(0.5)
+
     @inlined
-    def load(geometry, membership, i, s, means, conics, opacities, x0, y0, num_rows):
+    def load(geometry, i, s, means, conics, opacities, x0, y0, num_rows):
         xx, xy, yy, opacity = conics[s, 0], conics[s, 1], conics[s, 2], opacities[s]
         mean_y = means[s, 1] - real(y0)
-        geometry[MEAN_X, i], geometry[MEAN_Y, i] = means[s, 0] - real(x0), mean_y
-        geometry[FORM_XX, i], geometry[FORM_XY, i], geometry[FORM_YY, i] = screen_form(xx, xy, yy)
-        geometry[OPACITY, i] = opacity
+        geometry[i, MEAN_X], geometry[i, MEAN_Y] = means[s, 0] - real(x0) - half, mean_y - half
+        geometry[i, FORM_XX], geometry[i, FORM_XY], geometry[i, FORM_YY] = screen_form(xx, xy, yy)
+        geometry[i, OPACITY] = opacity
         first, last = row_range(mean_y, vertical_reach(xx, xy, yy, opacity), num_rows)
-        membership[FIRST, i], membership[LAST, i], membership[MEMBER, i] = first, last, s
+        return np.int32((1 << last) - (1 << first))
 
     return load
 
 
 def _coverage(real: type) -> Scalar:
-    exp2 = blend_maths(real).exp2
-    zero, half = real(0.0), real(0.5)
+    exp2, fused = exp2_maths(real), fused_maths()
 
     @inlined
-    def coverage(geometry, membership, i, column, row):
-        if row < membership[FIRST, i] or row >= membership[LAST, i]:
-            return zero
-        dx = real(np.int32(column)) + half - geometry[MEAN_X, i]
-        dy = real(np.int32(row)) + half - geometry[MEAN_Y, i]
-        linear, constant = geometry[FORM_XY, i] * dy, geometry[FORM_YY, i] * dy * dy
-        return geometry[OPACITY, i] * exp2((geometry[FORM_XX, i] * dx + linear) * dx + constant)
+    def coverage(geometry, i, x, y):
+        dx, dy = x - geometry[i, MEAN_X], y - geometry[i, MEAN_Y]
+        # Written out, because the compiler would choose anew in every kernel which products and sums to fuse: a splat
+        # at exactly 1/255 could be in the image and not in its gradient.
+        along = fused(geometry[i, FORM_XX], dx, geometry[i, FORM_XY] * dy)
+        exponent = fused(along, dx, geometry[i, FORM_YY] * dy * dy)
+        return geometry[i, OPACITY] * exp2(exponent)
 
     return coverage

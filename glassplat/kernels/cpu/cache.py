@@ -5,6 +5,7 @@ from __future__ import annotations
 import dis
 import hashlib
 import logging
+import pickle
 import time
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -12,15 +13,25 @@ from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
+from llvmlite import ir
+from numba.core import types
 from numba.core.caching import FunctionCache
 from numba.core.cpu import CPUContext
 from numba.core.registry import cpu_target
+from numba.extending import intrinsic
+
+from glassplat.kernels.cpu.cache_folders import KernelFiles
 
 log = logging.getLogger("glassplat.kernels")
 
 PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
 NAMED = (ModuleType, type, BuiltinFunctionType, np.ufunc)
-LIBRARIES = ("numba", "numpy")
+SPELLED = (types.Type, ir.Type)
+"""Types whose text says all about them."""
+LIBRARIES = ("numba", "numpy", "llvmlite")
+INTRINSIC = type(intrinsic(lambda typing: None))
+DAMAGE = (EOFError, pickle.UnpicklingError, AttributeError, ImportError, LookupError, TypeError, ValueError)
+"""What reading a file ends with that was cut short, or is another program's."""
 
 
 def fingerprint(function: Callable[..., Any], flags: str) -> str:
@@ -56,10 +67,18 @@ def _described(value: Any, seen: set[int]) -> Iterator[str]:
         yield from _described(value.co_consts, seen)
     elif isinstance(value, NAMED) or (isinstance(value, FunctionType) and value.__module__.startswith(LIBRARIES)):
         yield f"{getattr(value, '__module__', '')} {value.__name__}"
+    elif isinstance(value, SPELLED):
+        yield f"{type(value).__name__} {value}"
+    elif isinstance(value, INTRINSIC):
+        yield "intrinsic"
+        yield from _described(value.__wrapped__, seen)
     elif isinstance(value, FunctionType):
         if id(value) not in seen:
             seen.add(id(value))
             yield from _described_function(value, seen)
+    elif type(value).__name__ == "_Intrinsic":
+        # What a kernel says to the compiler in its own words, in a function that Numba wraps.
+        yield from _described(value._defn, seen)
     else:
         raise TypeError(
             f"a kernel uses {value!r}, a {type(value).__name__}, whose changes the cache would not notice; expected "
@@ -104,12 +123,30 @@ class KernelCache(FunctionCache):
     what has been compiled is loaded from the disk like everything else.
     """
 
+    _impl_class = KernelFiles
+
     def __init__(self, function: Callable[..., Any], compiled: Callable[..., Any], flags: str) -> None:
         super().__init__(function)
         self._function, self._compiled = function, compiled
         self._name_shown = function.__name__
+        self._files = self._impl.files(function)
         self._fingerprint = fingerprint(function, flags)
         self.compilations = 0
+
+    def _load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The kernel for a signature from the first folder that has it; a damaged file counts as none."""
+        key = self._index_key(sig, target_context.codegen())
+        for file in self._files:
+            try:
+                data = file.load(key)
+            except OSError:
+                continue  # A folder that is none, or that this user may not look into.
+            except DAMAGE as error:
+                log.warning("%s cannot be read (%s); compiling again", file._index_path, error)
+                continue
+            if data is not None:
+                return self._impl.rebuild(target_context, data)
+        return None
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, Any, str]:
         return sig, codegen.magic_tuple(), self._fingerprint
@@ -132,8 +169,18 @@ class KernelCache(FunctionCache):
         (made,) = dispatcher.overloads.values()
         self.compilations += 1
         log.info("compiled %s in %.1f s", self._name_shown, time.perf_counter() - started)
-        try:
-            self.save_overload(sig, made)
-        except OSError as error:
-            log.warning("cannot keep %s for the next time: %s", self._name_shown, error)
+        self._keep(sig, made)
         return made
+
+    def _keep(self, sig: Any, made: Any) -> None:
+        """Writes a compiled kernel to the disk; a damaged index, which cannot be added to, is begun anew."""
+        try:
+            try:
+                self.save_overload(sig, made)
+            except DAMAGE:
+                self.flush()
+                self.save_overload(sig, made)
+        except OSError as error:
+            self._impl.not_kept(error)
+        else:
+            self._impl.remark()

@@ -11,9 +11,14 @@ import numpy as np
 from numba.extending import register_jitable
 
 from glassplat.kernels.cpu.cache import KernelCache
+from glassplat.kernels.cpu.threads import entrance, prefer_openmp
 
-HOW = Path(__file__).read_text()
-"""This file; how a kernel is compiled decides, with its own code, whether the cache still holds."""
+# Before anything else in the process can start Numba's threads.
+prefer_openmp()
+
+HOW = "".join(Path(__file__).with_name(name).read_text() for name in ("jit.py", "vector.py"))
+"""This file and what operators on vectors mean, which no kernel names: with its own code, they decide whether the cache
+still holds."""
 
 # `nnan` and `ninf` stay out: with them a comparison with NaN is undefined, and culling bad Gaussians relies on it.
 FAST_MATH = frozenset({"contract", "reassoc", "nsz", "arcp", "afn"})
@@ -27,13 +32,19 @@ inlined = register_jitable(forceinline=True, _nrt=False, fastmath=set(FAST_MATH)
 class Kernel:
     """A compiled kernel and its name."""
 
-    def __init__(self, dispatcher: Any, name: str) -> None:
+    def __init__(self, dispatcher: Any, name: str, *, parallel: bool) -> None:
         self.dispatcher = dispatcher
         self.name = name
+        self._run: Callable[..., Any] = self._first_run if parallel else dispatcher
 
     def __call__(self, *arguments: Any) -> Any:
         """Runs the kernel, compiled at the first call unless the disk has it."""
-        return self.dispatcher(*arguments)
+        return self._run(*arguments)
+
+    def _first_run(self, *arguments: Any) -> Any:
+        """Starts the threads: only then it is known which they are, and how a parallel kernel may be entered."""
+        self._run = entrance(self.dispatcher)
+        return self._run(*arguments)
 
     @property
     def compilations(self) -> int:
@@ -59,6 +70,6 @@ def kernel(name: str, real: type, *, parallel: bool = True) -> Callable[[Callabl
         compiled = numba.njit(parallel=parallel, fastmath=set(FAST_MATH), error_model="numpy")
         dispatcher = compiled(function)
         dispatcher._cache = KernelCache(function, compiled, flags=f"parallel={parallel} {HOW}")
-        return Kernel(dispatcher, full_name)
+        return Kernel(dispatcher, full_name, parallel=parallel)
 
     return decorate

@@ -6,21 +6,24 @@ own launch looks at each array for microseconds; here the arguments are written 
 
 from __future__ import annotations
 
-import ctypes
 import math
 import re
+import struct
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import torch
-from cuda.core import LaunchConfig, ObjectCode, Stream, launch
 from numba import config, cuda, types
 from torch import Tensor
 
 from glassplat.kernels.cuda.cache import ImageCache
 from glassplat.kernels.devices import SIMULATED
+
+if not SIMULATED:
+    # The simulator has no driver.
+    from glassplat.kernels.cuda.driver import LoadedKernel
 
 # Small launches are part of every frame (few cameras, few panes), and Numba warns of each of them.
 config.CUDA_LOW_OCCUPANCY_WARNINGS = 0
@@ -34,14 +37,8 @@ SCALARS = {
     "float": types.float32,
     "double": types.float64,
 }
-CTYPES = {
-    "uint8": "c_uint8",
-    "int16": "c_int16",
-    "int32": "c_int32",
-    "int64": "c_int64",
-    "float32": "c_float",
-    "float64": "c_double",
-}
+FORMATS = {"bool": "?", "uint8": "B", "int16": "h", "int32": "i", "int64": "q", "float32": "f", "float64": "d"}
+"""How numbers are written to memory."""
 TOKEN = re.compile(r"([a-z]+)([1-4]?)")
 
 
@@ -63,7 +60,8 @@ class Kernel:
         self.signature = signature
         self.bounds = bounds
         self._expected = [Expected(type_) for type_ in signature]
-        self._loaded: dict[int, Any] = {}
+        self._loaded: dict[int, LoadedKernel] = {}
+        self._layout = struct.Struct("<" + "".join(expected.layout for expected in self._expected))
         self._images = ImageCache(function, name, signature, bounds)
         self._simulated = cuda.jit(function) if SIMULATED else None
 
@@ -73,7 +71,8 @@ class Kernel:
         Args:
             blocks: how many of them.
             threads: in each block.
-            arguments: contiguous tensors of one device, and numbers, in the order of the signature.
+            arguments: contiguous tensors of one device, and numbers, in the order of the signature. None stands for
+                an array without elements.
         """
         if blocks == 0:
             return
@@ -83,29 +82,26 @@ class Kernel:
             values_of = (e.simulated(argument) for e, argument in zip(self._expected, arguments, strict=True))
             self._simulated[blocks, threads](*values_of)
             return
-        device = next(argument.device for argument in arguments if isinstance(argument, Tensor))
+        index = next(argument.get_device() for argument in arguments if isinstance(argument, Tensor))
         values: list[Any] = []
         for argument, expected in zip(arguments, self._expected, strict=True):
             expected.append(values, argument)
-        # Numba keeps a current device of its own, and the threads of a backward pass may have none.
-        with cuda.gpus[device.index]:
-            stream = Stream.from_handle(torch.cuda.current_stream(device).cuda_stream)
-            launch(stream, LaunchConfig(grid=blocks, block=threads), self._on_device(device), *values)
+        loaded = self._loaded.get(index) or self._on_device(index)
+        loaded.launch(blocks, threads, torch.cuda.current_stream(index).cuda_stream, values)
 
-    def _on_device(self, device: torch.device) -> Any:
-        """The kernel on a GPU, which has to be the current one, loaded at first use."""
-        if device.index not in self._loaded:
-            code = self._images.machine_code(torch.cuda.get_device_capability(device))
-            self._loaded[device.index] = ObjectCode.from_cubin(code.cubin, name=self.name).get_kernel(code.entry)
-        return self._loaded[device.index]
+    def _on_device(self, index: int) -> LoadedKernel:
+        """The kernel on a GPU, loaded at first use."""
+        if index not in self._loaded:
+            code = self._images.machine_code(torch.cuda.get_device_capability(index))
+            self._loaded[index] = LoadedKernel(code, self.name, index, self._layout)
+        return self._loaded[index]
 
 
 @lru_cache(maxsize=4096)
-def _array_layout(shape: tuple[int, ...], size: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """What stands before and after an array's address, for elements of so many bytes."""
+def _array_layout(shape: tuple[int, ...], size: int) -> tuple[int, tuple[int, ...]]:
+    """The number of an array's elements, each of so many bytes, and what stands after its address: shape, strides."""
     strides = tuple(math.prod(shape[axis + 1 :]) * size for axis in range(len(shape)))
-    # Two pointers that only host memory uses, the number of elements and their size; then shape and strides.
-    return (0, 0, math.prod(shape), size), (*shape, *strides)
+    return math.prod(shape), (*shape, *strides)
 
 
 class Expected:
@@ -113,6 +109,7 @@ class Expected:
 
     Attributes:
         type: the Numba type.
+        layout: how what stands for an argument lies in memory, eight bytes for each value.
     """
 
     def __init__(self, type_: Any) -> None:
@@ -121,22 +118,32 @@ class Expected:
         self._ndim = type_.ndim if self._is_array else 0
         element = str(type_.dtype if self._is_array else type_)
         self._dtype = torch.bool if element == "bool" else getattr(torch, element)
-        self._number = bool if element == "bool" else getattr(ctypes, CTYPES[element])
+        self._is_bool = element == "bool"
+        self._size = self._dtype.itemsize
+        self._nothing = (0, 0, 0, self._size, 0, *(0,) * (2 * self._ndim))
+        self.layout = f"{5 + 2 * self._ndim}q" if self._is_array else f"{FORMATS[element]}{8 - self._size}x"
 
     def append(self, values: list[Any], argument: Any) -> None:
         """Adds what stands for an argument in Numba's calling convention to the values of a launch."""
         if not self._is_array:
-            values.append(self._number(argument))
+            values.append(argument)
             return
-        if argument.dtype != self._dtype or argument.dim() != self._ndim or not argument.is_contiguous():
-            raise TypeError(f"got {argument.dtype} of shape {tuple(argument.shape)}, expected contiguous {self.type}")
-        before, after = _array_layout(argument.shape, argument.element_size())
-        values += (*before, argument.data_ptr(), *after)
+        if argument is None:
+            values += self._nothing
+            return
+        shape = argument.shape
+        if argument.dtype != self._dtype or len(shape) != self._ndim or not argument.is_contiguous():
+            raise TypeError(f"got {argument.dtype} of shape {tuple(shape)}, expected contiguous {self.type}")
+        count, after = _array_layout(shape, self._size)
+        # Two pointers that only host memory uses come first.
+        values += (0, 0, count, self._size, argument.data_ptr(), *after)
 
     def simulated(self, argument: Any) -> Any:
         """What stands for an argument in the simulator."""
         if not self._is_array:
-            return bool(argument) if self._number is bool else np.dtype(str(self.type)).type(argument)
+            return bool(argument) if self._is_bool else np.dtype(str(self.type)).type(argument)
+        if argument is None:
+            return np.empty((0,) * self.type.ndim, np.dtype(str(self.type.dtype)))
         array = argument.detach().numpy()
         if argument.dtype != self._dtype or array.ndim != self.type.ndim or not array.flags.c_contiguous:
             raise TypeError(f"got {array.dtype} of shape {array.shape}, expected contiguous {self.type}")

@@ -8,6 +8,7 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, NamedTuple
 
+from cuda import pathfinder
 from cuda.core import Linker, LinkerOptions, ObjectCode
 from numba import cuda
 
@@ -58,8 +59,7 @@ def compiled(
 @cache
 def compiler_versions() -> str:
     """What a compiled kernel depends on beside its own code."""
-    linker = Linker.which_backend()
-    return " ".join([f"{name} {_version(name)}" for name in COMPILERS] + [str(linker), str(_linker_version(linker))])
+    return " ".join([*(f"{name} {_version(name)}" for name in COMPILERS), f"linker {_linker_version()}"])
 
 
 def _version(name: str) -> str:
@@ -69,12 +69,11 @@ def _version(name: str) -> str:
         return "none"
 
 
-def _linker_version(linker: str) -> Any:
-    if linker == "nvJitLink":
-        from cuda.bindings import nvjitlink
+def _linker_version() -> Any:
+    from cuda.bindings import driver, nvjitlink
 
+    try:
         return nvjitlink.version()
-    # Without nvJitLink the driver links, and its version is what counts.
-    from cuda.bindings import driver
-
-    return driver.cuDriverGetVersion()[1]
+    except (RuntimeError, pathfinder.DynamicLibNotFoundError):
+        # Without nvJitLink the driver links, and its version is what counts.
+        return driver.cuDriverGetVersion()[1]

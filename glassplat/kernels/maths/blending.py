@@ -21,7 +21,7 @@ TRANSMITTANCE_MIN = 1e-4
 """A pixel stops before the splat that would take its transmittance below this."""
 
 # Minimax polynomial of 2^f for f in [-1, 0] with 2^0 = 1 exactly; relative error 2.4e-7 in float32.
-_EXP2_COEFFICIENTS = (1.0, 0.693143721, 0.240180143, 0.0552973572, 0.00920579680, 0.000944903083)
+EXP2_COEFFICIENTS = (1.0, 0.693143721, 0.240180143, 0.0552973572, 0.00920579680, 0.000944903083)
 
 Scalar = Callable[..., Any]
 
@@ -52,7 +52,7 @@ def blend_maths(real: type) -> BlendMaths:
 
 
 def _fast_exp2(real: type) -> Scalar:
-    c0, c1, c2, c3, c4, c5 = (real(c) for c in _EXP2_COEFFICIENTS)
+    c0, c1, c2, c3, c4, c5 = (real(c) for c in EXP2_COEFFICIENTS)
     lowest = real(-80.0)
 
     @inlined

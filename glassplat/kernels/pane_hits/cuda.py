@@ -29,10 +29,9 @@ def pane_hits(
     depth = centers.new_empty(height, width)
     tiles = torch.zeros(count, rows, columns, dtype=torch.bool, device=centers.device)
     shown_columns, shown_rows = (tiles.new_zeros(count, size) for size in (width, height))
-    visible = centers.new_empty(0, 0) if mask is None else mask
-    before = (index.new_empty(0, 0), centers.new_empty(0, 0)) if beyond is None else (beyond.pane, beyond.depth)
+    before = (None, None) if beyond is None else (beyond.pane, beyond.depth)
     outputs = (index, depth, tiles, shown_columns, shown_rows)
-    pane_hits_forward(real)(rows * columns, PIXELS, *inputs, visible, *before, *outputs)
+    pane_hits_forward(real)(rows * columns, PIXELS, *inputs, mask, *before, *outputs)
     left, right = _edges(shown_columns)
     top, bottom = _edges(shown_rows)
     return PaneHits(index, depth, tiles, torch.stack([left, top, right, bottom], dim=1).to(centers.dtype))

@@ -12,7 +12,9 @@ import torch
 from numba import cuda
 from torch import Tensor
 
+from glassplat.kernels.cpu.jit import inlined
 from glassplat.kernels.cuda.launch import Kernel, kernel
+from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.ssim import RADIUS, ssim_maths
 from glassplat.kernels.splats import TILE
 from glassplat.kernels.tensor_checks import REAL_OF
@@ -49,10 +51,26 @@ def _blocks(image: Tensor) -> int:
     return -(-image.shape[0] // TILE) * -(-image.shape[1] // TILE) * CHANNELS
 
 
+def _places() -> tuple[Scalar, Scalar]:
+    @inlined
+    def place(block, width):
+        """Channel, first row and first column of a block's tile."""
+        tile, columns = block // CHANNELS, (width + TILE - 1) // TILE
+        return block % CHANNELS, tile // columns * TILE, tile % columns * TILE
+
+    @inlined
+    def around(i, top, left):
+        """Row and column of the i-th pixel of a tile with its margin; it may lie outside of the image."""
+        return top + i // WIDE - RADIUS, left + i % WIDE - RADIUS
+
+    return place, around
+
+
 @cache
 def photometric_forward(real: type) -> Kernel:
     """Fills slopes [3, H, W, 3], where they are not empty, and each block's sums of L1 and similarity."""
     blur, compare = ssim_maths(real)
+    place, around = _places()
     zero, white = real(0.0), real(255.0)
 
     @kernel("photometric_forward", real, "real3 byte3 real4 real2")
@@ -66,11 +84,9 @@ def photometric_forward(real: type) -> Kernel:
         blurred_squares = cuda.shared.array(STRIP, real)
         blurred_products = cuda.shared.array(STRIP, real)
         height, width, t = image.shape[0], image.shape[1], cuda.threadIdx.x
-        tile, channel = cuda.blockIdx.x // CHANNELS, cuda.blockIdx.x % CHANNELS
-        tile_columns = (width + TILE - 1) // TILE
-        top, left = tile // tile_columns * TILE, tile % tile_columns * TILE
+        channel, top, left = place(cuda.blockIdx.x, width)
         for i in range(t, AREA, PIXELS):
-            y, x = top + i // WIDE - RADIUS, left + i % WIDE - RADIUS
+            y, x = around(i, top, left)
             a, b = zero, zero
             if 0 <= y < height and 0 <= x < width:
                 a, b = image[y, x, channel], real(target[y, x, channel]) / white
@@ -116,7 +132,7 @@ def photometric_forward(real: type) -> Kernel:
 @cache
 def photometric_backward(real: type) -> Kernel:
     """Fills the gradient of the image from the slopes and the weights [2] of each pixel's L1 and similarity."""
-    blur = ssim_maths(real).blur
+    blur, (place, around) = ssim_maths(real).blur, _places()
     zero, two, white = real(0.0), real(2.0), real(255.0)
 
     @kernel("photometric_backward", real, "real3 byte3 real4 real1 real3")
@@ -128,11 +144,9 @@ def photometric_backward(real: type) -> Kernel:
         blurred_squares = cuda.shared.array(STRIP, real)
         blurred_product = cuda.shared.array(STRIP, real)
         height, width, t = image.shape[0], image.shape[1], cuda.threadIdx.x
-        tile, channel = cuda.blockIdx.x // CHANNELS, cuda.blockIdx.x % CHANNELS
-        tile_columns = (width + TILE - 1) // TILE
-        top, left = tile // tile_columns * TILE, tile % tile_columns * TILE
+        channel, top, left = place(cuda.blockIdx.x, width)
         for i in range(t, AREA, PIXELS):
-            y, x = top + i // WIDE - RADIUS, left + i % WIDE - RADIUS
+            y, x = around(i, top, left)
             by_mean[i], by_squares[i], by_product[i] = zero, zero, zero
             if 0 <= y < height and 0 <= x < width:
                 by_mean[i] = slopes[0, y, x, channel]

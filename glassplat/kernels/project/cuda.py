@@ -41,7 +41,8 @@ def project_gradients(
     means, cam_from_world = inputs[0], inputs[5]
     real, num_cameras = REAL_OF[means.dtype], cam_from_world.shape[0]
     blocks = blocks_for(means.shape[0], THREADS)
-    found = [torch.empty_like(tensor) for tensor in inputs[:5]]
+    # Harmonics are added to, and to clear them all at once is faster than one Gaussian at a time.
+    found = [*(torch.empty_like(tensor) for tensor in inputs[:4]), torch.zeros_like(inputs[4])]
     shape = (blocks, num_cameras, POSE) if needs_camera else (0, 0, 0)
     partial = torch.zeros(shape, dtype=torch.float64, device=means.device)
     lens = _lenses(cam_from_world, inputs[6], width, height)
@@ -149,8 +150,6 @@ def project_backward(real: type) -> Kernel:
         mean, g_mean, touched = vec3(means, n), (zero, zero, zero), False
         _, opacity, quat, inverse_norm, axes = shape(means, quats, log_scales, logit_opacities, n)
         g_opacity, ga_x, ga_y, ga_z = zero, (zero, zero, zero), (zero, zero, zero), (zero, zero, zero)
-        for k in range(sh.shape[1] if inside else 0):
-            g_sh[n, k, 0] = g_sh[n, k, 1] = g_sh[n, k, 2] = zero
         for c in range(cam_from_world.shape[0]):
             for i in range(POSE):
                 total[i] = 0.0

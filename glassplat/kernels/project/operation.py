@@ -45,8 +45,10 @@ def project(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, ne
         clip_planes = gaussians.means.new_empty(0, 4)
     windows = cameras.windows
     if windows is None:
-        whole = gaussians.means.new_tensor([0, 0, cameras.width, cameras.height])
-        windows = whole.repeat(cameras.cam_from_world.shape[0], 1)
+        # Filled in on the device: numbers that came from here would make it wait.
+        windows = gaussians.means.new_zeros(cameras.cam_from_world.shape[0], 4)
+        windows[:, 2].fill_(cameras.width)
+        windows[:, 3].fill_(cameras.height)
     outputs = _Project.apply(
         *gaussians, cameras.cam_from_world, cameras.intrinsics, clip_planes, windows,
         cameras.width, cameras.height, sh_degree, near,

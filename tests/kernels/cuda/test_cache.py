@@ -18,6 +18,7 @@ from numba import config
 
 from glassplat.kernels.cuda import cache, launch
 from glassplat.kernels.cuda.cache import ImageCache
+from glassplat.kernels.cuda.fast_maths import exp2_maths, reciprocal_maths
 from glassplat.kernels.devices import SIMULATED
 from tests.kernels.test_cache import printed_by
 from tools.compile_kernels import without_device
@@ -173,32 +174,31 @@ def test_an_interrupted_write_leaves_the_old_file(
     assert file.read_bytes() == before
 
 
-class Loader:
-    """Stands in for the driver, and notes what it is given."""
-
-    def __init__(self) -> None:
-        self.loaded: list[tuple[bytes, str]] = []
-
-    def from_cubin(self, cubin: bytes, *, name: str) -> Loader:
-        self.cubin = cubin
-        return self
-
-    def get_kernel(self, entry: str) -> str:
-        self.loaded.append((self.cubin, entry))
-        return f"kernel {len(self.loaded)}"
-
-
 def test_the_loader_gets_what_the_disk_has(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    loader = Loader()
-    monkeypatch.setattr(launch, "ObjectCode", loader)
-    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: CAPABILITY)
+    loaded: list[tuple[Any, int]] = []
+
+    def load(code: Any, name: str, index: int, layout: Any) -> str:
+        loaded.append((code, index))
+        return f"kernel {len(loaded)}"
+
+    monkeypatch.setattr(launch, "LoadedKernel", load)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: CAPABILITY)
     kept, _ = made(images(), caplog)
     caplog.clear()
     scale = launch.Kernel(images()._function, "scale_float32", images()._signature, None)
-    first, second = torch.device("cuda", 0), torch.device("cuda", 1)
     with caplog.at_level(logging.INFO, logger="glassplat.kernels"):
-        assert scale._on_device(first) == "kernel 1"
-        assert scale._on_device(second) == "kernel 2"
-        assert scale._on_device(first) == "kernel 1"
-    assert loader.loaded == [(kept.cubin, kept.entry)] * 2
+        assert [scale._on_device(index) for index in (0, 1, 0)] == ["kernel 1", "kernel 2", "kernel 1"]
+    assert loaded == [(kept, 0), (kept, 1)]
     assert caplog.messages == []
+
+
+def test_the_key_tells_apart_which_instruction_a_kernel_asks_for() -> None:
+    def key(maths: Callable[[type], Any]) -> bytes:
+        instruction = maths(np.float32)
+
+        def apply(values: Any) -> None:
+            values[0] = instruction(values[0])
+
+        return launch.kernel("apply", np.float32, "real1")(apply)._images.key(CAPABILITY)
+
+    assert key(exp2_maths) == key(exp2_maths) != key(reciprocal_maths)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import struct
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,9 +14,12 @@ import torch
 
 pytest.importorskip("numba_cuda", reason="numba-cuda is not installed; `make setup` installs it")
 
+from cuda.bindings.driver import CUresult
 from numba import types
 
+from glassplat.kernels.cuda.cache import ImageCache
 from glassplat.kernels.cuda.launch import Expected, blocks_for, kernel
+from glassplat.kernels.cuda.machine_code import MachineCode
 from glassplat.kernels.devices import SIMULATED
 
 if SIMULATED:
@@ -22,6 +27,9 @@ if SIMULATED:
 
 from numba.cuda.args import ArgHint
 from numba.cuda.dispatcher import _Kernel
+
+from glassplat.kernels.cuda import driver
+from glassplat.kernels.cuda.driver import SLOT
 
 
 class OnDevice(ArgHint):
@@ -41,10 +49,6 @@ def numbas_values(type_: Any, value: Any) -> list[Any]:
     found: list[Any] = []
     _Kernel._prepare_args(SimpleNamespace(extensions=[]), type_, value, 0, [], found)
     return found
-
-
-def plain(values: list[Any]) -> list[Any]:
-    return [(type(v).__name__, v.value) if isinstance(v, ctypes._SimpleCData) else v for v in values]
 
 
 @pytest.mark.parametrize(
@@ -71,9 +75,123 @@ def test_arrays_are_handed_over_as_numba_does(dtype: torch.dtype, element: Any, 
     [(types.int32, 7), (types.int64, -3), (types.float32, 0.1), (types.float64, 0.1), (types.boolean, True)],
 )
 def test_numbers_are_handed_over_as_numba_does(type_: Any, value: Any) -> None:
+    expected = Expected(type_)
     own: list[Any] = []
-    Expected(type_).append(own, value)
-    assert plain(own) == plain(numbas_values(type_, value))
+    expected.append(own, value)
+    packed = struct.pack(f"<{expected.layout}", *own)
+    (numbas,) = numbas_values(type_, value)
+    assert len(packed) == SLOT
+    assert packed.startswith(bytes(numbas) if isinstance(numbas, ctypes._SimpleCData) else struct.pack("?", numbas))
+
+
+class Driver:
+    """Stands in for the driver: notes each call, and reads the arguments of a launch as a GPU's driver would."""
+
+    CUcontext, CUfunction = int, int
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+        self.launches: list[tuple[Any, ...]] = []
+        self.contexts = [OWN]
+        self.refusal = 0
+
+    def cuCtxGetCurrent(self) -> tuple[int, int]:  # noqa: N802
+        self.calls.append("get")
+        return 0, self.contexts[-1]
+
+    def cuCtxPushCurrent(self, context: int) -> tuple[int]:  # noqa: N802
+        self.calls.append("push")
+        self.contexts.append(context)
+        return (0,)
+
+    def cuCtxPopCurrent(self) -> tuple[int, int]:  # noqa: N802
+        self.calls.append("pop")
+        return 0, self.contexts.pop()
+
+    def cuLaunchKernel(self, *arguments: int) -> tuple[Any]:  # noqa: N802
+        self.calls.append("launch")
+        *head, slots, _ = arguments
+        pointers = (ctypes.c_void_p * SLOTS).from_address(slots)
+        self.launches.append((self.contexts[-1], *head, *(ctypes.string_at(pointer, SLOT) for pointer in pointers)))
+        return (CUresult(self.refusal),)
+
+
+OWN, OTHER, SLOTS, STREAM = 11, 22, 11, 4660
+"""Two contexts, the slots of an array of two dimensions and two numbers, and a stream."""
+
+
+@pytest.fixture
+def gpu(monkeypatch: pytest.MonkeyPatch) -> Driver:
+    """A GPU that is not there, and takes every launch."""
+    found = Driver()
+    library = SimpleNamespace(get_kernel=lambda entry: SimpleNamespace(handle=77))
+    monkeypatch.setattr(driver, "driver", found)
+    monkeypatch.setattr(driver, "ObjectCode", SimpleNamespace(from_cubin=lambda cubin, name: library))
+    monkeypatch.setattr(driver.cuda, "gpus", [nullcontext()])
+    monkeypatch.setattr(torch.Tensor, "get_device", lambda tensor: 0)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda index: SimpleNamespace(cuda_stream=STREAM))
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: (9, 0))
+    monkeypatch.setattr(ImageCache, "machine_code", lambda images, capability: MachineCode("entry", b"cubin"))
+    return found
+
+
+def declared() -> Any:
+    """A kernel that is never compiled."""
+    return kernel("nothing", np.float32, "real2 int bool")(lambda values, count, flag: None)
+
+
+def test_a_launch_hands_the_driver_every_argument_in_a_slot_of_its_own(gpu: Driver) -> None:
+    values = torch.zeros(3, 2)
+    declared()(5, 64, values, -7, True)
+    ((context, function, *sizes, stream), slots) = gpu.launches[0][:10], gpu.launches[0][10:]
+    assert (context, function, stream) == (OWN, 77, STREAM)
+    assert sizes == [5, 1, 1, 64, 1, 1, 0]
+    assert [int.from_bytes(slot, "little") for slot in slots[:9]] == [0, 0, 6, 4, values.data_ptr(), 3, 2, 8, 4]
+    assert slots[9].startswith(struct.pack("<i", -7))
+    assert slots[10].startswith(b"\x01")
+
+
+def test_a_launch_takes_two_calls_of_the_driver_and_no_new_memory(gpu: Driver) -> None:
+    made, values = declared(), torch.zeros(3, 2)
+    made(5, 64, values, 1, True)
+    gpu.calls.clear()
+    loaded = made._on_device(0)
+    memory = loaded._address
+    for _ in range(3):
+        made(5, 64, values, 1, True)
+    assert gpu.calls == ["get", "launch"] * 3
+    assert made._on_device(0) is loaded
+    assert loaded._address == memory
+
+
+def test_a_thread_without_the_gpus_context_borrows_it(gpu: Driver) -> None:
+    made, values = declared(), torch.zeros(3, 2)
+    made(5, 64, values, 1, True)
+    gpu.contexts[:] = [OTHER]
+    gpu.calls.clear()
+    made(5, 64, values, 1, True)
+    assert gpu.calls == ["get", "push", "launch", "pop"]
+    assert gpu.launches[-1][0] == OWN
+    assert gpu.contexts == [OTHER]
+
+
+def test_what_the_driver_refuses_is_named(gpu: Driver) -> None:
+    gpu.refusal = 701
+    with pytest.raises(RuntimeError, match=r"nothing_float32 failed on the GPU: CUDA_ERROR_LAUNCH_OUT_OF_RESOURCES"):
+        declared()(5, 64, torch.zeros(3, 2), 1, True)
+
+
+@pytest.mark.parametrize("ndim", [1, 3])
+def test_none_stands_for_an_array_without_elements(ndim: int) -> None:
+    tensor = torch.zeros((0,) * ndim)
+    given, own = [], []
+    expected = Expected(types.Array(types.float32, ndim, "C"))
+    expected.append(given, tensor)
+    expected.append(own, None)
+    assert own[:4] == given[:4]
+    assert own[4] == tensor.data_ptr() == 0
+    # No element, no step from one to the next: shapes agree, strides do not count.
+    assert own[5 : 5 + ndim] == given[5 : 5 + ndim] == [0] * ndim
 
 
 @pytest.mark.parametrize(
@@ -89,11 +207,11 @@ def test_what_a_kernel_does_not_take_is_refused(tensor: torch.Tensor) -> None:
 def test_a_wrong_argument_list_is_refused() -> None:
     with pytest.raises(ValueError, match="'real7' is no argument type"):
         kernel("nothing", np.float32, "real7")(lambda values: None)
-    declared = kernel("nothing", np.float32, "real1 int")(lambda values, count: None)
-    assert declared.name == "nothing_float32"
-    declared(0, 32)
+    made = kernel("nothing", np.float32, "real1 int")(lambda values, count: None)
+    assert made.name == "nothing_float32"
+    made(0, 32)
     with pytest.raises(TypeError, match="takes 2 arguments, got 1"):
-        declared(1, 32, torch.zeros(3))
+        made(1, 32, torch.zeros(3))
 
 
 def test_blocks_cover_all_items() -> None:

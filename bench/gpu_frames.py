@@ -1,0 +1,174 @@
+"""Frames, gradients and steps on a GPU, beside gsplat 1.5.3 where that is installed."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import statistics
+import time
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from bench.methods import frame_work, step_work, view_of
+from bench.scene import bench_camera, bench_scene
+from bench.timing import Work, interleaved_seconds, paired_ratio
+from glassplat.data.dataset import View
+from glassplat.files.markdown_table import Table
+from glassplat.kernels.photometric import photometric
+from glassplat.render.planar import Planar
+from glassplat.render.splat import Splat
+from glassplat.scene.camera import Camera
+from glassplat.scene.scene import Scene
+from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.splat_recipe import SplatRecipe
+
+WIDTH, HEIGHT, REPEATS = 960, 720, 15
+
+
+def measured(count: int) -> Table:
+    """Frames, gradients and steps of both methods, and gsplat's."""
+    camera = bench_camera(WIDTH, HEIGHT).to("cuda")
+    scene = bench_scene(count, 1, 0.5, camera.to("cpu")).to("cuda")
+    view, recipe = view_of(camera), PlanarRecipe()
+    works: dict[str, Work] = {
+        "splat frame": frame_work(scene, Splat(depth=False), camera),
+        "splat frame and gradients": gradient_work(scene, camera),
+        "splat backward": backward_work(scene, camera),
+        "planar frame": frame_work(scene, Planar(), camera),
+        "splat step": step_work(scene, SplatRecipe().stages(0)[0], view),
+        "planar step": step_work(scene, recipe.stages(0)[2], view),
+    }
+    theirs = gsplat_works(scene, view) if importlib.util.find_spec("gsplat") else {}
+    partners = {
+        "splat frame": "gsplat frame",
+        "planar frame": "gsplat frame",
+        "splat frame and gradients": "gsplat frame and gradients",
+        "splat backward": "gsplat backward",
+        "splat step": "gsplat step",
+    }
+    started = time.perf_counter()
+    for work in works.values():
+        work()
+    torch.cuda.synchronize()
+    note = (
+        f"First use of all kernels took {time.perf_counter() - started:.1f} s, compilation included where the disk had "
+    )
+    note += "none. Memory is the most that torch held beyond the scene and what came before. "
+    note += "Ratios are medians of ratios taken round by round." if theirs else "gsplat is not installed."
+    seconds = interleaved_seconds({name: timed(work) for name, work in (works | theirs).items()}, REPEATS)
+    table = Table(
+        f"On a GPU: {count:,} primary Gaussians, SH 3, {WIDTH}x{HEIGHT}, one pane over half of the image",
+        ("what", "ms", "gsplat, ms", "gsplat : ours", "memory, MiB", "gsplat memory, MiB"),
+        note,
+    )
+    for name, work in works.items():
+        partner = partners.get(name) if theirs else None
+        table.add(name, milliseconds(seconds, name), *beside(seconds, name, partner), peak(work),
+                  peak(theirs[partner]) if partner else "")  # fmt: skip
+    return table
+
+
+def beside(seconds: Mapping[str, list[float]], name: str, partner: str | None) -> tuple[object, object]:
+    """The other's milliseconds and how many times ours they are; nothing where there is no other."""
+    if partner is None:
+        return "", ""
+    return milliseconds(seconds, partner), paired_ratio(seconds, partner, name)
+
+
+def milliseconds(seconds: Mapping[str, list[float]], name: str) -> float:
+    """Median milliseconds."""
+    return 1e3 * statistics.median(seconds[name])
+
+
+def timed(work: Work) -> Work:
+    """The work, until the GPU is done with it."""
+
+    def until_done() -> None:
+        work()
+        torch.cuda.synchronize()
+
+    return until_done
+
+
+def peak(work: Work) -> int:
+    """Most memory that torch held during the work beyond what it held before, in MiB."""
+    torch.cuda.synchronize()
+    torch.cuda.reset_peak_memory_stats()
+    before = torch.cuda.memory_allocated()
+    work()
+    torch.cuda.synchronize()
+    return int((torch.cuda.max_memory_allocated() - before) / 2**20)
+
+
+def trainable(scene: Scene, camera: Camera) -> tuple[Tensor, list[Tensor]]:
+    """A frame's colours [H, W, 3], and the leaves that they depend on."""
+    leaves = {name: tensor.detach().requires_grad_() for name, tensor in scene.primary.tensors().items()}
+    frame = Splat(depth=False)(Scene(scene.primary.with_tensors(leaves), scene.extent), camera)
+    return frame.rgb, [leaf for name, leaf in leaves.items() if name != "log_intensity"]
+
+
+def gradient_work(scene: Scene, camera: Camera) -> Work:
+    """One frame and the gradients of all raw Gaussian tensors."""
+
+    def work() -> None:
+        image, leaves = trainable(scene, camera)
+        torch.autograd.grad(image.sum(), leaves, allow_unused=True)
+
+    return work
+
+
+def backward_work(scene: Scene, camera: Camera) -> Work:
+    """The gradients alone, of a frame that is there."""
+    image, leaves = trainable(scene, camera)
+    ones = torch.ones_like(image)
+    return lambda: torch.autograd.grad([image], leaves, [ones], retain_graph=True, allow_unused=True)
+
+
+def gsplat_works(scene: Scene, view: View) -> dict[str, Work]:
+    """The same by gsplat; activations included, as in ours. Its step has our L1 and SSIM, and torch's fused Adam."""
+    rasterization = importlib.import_module("gsplat").rasterization
+    gaussians, camera = scene.primary, view.camera
+    names = ("means", "quats", "log_scales", "logit_opacities", "sh")
+    matrix = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], device="cuda")
+
+    def render(tensors: list[Tensor]) -> Tensor:
+        means, quats, log_scales, logit_opacities, sh = tensors
+        image: Tensor = rasterization(
+            means, quats, log_scales.exp(), logit_opacities.sigmoid(), sh, camera.cam_from_world[None], matrix[None],
+            camera.width, camera.height, sh_degree=gaussians.active_sh_degree, near_plane=0.03, packed=False,
+        )[0]  # fmt: skip
+        return image
+
+    def fresh() -> list[Tensor]:
+        return [getattr(gaussians, name).detach().clone().requires_grad_() for name in names]
+
+    def frame() -> None:
+        with torch.no_grad():
+            render([getattr(gaussians, name) for name in names])
+
+    def gradients() -> None:
+        leaves = fresh()
+        torch.autograd.grad(render(leaves).sum(), leaves)
+
+    kept = fresh()
+    image = render(kept)
+    ones = torch.ones_like(image)
+    parameters = fresh()
+    photo = (torch.rand(camera.height, camera.width, 3, device="cuda") * 255).to(torch.uint8)
+    optimizer = torch.optim.Adam(parameters, lr=1e-6, fused=True)
+
+    def step() -> None:
+        optimizer.zero_grad()
+        l1, ssim = photometric(render(parameters)[0], photo)
+        loss = 0.8 * l1 + 0.2 * (1 - ssim)
+        loss.backward()
+        optimizer.step()
+
+    return {
+        "gsplat frame": frame,
+        "gsplat frame and gradients": gradients,
+        "gsplat backward": lambda: torch.autograd.grad([image], kept, [ones], retain_graph=True),
+        "gsplat step": step,
+    }

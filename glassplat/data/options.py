@@ -1,0 +1,246 @@
+"""Options as dataclasses: their values checked against the fields' annotations, from the command line and from JSON.
+
+An annotation is the only place that says what a value may be: its type, `Literal` choices, and the requirements of
+`glassplat.data.ranges` beside it. A dataclass whose fields have to fit together has a method `contradiction`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from glassplat.data.errors import InputError
+from glassplat.data.ranges import Requirement
+
+LONGEST_SHOWN = 60
+"""Characters of a wrong value that a message repeats."""
+UNIONS = (typing.Union, types.UnionType)
+PLAIN = {bool: "True or False", int: "a whole number", float: "a number", str: "a text", Path: "a path"}
+"""Types of single values, and what messages call them."""
+
+
+class OptionError(InputError):
+    """A value that its field does not take; the name is that of the field, with those of the fields it lies in."""
+
+    def __init__(self, name: str, value: Any, expected: str) -> None:
+        super().__init__(f"{name or 'the value'} is {shown(value)}; expected {expected}")
+        self.name, self.value, self.expected = name, value, expected
+
+
+def check_options(options: Any) -> None:
+    """Checks a command or a recipe, and all that it consists of.
+
+    Raises:
+        InputError: a value is out of range, or values contradict; names the option as it is typed.
+    """
+    try:
+        checked(type(options), options, "")
+    except OptionError as error:
+        raise InputError(f"{as_typed(error.name)} is {shown(error.value)}; expected {error.expected}") from error
+
+
+def options_from_json(kind: type, value: Any) -> Any:
+    """An instance of a dataclass from what JSON made of it; fields that are missing have their defaults.
+
+    Raises:
+        InputError: not an object, an unknown field, or a value of a wrong type or out of range; names the field.
+    """
+    return checked(kind, value, "")
+
+
+def as_typed(name: str) -> str:
+    """The option of the command line that sets a field: `rates.means_end` is `--rates.means-end`."""
+    return "--" + name.replace("_", "-")
+
+
+def checked(hint: Any, value: Any, name: str) -> Any:
+    """The value in the type of its annotation, if it is as that demands.
+
+    Args:
+        hint: annotation of a field, or a dataclass.
+        value: of this type, or what JSON makes of such a one.
+        name: of the field, for messages.
+
+    Raises:
+        OptionError: it is not.
+    """
+    hint, requirements = unwrapped(hint)
+    result = _in_type(hint, value, name, requirements)
+    for requirement in requirements:
+        if result is not None and not requirement.allows(result):
+            raise OptionError(name, value, expectation(hint, requirements))
+    return result
+
+
+def unwrapped(hint: Any) -> tuple[Any, tuple[Requirement, ...]]:
+    """An annotation without its metadata, and what of them is a requirement."""
+    if typing.get_origin(hint) is not typing.Annotated:
+        return hint, ()
+    inner, *metadata = typing.get_args(hint)
+    return inner, tuple(data for data in metadata if isinstance(data, Requirement))
+
+
+def expectation(hint: Any, requirements: tuple[Requirement, ...] = ()) -> str:
+    """What a value of this annotation has to be, in words."""
+    bounds = " and ".join(requirement.expected for requirement in requirements)
+    return f"{PLAIN[hint]} {bounds}".rstrip() if hint in PLAIN else ", ".join(filter(None, (_structure(hint), bounds)))
+
+
+def _structure(hint: Any) -> str:
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Literal:
+        return f"one of {', '.join(map(str, inner))}"
+    if origin in UNIONS:
+        return " or ".join("None" if option is type(None) else expectation(*unwrapped(option)) for option in inner)
+    if origin is tuple:
+        if inner[-1] is ...:
+            return f"any number of values, each {expectation(*unwrapped(inner[0]))}"
+        kinds = dict.fromkeys(expectation(*unwrapped(part)) for part in inner)
+        return f"{len(inner)} values, " + (
+            f"each {next(iter(kinds))}" if len(kinds) == 1 else f"out of: {'; '.join(kinds)}"
+        )
+    return "an object with named values"
+
+
+def _in_type(hint: Any, value: Any, name: str, requirements: tuple[Requirement, ...]) -> Any:
+    """The value in a type without metadata; requirements are for the message."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return _fields(type(value), {field.name: getattr(value, field.name) for field in fields(value)}, name)
+    if dataclasses.is_dataclass(hint):
+        return _fields(typing.cast(type, hint), value, name)
+    origin = typing.get_origin(hint)
+    if origin in UNIONS:
+        return _alternative(hint, value, name)
+    if origin in CONTAINERS:
+        return CONTAINERS[origin](hint, value, name)
+    if not _is_of(hint, value):
+        raise OptionError(name, value, expectation(hint, requirements))
+    return hint(value) if hint in (float, Path) else value
+
+
+def _is_of(hint: Any, value: Any) -> bool:
+    """Whether a single value is of a type; a whole number is a number too, but True is not, nor is infinity."""
+    if hint is float:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and _is_finite(value)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    if hint is Path:
+        return isinstance(value, (str, Path))
+    return isinstance(value, hint)
+
+
+def _is_finite(value: float) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # A whole number of hundreds of digits.
+        return False
+
+
+def _fields(kind: type, value: Any, name: str) -> Any:
+    """An instance of a dataclass from its fields by name."""
+    if not isinstance(value, Mapping):
+        raise OptionError(name, value, "an object with named values")
+    hints = typing.get_type_hints(kind, include_extras=True)
+    known = [field.name for field in fields(kind)]
+    unknown = sorted(map(str, set(value) - set(known)))
+    if unknown:
+        raise InputError(f"unknown fields {unknown} of {name or 'the options'}; there are {known}")
+    missing = [field.name for field in fields(kind) if _is_needed(field) and field.name not in value]
+    if missing:
+        raise InputError(f"fields {missing} of {name or 'the options'} are missing")
+    values = {key: checked(hints[key], value[key], _inner_name(name, key, hints[key])) for key in known if key in value}
+    made = kind(**values)
+    contradiction = made.contradiction() if hasattr(made, "contradiction") else None
+    if contradiction:
+        raise InputError(contradiction)
+    return made
+
+
+def _is_needed(field: dataclasses.Field) -> bool:
+    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+
+
+def _inner_name(outer: str, field: str, hint: Any) -> str:
+    """The name of a field of a field; one that the command line does not name has no name of its own."""
+    nameless = any(getattr(data, "name", None) == "" for data in typing.get_args(hint)[1:])
+    return outer if nameless else f"{outer}.{field}".removeprefix(".")
+
+
+def _alternative(hint: Any, value: Any, name: str) -> Any:
+    """The value in the first type of a union that takes it."""
+    if value is None and type(None) in typing.get_args(hint):
+        return None
+    options = [option for option in typing.get_args(hint) if option is not type(None)]
+    if len(options) == 1:
+        try:
+            return checked(options[0], value, name)
+        except OptionError as error:
+            # Of a field inside of the value there is more to say than of the value.
+            raise OptionError(error.name, error.value, f"{error.expected}, or None") from error
+    for option in options:
+        try:
+            return checked(option, value, name)
+        except InputError:
+            continue
+    raise OptionError(name, value, expectation(hint))
+
+
+def _literal(hint: Any, value: Any, name: str) -> Any:
+    choices = typing.get_args(hint)
+    if not any(value == choice and type(value) is type(choice) for choice in choices):
+        raise OptionError(name, value, f"one of {', '.join(map(str, choices))}")
+    return value
+
+
+def _tuple(hint: Any, value: Any, name: str) -> tuple[Any, ...]:
+    inner = typing.get_args(hint)
+    if not isinstance(value, (list, tuple)) or (inner[-1] is not ... and len(value) != len(inner)):
+        raise OptionError(name, value, _structure(hint))
+    kinds = inner[:1] * len(value) if inner[-1] is ... else inner
+    try:
+        return tuple(checked(kind, element, name) for kind, element in zip(kinds, value, strict=True))
+    except OptionError as error:
+        raise OptionError(name, value, _structure(hint)) from error
+
+
+def _dict(hint: Any, value: Any, name: str) -> dict[Any, Any]:
+    keys, values = typing.get_args(hint)
+    if not isinstance(value, Mapping):
+        raise OptionError(name, value, _structure(hint))
+    return {checked(keys, key, name): checked(values, element, name) for key, element in value.items()}
+
+
+CONTAINERS: dict[Any, Callable[[Any, Any, str], Any]] = {typing.Literal: _literal, tuple: _tuple, dict: _dict}
+
+
+def shown(value: Any) -> str:
+    """A value for a message, cut short."""
+    try:
+        text = repr(value) if isinstance(value, str) else str(value)
+    except ValueError:  # A whole number of too many digits to print.
+        text = "a number of thousands of digits"
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
+
+
+def number_fields(kind: type, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Every option of a dataclass and of those in it that holds numbers: its name and the annotation of each number."""
+    for field, hint in typing.get_type_hints(kind, include_extras=True).items():
+        if typing.get_origin(hint) is not typing.ClassVar:
+            yield from _numbers(hint, _inner_name(name, field, hint))
+
+
+def _numbers(hint: Any, name: str) -> Iterator[tuple[str, Any]]:
+    inner, _ = unwrapped(hint)
+    if inner in (int, float):
+        yield name, hint
+    elif isinstance(inner, type) and dataclasses.is_dataclass(inner):
+        yield from number_fields(inner, name)
+    elif typing.get_origin(inner) is not typing.Literal:
+        for part in typing.get_args(inner):
+            yield from _numbers(part, name)

@@ -1,0 +1,92 @@
+"""What metrics are called, how their values are written, and what they mean; for people who did not compute them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+
+class Metric(NamedTuple):
+    """How a metric is shown: its label, its value as a pattern with its unit, and a sentence on what it is."""
+
+    label: str
+    pattern: str
+    meaning: str
+
+
+METRICS = {
+    "psnr": Metric("PSNR", "{:.2f} dB", "peak signal-to-noise ratio of the test images; higher is better"),
+    "ssim": Metric("SSIM", "{:.4f}", "structural similarity, 1 for equal images; higher is better"),
+    "lpips": Metric("LPIPS", "{:.4f}", "perceptual distance by a trained network, 0 for equal images; lower is better"),
+    "pane_psnr": Metric("PSNR, pane", "{:.2f} dB", "the same of the pixels that show a pane"),
+    "transmission_psnr": Metric(
+        "PSNR, transmission", "{:.2f} dB", "of what is seen through the panes, against the truth"
+    ),
+    "reflection_psnr": Metric(
+        "PSNR, reflection", "{:.2f} dB", "of what the panes mirror, times the reflection gain, against the truth"
+    ),
+}
+SURFACE_METRICS = {
+    "normal_error_deg": Metric("normal error", "{:.2f}°", "mean angle between rendered and true surface normals"),
+    "reflective_normal_error_deg": Metric(
+        "normal error, reflective", "{:.2f}°", "the same where the surface mirrors more than half"
+    ),
+    "strength_error": Metric("strength error", "{:.3f}", "mean difference of the share that is mirrored, 0 to 1"),
+    "environment_psnr": Metric(
+        "PSNR, environment", "{:.2f} dB", "of the learned surroundings, times the environment gain, against the truth"
+    ),
+    "environment_lpips": Metric("LPIPS, environment", "{:.4f}", "the same as a perceptual distance; lower is better"),
+}
+"""Shown where they are known: only synthetic captures of objects have the truth they need."""
+FACTS = {
+    "num_gaussians": Metric("Gaussians", "{:,}", "how many the scene has"),
+    "train_seconds": Metric("training", "{:.0f} s", "time that training took"),
+    "seconds_per_frame": Metric("per frame", "{:.3f} s", "time for one test image, median"),
+    "reflection_gain": Metric(
+        "reflection gain",
+        "{:.2f}",
+        "the one factor that brings all rendered reflections closest to the true ones: their brightness cannot be told "
+        "from the panes' strength; 1 where both are equally bright",
+    ),
+}
+SURFACE_FACTS = {
+    "environment_gain": Metric(
+        "environment gain", "{:.2f}", "the one factor that brings the learned surroundings closest to the true ones"
+    )
+}
+PLANE_COLUMNS = {
+    "label": Metric("pane", "{}", "its label in the masks"),
+    "base_reflectance": Metric("R0", "{:.3f}", "share of the light that the pane mirrors when seen head-on"),
+    "normal_error_deg": Metric("normal error", "{:.2f}°", "angle between the fitted plane and the true pane"),
+    "offset_error": Metric(
+        "offset error, of the extent",
+        "{:.3%}",
+        "distance of the true pane's centre from the fitted plane, in percent of the extent, which is 1.1 times the "
+        "radius of the training cameras",
+    ),
+    "base_reflectance_error": Metric("R0 error", "{:.3f}", "difference from the true R0"),
+}
+
+
+def written(value: object, pattern: str) -> str:
+    """A value with its unit; a dash where there is none."""
+    return "-" if value is None else pattern.format(value)
+
+
+def shown_metrics(results: Mapping[str, Any]) -> dict[str, Metric]:
+    """The metrics to show of an evaluation: all of any method, and those of surfaces that are known."""
+    always, known = METRICS | FACTS, SURFACE_METRICS | SURFACE_FACTS
+    return {
+        name: metric
+        for name, metric in (METRICS | SURFACE_METRICS | FACTS | SURFACE_FACTS).items()
+        if (name in always and name in results) or (name in known and results.get(name) is not None)
+    }
+
+
+def missing_reasons(results: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Why metrics that are shown have no value: the reasons, each with the names of those it holds for."""
+    reasons: dict[str, list[str]] = {}
+    for name in shown_metrics(results):
+        if results[name] is None:
+            reasons.setdefault(results.get(f"{name}_reason") or "not recorded", []).append(name)
+    return reasons

@@ -1,0 +1,71 @@
+"""Named tensors and a header in one safetensors file, no pickle."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from glassplat.files.atomic import atomic_write
+from glassplat.files.json_text import parse_json
+from glassplat.files.reading import reading
+
+HEADER_KEY = "glassplat"
+
+
+class TensorsFile(NamedTuple):
+    """An open file: its header, and what its tensors are read from."""
+
+    header: dict[str, Any]
+    file: Any
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+        return {name: self.file.get_tensor(name) for name in self.file.keys()}  # noqa: SIM118
+
+
+def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
+    """Writes tensors and a header atomically.
+
+    Raises:
+        OSError: the disk is full or not writable; an older file at `path` stays as it was.
+    """
+    owned = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
+    with atomic_write(path) as temporary:
+        temporary.touch()
+        usual_mode = temporary.stat().st_mode  # The library's own is for the owner alone, whatever the umask.
+        try:
+            save_file(owned, temporary, metadata={HEADER_KEY: json.dumps(header)})
+        except SafetensorError as error:  # What the system says reaches Python in this disguise.
+            raise OSError(str(error)) from error
+        temporary.chmod(usual_mode)
+
+
+@contextmanager
+def opened_tensors(path: Path, file_format: str, what: str) -> Iterator[TensorsFile]:
+    """A file that `write_tensors` wrote, its header checked to be of a format.
+
+    Args:
+        path: the file.
+        file_format: what the header says under `format`.
+        what: what the file is, for messages, such as "an environment".
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file cannot be read, is truncated or foreign; also if that shows while it is open.
+    """
+    try:
+        with reading(path), safe_open(path, framework="pt") as file:
+            header = parse_json((file.metadata() or {}).get(HEADER_KEY, "{}"), f"the header of {path}")
+            if not isinstance(header, dict) or header.get("format") != file_format:
+                found = header.get("format") if isinstance(header, dict) else header
+                raise ValueError(f"{path} has format {found!r}; expected {file_format!r}, as glassplat writes it")
+            yield TensorsFile(header, file)
+    except SafetensorError as error:
+        raise ValueError(f"{path} is truncated or not {what} ({error}); expected a whole file") from error

@@ -1,0 +1,38 @@
+"""Folders to write into."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from glassplat.files.folders import check_folder, make_folder
+
+
+@pytest.mark.parametrize("name", ["new", "new/below/it", "there", "link"])
+def test_a_folder_is_made_where_there_can_be_one(name: str, tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "there")
+    check_folder(tmp_path / name)
+    assert not (tmp_path / "new").exists()
+    make_folder(tmp_path / name)
+    assert (tmp_path / name).is_dir()
+
+
+@pytest.mark.parametrize("name", ["file", "file/below", "file/a/b", "nowhere", "nowhere/below", "loop", "x" * 300])
+def test_what_is_in_the_way_is_named_once(name: str, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("kept")
+    (tmp_path / "nowhere").symlink_to(tmp_path / "gone")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with pytest.raises(NotADirectoryError, match="folder") as caught:
+        make_folder(tmp_path / name)
+    assert str(caught.value).count(str(tmp_path)) <= 2 and "Errno" not in str(caught.value)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "loop", "nowhere"]
+
+
+def test_a_folder_that_may_not_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(PermissionError, match="nothing may be written"):
+        make_folder(tmp_path / "new")
+    assert not (tmp_path / "new").exists()

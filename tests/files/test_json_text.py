@@ -1,0 +1,69 @@
+"""JSON that anybody may have written."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from glassplat.files.json_text import DEEPEST, parse_json, read_json
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "not valid JSON"),
+        (b'{"a": 1', "not valid JSON"),
+        (b"[1,]", "not valid JSON"),
+        (b"[" * 100_000 + b"]" * 100_000, f"nested more than {DEEPEST} levels deep"),
+        (b"[" * (DEEPEST + 1) + b"]" * (DEEPEST + 1), f"nested more than {DEEPEST} levels deep"),
+        (b'{"a":' * 100_000 + b"1" + b"}" * 100_000, f"nested more than {DEEPEST} levels deep"),
+        (b'{"a": 1, "b": 2, "a": 3}', "the key 'a' occurs twice in one object"),
+        (b'{"name": "\xff\xfe"}', "is no text in UTF-8"),
+        ('{"name": "ü"}'.encode("utf-16"), "is no text in UTF-8"),
+        (b'{"name": "\\ud800.png"}', "is no valid Unicode"),
+        (b'{"\\udfff": 1}', "is no valid Unicode"),
+    ],
+)
+def test_damage_is_named_with_the_file(tmp_path: Path, content: bytes, message: str) -> None:
+    (tmp_path / "a.json").write_bytes(content)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_json(tmp_path / "a.json")
+    assert str(tmp_path / "a.json") in str(caught.value)
+
+
+def test_byte_order_marks_and_line_ends_of_other_systems_are_read(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_bytes('\ufeff{\r\n"a": "ü\\n",\r\n"b": [[1]]}\r\n'.encode())
+    assert read_json(tmp_path / "a.json") == {"a": "ü\n", "b": [[1]]}
+    nested = "[" * (DEEPEST - 1) + "1" + "]" * (DEEPEST - 1)
+    assert isinstance(parse_json(nested, "a text"), list)
+
+
+def test_numbers_of_any_length_are_numbers() -> None:
+    largest, beyond = parse_json(f"[{2**64 - 1}, 1{'0' * 5000}]", "a text")
+    assert largest == 2**64 - 1 and isinstance(largest, int)
+    assert beyond == float("inf")
+
+
+def test_what_is_no_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no file .*absent\.json"):
+        read_json(tmp_path / "absent.json")
+    os.symlink(tmp_path / "loop.json", tmp_path / "loop.json")
+    (tmp_path / "folder.json").mkdir()
+    os.mkfifo(tmp_path / "pipe.json")  # Nobody writes into it: opening it would wait for ever.
+    for name, reason in (
+        ("folder", "a folder, a pipe or a device"),
+        ("pipe", "a folder, a pipe or a device"),
+        ("loop", "levels of symbolic links"),
+        ("n" * 300, "too long"),
+    ):
+        with pytest.raises(ValueError, match=rf"{name}\.json cannot be read \(.*{reason}"):
+            read_json(tmp_path / f"{name}.json")
+
+
+def test_a_file_of_absurd_size_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / "huge.json").touch()
+    os.truncate(tmp_path / "huge.json", 2**40)  # A hole, which takes no room on the disk.
+    with pytest.raises(ValueError, match=r"huge\.json has 1099511627776 bytes"):
+        read_json(tmp_path / "huge.json")

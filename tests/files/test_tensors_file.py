@@ -1,0 +1,91 @@
+"""Tensors with a header, on disks that are full and from files that are foreign."""
+
+from __future__ import annotations
+
+import os
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from glassplat.files.tensors_file import opened_tensors, write_tensors
+
+TENSORS = {"a": torch.arange(1000.0), "b": torch.zeros(0, 3)}
+
+
+@contextmanager
+def no_file_beyond(size: int) -> Iterator[None]:
+    """Files of this process cannot grow beyond so many bytes, as on a disk that is full."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_tensors_and_header_survive(tmp_path: Path) -> None:
+    path = tmp_path / "a.safetensors"
+    write_tensors(path, TENSORS, {"format": "x-1", "step": 3})
+    with opened_tensors(path, "x-1", "an x") as file:
+        read = file.tensors()
+        assert file.header["step"] == 3
+    assert read.keys() == TENSORS.keys() and all(torch.equal(read[name], TENSORS[name]) for name in read)
+
+
+def test_a_full_disk_is_an_error_of_the_system_and_keeps_the_older_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.safetensors"
+    write_tensors(path, TENSORS, {"format": "x-1"})
+    before = path.read_bytes()
+    with no_file_beyond(2000), pytest.raises(OSError, match=r"could not write .*File too large.*unchanged"):
+        write_tensors(path, TENSORS, {"format": "x-1"})
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+def test_the_file_may_be_read_by_whom_other_files_may_be(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        write_tensors(tmp_path / "a.safetensors", TENSORS, {})
+    finally:
+        os.umask(before)
+    assert (tmp_path / "a.safetensors").stat().st_mode & 0o777 == 0o640
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        (None, "has format None; expected 'x-1'"),
+        ('{"format": "y"}', "has format 'y'; expected 'x-1'"),
+        ("[]", "the header of .* is|has format"),
+        ("{", "the header of .* is not valid JSON"),
+        ("[" * 100_000, "the header of .* is nested"),
+    ],
+)
+def test_a_foreign_header_is_named(tmp_path: Path, header: str | None, message: str) -> None:
+    path = tmp_path / "a.safetensors"
+    save_file(TENSORS, path, metadata=None if header is None else {"glassplat": header})
+    with pytest.raises(ValueError, match=message), opened_tensors(path, "x-1", "an x"):
+        pass
+
+
+@pytest.mark.parametrize("kept", [0, 7, 100, 1000])
+def test_a_file_that_is_cut_off_is_named(tmp_path: Path, kept: int) -> None:
+    path = tmp_path / "a.safetensors"
+    write_tensors(path, TENSORS, {"format": "x-1"})
+    os.truncate(path, kept)
+    with (
+        pytest.raises(ValueError, match=r"a\.safetensors is truncated or not an x"),
+        opened_tensors(path, "x-1", "an x"),
+    ):
+        pass
+
+
+def test_what_is_no_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no file"), opened_tensors(tmp_path / "absent", "x-1", "an x"):
+        pass
+    with pytest.raises(ValueError, match="cannot be read"), opened_tensors(tmp_path, "x-1", "an x"):
+        pass

@@ -1,0 +1,134 @@
+"""How often a frame and a training step wait for the GPU, counted on a stand-in for one."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+import glassplat.kernels
+from glassplat.data.view import View
+from glassplat.render.planar import Planar
+from glassplat.render.splat import Splat
+from glassplat.scene.scene import Scene
+from glassplat.scene.transfer import constant
+from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.splat_recipe import SplatRecipe
+from glassplat.train.state import TrainState
+from glassplat.train.trainer import collect_statistics, differentiate, update
+from tests.kernels.cuda.waiting import KERNEL_WAITS, Waits, as_on_a_gpu
+from tests.train.tiny_capture import tiny_capture, true_scene
+
+KERNELS = Path(glassplat.kernels.__file__).parent
+WAITING = {"tolist", "item", "cpu", "numpy", "nonzero", "unique", "masked_select", "new_tensor", "tensor"}
+
+
+@pytest.fixture
+def waits(monkeypatch: pytest.MonkeyPatch) -> Waits:
+    found = Waits()
+    as_on_a_gpu(monkeypatch, found)
+    return found
+
+
+def step(recipe: PlanarRecipe | SplatRecipe, stage: int, scene: Scene, view: View, waits: Waits) -> list[str]:
+    """Where the second step on a view waits; the first one makes what stays."""
+    state, chosen = TrainState(scene, seed=0), recipe.stages(seed=0)[stage]
+    for _ in range(2):
+        waits.places.clear()
+        with waits:
+            result = differentiate(chosen, state.scene, view, probed=True)
+            update(chosen, state, result.gradients, iterations=100)
+            collect_statistics(state, result.screen, view)
+    return waits.places
+
+
+def test_a_splat_frame_waits_for_the_number_of_its_pairs_alone(waits: Waits) -> None:
+    scene, view = true_scene(), tiny_capture().train[0]
+    waits.places.clear()
+    for _ in range(2):
+        waits.places.clear()
+        with waits, torch.no_grad():
+            Splat()(scene, view.camera)
+    assert waits.places == ["kernel bin_tiles"]
+
+
+def test_a_planar_frame_waits_for_two_lists_and_for_which_panes_it_shows(waits: Waits) -> None:
+    scene, view = true_scene(), tiny_capture().train[0]
+    for _ in range(2):
+        waits.places.clear()
+        with waits, torch.no_grad():
+            Planar()(scene, view.camera)
+    assert sorted(place.partition(":")[0] for place in waits.places) == [
+        "kernel bin_tiles",
+        "kernel bin_tiles",
+        "render/seen_panes.py",
+    ]
+
+
+@pytest.mark.parametrize("annotated", [True, False])
+def test_a_planar_step_waits_four_times(waits: Waits, annotated: bool) -> None:
+    view = next(view for view in tiny_capture().train if view.is_annotated == annotated)
+    places = step(PlanarRecipe(), 2, true_scene(), view, waits)
+    assert len(places) == 4, places
+    assert places.count("kernel bin_tiles") == 2
+
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_a_splat_step_waits_twice(waits: Waits, strategy: str) -> None:
+    places = step(SplatRecipe(strategy=strategy), 0, true_scene(), tiny_capture().train[0], waits)
+    assert len(places) == 2, places
+
+
+def test_the_stand_in_sees_what_waits(waits: Waits) -> None:
+    values, mask = torch.arange(4.0), torch.tensor([True, False, True, False])
+    source = "\n".join(
+        [
+            "float(values[0])", "values[mask]", "mask.nonzero()", "values.tolist()", "bool(mask.any())",
+            "torch.tensor([1.0, 2.0])", "values.new_tensor([1.0])", "values[[0, 1]]",
+        ]
+    )  # fmt: skip
+    for line in source.splitlines():
+        waits.places.clear()
+        with waits:
+            eval(compile(line, "/glassplat/line.py", "eval"), {"values": values, "mask": mask, "torch": torch})
+        assert len(waits.places) >= 1, line
+    waits.places.clear()
+    with waits:
+        eval(compile("values.sum() * 2 + values[1:].mean()", "/glassplat/line.py", "eval"), {"values": values})
+    assert waits.places == []
+
+
+def test_the_cuda_kernels_wait_where_the_stand_in_says() -> None:
+    found: dict[str, int] = {}
+    for path in sorted(KERNELS.glob("*/cuda*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in WAITING:
+                found[path.parent.name] = found.get(path.parent.name, 0) + 1
+    assert found == KERNEL_WAITS
+
+
+def test_what_is_left_out_on_a_gpu_gives_the_same_statistics(monkeypatch: pytest.MonkeyPatch) -> None:
+    def differentiated() -> tuple[dict[str, float], dict[str, Tensor], list[Tensor]]:
+        found = differentiate(PlanarRecipe().stages(seed=0)[2], true_scene(), tiny_capture().train[0], probed=True)
+        return found.losses, found.gradients, [torch.as_tensor(record.weight) for record, *_ in found.screen]
+
+    own = differentiated()
+    as_on_a_gpu(monkeypatch, Waits())
+    other = differentiated()
+    assert own[0] == pytest.approx(other[0], rel=1e-5)
+    for name, gradient in own[1].items():
+        torch.testing.assert_close(other[1][name], gradient, rtol=1e-4, atol=1e-7)
+    for weight, expected in zip(other[2], own[2], strict=True):
+        torch.testing.assert_close(weight, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_constants_are_made_once_for_each_type_and_device() -> None:
+    first = constant((1.0, 2.0), torch.float32, torch.device("cpu"))
+    assert constant((1.0, 2.0), torch.float32, torch.device("cpu")) is first
+    assert constant((1.0, 2.0), torch.float64, torch.device("cpu")).dtype == torch.float64
+    camera = replace(tiny_capture().train[0].camera, fx=31.5)
+    assert camera.intrinsics.tolist() == pytest.approx([31.5, camera.fy, camera.cx, camera.cy])

@@ -1,0 +1,115 @@
+"""A stand-in for a GPU that counts what the program would wait for: on the CPU, where nothing waits."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from glassplat.kernels import devices
+from glassplat.kernels.gradient_conflict import reference
+from glassplat.losses import reflection
+from glassplat.scene import transfer
+
+ATEN = torch.ops.aten
+LOOKED_AT = {ATEN._local_scalar_dense.default, ATEN.nonzero.default, ATEN.masked_select.default, ATEN.equal.default}
+"""What gives the program a number, or a size that depends on numbers."""
+FROM_HERE = {ATEN.lift_fresh.default}
+"""What turns the program's numbers into a tensor."""
+INDEXED = {ATEN.index.Tensor, ATEN.index_put_.default, ATEN.index_put.default, ATEN._index_put_impl_.default}
+READ = {torch.Tensor.tolist, torch.Tensor.numpy, torch.Tensor.cpu}
+KERNEL_WAITS = {"bin_tiles": 1}
+"""How often the CUDA kernels of an operation wait; the others never do (`test_waiting.py` looks)."""
+
+
+class Waits(TorchDispatchMode):
+    """Notes where the package would wait for a GPU, or copy numbers to it and wait for that."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.places: list[str] = []
+        self.pauses = 0
+        self.reads = Reads(self)
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Notes nothing meanwhile."""
+        self.pauses += 1
+        try:
+            yield
+        finally:
+            self.pauses -= 1
+
+    def note(self, what: str) -> None:
+        if self.pauses:
+            return
+        frame = sys._getframe(1)
+        while frame.f_back is not None and "/glassplat/" not in frame.f_code.co_filename:
+            frame = frame.f_back
+        if "/glassplat/" in frame.f_code.co_filename:
+            path = frame.f_code.co_filename.rpartition("/glassplat/")[2]
+            self.places.append(f"{path}:{frame.f_lineno} {what}")
+
+    def __torch_dispatch__(
+        self, function: Any, types: Sequence[type], args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        by_mask = function in INDEXED and any(t is not None and t.dtype == torch.bool for t in args[1])
+        if by_mask or function in LOOKED_AT or (function in FROM_HERE and args[0].device.type == "cpu"):
+            self.note(str(function))
+        return function(*args, **(kwargs or {}))
+
+    def __enter__(self) -> Waits:
+        self.reads.__enter__()
+        super().__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        super().__exit__(*error)
+        self.reads.__exit__(*error)
+
+
+class Reads(TorchFunctionMode):
+    """Notes what never reaches the dispatcher: a tensor that becomes a list or an array."""
+
+    def __init__(self, waits: Waits) -> None:
+        super().__init__()
+        self.waits = waits
+
+    def __torch_function__(
+        self, function: Callable[..., Any], types: Sequence[type], args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        if function not in READ:
+            return function(*args, **(kwargs or {}))
+        self.waits.note(function.__name__)
+        with self.waits.paused():
+            return function(*args, **(kwargs or {}))
+
+
+def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch, waits: Waits) -> None:
+    """Lets the program choose as on a GPU, count for its kernels what theirs do, and copy without waiting."""
+    module_of = devices._module
+
+    def counted(operation: str, folder: str) -> SimpleNamespace:
+        module = module_of(operation, folder)
+
+        def run(name: str) -> Callable[..., Any]:
+            def call(*args: Any, **kwargs: Any) -> Any:
+                waits.places += [f"kernel {operation}"] * KERNEL_WAITS.get(operation, 0)
+                with waits.paused():
+                    return getattr(module, name)(*args, **kwargs)
+
+            return call
+
+        return SimpleNamespace(**{name: run(name) for name, value in vars(module).items() if callable(value)})
+
+    monkeypatch.setattr(devices, "_module", counted)
+    # The only operation that is PyTorch's own on a GPU.
+    monkeypatch.setattr(reflection, "shared_edges", reference.gradient_conflict)
+    monkeypatch.setattr(transfer, "waits", lambda device: True)
