@@ -13,7 +13,7 @@ import pkgutil
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import _lru_cache_wrapper
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -21,6 +21,7 @@ from unittest import mock
 
 import numpy as np
 
+from glassplat.kernels.cuda.toolchain import has_library
 from tools.machine_loops import Loops, loops_of
 
 CAPABILITIES = ((8, 0), (9, 0), (12, 0))
@@ -72,13 +73,16 @@ def first_parameter(factory: Callable[..., Any]) -> str | None:
 
 @contextmanager
 def without_device(capability: tuple[int, int]) -> Iterator[None]:
-    """Lets Numba compile where there is no driver, and without the libraries that it only asks for their version."""
+    """Lets Numba compile where there is no driver, nor NVRTC, which it asks for the GPUs that are known.
+
+    Where NVRTC is installed, as on every machine with a GPU, it is asked: what it says decides there too.
+    """
     device = SimpleNamespace(compute_capability=capability)
-    with (
-        mock.patch("numba.cuda.dispatcher.get_current_device", return_value=device),
-        mock.patch("numba.cuda.cudadrv.nvrtc.get_supported_ccs", return_value=SUPPORTED),
-        mock.patch("numba.cuda.cuda_paths._get_nvrtc_path", return_value=None),
-    ):
+    with ExitStack() as stack:
+        stack.enter_context(mock.patch("numba.cuda.dispatcher.get_current_device", return_value=device))
+        if not has_library("nvrtc"):
+            stack.enter_context(mock.patch("numba.cuda.cudadrv.nvrtc.get_supported_ccs", return_value=SUPPORTED))
+            stack.enter_context(mock.patch("numba.cuda.cuda_paths._get_nvrtc_path", return_value=None))
         yield
 
 

@@ -6,6 +6,7 @@ captures of transparent panes such as RTR's, whose own files were never publishe
 
 from __future__ import annotations
 
+from os.path import isfile
 from pathlib import Path
 
 from glassplat.data.capture import Capture, PointCloud, Shot
@@ -43,7 +44,7 @@ def _shots(root: Path, model: Model) -> tuple[Shot, ...]:
         raise InputError(
             f"no folder {images} beside the COLMAP model; expected the {len(model.images)} photographs there"
         )
-    missing = sorted(image.name for image in model.images if not (images / image.name).is_file())
+    missing = sorted(image.name for image in model.images if not isfile(images / image.name))
     if missing:
         raise InputError(
             f"{len(missing)} of the {len(model.images)} photographs of the COLMAP model are missing in {images}: "

@@ -11,7 +11,6 @@ from torch import Tensor
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
 from glassplat.kernels.cube_lookup import cube_lookup
-from glassplat.kernels.pane_hits.reference import ray_grid
 from glassplat.kernels.shade_environment import shade_environment
 from glassplat.kernels.shade_environment.shaded import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
 from glassplat.kernels.splats import Projected
@@ -28,6 +27,7 @@ from glassplat.render.rasterize import (
     screen_pass,
     shown,
 )
+from glassplat.render.surface import view_directions
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
@@ -152,9 +152,3 @@ def check_reflective(scene: Scene) -> None:
             f"the Gaussians have the channels {sorted(scene.primary.channels)}; expected logit_strength, as "
             "`deferred` trains it"
         )
-
-
-def view_directions(camera: Camera) -> Tensor:
-    """[H, W, 3] directions from the camera through the pixel centres, world axes, not unit."""
-    rotation = camera.cam_from_world[:3, :3]
-    return ray_grid(camera.intrinsics.to(rotation), camera.width, camera.height) @ rotation

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,10 +13,14 @@ from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import TRAINABLE, Planes
 
+GAUSSIAN_SETS = ("primary", "glass", "surroundings")
+PARTS = (*GAUSSIAN_SETS, "planes", "environment")
+"""Fields of `Scene` that hold tensors."""
+
 
 @dataclass(frozen=True)
 class Scene:
-    """Primary Gaussians, glass Gaussians, reflection planes and the environment.
+    """Primary Gaussians, glass Gaussians, reflection planes, and what shiny surfaces mirror.
 
     Attributes:
         primary: the scene itself, in front of the panes and behind them.
@@ -23,6 +28,8 @@ class Scene:
         planes: the panes; empty for a scene without reflection.
         extent: radius of the capture in world units; learning rates and distances scale with it.
         environment: what shiny surfaces mirror from far away; empty for most methods.
+        surroundings: Gaussians that shiny surfaces mirror from near by, and nothing else shows (EnvGS); empty for most
+            methods.
     """
 
     primary: Gaussians
@@ -30,10 +37,12 @@ class Scene:
     glass: Gaussians = field(default_factory=lambda: Gaussians.empty(channels=("logit_mark",)))
     planes: Planes = field(default_factory=Planes.empty)
     environment: Environment = field(default_factory=Environment.empty)
+    surroundings: Gaussians = field(default_factory=Gaussians.empty)
 
     def gaussian_sets(self) -> dict[str, Gaussians]:
-        """The sets of Gaussians by name."""
-        return {"primary": self.primary, "glass": self.glass}
+        """The sets of Gaussians by name; the surroundings are among them where there are any."""
+        sets = {"primary": self.primary, "glass": self.glass}
+        return sets | ({"surroundings": self.surroundings} if len(self.surroundings) else {})
 
     def parameters(self) -> dict[str, Tensor]:
         """Every trainable tensor by dotted name (`primary.means`, `planes.centers`, ...).
@@ -47,34 +56,23 @@ class Scene:
 
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> Scene:
         """The same scene with some tensors replaced by dotted name."""
-        parts: dict[str, dict[str, Tensor]] = {"primary": {}, "glass": {}, "planes": {}, "environment": {}}
+        parts: dict[str, dict[str, Tensor]] = {name: {} for name in PARTS}
         for dotted, tensor in parameters.items():
             part, _, name = dotted.partition(".")
             if part not in parts:
                 raise ValueError(f"unknown scene part {part!r} in {dotted!r}; expected one of {sorted(parts)}")
             parts[part][name] = tensor
-        return replace(
-            self,
-            primary=self.primary.with_tensors(parts["primary"]),
-            glass=self.glass.with_tensors(parts["glass"]),
-            planes=self.planes.with_tensors(parts["planes"]),
-            environment=self.environment.with_tensors(parts["environment"]),
-        )
+        changed: dict[str, Any] = {name: getattr(self, name).with_tensors(parts[name]) for name in PARTS if parts[name]}
+        return replace(self, **changed)
 
     def with_gaussians(self, part: str, gaussians: Gaussians) -> Scene:
         """The same scene with one set of Gaussians replaced."""
-        if part == "primary":
-            return replace(self, primary=gaussians)
-        if part == "glass":
-            return replace(self, glass=gaussians)
-        raise ValueError(f"unknown set of Gaussians {part!r}; expected one of {sorted(self.gaussian_sets())}")
+        if part not in GAUSSIAN_SETS:
+            raise ValueError(f"unknown set of Gaussians {part!r}; expected one of {sorted(GAUSSIAN_SETS)}")
+        changed: dict[str, Any] = {part: gaussians}
+        return replace(self, **changed)
 
     def to(self, device: torch.device | str) -> Scene:
         """The same scene on another device."""
-        return replace(
-            self,
-            primary=self.primary.to(device),
-            glass=self.glass.to(device),
-            planes=self.planes.to(device),
-            environment=self.environment.to(device),
-        )
+        moved: dict[str, Any] = {name: getattr(self, name).to(device) for name in PARTS}
+        return replace(self, **moved)

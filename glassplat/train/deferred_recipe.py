@@ -45,7 +45,7 @@ from glassplat.train.propagation import (
     Propagate,
     PropagationSchedule,
     RefineEnvironment,
-    ResetAfterPropagation,
+    ResetRaised,
 )
 from glassplat.train.splat_recipe import GaussianRates, image_terms
 from glassplat.train.stage import Action, Every, Stage
@@ -99,8 +99,8 @@ class DeferredRecipe:
         consistency_weight: weight of the difference between normals and the slope of the depths, while normals spread.
         propagation: how normals spread and colours are sabotaged.
         schedule: when they do.
-        hurry_matte: raise the learning rates to those of `splat` for the rest of a run in which propagation has found
-            nothing that reflects.
+        hurry_matte: raise the learning rates to those of `splat` until the first reset of opacities, and for the rest
+            of a run in which nothing was found that reflects.
         propagation_interval: steps between densifications while normals spread; None keeps `densify.interval`.
         rates: learning rates of the Gaussians; they do not rise in short runs, which costs a mirror ball its normals
             (docs/experiments.md).
@@ -192,7 +192,7 @@ class DeferredRecipe:
             share=self.bootstrap,
             renderer=Splat(self.background or BLACK, depth=False),
             losses=(*image, *population.terms),
-            rates=self.rates.of("primary"),
+            rates=(self._hurried_rates() if self.hurry_matte else self.rates).of("primary"),
             actions=population.edits,
             motions=population.motions,
             densify_until=population.densify_until,
@@ -215,8 +215,7 @@ class DeferredRecipe:
                 # Before the resets: it looks at what is seen, also at the beats that it leaves to them.
                 Propagate(beat, self.propagation, self.schedule, renderer, matte_rates=self._matte_rates()),
                 GrowShAfterPropagation(Every(self.rhythm.sh)),
-                *population.resets,
-                *self._last_resets(population),
+                *self._resets(population),
                 RefineEnvironment(self._doublings(), self.texels),
             ),
             motions=population.motions,
@@ -258,10 +257,15 @@ class DeferredRecipe:
             for edit in population.edits
         )
 
-    def _last_resets(self, population: Population) -> tuple[ResetOpacity, ...]:
-        """The resets after propagation."""
-        resets = population.resets if self.schedule.last_reset else ()
-        return tuple(ResetAfterPropagation.following(reset) for reset in resets)
+    def _resets(self, population: Population) -> tuple[ResetOpacity, ...]:
+        """The resets during and after propagation."""
+        if not self.schedule.last_reset:
+            return population.resets
+        return tuple(ResetRaised.instead_of(reset) for reset in population.resets)
+
+    def _hurried_rates(self) -> GaussianRates:
+        """Those of `splat`, where no normal means anything that they would spoil."""
+        return replace(self.rates, short_run_power=GaussianRates().short_run_power)
 
     def _matte_rates(self) -> dict[str, Rate]:
         """What brings the learning rates to those of `splat`, where nothing reflects that higher ones would spoil."""

@@ -25,12 +25,14 @@ log = logging.getLogger("glassplat.train")
 ENDED, MOST, GREW, TURNS = "propagation ended", "most reflective", "reflective grew", "turns with the view"
 """Names in `TrainState.records`: the step of the end, the largest share of reflection, the step of its growth, and the
 share that does not reflect, but turns with the view."""
+RAISED, LOWERED = "opacities raised", "opacities lowered"
+"""The same: the last step at which each was done."""
 GROWTH = 0.01
 """By how much the share has to rise to count as growing; a ratio would let the little that noise makes of it in a matte
 scene go on for ever."""
 FOUND = 0.03
 """Share from which on something reflective has been found."""
-LOOKS_REFLECTIVE = 0.06
+LOOKS_REFLECTIVE = 0.1
 """Share that turns with the view, below which there is nothing to look for."""
 NOTHING_FOUND = "step %d: nothing reflective was found, so that the rest of the run trains like splat; %s"
 MATTE = "nothing looks different from different sides either: splat suits such a scene"
@@ -48,9 +50,10 @@ class PropagationSchedule:
         end: `settled` ends it when what reflects has stopped growing (the paper's criterion), `fixed` at `stop`.
         stop: share of the run after which nothing is propagated any more.
         patience: beats without growth after which it counts as settled; a strength needs some hundred steps to be seen,
-            however short the run. One is enough where nothing reflects nor looks as if it did.
+            however short the run. None is needed where nothing reflects nor looks as if it did.
         pause: steps for which raised opacities are held.
-        last_reset: reset opacities once more after the end, if no regular reset comes after it.
+        last_reset: after the end, reset opacities only if they have been raised since the last time; if not, regular
+            resets go on as if nothing had been propagated.
     """
 
     end: Literal["settled", "fixed"] = "settled"
@@ -71,8 +74,9 @@ class Propagate:
         propagation: what it does.
         schedule: when it ends.
         renderer: that of the stage.
-        matte_rates: factors on learning rates for the rest of the run where nothing reflective was found, by dotted
-            parameter name; of them the value for a run of this length is taken.
+        matte_rates: factors on learning rates before the first beat at which normals may be propagated, and after the
+            last one where nothing reflective was found, by dotted parameter name; of them the value for a run of this
+            length is taken.
         search: what tells how much reflects.
     """
 
@@ -90,8 +94,12 @@ class Propagate:
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state`, until propagation has ended."""
-        if has_ended(state) or clock.step < min(self._first(clock), self._last(clock)):
+        if has_ended(state):
             return False
+        if clock.step < min(self._first(clock), self._last(clock)):
+            self._hurry(state, clock)
+            return False
+        state.optimizer.hurried = {}
         if clock.step >= self._last(clock) or self._settles(state, dataset, clock):
             self._end(state, dataset, clock)
             return False
@@ -102,12 +110,17 @@ class Propagate:
         state.scene, state.optimizer.moments = replace(state.scene, primary=primary), moments
         if self.propagation.propagates:
             state.optimizer.paused["primary.logit_opacities"] = self.schedule.pause
+            state.records[RAISED] = clock.step
         return True
 
     @property
     def _beats(self) -> Every:
         """All of them."""
         return replace(self.when, skip_multiples_of=None)
+
+    def _hurry(self, state: TrainState, clock: Clock) -> None:
+        """Learns faster while there is no normal that this would spoil."""
+        state.optimizer.hurried = {name: rate.at(0.0, 1.0, clock.iterations) for name, rate in self.matte_rates.items()}
 
     def _first(self, clock: Clock) -> int:
         """The first beat that is left to a reset.
@@ -128,19 +141,19 @@ class Propagate:
         if GREW not in state.records or share > state.records[MOST] + GROWTH:
             state.records |= {MOST: share, GREW: clock.step}
         waited = (clock.step - state.records[GREW]) / self.when.interval(clock)
-        return waited >= (1 if self._looks_matte(state, dataset, clock) else self.schedule.patience)
+        return waited >= self.schedule.patience or self._looks_matte(state, dataset, clock)
 
     def _looks_matte(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Whether nothing reflects nor turns with the view; keeps the record.
 
-        That is asked at the beat after a reset. At others, raised opacities have whatever stands in the way turn with
-        the view.
+        That is asked before opacities are raised for the first time, and at the beats after a reset. At others,
+        whatever stands in the way turns with the view.
         """
         if state.records[MOST] >= FOUND:
             return False
-        if clock.step % self._first(clock) == self.when.interval(clock):
+        if TURNS not in state.records or clock.step % self._first(clock) == self.when.interval(clock):
             state.records[TURNS] = self.search.turning(state.scene, dataset.train, self.renderer)
-        return state.records.get(TURNS, 1.0) < LOOKS_REFLECTIVE
+        return state.records[TURNS] < LOOKS_REFLECTIVE
 
     def _end(self, state: TrainState, dataset: Dataset, clock: Clock) -> None:
         """Notes the end and says what was found."""
@@ -151,8 +164,7 @@ class Propagate:
                 "step %d: normal propagation has ended, %.0f %% of what is seen is reflection", clock.step, 100 * share
             )
             return
-        hurried = {name: rate.at(0.0, 1.0, clock.iterations) for name, rate in self.matte_rates.items()}
-        state.optimizer.hurried |= hurried
+        self._hurry(state, clock)
         turns = state.records.get(TURNS)
         if turns is None:
             turns = self.search.turning(state.scene, dataset.train, self.renderer)
@@ -171,38 +183,37 @@ class GrowShAfterPropagation(GrowSh):
 
 
 @dataclass(frozen=True)
-class ResetAfterPropagation(ResetOpacity):
-    """Resets opacities once more, if propagation has gone on after the last regular reset.
+class ResetRaised(ResetOpacity):
+    """Resets opacities regularly while normals are propagated, and once more afterwards if they have been raised since.
 
     Propagation raises every opacity, also of what only stands in the way, as in the hole of a ring. Most of that is
     never lowered again without a reset. A scene whose opacities have not come back is worse than one in which something
-    stands in the way: the rest of the run has to be as long as the time between two regular resets.
+    stands in the way: the rest of the run has to be as long as the time between two resets.
 
     Attributes:
-        when: its moments, of which it takes the first after the end of propagation; they begin after the regular ones.
-        regular: moments of the regular resets.
+        when: its moments, to the end of the run.
+        regular: those of them at which resets happen while normals are propagated.
     """
 
     regular: Every = field(kw_only=True)
 
     @staticmethod
-    def following(reset: ResetOpacity) -> ResetAfterPropagation:
-        """The one that comes after regular resets, at the moments at which they would go on."""
-        when = replace(reset.when, start=reset.when.stop, stop=1.0)
-        return ResetAfterPropagation(when, reset.ceiling, regular=reset.when)
+    def instead_of(reset: ResetOpacity) -> ResetRaised:
+        """The one that takes the place of regular resets, at the same moments and those at which they would go on."""
+        return ResetRaised(replace(reset.when, stop=1.0), reset.ceiling, regular=reset.when)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Edits `state`, once, and only if no reset has come since propagation ended."""
-        if not has_ended(state) or clock.step + self._recovery(clock) > clock.iterations:
+        """Edits `state`, where something is to be lowered and there is time to recover."""
+        raised = state.records.get(RAISED, 0) > state.records.get(LOWERED, 0)
+        wanted = raised if has_ended(state) else self.regular.due(clock)
+        if not wanted or clock.step + self._recovery(clock) > clock.iterations:
             return False
-        since = range(int(state.records[ENDED]) + 1, clock.step)
-        if any(when.due(replace(clock, step=step)) for step in since for when in (self.regular, self.when)):
-            return False
+        state.records[LOWERED] = clock.step
         return super().apply(state, dataset, clock)
 
     def _recovery(self, clock: Clock) -> int:
-        """Steps in which opacities come back: those between two regular resets."""
-        return self.regular.interval(clock) * (self.regular.only_multiples_of or 1)
+        """Steps in which opacities come back: those between two resets."""
+        return self.when.interval(clock) * (self.when.only_multiples_of or 1)
 
 
 @dataclass(frozen=True)

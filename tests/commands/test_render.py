@@ -40,7 +40,7 @@ def test_edits_reach_the_picture(options: str, scene: Scene, tmp_path: Path) -> 
     ("options", "words"),
     [
         ("--as-mirror 4", "no pane 4; the panes are 1"),
-        ("--reflectance 1 2", "expected a number in [0, 1]"),
+        ("--reflectance 1 2", "expected a number from 0 to 1"),
         ("--remove-glass --as-mirror 1", "without the other edits"),
         ("--as-mirror 1 --reflectance 1 0.5", "give one of the two"),
     ],

@@ -171,6 +171,7 @@ def test_cut_off_binary_file_is_named(capture, name: str, share: float) -> None:
         ("images", "1 1 0 0 0 inf 2 3 1 0000.png\n", "pose of 0000.png holds values that are not finite"),
         ("images", "1 1e300 1e300 0 0 1 2 3 1 0000.png\n", "rotation of 0000.png"),
         ("images", "1 1 0 0 0 1e300 2 3 1 0000.png\n", r"the pose of 0000.png holds the value 1e\+300"),
+        ("images", f"1 1 0 0 0 1 2 3 1 {'n' * 5000}.png\n", "1 of the 1 photographs of the COLMAP model are missing"),
         ("images", "", r"images\.txt registers no photograph"),
         ("images", "1 1 0 0 0 1 2 3 1 0000.png\n2 1 0 0 0 1 2 3 1 0001.png", "line after 0000.png is no list of obser"),
         ("images", "1 1 0 0 0 1 2", r"images\.txt is cut off or damaged"),

@@ -191,6 +191,30 @@ def test_whatever_a_kernel_is_made_from_changes_its_fingerprint(old: str, new: s
     assert fingerprint(made_from(KERNEL_SOURCE), "fast") != fingerprint(made_from(changed), "fast")
 
 
+VECTOR_SOURCE = """
+import numpy as np
+from glassplat.kernels.cpu.vector import constant, store, vector_kind
+
+def factory(real, lanes):
+    load, offsets = vector_kind(real, lanes).load, constant(real, (1.0,) * lanes)
+
+    def compiled(values):
+        store(values, 0, load(values, 0) + offsets())
+
+    return compiled
+
+made = factory(np.float32, 8)
+"""
+
+
+@pytest.mark.parametrize(("old", "new"), [("np.float32", "np.float64"), ("32, 8", "32, 16"), ("(1.0,)", "(2.0,)")])
+def test_vectors_change_the_fingerprint(old: str, new: str) -> None:
+    assert old in VECTOR_SOURCE
+    same, changed = made_from(VECTOR_SOURCE), made_from(VECTOR_SOURCE.replace(old, new))
+    assert fingerprint(made_from(VECTOR_SOURCE), "fast") == fingerprint(same, "fast")
+    assert fingerprint(same, "fast") != fingerprint(changed, "fast")
+
+
 def test_the_compiler_options_change_the_fingerprint() -> None:
     made = made_from(KERNEL_SOURCE)
     assert fingerprint(made, "fast") != fingerprint(made, "exact")

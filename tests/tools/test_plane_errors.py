@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,7 +13,7 @@ import torch
 from glassplat.commands.demo import SCENE
 from glassplat.data.dataset import Dataset, load_dataset
 from glassplat.evaluate.truth import GroundTruth, load_truth
-from tools.plane_errors import Fit, fits_of, row
+from tools.plane_errors import Fit, fits_of, main, row
 
 
 @pytest.fixture(scope="module")
@@ -47,3 +50,18 @@ def test_a_row_counts_what_was_refused_and_what_is_good() -> None:
     fits = [Fit((), (0.5, 0.1), 1.0), Fit((), (3.0, 0.3), 2.0), Fit((), None, 3.0)]
     assert row("case 1", fits) == ["case 1", 3, 1, 1, "1.75 (3.00)", "0.20 (0.30)", 2.0]
     assert row("case 1", fits[2:])[1:6] == [1, 1, 0, "-", "-"]
+
+
+def test_a_scene_without_truth_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copied = shutil.copytree(SCENE, tmp_path / "scene", ignore=shutil.ignore_patterns("gt"))
+    monkeypatch.setattr(sys, "argv", ["plane_errors", "--data", str(copied)])
+    with pytest.raises(SystemExit, match=r"has no ground truth; expected gt/planes\.json"):
+        main()
+
+
+def test_the_command_prints_a_row_for_each_pane(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    monkeypatch.setattr(sys, "argv", ["plane_errors", "--data", str(SCENE), "--masks", "3", "--every", "1000"])
+    main()
+    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith(f"| {SCENE.name} 1 ")]
+    assert len(rows) == 1
+    assert [cell.strip() for cell in rows[0].split("|")][2:4] == ["1", "0"]

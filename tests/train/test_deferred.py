@@ -23,10 +23,11 @@ from glassplat.train.messages import ActionDone, Message, StepDone
 from glassplat.train.optimizer import Rate
 from glassplat.train.propagation import (
     ENDED,
+    RAISED,
     Propagate,
     PropagationSchedule,
     RefineEnvironment,
-    ResetAfterPropagation,
+    ResetRaised,
 )
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
 from glassplat.train.splat_recipe import SplatRecipe
@@ -118,17 +119,25 @@ def test_propagation_and_resets_never_meet() -> None:
 
 
 @pytest.mark.parametrize(
-    ("ended", "resets"),
-    [(None, []), (10, []), (41, [60]), (59, [60]), (70, [])],
-    ids=["never", "before a regular reset", "after the last one", "late", "too late"],
+    ("raised", "ended", "resets"),
+    [
+        (80, None, [30]),
+        (25, 28, [30]),
+        (0, 10, []),
+        (20, 41, [30]),
+        (40, 41, [30, 60]),
+        (58, 59, [30, 60]),
+        (69, 70, [30]),
+    ],
+    ids=["no end", "before a regular reset", "nothing raised", "lowered", "after the last one", "late", "too late"],
 )
-def test_opacities_are_reset_once_after_propagation(ended: int | None, resets: list[int]) -> None:
-    regular = ResetOpacity(Every(0.1, stop=0.4, only_multiples_of=3))
-    state, action, done = fresh_state(), ResetAfterPropagation.following(regular), []
+def test_opacities_are_reset_once_after_propagation(raised: int, ended: int | None, resets: list[int]) -> None:
+    action = ResetRaised.instead_of(ResetOpacity(Every(0.1, stop=0.4, only_multiples_of=3)))
+    state, done = fresh_state(), []
     for step in range(1, 101):
         clock = Clock(step, 100, 5)
-        if step == ended:
-            state.records[ENDED] = step
+        state.records |= {RAISED: step} if step == raised else {}
+        state.records |= {ENDED: step} if step == ended else {}
         if action.due(clock) and action.apply(state, tiny_capture(), clock):
             done.append(step)
     assert done == resets
@@ -195,11 +204,11 @@ def propagated(search: Search, schedule: PropagationSchedule, beats: int = 10) -
     ("end", "shares", "turns", "ended"),
     [
         ("settled", [0.1, 0.2, 0.4, 0.6, 0.6], 0.0, 80),
-        ("settled", [0.0, 0.1, 0.1, 0.1], 0.0, 60),
+        ("settled", [0.0, 0.1, 0.1, 0.1], 0.5, 60),
         ("settled", [0.3, 0.2, 0.1, 0.4], 0.0, 50),
         ("settled", [0.300, 0.305, 0.309, 0.5], 0.0, 50),
-        ("settled", [0.0], 0.0, 40),
-        ("settled", [0.0, 0.02, 0.0], 0.0, 50),
+        ("settled", [0.0], 0.0, 30),
+        ("settled", [0.02], 0.0, 30),
         ("settled", [0.0], 0.5, 50),
         ("settled", [0.0, 0.2, 0.4, 0.6], 0.5, 80),
         ("fixed", [0.4], 0.0, 90),
@@ -284,8 +293,10 @@ def test_a_reset_leaves_the_steps_to_recover(iterations: int, end: Literal["sett
     state, capture = fresh_state(), tiny_capture()
     for ended in ends if end == "settled" else ends[-1:]:
         done = []
+        state.records = {}
         for clock, reset in moments:
-            state.records = {ENDED: ended} if clock.step >= ended else {}
+            if clock.step >= ended:
+                state.records |= {ENDED: ended, RAISED: ended - 1}
             if reset.apply(state, capture, clock):
                 done.append(clock.step)
         assert all(iterations - step >= 450 for step in done), ended

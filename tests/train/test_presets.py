@@ -29,7 +29,7 @@ from glassplat.train.propagation import (
     DensifyWhilePropagating,
     Propagate,
     PropagationSchedule,
-    ResetAfterPropagation,
+    ResetRaised,
 )
 from glassplat.train.recipe import RECIPES, recipe_of
 from glassplat.train.splat_recipe import SplatRecipe
@@ -328,7 +328,7 @@ def test_the_reset_after_propagation_can_be_left_out() -> None:
         recipe = DeferredRecipe(schedule=PropagationSchedule(last_reset=asked))
         return [type(action) for action in recipe.stages(0)[1].actions]
 
-    assert ResetAfterPropagation in kinds(True) and ResetAfterPropagation not in kinds(False)
+    assert ResetRaised in kinds(True) and ResetRaised not in kinds(False)
     assert ResetOpacity in kinds(False)
 
 

@@ -19,10 +19,10 @@ from glassplat.data.errors import InputError
 from glassplat.data.options import as_typed, check_options, number_fields, unwrapped
 from glassplat.data.ranges import Range
 from glassplat.train.recipe import RECIPES, recipe_from_json, recipe_of, recipe_to_json
-from glassplat.train.run_directory import RunDirectory
+from glassplat.train.run_directory import RunDirectory, RunSettings
 from glassplat.train.splat_recipe import SplatRecipe
 
-COMMANDS = [Train, Demo, BenchScenes, BenchAblation, Render]
+COMMANDS = [Train, Demo, BenchScenes, BenchAblation, Render, RunSettings]
 DECLARED = [(kind, name, hint) for kind in (*RECIPES.values(), *COMMANDS) for name, hint in number_fields(kind)]
 
 
@@ -149,7 +149,20 @@ def test_what_is_not_a_recipe_is_refused_in_one_message(text: str, tmp_path: Pat
         RunDirectory(tmp_path).recipe()
 
 
-def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "recipe.json").write_bytes(b"\xff\xfe{}")
-    with pytest.raises(InputError, match=r"recipe\.json"):
-        RunDirectory(tmp_path).recipe()
+def test_files_that_are_no_text_are_refused(tmp_path: Path) -> None:
+    for name, read in (("recipe.json", RunDirectory.recipe), ("settings.json", RunDirectory.settings)):
+        (tmp_path / name).write_bytes(b"\xff\xfe{}")
+        with pytest.raises(InputError, match=name):
+            read(RunDirectory(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"iterations": "10"}, {"iterations": 0}, {"downscale": None}, {"seed": -1}, {"more": 1}, {"mask_polarity": "x"}],
+    ids=str,
+)
+def test_settings_are_checked_as_options_are(fields: dict[str, Any], tmp_path: Path) -> None:
+    settings = {"data": "x", "iterations": 5, **fields}
+    (tmp_path / "settings.json").write_text(json.dumps(settings))
+    with pytest.raises(InputError, match=r"settings\.json"):
+        RunDirectory(tmp_path).settings()

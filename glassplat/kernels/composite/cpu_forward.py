@@ -339,6 +339,10 @@ def composite_forward(real: type) -> Kernel:
                         blend_more(planes, i, batch, width, entries, taken, VALUES + 4 * group, weights)
                     if not runs:
                         running &= ~(np.int64(1) << b)
+                        # What the block was not asked about any more does not reach it in the backward pass either.
+                        for e in range(taken, count):
+                            k = entries[e]
+                            pairs[first + (~k if k < 0 else k)] &= ~(np.int32(1) << b)
                 if running == 0:
                     stop = last
                     break

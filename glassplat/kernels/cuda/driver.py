@@ -34,7 +34,7 @@ class LoadedKernel:
             layout: how the arguments lie in memory, each at the beginning of a slot.
         """
         self.name = name
-        with cuda.gpus[index]:
+        with current_gpu(index):
             self._context = driver.CUcontext(int(checked("cuCtxGetCurrent", driver.cuCtxGetCurrent())))
             self._library = ObjectCode.from_cubin(code.cubin, name=name)
             self._function = driver.CUfunction(int(self._library.get_kernel(code.entry).handle))
@@ -69,6 +69,11 @@ class LoadedKernel:
                 if elsewhere:
                     checked("cuCtxPopCurrent", driver.cuCtxPopCurrent())
             checked(self.name, done)
+
+
+def current_gpu(index: int) -> Any:
+    """A block in which a GPU's primary context, the one that torch uses too, is the current one."""
+    return cuda.gpus[index]
 
 
 def checked(what: str, answer: tuple[Any, ...]) -> Any:

@@ -23,7 +23,7 @@ from glassplat.kernels.devices import SIMULATED
 
 if not SIMULATED:
     # The simulator has no driver.
-    from glassplat.kernels.cuda.driver import LoadedKernel
+    from glassplat.kernels.cuda.driver import LoadedKernel, current_gpu
 
 # Small launches are part of every frame (few cameras, few panes), and Numba warns of each of them.
 config.CUDA_LOW_OCCUPANCY_WARNINGS = 0
@@ -92,8 +92,10 @@ class Kernel:
     def _on_device(self, index: int) -> LoadedKernel:
         """The kernel on a GPU, loaded at first use."""
         if index not in self._loaded:
-            code = self._images.machine_code(torch.cuda.get_device_capability(index))
-            self._loaded[index] = LoadedKernel(code, self.name, index, self._layout)
+            # Numba asks the current GPU about itself while it compiles, and torch's threads may have none.
+            with current_gpu(index):
+                code = self._images.machine_code(torch.cuda.get_device_capability(index))
+                self._loaded[index] = LoadedKernel(code, self.name, index, self._layout)
         return self._loaded[index]
 
 

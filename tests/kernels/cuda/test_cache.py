@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import runpy
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -176,12 +177,14 @@ def test_an_interrupted_write_leaves_the_old_file(
 
 def test_the_loader_gets_what_the_disk_has(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     loaded: list[tuple[Any, int]] = []
+    entered: list[int] = []
 
     def load(code: Any, name: str, index: int, layout: Any) -> str:
         loaded.append((code, index))
         return f"kernel {len(loaded)}"
 
     monkeypatch.setattr(launch, "LoadedKernel", load)
+    monkeypatch.setattr(launch, "current_gpu", lambda index: nullcontext(entered.append(index)))
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: CAPABILITY)
     kept, _ = made(images(), caplog)
     caplog.clear()
@@ -189,6 +192,7 @@ def test_the_loader_gets_what_the_disk_has(monkeypatch: pytest.MonkeyPatch, capl
     with caplog.at_level(logging.INFO, logger="glassplat.kernels"):
         assert [scale._on_device(index) for index in (0, 1, 0)] == ["kernel 1", "kernel 2", "kernel 1"]
     assert loaded == [(kept, 0), (kept, 1)]
+    assert entered == [0, 1]
     assert caplog.messages == []
 
 

@@ -28,7 +28,7 @@ if SIMULATED:
 from numba.cuda.args import ArgHint
 from numba.cuda.dispatcher import _Kernel
 
-from glassplat.kernels.cuda import driver
+from glassplat.kernels.cuda import driver, launch
 from glassplat.kernels.cuda.driver import SLOT
 
 
@@ -127,7 +127,8 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> Driver:
     library = SimpleNamespace(get_kernel=lambda entry: SimpleNamespace(handle=77))
     monkeypatch.setattr(driver, "driver", found)
     monkeypatch.setattr(driver, "ObjectCode", SimpleNamespace(from_cubin=lambda cubin, name: library))
-    monkeypatch.setattr(driver.cuda, "gpus", [nullcontext()])
+    for module in (driver, launch):
+        monkeypatch.setattr(module, "current_gpu", lambda index: nullcontext())
     monkeypatch.setattr(torch.Tensor, "get_device", lambda tensor: 0)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda index: SimpleNamespace(cuda_stream=STREAM))
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: (9, 0))

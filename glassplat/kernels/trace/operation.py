@@ -1,0 +1,106 @@
+"""Traces rays through Gaussians, front to back, with gradients to both."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from glassplat.kernels.devices import kernels_for
+from glassplat.kernels.maths.harmonics import MAX_DEGREE
+from glassplat.kernels.splats import RawGaussians
+from glassplat.kernels.tensor_checks import check_tensors
+from glassplat.kernels.trace.records import Bvh, Rays, Traced
+from glassplat.kernels.trace.shapes import FLAT, SOLID, shapes_of
+
+
+def trace(gaussians: RawGaussians, rays: Rays, bvh: Bvh, *, sh_degree: int, near: float) -> Traced:
+    """Blends what each ray meets, nearest first (EnvGS, Section 4.2 and Eq. 2).
+
+    Gaussians are discs (2DGS) where `log_scales` is [N, 2], met where the ray crosses their plane, and ellipsoids
+    (3DGS) where it is [N, 3], met where their density along the ray is largest. A Gaussian covers with its opacity
+    times the falloff there, up to 3 standard deviations from its centre and 0.99, not at all below 1/255. A ray ends
+    before the Gaussian that would take its transmittance below 1e-4. Colours are seen along the ray, offset by 0.5 and
+    clamped at 0; equal distances keep the Gaussians' order.
+
+    A disc that is seen from its edge (cosine below 1e-3), a Gaussian of which something is not finite and one whose hit
+    lies at or before `near` are not met; a ray without length, or that is not finite, meets nothing. None of them gets
+    a gradient.
+
+    Differentiable in all tensors of `gaussians`, in origins and in directions (Eqs. 13 and 14, and the colour's turn
+    with the direction besides); the same bits for any number of threads.
+
+    Args:
+        gaussians: raw tensors, float32 or float64.
+        rays: of the same floating-point type.
+        bvh: `build_bvh` of these Gaussians.
+        sh_degree: highest degree of the spherical harmonics to evaluate; `gaussians.sh` may hold more, or none at all,
+            which makes all colours zero.
+        near: smallest distance of a hit, in lengths of the ray's direction, at least 0.
+
+    Raises:
+        ValueError: a shape, the degree or `near` is out of range, or the hierarchy is of other Gaussians.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
+    """
+    _check(gaussians, rays, bvh, sh_degree, near)
+    shapes = shapes_of(gaussians)
+    flat = gaussians.log_scales.shape[1] == FLAT
+    return Traced(*_Trace.apply(*shapes, *rays, bvh, flat, sh_degree if gaussians.sh.shape[1] else -1, near))
+
+
+def _check(gaussians: RawGaussians, rays: Rays, bvh: Bvh, sh_degree: int, near: float) -> None:
+    count, num_rays = gaussians.means.shape[0], rays.origins.shape[0]
+    coefficients = gaussians.sh.shape[1] if gaussians.sh.dim() == 3 else 0
+    scales = gaussians.log_scales.shape[1] if gaussians.log_scales.dim() == 2 else 0
+    check_tensors(
+        {
+            "means": (gaussians.means, (count, 3)),
+            "quats": (gaussians.quats, (count, 4)),
+            "log_scales": (gaussians.log_scales, (count, FLAT if scales == FLAT else SOLID)),
+            "logit_opacities": (gaussians.logit_opacities, (count,)),
+            "sh": (gaussians.sh, (count, coefficients, 3)),
+            "origins": (rays.origins, (num_rays, 3)),
+            "directions": (rays.directions, (num_rays, 3)),
+            "boxes": (bvh.boxes, tuple(bvh.boxes.shape)),
+        }
+    )
+    if bvh.order.shape[0] != count:
+        raise ValueError(
+            f"bvh is over {bvh.order.shape[0]} Gaussians and there are {count}; build it again with build_bvh"
+        )
+    if not 0 <= sh_degree <= MAX_DEGREE or (coefficients and coefficients < (sh_degree + 1) ** 2):
+        raise ValueError(
+            f"sh_degree is {sh_degree}, but degrees go from 0 to {MAX_DEGREE} and sh holds {coefficients} coefficients"
+            ", of which degree L needs (L + 1)^2; lower sh_degree or pass more"
+        )
+    if not near >= 0:
+        raise ValueError(f"near is {near}; expected a distance of at least 0")
+
+
+class _Trace(torch.autograd.Function):
+    """The kernels as one node of the autograd graph."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, frames: Tensor, opacities: Tensor, sh: Tensor, origins: Tensor, directions: Tensor,
+        bvh: Bvh, flat: bool, degree: int, near: float,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        tensors = [tensor.detach().contiguous() for tensor in (means, frames, opacities, sh, origins, directions)]
+        kernels = kernels_for("trace", means.device)
+        outputs: tuple[Tensor, ...] = kernels.trace(tensors[:4], tensors[4:], bvh, flat=flat, degree=degree, near=near)
+        ctx.save_for_backward(*tensors, *bvh, *outputs)
+        ctx.options = {"flat": flat, "degree": degree, "near": near}
+        ctx.mark_non_differentiable(outputs[3])
+        return outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        saved = ctx.saved_tensors
+        shapes, rays, bvh, outputs = saved[:4], saved[4:6], saved[6:9], saved[9:]
+        cotangents = [gradient.contiguous() for gradient in gradients[:3]]
+        kernels = kernels_for("trace", shapes[0].device)
+        found = kernels.trace_gradients(shapes, rays, bvh, outputs, cotangents, **ctx.options)
+        return (*found, None, None, None, None)

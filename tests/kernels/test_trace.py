@@ -1,0 +1,258 @@
+"""`trace` and `build_bvh`: against the twin, which knows no hierarchy, by finite differences, and on bad inputs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numba
+import pytest
+import torch
+from torch import Tensor
+
+from glassplat.kernels.build_bvh import build_bvh
+from glassplat.kernels.build_bvh.hilbert import hilbert_codes
+from glassplat.kernels.splats import RawGaussians
+from glassplat.kernels.trace import Bvh, Rays, Traced, trace
+from glassplat.kernels.trace.reference import trace as twin
+from glassplat.kernels.trace.shapes import shapes_of
+
+DISCS, ELLIPSOIDS = 2, 3
+DTYPES = [(torch.float32, 1e-4), (torch.float64, 1e-11)]
+
+
+def cloud(count: int, scales: int, *, dtype: torch.dtype = torch.float64, size: float = -2.0) -> RawGaussians:
+    """Gaussians around the origin, large and small, faint and opaque."""
+    generator = torch.Generator().manual_seed(1)
+    shapes = ((count, 3), (count, 4), (count, scales), (count,), (count, 16, 3))
+    means, quats, spread, opacities, sh = (torch.randn(s, generator=generator, dtype=torch.float64) for s in shapes)
+    return RawGaussians(*(x.to(dtype) for x in (1.5 * means, quats, size + 0.7 * spread, 2 * opacities, 0.6 * sh)))
+
+
+def rays_around(count: int, *, dtype: torch.dtype = torch.float64) -> Rays:
+    """Rays of different lengths from around the cloud towards its middle, some of them from inside."""
+    generator = torch.Generator().manual_seed(2)
+    origins, targets = 3 * torch.randn(2, count, 3, generator=generator, dtype=torch.float64)
+    lengths = 0.2 + torch.rand(count, 1, generator=generator, dtype=torch.float64)
+    return Rays(origins.to(dtype), ((0.2 * targets - origins) * lengths).to(dtype))
+
+
+def bvh_of(gaussians: RawGaussians) -> Bvh:
+    return build_bvh(shapes_of(gaussians), flat=gaussians.log_scales.shape[1] == DISCS)
+
+
+def traced(gaussians: RawGaussians, rays: Rays, *, sh_degree: int = 3, near: float = 0.0) -> Traced:
+    return trace(gaussians, rays, bvh_of(gaussians), sh_degree=sh_degree, near=near)
+
+
+def with_gradients(function: Callable[..., Traced], gaussians: RawGaussians, rays: Rays, degree: int) -> list[Tensor]:
+    """Everything that comes back, and the gradients of a random sum of it."""
+    leaves = [tensor.detach().clone().requires_grad_() for tensor in (*gaussians, *rays)]
+    own, own_rays = RawGaussians(*leaves[:5]), Rays(*leaves[5:])
+    found = function(own, own_rays, bvh_of(own), sh_degree=degree, near=0.05)
+    generator = torch.Generator().manual_seed(3)
+    weights = [torch.randn(x.shape, generator=generator, dtype=torch.float64).to(x.dtype) for x in found[:3]]
+    total = torch.stack([(weight * value).sum() for weight, value in zip(weights, found, strict=False)]).sum()
+    return [*(x.detach() for x in found), *torch.autograd.grad(total, leaves)]
+
+
+@pytest.mark.parametrize("scales", [DISCS, ELLIPSOIDS])
+@pytest.mark.parametrize(("dtype", "tolerance"), DTYPES)
+@pytest.mark.parametrize(
+    ("count", "num_rays", "degree"), [(0, 5, 0), (1, 3, 1), (9, 0, 2), (600, 700, 3), (70, 300, 0)]
+)
+def test_what_rays_meet_and_its_gradients_match_the_twin(
+    scales: int, dtype: torch.dtype, tolerance: float, count: int, num_rays: int, degree: int
+) -> None:
+    gaussians, rays = cloud(count, scales, dtype=dtype), rays_around(num_rays, dtype=dtype)
+    found, expected = (with_gradients(f, gaussians, rays, degree) for f in (trace, twin))
+    assert torch.equal(found[3], expected[3])
+    for tensor, other in zip(found, expected, strict=True):
+        scale = max(float(other.abs().max()), 1e-3) if other.numel() else 1.0
+        torch.testing.assert_close(tensor, other, rtol=0, atol=tolerance * scale)
+
+
+@pytest.mark.parametrize("scales", [DISCS, ELLIPSOIDS])
+def test_hundreds_of_hits_on_a_ray_come_in_order(scales: int) -> None:
+    gaussians = cloud(9000, scales, size=-0.7)
+    faint = gaussians._replace(logit_opacities=torch.full((9000,), -4.8, dtype=torch.float64))
+    rays = rays_around(60)
+    found, expected = traced(faint, rays), twin(faint, rays, None, sh_degree=3, near=0.0)
+    assert int(expected.hits.max()) > 400
+    assert torch.equal(found.hits, expected.hits)
+    torch.testing.assert_close(found.colors, expected.colors, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("scales", [DISCS, ELLIPSOIDS])
+def test_gradients_match_finite_differences(scales: int) -> None:
+    gaussians, rays = cloud(12, scales, size=-0.7), rays_around(6)
+    bvh = bvh_of(gaussians)
+
+    def of_leaves(*leaves: Tensor) -> tuple[Tensor, ...]:
+        return tuple(trace(RawGaussians(*leaves[:5]), Rays(*leaves[5:]), bvh, sh_degree=3, near=0.0)[:3])
+
+    leaves = [tensor.clone().requires_grad_() for tensor in (*gaussians, *rays)]
+    assert int(of_leaves(*leaves)[1].count_nonzero()) >= 4
+    assert torch.autograd.gradcheck(of_leaves, leaves, eps=1e-7, atol=1e-5, fast_mode=True)
+
+
+@pytest.mark.parametrize("scales", [DISCS, ELLIPSOIDS])
+def test_threads_do_not_change_a_bit(scales: int) -> None:
+    gaussians, rays = cloud(500, scales, dtype=torch.float32), rays_around(900, dtype=torch.float32)
+    many = with_gradients(trace, gaussians, rays, 2)
+    numba.set_num_threads(1)
+    one = with_gradients(trace, gaussians, rays, 2)
+    assert all(torch.equal(a, b) for a, b in zip(many, one, strict=True))
+
+
+@pytest.mark.parametrize("scales", [DISCS, ELLIPSOIDS])
+@pytest.mark.parametrize("poison", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("which", range(5))
+def test_a_gaussian_that_is_not_finite_is_not_met(scales: int, poison: float, which: int) -> None:
+    gaussians, rays = cloud(40, scales), rays_around(50)
+    others = RawGaussians(*(torch.cat([x[:7], x[8:]]) for x in gaussians))
+    bad = RawGaussians(*(x.clone() for x in gaussians))
+    bad[which][7] = poison
+    found, expected = with_gradients(trace, bad, rays, 3), with_gradients(trace, others, rays, 3)
+    assert all(bool(x.isfinite().all()) for x in found)
+    for tensor, other in zip(found[:4], expected[:4], strict=True):
+        torch.testing.assert_close(tensor, other)
+
+
+@pytest.mark.parametrize(
+    "direction", [(0.0, 0.0, 0.0), (math.nan, 0.0, 1.0), (math.inf, 0.0, 0.0), (1e200, 1e200, 0.0)]
+)
+def test_a_ray_that_is_none_meets_nothing(direction: tuple[float, float, float]) -> None:
+    gaussians, rays = cloud(40, DISCS, size=0.0), rays_around(3)
+    rays.directions[1] = torch.tensor(direction)
+    found = with_gradients(trace, gaussians, rays, 1)
+    assert int(found[3][1]) == 0 and int(found[3][0]) > 0
+    assert all(bool(x.isfinite().all()) for x in found)
+    assert bool((found[0][1] == 0).all() and (found[-1][1] == 0).all())
+
+
+def one_disc(**changes: Tensor) -> RawGaussians:
+    """A nearly opaque disc of deviation 1 in the plane z = 2, that is white."""
+    values = {
+        "means": torch.tensor([[0.0, 0.0, 2.0]]),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        "log_scales": torch.zeros(1, 2),
+        "logit_opacities": torch.tensor([20.0]),
+        "sh": torch.full((1, 1, 3), 0.5 / 0.28209479177387814),
+    } | changes
+    return RawGaussians(*(x.double() for x in values.values()))
+
+
+def ray(origin: tuple[float, ...], direction: tuple[float, ...]) -> Rays:
+    return Rays(torch.tensor([origin], dtype=torch.float64), torch.tensor([direction], dtype=torch.float64))
+
+
+def test_a_disc_is_met_where_its_plane_is() -> None:
+    found = traced(one_disc(), ray((1.0, 0.0, 0.0), (0.0, 0.0, 4.0)), sh_degree=0)
+    alpha = math.exp(-0.5)
+    assert float(found.alphas) == pytest.approx(alpha)
+    assert float(found.depths / found.alphas) == pytest.approx(2.0)
+    assert found.colors[0].tolist() == pytest.approx([alpha] * 3)
+
+
+def test_coverage_is_clamped_and_ends_at_three_deviations() -> None:
+    inside, outside = (traced(one_disc(), ray((x, 0.0, 0.0), (0.0, 0.0, 1.0)), sh_degree=0) for x in (2.99, 3.01))
+    assert float(traced(one_disc(), ray((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), sh_degree=0).alphas) == pytest.approx(0.99)
+    assert float(inside.alphas) > 0 and float(outside.alphas) == 0
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 2.0), (0.0, 0.0, 3.0)])
+def test_what_lies_behind_the_origin_or_at_it_is_not_met(origin: tuple[float, ...]) -> None:
+    assert int(traced(one_disc(), ray(origin, (0.0, 0.0, 1.0)), sh_degree=0).hits) == 0
+
+
+def test_a_disc_seen_from_its_edge_is_not_met() -> None:
+    assert int(traced(one_disc(), ray((-2.0, 0.0, 2.0), (1.0, 0.0, 1e-5)), sh_degree=0).hits) == 0
+
+
+def test_hits_before_the_near_distance_are_left_out() -> None:
+    along = ray((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    assert int(traced(one_disc(), along, sh_degree=0, near=1.9).hits) == 1
+    assert int(traced(one_disc(), along, sh_degree=0, near=2.1).hits) == 0
+
+
+def test_nothing_is_met_behind_what_is_opaque() -> None:
+    row = RawGaussians(*(x.repeat(50, *(1,) * (x.dim() - 1)) for x in one_disc()))
+    row.means[:, 2] = torch.linspace(1, 5, 50)
+    # Each lets a hundredth of the light through: the third would take it below 1e-4.
+    assert int(traced(row, ray((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), sh_degree=0).hits) == 2
+
+
+def test_equal_distances_keep_the_order_of_the_gaussians() -> None:
+    pile = RawGaussians(*(x.repeat(40, *(1,) * (x.dim() - 1)) for x in one_disc(logit_opacities=torch.tensor([-2.0]))))
+    pile.sh[:, 0] = torch.randn(40, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    along = ray((0.1, 0.2, 0.0), (0.0, 0.0, 1.0))
+    found, expected = traced(pile, along, sh_degree=0), twin(pile, along, None, sh_degree=0, near=0.0)
+    assert int(found.hits) == int(expected.hits) == 40
+    torch.testing.assert_close(found.colors, expected.colors)
+
+
+def test_a_disc_of_no_size_is_a_point_that_rays_miss() -> None:
+    point = one_disc(log_scales=torch.full((1, 2), -800.0))
+    found = with_gradients(trace, point, ray((0.1, 0.0, 0.0), (0.0, 0.0, 1.0)), 0)
+    assert int(found[3]) == 0 and all(bool(x.isfinite().all()) for x in found)
+
+
+@pytest.mark.parametrize("scales", [DISCS, ELLIPSOIDS])
+def test_boxes_that_are_refitted_hold_gaussians_that_have_moved(scales: int) -> None:
+    before, rays = cloud(300, scales), rays_around(100)
+    after = before._replace(means=before.means.flip(0) + 0.3, log_scales=before.log_scales + 0.5)
+    refitted = build_bvh(shapes_of(after), flat=scales == DISCS, order=bvh_of(before).order)
+    found, expected = (
+        trace(after, rays, refitted, sh_degree=3, near=0.0),
+        twin(after, rays, None, sh_degree=3, near=0.0),
+    )
+    assert torch.equal(found.hits, expected.hits)
+    torch.testing.assert_close(found.colors, expected.colors)
+
+
+@pytest.mark.parametrize("count", [1, 8, 9, 64, 65, 1000])
+def test_every_gaussian_has_one_place_in_the_hierarchy(count: int) -> None:
+    bvh = bvh_of(cloud(count, DISCS))
+    assert sorted(bvh.order.tolist()) == list(range(count))
+    assert int(bvh.level_offsets[-1]) == len(bvh.boxes)
+    top = bvh.boxes[-1]
+    full = top[0] <= top[3]
+    assert bool((top[:3, full].amin(1) <= cloud(count, DISCS).means.amin(0)).all())
+
+
+def test_neighbours_on_the_curve_are_neighbours_in_space() -> None:
+    grid = torch.cartesian_prod(*[torch.arange(8.0)] * 3)
+    along = grid[hilbert_codes(grid).argsort()]
+    assert bool((along.diff(dim=0).abs().sum(1) == 1).all())
+
+
+def test_places_on_the_curve_need_no_extent() -> None:
+    points = torch.tensor([[1.0, 2.0, 3.0]]).repeat(4, 1)
+    points[2, 1] = math.nan
+    assert hilbert_codes(points).argsort(stable=True).tolist() == [0, 1, 3, 2]
+
+
+def test_moving_rays_and_gaussians_together_changes_nothing() -> None:
+    gaussians, rays = cloud(200, DISCS), rays_around(100)
+    shift = torch.tensor([3.0, -2.0, 5.0], dtype=torch.float64)
+    moved = traced(gaussians._replace(means=gaussians.means + shift), Rays(rays.origins + shift, rays.directions))
+    torch.testing.assert_close(moved.colors, traced(gaussians, rays).colors)
+
+
+def test_the_length_of_a_direction_changes_nothing() -> None:
+    gaussians, rays = cloud(200, DISCS), rays_around(100)
+    longer = traced(gaussians, Rays(rays.origins, 7 * rays.directions))
+    for tensor, other in zip(longer, traced(gaussians, rays), strict=True):
+        torch.testing.assert_close(tensor, other)
+
+
+def test_a_hierarchy_of_other_gaussians_is_refused() -> None:
+    with pytest.raises(ValueError, match="bvh is over 5 Gaussians and there are 6; build it again"):
+        trace(cloud(6, DISCS), rays_around(2), bvh_of(cloud(5, DISCS)), sh_degree=0, near=0.0)
+
+
+@pytest.mark.parametrize(("degree", "near"), [(4, 0.0), (-1, 0.0), (0, -1.0), (0, math.nan)])
+def test_options_out_of_range_are_refused(degree: int, near: float) -> None:
+    with pytest.raises(ValueError, match=r"sh_degree is|near is"):
+        traced(cloud(3, DISCS), rays_around(2), sh_degree=degree, near=near)

@@ -1,0 +1,146 @@
+"""Traced reflections: flat mirrors against mirrored cameras, gradients, and limits."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from glassplat.render.splat import Splat
+from glassplat.render.surface import view_directions
+from glassplat.render.traced import Traced
+from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Scene
+from tests.render.tiny_scene import camera_at, random_gaussians
+
+
+def mirror_wall(strength: float = 1 - 1e-9) -> Gaussians:
+    """One huge, flat, opaque Gaussian in the plane z = 3, dark and mirroring; float64.
+
+    Its depth is that of its centre, and so right where the camera looks straight at it.
+    """
+    return Gaussians(
+        means=torch.tensor([[0.0, 0.0, 3.0]], dtype=torch.float64),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64),
+        log_scales=torch.log(torch.tensor([[50.0, 50.0, 1e-6]], dtype=torch.float64)),
+        logit_opacities=torch.full((1,), 30.0, dtype=torch.float64),
+        sh=torch.full((1, 1, 3), -0.5 / 0.28209479177387814, dtype=torch.float64),
+        channels={"logit_strength": torch.logit(torch.tensor([strength], dtype=torch.float64))},
+    )
+
+
+def surroundings(count: int = 16) -> Gaussians:
+    """Things behind the camera, which the wall mirrors."""
+    found = replace(random_gaussians(count, (0.2, 0.1, -1.5), seed=2), channels={})
+    return found.with_tensors({"log_scales": found.log_scales + 1.0})
+
+
+def glossy(strength: float = 0.3) -> Scene:
+    """Random Gaussians before the camera that mirror random ones behind it; float64."""
+    primary = random_gaussians(14, (0.0, 0.0, 3.0), seed=4)
+    strengths = torch.full((14,), math.log(strength / (1 - strength)), dtype=torch.float64)
+    return Scene(replace(primary, channels={"logit_strength": strengths}), extent=2.0, surroundings=surroundings())
+
+
+def mirrored(camera: Camera) -> Camera:
+    """The camera mirrored about the plane z = 3."""
+    reflection = torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
+    reflection[2, 3] = 6.0
+    return replace(camera, cam_from_world=camera.cam_from_world @ reflection)
+
+
+def test_a_flat_mirror_shows_what_the_mirrored_camera_sees() -> None:
+    camera, scene = camera_at(0.1, -0.2, 0.0), Scene(mirror_wall(), extent=0.01, surroundings=surroundings())
+    frame = Traced()(scene, camera)
+    expected = Traced(surroundings=True)(scene, mirrored(camera)).layers["surroundings"]
+    torch.testing.assert_close(frame.layers["reflection"], expected)
+    assert float(expected.max()) > 0.3
+
+
+def test_without_strength_it_is_the_base_bit_for_bit() -> None:
+    scene = glossy()
+    dull = replace(
+        scene, primary=replace(scene.primary, channels={"logit_strength": torch.full((14,), -800.0).double()})
+    )
+    frame = Traced()(dull, camera_at(0.0, 0.0, 0.0))
+    assert torch.equal(frame.rgb, frame.layers["base"])
+    assert torch.equal(frame.rgb, Splat()(dull, camera_at(0.0, 0.0, 0.0)).rgb)
+
+
+def test_layers_recombine() -> None:
+    frame = Traced()(glossy(), camera_at(0.0, 0.0, 0.0))
+    strength = frame.layers["strength"][..., None]
+    found = (1 - strength) * frame.layers["base"] + strength * frame.layers["reflection"]
+    torch.testing.assert_close(found, frame.rgb)
+    assert float(frame.layers["reflection"].max()) > 0.05
+
+
+def test_pixels_that_reflect_less_than_asked_keep_their_base() -> None:
+    frame = Traced(least_strength=0.2)(glossy(), camera_at(0.0, 0.0, 0.0))
+    faint = frame.layers["strength"] <= 0.2
+    assert bool(faint.any()) and not bool(faint.all())
+    assert torch.equal(frame.rgb[faint], frame.layers["base"][faint])
+    assert int(frame.layers["reflection"][faint].count_nonzero()) == 0
+
+
+def leaves_of(scene: Scene) -> dict[str, torch.Tensor]:
+    return {name: t.clone().requires_grad_() for name, t in scene.parameters().items() if t.numel()}
+
+
+def test_gradients_reach_surfaces_and_surroundings() -> None:
+    scene, camera = glossy(), camera_at(0.0, 0.0, 0.0)
+    leaves = leaves_of(scene)
+    gradients = torch.autograd.grad(Traced()(scene.with_parameters(leaves), camera).rgb.square().sum(), leaves.values())
+    assert all(bool(g.isfinite().all()) and float(g.abs().max()) > 0 for g in gradients)
+
+
+def test_gradients_match_finite_differences() -> None:
+    scene, camera = glossy(), camera_at(0.0, 0.0, 0.0, width=12, height=9)
+    names = ("primary.quats", "primary.means", "primary.logit_strength", "surroundings.means", "surroundings.sh")
+    parameters = scene.parameters()
+
+    def image(*tensors: torch.Tensor) -> torch.Tensor:
+        return Traced()(scene.with_parameters(dict(zip(names, tensors, strict=True))), camera).layers["reflection"]
+
+    leaves = [parameters[name].clone().requires_grad_() for name in names]
+    assert torch.autograd.gradcheck(image, leaves, eps=1e-7, atol=2e-4, fast_mode=True)
+
+
+def test_reflections_can_be_kept_from_moving_surfaces() -> None:
+    scene, camera = glossy(), camera_at(0.0, 0.0, 0.0)
+    leaves = leaves_of(scene)
+    layer = Traced(joint=False)(scene.with_parameters(leaves), camera).layers["reflection"]
+    gradients = torch.autograd.grad(layer.sum(), leaves.values(), allow_unused=True)
+    reached = {name for name, g in zip(leaves, gradients, strict=True) if g is not None and float(g.abs().max()) > 0}
+    assert reached and all(name.startswith("surroundings.") for name in reached)
+
+
+def test_moving_scene_and_camera_together_changes_nothing() -> None:
+    scene, shift = glossy(), torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
+    means = {f"{part}.means": g.means + shift for part, g in scene.gaussian_sets().items() if len(g)}
+    moved = Traced()(scene.with_parameters(means), camera_at(1.0, -2.0, 0.5))
+    torch.testing.assert_close(moved.rgb, Traced()(scene, camera_at(0.0, 0.0, 0.0)).rgb)
+
+
+def test_reflected_rays_see_the_background_where_nothing_is() -> None:
+    scene = Scene(mirror_wall(), extent=0.01, surroundings=surroundings())
+    frame = Traced(background=(1.0, 1.0, 1.0))(scene, camera_at(0.0, 0.0, 0.0))
+    away = Traced()(scene, camera_at(0.0, 0.0, 0.0)).layers["reflection"].sum(-1) == 0
+    assert bool(away.any())
+    assert bool((frame.layers["reflection"][away] == 1).all())
+
+
+def test_a_scene_without_surroundings_is_refused() -> None:
+    scene = glossy()
+    with pytest.raises(ValueError, match="has no surroundings; expected one trained with `traced`"):
+        Traced()(replace(scene, surroundings=Gaussians.empty()), camera_at(0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="expected logit_strength"):
+        Traced()(replace(scene, primary=replace(scene.primary, channels={})), camera_at(0.0, 0.0, 0.0))
+
+
+def test_directions_go_through_pixel_centres() -> None:
+    camera = camera_at(0.0, 0.0, 0.0)
+    assert view_directions(camera)[0, 0].tolist() == pytest.approx([(0.5 - 20.3) / 30, (0.5 - 13.8) / 31, 1.0])
