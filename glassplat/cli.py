@@ -174,11 +174,14 @@ def run(command: Any) -> None:
 
 def interrupted(stop: KeyboardInterrupt, command: Any) -> int:
     """Says what an interrupted command leaves behind, and how to go on."""
-    from glassplat.commands.messages import message_console, say
+    from glassplat.commands.messages import drop_output, message_console, say
     from glassplat.commands.signals import code_of
 
     left = "" if command is None else f"; {command.left_behind()}"
-    say(message_console(stderr=True), f"{str(stop) or 'interrupted'}{left}")
+    try:
+        say(message_console(stderr=True), f"{str(stop) or 'interrupted'}{left}")
+    except OSError:  # A terminal that was closed shows nothing any more.
+        drop_output()
     return code_of(stop)
 
 

@@ -11,6 +11,7 @@ os.environ.setdefault("NUMBA_NUM_THREADS", "2")
 import glassplat  # noqa: F401, I001
 
 import random
+import signal
 from collections.abc import Iterator
 
 import hypothesis
@@ -19,6 +20,11 @@ import numpy as np
 import pytest
 import torch
 from _pytest.terminal import TerminalReporter
+
+# A shell lets what it starts in the background ignore Ctrl-C, and `nohup` the end of the terminal. The package leaves
+# ignored what it finds ignored; its tests want these signals heard, here and in the processes that they start.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 hypothesis.settings.register_profile("deterministic", derandomize=True, deadline=None, max_examples=30, database=None)
 hypothesis.settings.load_profile("deterministic")

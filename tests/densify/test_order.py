@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from glassplat.densify.order import BITS, in_morton_order, morton_codes
+from glassplat.densify.order import in_morton_order
+from glassplat.kernels.morton import BITS, morton_codes
 
 
 def test_the_corners_of_a_cube_come_in_the_order_of_the_curve() -> None:

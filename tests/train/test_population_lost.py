@@ -38,7 +38,8 @@ def place_true_planes(state: TrainState, dataset: object) -> None:
 
 
 def stages_of(recipe: SplatRecipe | PlanarRecipe | DeferredRecipe) -> tuple[Stage, ...]:
-    return tuple(replace(s, entry=place_true_planes) if s.entry else s for s in recipe.stages(seed=0))
+    panes = recipe.method == "planar"
+    return tuple(replace(s, entry=place_true_planes) if s.entry and panes else s for s in recipe.stages(seed=0))
 
 
 def fresh_state() -> TrainState:

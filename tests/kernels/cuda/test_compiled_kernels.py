@@ -133,7 +133,8 @@ def exponent_of(ptx: str) -> Tree:
 def agree(pattern: Tree, other: Tree, known: dict[str, Tree]) -> bool:
     """Whether both compute the same: what `pattern` loads, the other may have computed, the same wherever it stands."""
     if isinstance(pattern, str):
-        return known.setdefault(pattern, other) == other
+        is_another = any(value == other for name, value in known.items() if name != pattern)
+        return not is_another and known.setdefault(pattern, other) == other
     if isinstance(other, str) or pattern[0] != other[0]:
         return False
     swapped = [other[1][1], other[1][0], *other[1][2:]]
