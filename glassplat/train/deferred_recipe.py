@@ -99,8 +99,8 @@ class DeferredRecipe:
         consistency_weight: weight of the difference between normals and the slope of the depths, while normals spread.
         propagation: how normals spread and colours are sabotaged.
         schedule: when they do.
-        hurry_matte: raise the learning rates to those of `splat` until the first reset of opacities, and for the rest
-            of a run in which nothing was found that reflects.
+        hurry_matte: raise the learning rates to those of `splat` for the rest of a run in which nothing was found that
+            reflects.
         propagation_interval: steps between densifications while normals spread; None keeps `densify.interval`.
         rates: learning rates of the Gaussians; they do not rise in short runs, which costs a mirror ball its normals
             (docs/experiments.md).
@@ -192,7 +192,7 @@ class DeferredRecipe:
             share=self.bootstrap,
             renderer=Splat(self.background or BLACK, depth=False),
             losses=(*image, *population.terms),
-            rates=(self._hurried_rates() if self.hurry_matte else self.rates).of("primary"),
+            rates=self.rates.of("primary"),
             actions=population.edits,
             motions=population.motions,
             densify_until=population.densify_until,
@@ -262,10 +262,6 @@ class DeferredRecipe:
         if not self.schedule.last_reset:
             return population.resets
         return tuple(ResetRaised.instead_of(reset) for reset in population.resets)
-
-    def _hurried_rates(self) -> GaussianRates:
-        """Those of `splat`, where no normal means anything that they would spoil."""
-        return replace(self.rates, short_run_power=GaussianRates().short_run_power)
 
     def _matte_rates(self) -> dict[str, Rate]:
         """What brings the learning rates to those of `splat`, where nothing reflects that higher ones would spoil."""

@@ -97,9 +97,7 @@ class Propagate:
         if has_ended(state):
             return False
         if clock.step < min(self._first(clock), self._last(clock)):
-            self._hurry(state, clock)
             return False
-        state.optimizer.hurried = {}
         if clock.step >= self._last(clock) or self._settles(state, dataset, clock):
             self._end(state, dataset, clock)
             return False
@@ -119,7 +117,7 @@ class Propagate:
         return replace(self.when, skip_multiples_of=None)
 
     def _hurry(self, state: TrainState, clock: Clock) -> None:
-        """Learns faster while there is no normal that this would spoil."""
+        """Learns faster where there is no normal that this would spoil."""
         state.optimizer.hurried = {name: rate.at(0.0, 1.0, clock.iterations) for name, rate in self.matte_rates.items()}
 
     def _first(self, clock: Clock) -> int:
