@@ -28,6 +28,15 @@ SH_CONSTANTS = (
 (y (3 x^2 - y^2), xyz, y (4 z^2 - x^2 - y^2), z (2 z^2 - 3 x^2 - 3 y^2), z (x^2 - y^2))."""
 
 
+def check_sh_degree(sh_degree: int, coefficients: int) -> None:
+    """Raises ValueError where a degree is out of range, or needs more coefficients than there are; none are fine."""
+    if not 0 <= sh_degree <= MAX_DEGREE or (coefficients and coefficients < (sh_degree + 1) ** 2):
+        raise ValueError(
+            f"sh_degree is {sh_degree}, but degrees go from 0 to {MAX_DEGREE} and sh holds {coefficients} coefficients"
+            ", of which degree L needs (L + 1)^2; lower sh_degree or pass more"
+        )
+
+
 class ColorMaths(NamedTuple):
     """Colour of one Gaussian from its coefficients `sh[n]` [K, 3], for one floating-point type.
 

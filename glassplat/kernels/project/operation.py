@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.devices import kernels_for
-from glassplat.kernels.maths.harmonics import MAX_DEGREE
+from glassplat.kernels.maths.harmonics import check_sh_degree
 from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians
 from glassplat.kernels.tensor_checks import check_tensors
 
@@ -73,11 +73,7 @@ def _check(gaussians: RawGaussians, cameras: CameraBatch, sh_degree: int, near: 
     if cameras.windows is not None:
         expected["windows"] = (cameras.windows, (num_cameras, 4))
     check_tensors(expected)
-    if not 0 <= sh_degree <= MAX_DEGREE or (coefficients and coefficients < (sh_degree + 1) ** 2):
-        raise ValueError(
-            f"sh_degree is {sh_degree}, but degrees go from 0 to {MAX_DEGREE} and sh holds {coefficients} coefficients"
-            ", of which degree L needs (L + 1)^2; lower sh_degree or pass more"
-        )
+    check_sh_degree(sh_degree, coefficients)
     if not near >= 0:
         raise ValueError(f"near is {near}; expected a depth of at least 0")
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.devices import kernels_for
-from glassplat.kernels.maths.harmonics import MAX_DEGREE
+from glassplat.kernels.maths.harmonics import check_sh_degree
 from glassplat.kernels.splats import RawGaussians
 from glassplat.kernels.tensor_checks import check_tensors
 from glassplat.kernels.trace.records import Bvh, Rays, Traced
@@ -70,11 +70,7 @@ def _check(gaussians: RawGaussians, rays: Rays, bvh: Bvh, sh_degree: int, near: 
         raise ValueError(
             f"bvh is over {bvh.order.shape[0]} Gaussians and there are {count}; build it again with build_bvh"
         )
-    if not 0 <= sh_degree <= MAX_DEGREE or (coefficients and coefficients < (sh_degree + 1) ** 2):
-        raise ValueError(
-            f"sh_degree is {sh_degree}, but degrees go from 0 to {MAX_DEGREE} and sh holds {coefficients} coefficients"
-            ", of which degree L needs (L + 1)^2; lower sh_degree or pass more"
-        )
+    check_sh_degree(sh_degree, coefficients)
     if not near >= 0:
         raise ValueError(f"near is {near}; expected a distance of at least 0")
 
