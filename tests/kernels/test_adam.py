@@ -98,7 +98,7 @@ def test_no_parameters_take_no_step() -> None:
 
 def test_parameters_of_different_types_are_refused() -> None:
     single, double = (torch.zeros(3, dtype=dtype) for dtype in (torch.float32, torch.float64))
-    with pytest.raises(TypeError, match="parameter is torch.float64 and the first parameter is torch.float32"):
+    with pytest.raises(TypeError, match=r"parameter is torch\.float64 and the first parameter is torch\.float32"):
         adam([Update(*[single] * 4, 0.1, 1), Update(*[double] * 4, 0.1, 1)])
 
 

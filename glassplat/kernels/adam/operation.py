@@ -12,6 +12,7 @@ from glassplat.kernels.adam.update import Update
 from glassplat.kernels.devices import kernels_for
 from glassplat.kernels.tensor_checks import check_tensors
 
+TENSORS = Update._fields[:4]
 CHANGED = ("parameter", "first_moment", "second_moment")
 
 
@@ -38,7 +39,7 @@ def adam(updates: Sequence[Update], *, betas: tuple[float, float] = (0.9, 0.999)
 
 def _check(update: Update, like: Tensor) -> None:
     shape = tuple(update.parameter.shape)
-    tensors = {name: (getattr(update, name), shape) for name in Update._fields[:4]}
+    tensors = {name: (getattr(update, name), shape) for name in TENSORS}
     check_tensors({"the first parameter": (like, tuple(like.shape)), **tensors})
     for name in CHANGED:
         if not getattr(update, name).is_contiguous():
@@ -52,5 +53,5 @@ def _check(update: Update, like: Tensor) -> None:
 
 def _flat(update: Update) -> Update:
     """The same update of one row of elements each."""
-    tensors = (update.parameter, update.gradient.contiguous(), update.first_moment, update.second_moment)
-    return Update(*(tensor.detach().view(-1) for tensor in tensors), update.lr, update.step)
+    contiguous = update._replace(gradient=update.gradient.contiguous())
+    return contiguous._replace(**{name: getattr(contiguous, name).detach().view(-1) for name in TENSORS})
