@@ -101,6 +101,7 @@ def evaluate(
     0.5; `pane_region` says which. A method without layers is scored with its image as its transmission:
     that is what its user has.
 
+    `reflective_psnr` is that over the pixels of which more than half is mirrored, where the true strength is known.
     `normal_error_deg` is the mean angle between the layer `normal` and the true normals over the pixels that show a
     surface, `reflective_normal_error_deg` the same where it mirrors more than half, `strength_error` the mean
     difference of the layer `strength` from the true one. `environment_psnr` compares the learned environment with the
@@ -192,7 +193,7 @@ def _measure(
         "lpips": NO_WEIGHTS if isinstance(lpips, str) else lpips(quantized(frame.rgb), quantized(photo)),
         "pane_psnr": pane if isinstance(pane, str) else _region_psnr(frame.rgb, photo, pane, TOO_FEW),
         "transmission_psnr": _transmission_psnr(frame, *truth),
-        **surface_metrics(frame, surface),
+        **surface_metrics(frame, photo, surface),
     }
     return _Measurement(metrics, seconds, _reflection_pixels(frame, *truth))
 
@@ -265,8 +266,9 @@ def _description(scene: Scene, dataset: Dataset) -> dict[str, Any]:
         "resolution": ", ".join(sizes),
         "split": dataset.split,
         "num_test_views": len(dataset.test),
-        "num_gaussians": len(scene.primary) + len(scene.glass),
+        "num_gaussians": sum(len(part) for part in scene.gaussian_sets().values()),
         "num_glass_gaussians": len(scene.glass),
+        "num_surroundings_gaussians": len(scene.surroundings),
     }
 
 

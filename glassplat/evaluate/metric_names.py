@@ -27,6 +27,9 @@ METRICS = {
     ),
 }
 SURFACE_METRICS = {
+    "reflective_psnr": Metric(
+        "PSNR, reflective", "{:.2f} dB", "PSNR of the pixels of which the surface mirrors more than half"
+    ),
     "normal_error_deg": Metric("normal error", "{:.2f}°", "mean angle between rendered and true surface normals"),
     "reflective_normal_error_deg": Metric(
         "normal error, reflective", "{:.2f}°", "the same where the surface mirrors more than half"
