@@ -241,11 +241,11 @@ class DefaultDensify:
 
 @torch.no_grad()
 def reset_opacity(
-    gaussians: Gaussians, moments: Moments, *, ceiling: float = 0.01
+    gaussians: Gaussians, moments: Moments, *, ceiling: float = 0.01, part: str = "primary"
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
     """Lowers every opacity to at most `ceiling` and forgets the opacities' moments (3DGS, Section 5.2).
 
     What the photographs need grows back; what does not is pruned.
     """
     lowered = gaussians.logit_opacities.clamp(max=logit(ceiling))
-    return gaussians.with_tensors({"logit_opacities": lowered}), forget(moments, ("primary.logit_opacities",))
+    return gaussians.with_tensors({"logit_opacities": lowered}), forget(moments, (f"{part}.logit_opacities",))

@@ -212,10 +212,11 @@ class Explore:
 
 @dataclass(frozen=True)
 class ResetOpacity:
-    """Lowers the opacity of the primary Gaussians to a ceiling (3DGS)."""
+    """Lowers the opacity of a set of Gaussians to a ceiling (3DGS)."""
 
     when: Every
     ceiling: float = 0.01
+    part: str = "primary"
     name: str = "reset opacity"
 
     def due(self, clock: Clock) -> bool:
@@ -224,10 +225,11 @@ class ResetOpacity:
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state`, if there is anything to edit."""
+        gaussians = state.scene.gaussian_sets()[self.part]
         lowered, state.optimizer.moments = reset_opacity(
-            state.scene.primary, state.optimizer.moments, ceiling=self.ceiling
+            gaussians, state.optimizer.moments, ceiling=self.ceiling, part=self.part
         )
-        state.scene = replace(state.scene, primary=lowered)
+        state.scene = state.scene.with_gaussians(self.part, lowered)
         return True
 
 

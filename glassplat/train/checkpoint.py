@@ -190,9 +190,10 @@ def restored_state(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
 def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Scene:
     """The scene; ValueError where a tensor is missing or of another shape."""
     empty = Scene(Gaussians.empty(), extent=header["extent"])
-    if header["active_sh_degree"].keys() != empty.gaussian_sets().keys():
+    if header["active_sh_degree"].keys() - {"surroundings"} != empty.gaussian_sets().keys():
         raise InputError(
-            f"it holds the sets of Gaussians {sorted(header['active_sh_degree'])}; expected primary, glass"
+            f"it holds the sets of Gaussians {sorted(header['active_sh_degree'])}; expected primary, glass, and "
+            "surroundings where there are any"
         )
     if "scene/glass/logit_mark" not in tensors:
         raise InputError("the glass has no logit_mark")
