@@ -84,7 +84,7 @@ def test_what_is_missing_is_the_reason() -> None:
 def test_the_image_is_measured_where_it_is_a_reflection() -> None:
     image = torch.where((COVERED & (STRENGTH > 0.5))[..., None], 0.9, 0.0).expand(HEIGHT, WIDTH, 3)
     metrics = surface_metrics(Frame(image), PHOTO, TRUTH)
-    assert metrics["reflective_psnr"] == pytest.approx(20.0, abs=0.1)
+    assert metrics["reflective_psnr"] == pytest.approx(20.0, abs=0.2)
 
 
 def test_slivers_do_not_count() -> None:
