@@ -23,6 +23,7 @@ from glassplat.files.images import write_image
 from glassplat.kernels.devices import DeviceName
 from glassplat.render.deferred import Deferred
 from glassplat.render.frame import Frame
+from glassplat.render.traced import Traced
 
 Layer = Literal[
     "rgb",
@@ -36,6 +37,7 @@ Layer = Literal[
     "base",
     "normal",
     "environment",
+    "surroundings",
     "median_depth",
 ]
 
@@ -43,6 +45,7 @@ LAYERS: dict[str, tuple[Layer, ...]] = {
     "splat": ("rgb", "depth", "alpha"),
     "planar": ("rgb", "transmission", "without_panes", "reflection", "strength", "mask", "depth", "alpha"),
     "deferred": ("rgb", "base", "reflection", "strength", "normal", "environment", "depth", "alpha"),
+    "traced": ("rgb", "base", "reflection", "strength", "normal", "surroundings", "depth", "alpha"),
 }
 """What each method renders that is worth looking at; its frames hold more for the losses."""
 
@@ -80,6 +83,8 @@ class Render:
         renderer = stored.renderer
         if "environment" in self.layers and isinstance(renderer, Deferred):
             renderer = replace(renderer, environment=True)
+        if "surroundings" in self.layers and isinstance(renderer, Traced):
+            renderer = replace(renderer, surroundings=True)
         views = chosen_views(stored.dataset, self.split)
         paths = pictures_of(stored.dataset)
         targets = [self.output / layer / paths[view.name] for layer in self.layers for view in views]

@@ -102,6 +102,29 @@ def accumulate(
     )
 
 
+@torch.no_grad()
+def accumulate_in_space(statistics: ScreenStatistics, means_gradient: Tensor, distances: Tensor) -> ScreenStatistics:
+    """The statistics with a step added in which rays met the Gaussians in space (EnvGS, Section 5.1).
+
+    A gradient times half of the distance at which a Gaussian was met is what on a screen would be one in normalised
+    device coordinates; without that factor, what is far away would get too few Gaussians.
+
+    Args:
+        statistics: the record so far.
+        means_gradient: [N, 3] gradient of one view's loss with respect to the centres.
+        distances: [N] at which they were met, world units.
+    """
+    norms = means_gradient.norm(dim=-1)
+    met = (norms > 0).to(statistics.view_count.dtype)
+    pulls = 0.5 * distances * norms
+    return ScreenStatistics(
+        gradient_sum=statistics.gradient_sum + pulls,
+        pull_sum=statistics.pull_sum + pulls,
+        view_count=statistics.view_count + met,
+        max_radius=statistics.max_radius,
+    )
+
+
 @dataclass(frozen=True)
 class DefaultDensify:
     """When and how 3DGS adds and removes Gaussians, with the criterion of AbsGS (arXiv 2404.10484) for splits.

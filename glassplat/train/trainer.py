@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from glassplat.data.dataset import Dataset, View
-from glassplat.densify.default import ScreenStatistics, accumulate
-from glassplat.render.frame import Frame, ScreenPass
+from glassplat.densify.default import ScreenStatistics, accumulate, accumulate_in_space
+from glassplat.render.frame import Frame, ScreenPass, SpacePass
 from glassplat.scene.scene import Scene
 from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
 from glassplat.train.optimizer import rate_tensor
@@ -36,12 +36,13 @@ WHERE_TO_LOOK = (
 class Differentiated(NamedTuple):
     """One view's losses and their gradients; of each pass on screen those of its centres and of its probe.
 
-    `visible` is the frame's.
+    `space` and `visible` are the frame's.
     """
 
     losses: dict[str, float]
     gradients: dict[str, Tensor]
     screen: list[tuple[ScreenPass, Tensor, Tensor]]
+    space: tuple[SpacePass, ...]
     visible: Tensor | None
 
 
@@ -86,6 +87,7 @@ def advance(stage: Stage, dataset: Dataset, state: TrainState, iterations: int, 
     sight.note(result.visible, state.step)
     update(stage, state, result.gradients, iterations)
     collect_statistics(state, result.screen, view)
+    collect_in_space(state, result)
     state.step += 1
     clock = Clock(state.step, iterations, len(dataset.train))
     for motion in stage.motions:
@@ -181,7 +183,7 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Di
     pulls = zip(tracked, on_screen[: len(tracked)], on_screen[len(tracked) :], strict=True)
     screen = [(s, v_means, v_probe) for s, v_means, v_probe in pulls if v_means is not None and v_probe is not None]
     losses = dict(zip(terms, stacked.tolist(), strict=True))
-    return Differentiated(losses, gradients, screen, frame.visible)
+    return Differentiated(losses, gradients, screen, frame.space, frame.visible)
 
 
 def weighted_terms(stage: Stage, frame: Frame, view: View, scene: Scene) -> dict[str, Tensor]:
@@ -216,6 +218,18 @@ def collect_statistics(state: TrainState, screen: list[tuple[ScreenPass, Tensor,
             weight=record.weight,
             direct=record.direct,
         )
+
+
+def collect_in_space(state: TrainState, result: Differentiated) -> None:
+    """Adds the step's gradients in space, of what rays met, to the statistics that densification reads."""
+    for record in result.space:
+        gradient = result.gradients.get(f"{record.part}.means")
+        if gradient is None:
+            continue
+        known = state.statistics.get(record.part)
+        if known is None:
+            known = ScreenStatistics.zeros(gradient.shape[0], device=gradient.device)
+        state.statistics[record.part] = accumulate_in_space(known, gradient, record.distances)
 
 
 def counts_of(scene: Scene) -> dict[str, int]:
