@@ -1,4 +1,4 @@
-"""The command line: `glassplat train | eval | render | dereflect | demo | bench`.
+"""The command line: `glassplat prepare | train | eval | render | dereflect | export | demo | bench`.
 
 A command's module is imported when the command is chosen, and nothing before that which takes long: the list of
 commands appears at once, and Ctrl-C works from the beginning.
@@ -29,6 +29,7 @@ class Listed(NamedTuple):
 
 
 COMMANDS = {
+    "prepare": Listed("prepare", "Prepare", "Find out where photographs were taken, and make a capture of them."),
     "train": Listed("train", "Train", "Train a scene from photographs."),
     "eval": Listed("evaluate", "Evaluate", "Measure a run on its test views and write comparison sheets."),
     "render": Listed(
@@ -38,6 +39,11 @@ COMMANDS = {
         "dereflect",
         "Dereflect",
         "Take the reflections out of a planar run's photographs; one PNG per photograph, under its name.",
+    ),
+    "export": Listed(
+        "export",
+        "Export",
+        "Write a scene in the formats that others read: PLY, SPZ, and planes and environment beside them.",
     ),
     "demo": Listed(
         "demo",

@@ -15,7 +15,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import tyro
@@ -25,12 +25,14 @@ from PIL import Image
 from glassplat.data.random_points import points_in_box
 from glassplat.files.ply_table import write_table
 from tools.make_demo_scene import srgb_from_linear
-from tools.scene_draws import Body, DrawnScene, draw_scene
+from tools.scene_draws import MATTE, Body, DrawnScene, draw_scene
 from tools.scene_environment import make_environment
+from tools.scene_near import NEAR_SCENES, NearScene, near_scene
 from tools.scene_surfaces import Triangles, ball_texture, disc, ground_texture, torus, torus_depth
 
-SceneName = Literal["ball", "torus", "control"]
-NAMES: tuple[SceneName, ...] = ("ball", "torus", "control")
+StudioName = Literal["ball", "torus", "control"]
+SceneName = Literal[StudioName, NearScene]
+NAMES: tuple[SceneName, ...] = ("ball", "torus", "control", *NEAR_SCENES)
 Variant = Literal["llvm_ad_rgb", "cuda_ad_rgb"]
 Array = NDArray[np.floating]
 
@@ -150,7 +152,7 @@ def mesh(mitsuba: Any, triangles: Triangles, material: Mapping[str, Any]) -> Any
     return shape
 
 
-def make_body(mitsuba: Any, name: SceneName) -> tuple[Any, float]:
+def make_body(mitsuba: Any, name: StudioName) -> tuple[Any, float]:
     """The object of a scene, about the origin, and the height of the ground that it stands on."""
     if name == "torus":
         coated = {
@@ -170,6 +172,10 @@ def make_drawn_body(mitsuba: Any, body: Body) -> Any:
     tint = {"type": "rgb", "value": list(body.tint)}
     if body.coating == "mirror":
         material: dict[str, Any] = {"type": "conductor", "material": "none"}
+    elif body.coating == "matte":
+        material = {"type": "diffuse", "reflectance": tint}
+    elif body.coating == "patterned":
+        material = textured(mitsuba, ball_texture(TEXTURE_SIZE, seed=body.pattern_seed))
     elif body.coating == "metal":
         # A metal reflects more than half of the light, whatever its colour.
         value = [0.5 + channel / 2 for channel in body.tint]
@@ -181,7 +187,7 @@ def make_drawn_body(mitsuba: Any, body: Body) -> Any:
     return mesh(mitsuba, body.triangles, material)
 
 
-def make_studio(mitsuba: Any, name: SceneName, environment: Array, size: int) -> Studio:
+def make_studio(mitsuba: Any, name: StudioName, environment: Array, size: int) -> Studio:
     """A scene with a name: object, ground and environment."""
     body, ground_z = make_body(mitsuba, name)
     ground = mesh(
@@ -196,7 +202,8 @@ def make_drawn_studio(mitsuba: Any, drawn: DrawnScene, environment: Array, size:
     picture = ground_texture(stand.radius, TEXTURE_SIZE, checker_size=stand.checker_size, seed=stand.pattern_seed)
     ground = mesh(mitsuba, disc(stand.radius, stand.z), textured(mitsuba, picture))
     bodies = tuple(make_drawn_body(mitsuba, body) for body in drawn.bodies)
-    return assembled(mitsuba, bodies, ground, environment, mirrors=len(bodies), size=size)
+    mirrors = sum(body.coating not in MATTE for body in drawn.bodies)
+    return assembled(mitsuba, bodies, ground, environment, mirrors=mirrors, size=size)
 
 
 def assembled(
@@ -345,14 +352,14 @@ def main(arguments: Arguments) -> None:
 def make_scene(mitsuba: Any, key: SceneName | int, folder: Path, arguments: Arguments) -> None:
     """Makes the scene of a name or a seed in a new folder."""
     folder.mkdir(parents=True)
-    if isinstance(key, int):
-        drawn = draw_scene(key)
+    if isinstance(key, int) or key in NEAR_SCENES:
+        drawn = draw_scene(key) if isinstance(key, int) else near_scene(cast(NearScene, key))
         environment = make_environment(arguments.environment_height, drawn.surroundings)
         studio = make_drawn_studio(mitsuba, drawn, environment, arguments.size)
         print(f"{folder.name}: " + ", ".join(f"{body.coating} {body.shape}" for body in drawn.bodies))
     else:
         environment = make_environment(arguments.environment_height)
-        studio = make_studio(mitsuba, key, environment, arguments.size)
+        studio = make_studio(mitsuba, cast(StudioName, key), environment, arguments.size)
     write_environment(mitsuba, environment, folder)
     if arguments.points:
         write_points(arguments.points, folder)

@@ -19,10 +19,13 @@ from tools.scene_surfaces import Triangles, placed, solid_noise, star_shaped, to
 
 Array = NDArray[np.floating]
 Shape = Literal["ball", "egg", "box", "pebble", "torus"]
-Coating = Literal["mirror", "metal", "glaze", "patterned glaze"]
+Coating = Literal["mirror", "metal", "glaze", "patterned glaze", "matte", "patterned"]
 
 SHAPES: tuple[Shape, ...] = ("ball", "egg", "box", "pebble", "torus")
 COATINGS: tuple[Coating, ...] = ("mirror", "metal", "glaze", "patterned glaze")
+"""Those that are drawn."""
+MATTE: tuple[Coating, ...] = ("matte", "patterned")
+"""Those that reflect nothing like a mirror."""
 SIZES = ((0.6, 0.75), (0.42, 0.5))
 """Least and largest radius of a body that is alone, and of one of two, world units."""
 DISTANCES = (0.0, 0.55)
@@ -31,13 +34,14 @@ DISTANCES = (0.0, 0.55)
 
 @dataclass(frozen=True)
 class Body:
-    """A thing that reflects.
+    """A thing, as a rule one that reflects.
 
     Attributes:
         shape: its kind, which `triangles` are one of.
         triangles: where it is.
-        coating: a perfect mirror, a tinted one, or a smooth clear coat over a matte colour or over patches.
-        tint: of the metal, or of what lies under the glaze, linear.
+        coating: a perfect mirror, a tinted one, a smooth clear coat over a matte colour or over patches, or these
+            without the coat.
+        tint: of the metal, or of the matte colour, linear.
         refraction: refractive index of the glaze.
         pattern_seed: chooses the patches.
     """

@@ -34,7 +34,7 @@ from glassplat.train.ablations import ABLATIONS, Ablated, Ablation, Switch
 from glassplat.train.recipe import RECIPES, Preset, recipe_of
 from glassplat.train.run_directory import write_text
 
-Method = Literal["splat", "planar", "deferred"]
+Method = Literal["splat", "planar", "deferred", "traced"]
 Strategy = Literal["default", "mcmc"]
 FULL = "full"
 SPREAD_NOTE = "Means over the seeds ± their standard deviation."
@@ -182,7 +182,7 @@ def compared_variants() -> list[tuple[str, str]]:
         (variant_name(method, strategy, preset), variant_name("splat", strategy, preset))
         for preset in presets
         for strategy in strategies
-        for method in ("planar", "deferred")
+        for method in ("planar", "deferred", "traced")
     ]
     changes = [
         (variant_name(method, strategy), variant_name(method, strategy, "paper"))

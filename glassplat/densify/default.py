@@ -49,6 +49,22 @@ class ScreenStatistics:
         """Adds the views of one training step, in place."""
         add_views(Sums(self.gradient_sum, self.pull_sum, self.view_count, self.max_radius), views)
 
+    @torch.no_grad()
+    def add_in_space(self, means_gradient: Tensor, distances: Tensor) -> None:
+        """Adds a training step in which rays met the Gaussians in space, in place (EnvGS, Section 5.1).
+
+        A gradient times half of the distance at which a Gaussian was met is what on a screen would be one in normalised
+        device coordinates; without that factor, what is far away would get too few Gaussians.
+
+        Args:
+            means_gradient: [N, 3] gradient of one view's loss with respect to the centres.
+            distances: [N] at which they were met, world units.
+        """
+        norms = means_gradient.norm(dim=-1)
+        pulls = 0.5 * distances * norms
+        for total, added in ((self.gradient_sum, pulls), (self.pull_sum, pulls), (self.view_count, norms > 0)):
+            total += added
+
     @property
     def mean_gradient(self) -> Tensor:
         """[N] mean gradient norm over the views that saw the Gaussian, direct ones if there are any; 0 if none did."""
@@ -203,11 +219,11 @@ class DefaultDensify:
 
 @torch.no_grad()
 def reset_opacity(
-    gaussians: Gaussians, moments: Moments, *, ceiling: float = 0.01
+    gaussians: Gaussians, moments: Moments, *, ceiling: float = 0.01, part: str = "primary"
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
     """Lowers every opacity to at most `ceiling` and forgets the opacities' moments (3DGS, Section 5.2).
 
     What the photographs need grows back; what does not is pruned.
     """
     lowered = gaussians.logit_opacities.clamp(max=logit(ceiling))
-    return gaussians.with_tensors({"logit_opacities": lowered}), forget(moments, ("primary.logit_opacities",))
+    return gaussians.with_tensors({"logit_opacities": lowered}), forget(moments, (f"{part}.logit_opacities",))

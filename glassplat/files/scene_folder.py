@@ -1,4 +1,4 @@
-"""A scene as a folder of files: standard PLY, and beside it glass, planes and environment."""
+"""A scene as a folder of files: standard PLY, and beside it glass, planes, surroundings and environment."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
 PRIMARY, GLASS, PLANES, SCENE = "point_cloud.ply", "glass.ply", "planes.json", "scene.json"
-ENVIRONMENT = "environment.safetensors"
+ENVIRONMENT, SURROUNDINGS = "environment.safetensors", "surroundings.ply"
 LARGEST_COLOR = 1e6
 LARGEST_LOG = 40.0
 """Of a logarithm: its exponential, squared, fits float32."""
@@ -26,7 +26,8 @@ SH_DEGREE = Whole(0, 3)
 HEADER: dict[str, Field] = {
     "extent": EXTENT,
     "active_sh_degree": SH_DEGREE,
-    "files": Optional(Items(Choice((PRIMARY, GLASS, PLANES, ENVIRONMENT)))),
+    "surroundings_sh_degree": Optional(SH_DEGREE),
+    "files": Optional(Items(Choice((PRIMARY, GLASS, PLANES, ENVIRONMENT, SURROUNDINGS)))),
 }
 """`files` is what the scene consists of, so that one that is lost is missed; folders of earlier versions lack it."""
 
@@ -36,7 +37,8 @@ def write_scene(folder: Path, scene: Scene) -> None:
 
     `point_cloud.ply` holds the primary Gaussians, which any splat viewer shows without the reflections;
     `glass.ply` and `planes.json` hold what a viewer that knows panes needs on top, `environment.safetensors` the raw
-    texels of the environment's cube map. Each is there only where the scene has it.
+    texels of the environment's cube map, `surroundings.ply` the Gaussians that reflections show. Each is there only
+    where the scene has it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = [PRIMARY]
@@ -49,6 +51,10 @@ def write_scene(folder: Path, scene: Scene) -> None:
         write_environment(folder / ENVIRONMENT, scene.environment)
         files += [ENVIRONMENT]
     header = {"extent": scene.extent, "active_sh_degree": scene.primary.active_sh_degree, "files": files}
+    if len(scene.surroundings):
+        write_gaussians(folder / SURROUNDINGS, scene.surroundings)
+        header["surroundings_sh_degree"] = scene.surroundings.active_sh_degree
+        files += [SURROUNDINGS]
     with atomic_write(folder / SCENE) as temporary:
         temporary.write_text(json.dumps(header, indent=2) + "\n", encoding="utf-8")
 
@@ -63,20 +69,25 @@ def read_scene(folder: Path) -> Scene:
     for name in header["files"] or ():
         if not os.path.isfile(folder / name):
             raise FileNotFoundError(f"no {name} in {folder}; {SCENE} says that the scene has one: export it again")
-    scene = Scene(_primary(folder, header["active_sh_degree"]), header["extent"])
+    scene = Scene(_colored(folder, PRIMARY, header["active_sh_degree"]), header["extent"])
     if (folder / PLANES).is_file():
         scene = replace(scene, glass=_glass(folder / GLASS), planes=read_planes(folder / PLANES))
     if (folder / ENVIRONMENT).is_file():
         scene = replace(scene, environment=read_environment(folder / ENVIRONMENT))
+    if (folder / SURROUNDINGS).is_file():
+        scene = replace(scene, surroundings=_colored(folder, SURROUNDINGS, header["surroundings_sh_degree"]))
     return scene
 
 
-def _primary(folder: Path, active_sh_degree: int) -> Gaussians:
-    gaussians = _drawable(folder / PRIMARY)
+def _colored(folder: Path, name: str, active_sh_degree: int | None) -> Gaussians:
+    """Gaussians with the degree that the scene's header names; without one, with the highest that is stored."""
+    gaussians = _drawable(folder / name)
+    if active_sh_degree is None:
+        return gaussians
     try:
         return replace(gaussians, active_sh_degree=active_sh_degree)
     except ValueError as error:
-        raise ValueError(f"{folder / SCENE} and {folder / PRIMARY} do not belong together: {error}") from error
+        raise ValueError(f"{folder / SCENE} and {folder / name} do not belong together: {error}") from error
 
 
 def _glass(path: Path) -> Gaussians:

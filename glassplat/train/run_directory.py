@@ -73,7 +73,7 @@ class RunDirectory:
     train.lock                         held while a training writes here
     checkpoint.safetensors             to resume from
     cameras.json                       all cameras
-    point_cloud/iteration_N/           point_cloud.ply, glass.ply, environment.safetensors, scene.json
+    point_cloud/iteration_N/           point_cloud.ply, scene.json, and what else the scene has
     results.json  per_view.json        metrics
     sheets/  uses.png  index.html      pictures
     ```

@@ -13,7 +13,7 @@ from torch import Tensor
 from glassplat.data.dataset import Dataset, View
 from glassplat.densify.default import ScreenStatistics
 from glassplat.kernels.screen_statistics import Views
-from glassplat.render.frame import Frame, ScreenPass
+from glassplat.render.frame import Frame, ScreenPass, SpacePass
 from glassplat.scene.scene import Scene
 from glassplat.scene.transfer import constant
 from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
@@ -39,12 +39,13 @@ WHERE_TO_LOOK = (
 class Differentiated(NamedTuple):
     """One view's losses and their gradients; of each pass on screen those of its centres and of its probe.
 
-    `visible` is the frame's.
+    `space` and `visible` are the frame's.
     """
 
     losses: dict[str, float]
     gradients: dict[str, Tensor]
     screen: list[tuple[ScreenPass, Tensor, Tensor]]
+    space: tuple[SpacePass, ...]
     visible: Tensor | None
 
 
@@ -89,6 +90,7 @@ def advance(stage: Stage, dataset: Dataset, state: TrainState, iterations: int, 
     sight.note(result.visible, state.step)
     update(stage, state, result.gradients, iterations)
     collect_statistics(state, result.screen, view)
+    collect_in_space(state, result)
     state.step += 1
     clock = Clock(state.step, iterations, len(dataset.train))
     for motion in stage.motions:
@@ -196,7 +198,7 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Di
     screen = [(s, v_means, v_probe) for s, v_means, v_probe in pulls if v_means is not None and v_probe is not None]
     values = torch.stack([term.detach() for term in terms.values()]) * weights
     losses = dict(zip(terms, values.tolist(), strict=True))
-    return Differentiated(losses, gradients, screen, frame.visible)
+    return Differentiated(losses, gradients, screen, frame.space, frame.visible)
 
 
 def loss_terms(stage: Stage, frame: Frame, view: View, scene: Scene) -> tuple[dict[str, Tensor], Tensor]:
@@ -218,13 +220,26 @@ def update(stage: Stage, state: TrainState, gradients: Mapping[str, Tensor], ite
 
 def collect_statistics(state: TrainState, screen: list[tuple[ScreenPass, Tensor, Tensor]], view: View) -> None:
     """Adds the step's screen gradients to the statistics that densification reads."""
+    size = view.camera.width, view.camera.height
     for record, v_means, v_probe in screen:
-        known = state.statistics.get(record.part)
-        if known is None:
-            known = ScreenStatistics.zeros(record.means2d.shape[1], device=v_means.device)
-            state.statistics[record.part] = known
-        size = view.camera.width, view.camera.height
+        known = statistics_of(state, record.part, v_means.shape[1], v_means.device)
         known.add(Views(v_means, v_probe, record.radii, *size, record.weight, record.direct))
+
+
+def collect_in_space(state: TrainState, result: Differentiated) -> None:
+    """Adds the step's gradients in space, of what rays met, to the statistics that densification reads."""
+    for record in result.space:
+        gradient = result.gradients.get(f"{record.part}.means")
+        if gradient is not None:
+            known = statistics_of(state, record.part, gradient.shape[0], gradient.device)
+            known.add_in_space(gradient, record.distances)
+
+
+def statistics_of(state: TrainState, part: str, count: int, device: torch.device) -> ScreenStatistics:
+    """What the state has collected of a part of the scene; of so many Gaussians, where that begins."""
+    if part not in state.statistics:
+        state.statistics[part] = ScreenStatistics.zeros(count, device=device)
+    return state.statistics[part]
 
 
 def counts_of(scene: Scene) -> dict[str, int]:

@@ -1,9 +1,11 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import torch
 
-from glassplat.files.cameras_json import write_cameras
+from glassplat.files.cameras_json import read_cameras, write_cameras
 from glassplat.scene.camera import Camera
 from glassplat.scene.pose import rotation_from_quat
 
@@ -21,3 +23,40 @@ def test_entries_give_the_pose_of_the_camera_in_the_world(tmp_path: Path) -> Non
     world_from_cam[:3, :3] = torch.tensor(first["rotation"])
     world_from_cam[:3, 3] = torch.tensor(first["position"])
     torch.testing.assert_close(world_from_cam @ pose, torch.eye(4), atol=1e-6, rtol=0)
+
+
+def test_cameras_come_back(tmp_path: Path) -> None:
+    pose = torch.eye(4)
+    pose[:3, :3] = rotation_from_quat(torch.tensor([0.9, 0.1, -0.3, 0.2]))
+    pose[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
+    camera = Camera(pose, fx=10.0, fy=11.0, cx=4.5, cy=3.0, width=8, height=6)
+    write_cameras(tmp_path / "cameras.json", [("a.jpg", camera), ("b.jpg", camera)])
+    (name, first), (other, _) = read_cameras(tmp_path / "cameras.json")
+    assert (name, other) == ("a.jpg", "b.jpg")
+    torch.testing.assert_close(first.cam_from_world, pose, atol=1e-6, rtol=0)
+    assert replace(first, cam_from_world=pose) == replace(camera, cam_from_world=pose)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "rotation of camera 1"),
+        ({"rotation": [[1, 0, 0], [0, 1, 0], [1, 0, 0]]}, "rotation of camera 1"),
+        ({"position": [0, 0]}, "position of camera 1"),
+        ({"fx": 0}, "fx of camera 1"),
+        ({"width": 2**40}, "width of camera 1"),
+        ({"img_name": None}, "img_name of camera 1"),
+    ],
+)
+def test_what_is_no_camera_is_refused(change: dict, words: str, tmp_path: Path) -> None:
+    whole = {"img_name": "a", "width": 8, "height": 6, "position": [0, 0, 0], "fx": 8, "fy": 8}
+    whole["rotation"] = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps([whole]))
+    assert read_cameras(path)[0][1].cx == 4
+    path.write_text(json.dumps([whole | change]))
+    with pytest.raises(ValueError, match=words):
+        read_cameras(path)
+    path.write_text("{}")
+    with pytest.raises(ValueError, match="expected a list"):
+        read_cameras(path)

@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,6 +32,34 @@ def test_a_scene_survives_bit_for_bit(tmp_path: Path, panes: bool, environment: 
     for name, tensor in scene.parameters().items():
         assert torch.equal(read.parameters()[name], tensor), name
     assert (tmp_path / "environment.safetensors").is_file() != environment.is_empty
+
+
+def surrounded() -> Scene:
+    """A scene whose surroundings use fewer harmonics than they hold."""
+    scene = in_single_precision(showcase())
+    around = replace(scene.primary, channels={}, active_sh_degree=0)
+    return replace(Scene(scene.primary, scene.extent), surroundings=around.select(torch.arange(0, len(around), 2)))
+
+
+def test_surroundings_survive_bit_for_bit(tmp_path: Path) -> None:
+    scene = surrounded()
+    write_scene(tmp_path, scene)
+    read = read_scene(tmp_path)
+    assert read.parameters().keys() == scene.parameters().keys()
+    assert all(torch.equal(read.parameters()[name], tensor) for name, tensor in scene.parameters().items())
+    assert read.surroundings.active_sh_degree == 0 < read.primary.active_sh_degree
+    assert not read.surroundings.channels
+
+
+def test_surroundings_that_are_lost_or_foreign_are_missed(tmp_path: Path) -> None:
+    write_scene(tmp_path, surrounded())
+    header = json.loads((tmp_path / "scene.json").read_text())
+    (tmp_path / "scene.json").write_text(json.dumps(header | {"surroundings_sh_degree": 3}))
+    with pytest.raises(ValueError, match=r"scene\.json and .*surroundings\.ply do not belong together"):
+        read_scene(tmp_path)
+    (tmp_path / "surroundings.ply").unlink()
+    with pytest.raises(FileNotFoundError, match=r"no surroundings\.ply in .*; scene\.json says that the scene has one"):
+        read_scene(tmp_path)
 
 
 def test_a_damaged_environment_is_named(tmp_path: Path) -> None:

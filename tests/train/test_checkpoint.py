@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,15 @@ def test_a_state_survives(checkpoint: Path) -> None:
         assert torch.equal(read.scene.parameters()[name], tensor), name
         assert torch.equal(read.means[name], tensor), name
         assert torch.equal(read.optimizer.moments[name][1], torch.ones_like(tensor)), name
+
+
+def test_surroundings_survive(tmp_path: Path) -> None:
+    scene = true_scene()
+    around = replace(scene.primary, channels={}, active_sh_degree=0)
+    save_checkpoint(tmp_path / "checkpoint", TrainState(replace(scene, surroundings=around), seed=3))
+    read = load_checkpoint(tmp_path / "checkpoint").scene
+    assert read.surroundings.active_sh_degree == 0 and torch.equal(read.surroundings.sh, around.sh)
+    assert read.parameters().keys() > scene.parameters().keys()
 
 
 def test_a_full_disk_leaves_the_older_checkpoint(checkpoint: Path) -> None:

@@ -36,8 +36,7 @@ def cube_lookup_gradients(texels: Tensor, directions: Tensor, cotangents: Tensor
 def cube_lookup_forward(real: type) -> Kernel:
     """Fills what padded faces show."""
     maths = cube_maths(real)
-    on_face, cell = maths.on_face, maths.cell
-    one = real(1.0)
+    on_face, cell, between = maths.on_face, maths.cell, maths.between
 
     @kernel("cube_lookup_forward", real)
     def forward(padded, directions, found):
@@ -49,9 +48,9 @@ def cube_lookup_forward(real: type) -> Kernel:
             row, down = cell(v, size)
             upper, lower = padded[face, row], padded[face, row + 1]
             for d in range(depth):
-                above = upper[column, d] * (one - along) + upper[column + 1, d] * along
-                below = lower[column, d] * (one - along) + lower[column + 1, d] * along
-                found[i, d] = above * (one - down) + below * down
+                found[i, d] = between(
+                    upper[column, d], upper[column + 1, d], lower[column, d], lower[column + 1, d], along, down
+                )
 
     return forward
 
@@ -60,7 +59,7 @@ def cube_lookup_forward(real: type) -> Kernel:
 def cube_lookup_backward(real: type) -> Kernel:
     """Fills the gradients of the directions, and which cells each lookup blends at which fractions."""
     maths = cube_maths(real)
-    on_face, from_face, cell = maths.on_face, maths.from_face, maths.cell
+    on_face, from_face, cell, slopes = maths.on_face, maths.from_face, maths.cell, maths.slopes
     zero, half = real(0.0), real(0.5)
 
     @kernel("cube_lookup_backward", real)
@@ -76,11 +75,11 @@ def cube_lookup_backward(real: type) -> Kernel:
             upper, lower = padded[face, row], padded[face, row + 1]
             v_along, v_down = zero, zero
             for d in range(depth):
-                v = v_found[i, d]
-                across_above = upper[column + 1, d] - upper[column, d]
-                across_below = lower[column + 1, d] - lower[column, d]
-                v_along += v * (across_above + down * (across_below - across_above))
-                v_down += v * (lower[column, d] - upper[column, d] + along * (across_below - across_above))
+                by_along, by_down = slopes(
+                    upper[column, d], upper[column + 1, d], lower[column, d], lower[column + 1, d], along, down
+                )
+                v_along += v_found[i, d] * by_along
+                v_down += v_found[i, d] * by_down
             x, y, z = from_face(place, v_along * texels_per_u, v_down * texels_per_u)
             v_directions[i, 0], v_directions[i, 1], v_directions[i, 2] = x, y, z
             first_cells[i, 0], first_cells[i, 1] = face * side + row, column

@@ -41,8 +41,7 @@ def cube_lookup_gradients(texels: Tensor, directions: Tensor, cotangents: Tensor
 def cube_lookup_forward(real: type) -> Kernel:
     """Fills what padded faces show."""
     maths = cube_maths(real)
-    on_face, cell = maths.on_face, maths.cell
-    one = real(1.0)
+    on_face, cell, between = maths.on_face, maths.cell, maths.between
 
     @kernel("cube_lookup_forward", real, "real4 real2 real2")
     def forward(padded, directions, found):
@@ -52,10 +51,11 @@ def cube_lookup_forward(real: type) -> Kernel:
         _, face, u, v, _ = on_face(directions[i, 0], directions[i, 1], directions[i, 2])
         column, along = cell(u, size)
         row, down = cell(v, size)
+        upper, lower = padded[face, row], padded[face, row + 1]
         for d in range(padded.shape[3]):
-            above = padded[face, row, column, d] * (one - along) + padded[face, row, column + 1, d] * along
-            below = padded[face, row + 1, column, d] * (one - along) + padded[face, row + 1, column + 1, d] * along
-            found[i, d] = above * (one - down) + below * down
+            found[i, d] = between(
+                upper[column, d], upper[column + 1, d], lower[column, d], lower[column + 1, d], along, down
+            )
 
     return forward
 
@@ -64,7 +64,7 @@ def cube_lookup_forward(real: type) -> Kernel:
 def cube_lookup_backward(real: type) -> Kernel:
     """Fills the gradients of the directions, and which cells each lookup blends at which fractions."""
     maths = cube_maths(real)
-    on_face, from_face, cell = maths.on_face, maths.from_face, maths.cell
+    on_face, from_face, cell, slopes = maths.on_face, maths.from_face, maths.cell, maths.slopes
     zero, half = real(0.0), real(0.5)
 
     @kernel("cube_lookup_backward", real, "real4 real2 real2 real2 int1 real2")
@@ -76,13 +76,14 @@ def cube_lookup_backward(real: type) -> Kernel:
         face = place[1]
         column, along = cell(place[2], side - 2)
         row, down = cell(place[3], side - 2)
+        upper, lower = padded[face, row], padded[face, row + 1]
         v_along, v_down = zero, zero
         for d in range(padded.shape[3]):
-            v, upper, lower = v_found[i, d], padded[face, row, column, d], padded[face, row + 1, column, d]
-            across_above = padded[face, row, column + 1, d] - upper
-            twist = padded[face, row + 1, column + 1, d] - lower - across_above
-            v_along += v * (across_above + down * twist)
-            v_down += v * (lower - upper + along * twist)
+            by_along, by_down = slopes(
+                upper[column, d], upper[column + 1, d], lower[column, d], lower[column + 1, d], along, down
+            )
+            v_along += v_found[i, d] * by_along
+            v_down += v_found[i, d] * by_down
         texels_per_u = half * real(side - 2)
         x, y, z = from_face(place, v_along * texels_per_u, v_down * texels_per_u)
         v_directions[i, 0], v_directions[i, 1], v_directions[i, 2] = x, y, z

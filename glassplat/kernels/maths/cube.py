@@ -24,18 +24,23 @@ class CubeMaths(NamedTuple):
         from_face: gradient of x, y, z from those of u and v, given what `on_face` returned.
         cell: first of the two cells that u or v lies between, and its fraction of the way to the second one. The cell
             exists whatever the value; the fraction is NaN where the value is.
+        between: value of the bilinear filter between two cells of a row and the two below them, at the fractions along
+            the row and down.
+        slopes: its derivatives with respect to these fractions.
         logistic: 1 / (1 + exp(-x)).
     """
 
     on_face: Scalar
     from_face: Scalar
     cell: Scalar
+    between: Scalar
+    slopes: Scalar
     logistic: Scalar
 
 
 def cube_maths(real: type) -> CubeMaths:
     """Builds the functions for `real`, np.float32 or np.float64."""
-    return CubeMaths(*_faces(real), _cell(real), _logistic(real))
+    return CubeMaths(*_faces(real), _cell(real), *_filter(real), _logistic(real))
 
 
 def _faces(real: type) -> tuple[Scalar, Scalar]:
@@ -81,6 +86,24 @@ def _cell(real: type) -> Scalar:
         return first, position - real(first)
 
     return cell
+
+
+def _filter(real: type) -> tuple[Scalar, Scalar]:
+    one = real(1.0)
+
+    @inlined
+    def between(left, right, lower_left, lower_right, along, down):  # type: ignore[no-untyped-def]
+        above = left * (one - along) + right * along
+        below = lower_left * (one - along) + lower_right * along
+        return above * (one - down) + below * down
+
+    @inlined
+    def slopes(left, right, lower_left, lower_right, along, down):  # type: ignore[no-untyped-def]
+        across = right - left
+        twist = lower_right - lower_left - across
+        return across + down * twist, lower_left - left + along * twist
+
+    return between, slopes
 
 
 def _logistic(real: type) -> Scalar:

@@ -106,7 +106,8 @@ def _place(real: type) -> Scalar:
 @cache
 def shade_environment_forward(real: type) -> Kernel:
     """Fills rgb, base and reflection."""
-    logistic, place, dot = cube_maths(real).logistic, _place(real), vector_maths().dot
+    maths, place, dot = cube_maths(real), _place(real), vector_maths().dot
+    logistic, between = maths.logistic, maths.between
     shortest = real(NORMAL_MIN**2)
     zero, one = real(0.0), real(1.0)
 
@@ -116,9 +117,8 @@ def shade_environment_forward(real: type) -> Kernel:
         for d in range(3):
             for i in range(RUN):
                 at, along, down = whole[FIRST + i] + d, run[ALONG + i], run[DOWN + i]
-                upper = flat[at] * (one - along) + flat[at + 3] * along
-                lower = flat[at + below] * (one - along) + flat[at + below + 3] * along
-                run[SEEN + d * RUN + i] = upper * (one - down) + lower * down
+                under = at + below
+                run[SEEN + d * RUN + i] = between(flat[at], flat[at + 3], flat[under], flat[under + 3], along, down)
         for i in range(3 * RUN):
             run[SEEN + i] = logistic(run[SEEN + i])
 
@@ -163,23 +163,24 @@ def shade_environment_forward(real: type) -> Kernel:
 
 
 def _slopes(real: type) -> Scalar:
-    zero = real(0.0)
+    slopes, zero = cube_maths(real).slopes, real(0.0)
 
     @inlined
-    def slopes(run, whole, flat, below):
+    def slopes_of_run(run, whole, flat, below):
         """Gradients of each pixel's place among the cells, from those of what it looks up."""
         for i in range(RUN):
             run[BY_COLUMN + i], run[BY_ROW + i] = zero, zero
         for d in range(3):
             for i in range(RUN):
-                at, along, down, v = whole[FIRST + i] + d, run[ALONG + i], run[DOWN + i], run[V_RAW + d * RUN + i]
-                first, under = flat[at], flat[at + below]
-                across = flat[at + 3] - first
-                twist = flat[at + below + 3] - under - across
-                run[BY_COLUMN + i] += v * (across + down * twist)
-                run[BY_ROW + i] += v * (under - first + along * twist)
+                at, v = whole[FIRST + i] + d, run[V_RAW + d * RUN + i]
+                under = at + below
+                by_column, by_row = slopes(
+                    flat[at], flat[at + 3], flat[under], flat[under + 3], run[ALONG + i], run[DOWN + i]
+                )
+                run[BY_COLUMN + i] += v * by_column
+                run[BY_ROW + i] += v * by_row
 
-    return slopes
+    return slopes_of_run
 
 
 def _turn(real: type) -> Scalar:

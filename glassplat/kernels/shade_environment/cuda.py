@@ -74,7 +74,8 @@ def _place(real: type) -> Scalar:
 @cache
 def shade_environment_forward(real: type) -> Kernel:
     """Fills rgb, base and reflection."""
-    logistic, place, dot = cube_maths(real).logistic, _place(real), vector_maths().dot
+    maths, place, dot = cube_maths(real), _place(real), vector_maths().dot
+    logistic, between = maths.logistic, maths.between
     shortest, zero, one = real(NORMAL_MIN**2), real(0.0), real(1.0)
 
     @kernel("shade_environment_forward", real, "real real3 real2 real4 real1 real2 real1 real3 real3 real3")
@@ -92,11 +93,10 @@ def shade_environment_forward(real: type) -> Kernel:
                 rgb[row, column, d], reflection[row, column, d] = base[row, column, d], zero
             return
         _, at, left, along, top, down = place(row, column, normal, intrinsics, rotation, padded.shape[1] - 2)
-        face = at[1]
+        upper, lower = padded[at[1], top], padded[at[1], top + 1]
         for d in range(3):
-            upper = padded[face, top, left, d] * (one - along) + padded[face, top, left + 1, d] * along
-            lower = padded[face, top + 1, left, d] * (one - along) + padded[face, top + 1, left + 1, d] * along
-            seen, behind = logistic(upper * (one - down) + lower * down), base[row, column, d]
+            raw = between(upper[left, d], upper[left + 1, d], lower[left, d], lower[left + 1, d], along, down)
+            seen, behind = logistic(raw), base[row, column, d]
             reflection[row, column, d] = seen
             rgb[row, column, d] = behind + share * (seen - behind)
 
@@ -106,7 +106,8 @@ def shade_environment_forward(real: type) -> Kernel:
 @cache
 def shade_environment_backward(real: type) -> Kernel:
     """Fills the gradients of blended, alpha and of what was looked up, and which cells each pixel blends."""
-    from_face, place, dot = cube_maths(real).from_face, _place(real), vector_maths().dot
+    maths, place, dot = cube_maths(real), _place(real), vector_maths().dot
+    from_face, slopes = maths.from_face, maths.slopes
     mirrored_gradient = mirror_maths(real).gradient
     shortest, zero, half, one = real(NORMAL_MIN**2), real(0.0), real(0.5), real(1.0)
 
@@ -139,16 +140,15 @@ def shade_environment_backward(real: type) -> Kernel:
             return
         ray, at, left, along, top, down = place(row, column, normal, intrinsics, rotation, side - 2)
         face, v_share, by_column, by_row = at[1], zero, zero, zero
+        upper, lower = padded[face, top], padded[face, top + 1]
         for d in range(3):
             seen, v = reflection[row, column, d], v_rgb[row, column, d]
             v_share += v * (seen - base[row, column, d])
             v = (v * share + v_reflection[row, column, d]) * seen * (one - seen)
             v_raw[i, d] = v
-            first, under = padded[face, top, left, d], padded[face, top + 1, left, d]
-            across = padded[face, top, left + 1, d] - first
-            twist = padded[face, top + 1, left + 1, d] - under - across
-            by_column += v * (across + down * twist)
-            by_row += v * (under - first + along * twist)
+            steepness = slopes(upper[left, d], upper[left + 1, d], lower[left, d], lower[left + 1, d], along, down)
+            by_column += v * steepness[0]
+            by_row += v * steepness[1]
         v_pixel[STRENGTH_AT] = v_share
         cells_per_u = half * real(side - 2)
         g = from_face(at, by_column * cells_per_u, by_row * cells_per_u)

@@ -1,0 +1,156 @@
+"""`glassplat export`: a scene in the formats that others read."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+import tyro
+from rich.console import Console
+
+from glassplat.commands.messages import say, warn
+from glassplat.commands.opened_scene import OpenedScene, cameras_of, open_scene
+from glassplat.commands.output_folder import check_targets, claim_folder
+from glassplat.commands.scene_edits import SceneEdits
+from glassplat.data.errors import InputError
+from glassplat.evaluate.metrics import psnr
+from glassplat.files.atomic import atomic_write
+from glassplat.files.environment_image import write_equirect
+from glassplat.files.planes_json import write_planes
+from glassplat.files.ply import write_gaussians
+from glassplat.files.spz import write_spz
+from glassplat.kernels.devices import DeviceName
+from glassplat.render.baked import baked
+from glassplat.render.environment import equirect_from_environment
+from glassplat.render.splat import Splat
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.plane_edits import without_glass
+from glassplat.scene.scene import Scene
+
+Format = Literal["ply", "spz"]
+COMPARED_VIEWS = 12
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a scene in the formats that others read: PLY, SPZ, and planes and environment beside them.
+
+    Attributes:
+        run_directory: the run's directory.
+        output: where the files go; a new folder, or one that this command wrote.
+        formats: which files.
+        layer: all is the scene with its panes beside it, as planes.json and glass.ply; transmission is the place
+            without its panes and what they reflect.
+        bake_reflections: put what the panes reflect behind them, as Gaussians, for viewers that know nothing of
+            panes; says how far that is from the true render.
+        spz_version: 3, which every reader knows, or 4.
+        edits: changes to the panes.
+        device: where to render what has to be rendered; auto takes an NVIDIA GPU where one can be used.
+    """
+
+    run_directory: tyro.conf.Positional[Path]
+    output: Path
+    formats: tuple[Format, ...] = ("ply", "spz")
+    layer: Literal["all", "transmission"] = "all"
+    bake_reflections: bool = False
+    spz_version: Literal[3, 4] = 3
+    edits: Annotated[SceneEdits, tyro.conf.arg(name="")] = field(default_factory=SceneEdits)
+    device: DeviceName = "auto"
+
+    def run(self, console: Console) -> None:
+        """Writes the files."""
+        if not self.formats:
+            raise InputError("nothing to write without --formats; expected ply, spz or both")
+        opened = open_scene(self.run_directory, self.device)
+        opened = opened._replace(scene=self._chosen(self.edits.applied(opened.scene)))
+        targets = [self.output / name for name in ("scene.ply", "scene.spz", "glass.ply", "planes.json")]
+        check_targets(self.output, targets, [])
+        if claim_folder(self.output, "export", self.run_directory):
+            say(console, f"replacing the files of an earlier run of this command in {self.output}")
+        gaussians = opened.scene.primary
+        if self.bake_reflections:
+            gaussians = self._baked(opened, console)
+        else:
+            self._write_beside(opened.scene, console)
+        self._write_gaussians(gaussians, console)
+
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        return f"files already written to {self.output} are whole: repeat the command for all of them"
+
+    def _chosen(self, scene: Scene) -> Scene:
+        if self.layer == "all":
+            return scene
+        if self.bake_reflections:
+            raise InputError("--layer transmission has no reflections to bake; give one of the two")
+        bare = without_glass(scene)
+        return replace(bare, primary=replace(bare.primary, channels={}))
+
+    def _baked(self, opened: OpenedScene, console: Console) -> Gaussians:
+        if not len(opened.scene.planes):
+            raise InputError(f"{opened.path} has no panes whose reflections could be baked")
+        say(console, "rendering the panes to bake what they reflect")
+        gaussians = baked(opened.scene, opened.renderer, [camera for _, camera in cameras_of(opened, "train")])
+        before, after = baking_errors(opened, gaussians)
+        say(
+            console,
+            f"{len(gaussians) - len(opened.scene.primary)} Gaussians added behind the panes; of the true render's "
+            f"panes they show {after:.1f} dB over the test views, the scene without them {before:.1f} dB",
+        )
+        return replace(gaussians, channels={})
+
+    def _write_gaussians(self, gaussians: Gaussians, console: Console) -> None:
+        if "ply" in self.formats:
+            write_gaussians(self.output / "scene.ply", gaussians)
+            say(console, f"{len(gaussians)} Gaussians -> {self.output / 'scene.ply'}")
+        if "spz" in self.formats:
+            path = self.output / "scene.spz"
+            write_spz(path, gaussians, self.spz_version)
+            say(console, f"{path.stat().st_size / 1e6:.2f} MB, version {self.spz_version} -> {path}")
+
+    def _write_beside(self, scene: Scene, console: Console) -> None:
+        """Planes, glass and environment, where there are any."""
+        if len(scene.planes):
+            write_planes(self.output / "planes.json", scene.planes)
+            write_gaussians(self.output / "glass.ply", scene.glass)
+            say(console, f"{len(scene.planes)} panes -> {self.output / 'planes.json'}, their shape -> glass.ply")
+        if not scene.environment.is_empty:
+            write_environment_files(self.output, scene)
+            warn(console, "other viewers show this scene without what it mirrors; that is in environment.json")
+
+
+@torch.no_grad()
+def baking_errors(opened: OpenedScene, gaussians: Gaussians) -> tuple[float, float]:
+    """PSNR over the pixels of panes, against the true render, without baked reflections and with them."""
+    chosen = cameras_of(opened, "test")
+    bare, full = Scene(opened.scene.primary, opened.scene.extent), Scene(gaussians, opened.scene.extent)
+    images: dict[str, list[torch.Tensor]] = {"truth": [], "bare": [], "full": []}
+    for _, camera in chosen[:: max(1, len(chosen) // COMPARED_VIEWS)]:
+        frame = opened.renderer(opened.scene, camera)
+        hit = frame.layers["strength"] > 0
+        images["truth"].append(frame.rgb[hit])
+        images["bare"].append(Splat()(bare, camera).rgb[hit])
+        images["full"].append(Splat()(full, camera).rgb[hit])
+    truth, without, with_images = (torch.cat(images[name]) for name in ("truth", "bare", "full"))
+    if not len(truth):
+        raise InputError(f"no view of {opened.path} shows a pane; there is nothing to bake")
+    return psnr(without, truth), psnr(with_images, truth)
+
+
+def write_environment_files(folder: Path, scene: Scene) -> None:
+    """The surroundings as a panorama, and a description that says how to read it."""
+    environment = scene.environment
+    write_equirect(folder / "environment.png", equirect_from_environment(environment, 2 * environment.size))
+    description = {
+        "image": "environment.png",
+        "projection": "equirectangular",
+        "color": "sRGB",
+        "up": "+z in the top row",
+        "forward": "+x in the middle column, +y left of it",
+        "region": environment.region,
+    }
+    with atomic_write(folder / "environment.json") as temporary:
+        temporary.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")

@@ -1,0 +1,85 @@
+"""`glassplat export`: files that others read, and nothing written where it must not be."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import gsply
+import numpy as np
+import pytest
+import torch
+
+from glassplat.cli import main
+from glassplat.files.planes_json import read_planes
+from glassplat.files.ply import read_gaussians
+from glassplat.files.spz import read_spz
+from tests.commands.tiny_run import write_run
+from tests.train.tiny_capture import true_scene
+
+
+def exported(tmp_path: Path, *options: str) -> Path:
+    output = tmp_path / "out"
+    assert main(["export", str(write_run(tmp_path / "run")), "--output", str(output), *options]) == 0
+    return output
+
+
+def test_all_that_the_scene_has_is_written(tmp_path: Path) -> None:
+    output, scene = exported(tmp_path, "--formats", "ply", "spz"), true_scene()
+    read = read_gaussians(output / "scene.ply")
+    for name, tensor in scene.primary.tensors().items():
+        assert torch.equal(read.tensors()[name], tensor), name
+    assert torch.equal(read_planes(output / "planes.json").centers, scene.planes.centers)
+    assert len(read_gaussians(output / "glass.ply")) == len(scene.glass)
+    torch.testing.assert_close(read_spz(output / "scene.spz").means, scene.primary.means, rtol=0, atol=1e-4)
+
+
+def test_the_photographs_need_not_be_there(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    shutil.rmtree(tmp_path / "capture")
+    assert main(["export", str(run), "--output", str(tmp_path / "out"), "--formats", "ply"]) == 0
+
+
+def test_another_program_reads_the_ply(tmp_path: Path) -> None:
+    output, scene = exported(tmp_path, "--layer", "transmission", "--formats", "ply"), true_scene()
+    assert sorted(path.name for path in output.iterdir()) == ["glassplat.json", "scene.ply"]
+    theirs = gsply.plyread(str(output / "scene.ply"))
+    np.testing.assert_array_equal(theirs.means, scene.primary.means)
+    np.testing.assert_array_equal(theirs.sh0, scene.primary.sh[:, 0])
+
+
+def test_baking_adds_gaussians_and_says_what_is_gained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = exported(tmp_path, "--bake-reflections", "--formats", "ply")
+    text = " ".join(capsys.readouterr().out.split())
+    assert "Gaussians added behind the panes" in text and "dB" in text
+    gaussians = read_gaussians(output / "scene.ply")
+    assert len(gaussians) > len(true_scene().primary) and not gaussians.channels
+    assert not (output / "planes.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--layer transmission --bake-reflections", "give one of the two"),
+        ("--remove-glass --bake-reflections", "no panes whose reflections"),
+        ("--as-mirror 4", "no pane 4"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(
+    options: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, output = write_run(tmp_path / "run"), tmp_path / "out"
+    assert main(["export", str(run), "--output", str(output), *options.split()]) == 2
+    assert words in " ".join(capsys.readouterr().err.split())
+    assert not list(output.glob("scene.*"))
+
+
+def test_foreign_folders_and_missing_runs_are_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, output = write_run(tmp_path / "run"), tmp_path / "out"
+    output.mkdir()
+    (output / "scene.ply").write_text("mine")
+    assert main(["export", str(run), "--output", str(output)]) == 2
+    assert (output / "scene.ply").read_text() == "mine"
+    assert main(["export", str(tmp_path / "none"), "--output", str(tmp_path / "new")]) == 2
+    assert "not a run directory" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "new").exists()
