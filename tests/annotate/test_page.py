@@ -10,49 +10,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from glassplat.annotate.server import AnnotationServer
 from glassplat.data.dataset import load_dataset
 from glassplat.files.images import read_image
-from tests.annotate.conftest import NAMES, serving, true_corners
-from tests.browser import Browser, browser, needs_browser, wait_until
+from tests.annotate.browser_needed import needs_browser
+from tests.annotate.conftest import NAMES, true_corners
 from tests.init.pane_scene import FRONT
+from tools.browser import wait_until
+from tools.marking_page import MarkingPage, marking_page
 
 pytestmark = needs_browser
 
 
-class Page:
-    """The page for marking, as somebody uses it."""
+class Page(MarkingPage):
+    """The page for marking, with what tests look at."""
 
-    def __init__(self, window: Browser, root: Path, server: AnnotationServer) -> None:
-        self.window, self.root, self.server = window, root, server
+    @property
+    def root(self) -> Path:
+        return self.server.session.root
 
-    def open(self) -> None:
-        self.window.open(self.server.address)
-        self.window.wait("document.body.dataset.ready === 'yes'", "the page")
-        self.saved()
-
-    def saved(self) -> None:
-        self.window.wait("['saved', undefined].includes(document.body.dataset.state)", "the document to be saved")
-
-    def show(self, view: int) -> None:
-        self.window.run("document.querySelectorAll('#views button')[arguments[0]].click()", view)
-        self.window.wait(f"document.body.dataset.view === '{view}'", f"photograph {view}")
-
-    def on_screen(self, places: np.ndarray) -> list[tuple[float, float]]:
-        """Places of a photograph in the window; the photograph is shown whole, with a quarter of room around it."""
-        left, top, width, height = self.window.run(
-            "const box = document.getElementById('canvas').getBoundingClientRect();"
-            "return [box.left, box.top, box.width, box.height]"
-        )
-        scale = min(width / (300 * 1.5), height / (220 * 1.5))
-        x, y = left + (width - 300 * scale) / 2, top + (height - 220 * scale) / 2
-        return [(x + scale * place[0], y + scale * place[1]) for place in places]
-
-    def mark(self, view: int, corners: tuple[int, ...] = (0, 1, 2, 3)) -> None:
-        self.show(view)
-        for x, y in self.on_screen(true_corners(view)[list(corners)]):
-            self.window.click(x, y)
-        self.saved()
+    def mark_true(self, view: int) -> None:
+        """Clicks where the corners really are."""
+        self.mark(view, true_corners(view))
 
     def color_at(self, place: tuple[float, float]) -> np.ndarray:
         """[3] the colour that the window shows at a place of the photograph."""
@@ -65,10 +43,8 @@ class Page:
 
 @pytest.fixture
 def page(room: Path) -> Iterator[Page]:
-    with serving(room) as server, browser() as window:
-        opened = Page(window, room, server)
-        opened.open()
-        yield opened
+    with marking_page(room) as opened:
+        yield Page(opened.window, opened.server)
 
 
 def is_blue(color: np.ndarray) -> bool:
@@ -80,10 +56,10 @@ def test_a_pane_is_marked_cut_and_written(page: Page) -> None:
     middle = true_corners(3).mean(axis=0)
     page.show(3)
     assert not is_blue(page.color_at(middle))
-    page.mark(0)
+    page.mark_true(0)
     assert page.window.run("return document.querySelectorAll('#views .suggested').length") > 0
-    page.mark(1)
-    page.mark(2)
+    page.mark_true(1)
+    page.mark_true(2)
     page.show(3)  # Nothing was clicked here: the pane shows where it must be.
     assert is_blue(page.color_at(middle))
     outside = true_corners(3)[0] - (12, 12)
@@ -103,9 +79,7 @@ def test_a_pane_is_marked_cut_and_written(page: Page) -> None:
     assert not is_blue(page.color_at(inside))
     assert is_blue(page.color_at(tuple(corners[:2].mean(axis=0) * 0.8 + corners.mean(axis=0) * 0.2)))
 
-    page.window.press("#write")
-    page.window.wait("document.body.dataset.written", "masks and planes")
-    assert page.window.run("return document.getElementById('status').textContent") == "written: 3 masks, 1 planes"
+    assert page.write() == "written: 3 masks, 1 planes"
     dataset = load_dataset(page.root)
     assert dataset.planes is not None and dataset.pane_labels == (1,)
     turned = math.degrees(math.acos(min(1.0, abs(float(dataset.planes.normals[0].double().numpy() @ FRONT.normal)))))
@@ -117,7 +91,7 @@ def test_a_pane_is_marked_cut_and_written(page: Page) -> None:
 
 
 def test_corners_are_dragged_undone_and_survive_a_reload(page: Page) -> None:
-    page.mark(0)
+    page.mark_true(0)
     before = page.document()["corners"][2]["0.png"]
     (start,) = page.on_screen(np.array([before]))
     page.window.drag([start, (start[0] + 20, start[1] + 10), (start[0] + 40, start[1] + 20)])
@@ -134,8 +108,8 @@ def test_corners_are_dragged_undone_and_survive_a_reload(page: Page) -> None:
 
 
 def test_a_corner_that_only_the_fit_knows_can_be_dragged(page: Page) -> None:
-    page.mark(0)
-    page.mark(1)
+    page.mark_true(0)
+    page.mark_true(1)
     page.show(2)
     (start,) = page.on_screen(true_corners(2)[1:2])
     page.window.drag([start, (start[0] + 6, start[1])])
@@ -144,8 +118,8 @@ def test_a_corner_that_only_the_fit_knows_can_be_dragged(page: Page) -> None:
 
 
 def test_keys_choose_photographs_panes_and_brushes(page: Page) -> None:
-    page.mark(0)
-    page.mark(1)
+    page.mark_true(0)
+    page.mark_true(1)
     page.show(0)
     page.window.keys("Right")
     page.window.wait("document.body.dataset.view === '1'", "the next photograph")
@@ -180,7 +154,7 @@ def test_edges_do_where_no_corner_shows(page: Page) -> None:
 
 
 def test_the_page_asks_for_nothing_from_elsewhere(page: Page) -> None:
-    page.mark(0)
+    page.mark_true(0)
     names = page.window.run("return performance.getEntriesByType('resource').map((one) => one.name)")
     assert names and all(name.startswith(page.server.address.split("/?")[0]) for name in names)
 

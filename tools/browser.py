@@ -1,4 +1,4 @@
-"""A headless Chromium that tests drive like a person: clicks, keys, and pictures of what it shows.
+"""A headless Chromium that is driven like a person drives it: clicks, keys, and pictures of what it shows.
 
 It is spoken to in the W3C's WebDriver protocol, which chromedriver serves; both are Debian packages (`make browser`).
 """
@@ -20,7 +20,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-import pytest
 from PIL import Image
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -41,10 +40,6 @@ KEYS = {
     "Tab": "\ue004",
 }
 
-needs_browser = pytest.mark.skipif(
-    CHROMIUM is None or DRIVER is None, reason="chromium and chromedriver are not installed; `make browser` does it"
-)
-
 
 class Browser:
     """One window."""
@@ -57,6 +52,7 @@ class Browser:
         return _ask(f"{self._base}{path}", body)
 
     def open(self, address: str) -> None:
+        """Goes to an address."""
         self.ask("/url", {"url": address})
 
     def run(self, script: str, *arguments: Any) -> Any:
