@@ -36,6 +36,7 @@ COLUMNS = (
     Column("pane_psnr", "pane psnr", ".2f"),
     Column("transmission_psnr", "transmission psnr", ".2f"),
     Column("reflection_psnr", "reflection psnr", ".2f"),
+    Column("reflective_psnr", "reflective psnr", ".2f"),
     Column("normal_error_deg", "normal error, deg", ".2f"),
     Column("reflective_normal_error_deg", "reflective normal error, deg", ".2f"),
     Column("strength_error", "strength error", ".3f"),

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from glassplat.commands.messages import say
+from glassplat.commands.pane_source import PaneSource, pane_regions
 from glassplat.commands.stored_run import StoredRun, open_run
 from glassplat.evaluate.evaluate import Evaluation, evaluate
 from glassplat.evaluate.metric_names import PLANE_COLUMNS, missing_reasons, shown_metrics, written
@@ -29,17 +30,21 @@ class Evaluate:
         run_directory: the run's directory.
         device: where to render; auto takes an NVIDIA GPU where one can be used.
         data: where the capture is now, if it has moved since training.
+        panes: where views show panes, for the metric over them: what the ground truth says, the masks and the planes
+            that are fitted to them, or the mask that the run renders; auto takes the first of these that there is.
+            Runs of different methods compare over the same pixels with the first two.
     """
 
     run_directory: tyro.conf.Positional[Path]
     device: DeviceName = "auto"
     data: Path | None = None
+    panes: PaneSource = "auto"
 
     def run(self, console: Console) -> None:
         """Evaluates and reports."""
         stored = open_run(self.run_directory, self.device, self.data)
         with console.status(f"rendering {len(stored.dataset.test)} test views"):
-            results = evaluate_run(stored)
+            results = evaluate_run(stored, self.panes)
         print_results(console, results)
         say(console, f"pictures: {stored.directory.path / 'index.html'}")
 
@@ -48,12 +53,17 @@ class Evaluate:
         return f"{self.run_directory} itself is as it was: repeat the command to evaluate it"
 
 
-def evaluate_run(stored: StoredRun) -> dict:
-    """Evaluates a run, writes `results.json`, `per_view.json`, sheets and overview; returns the results."""
+def evaluate_run(stored: StoredRun, panes: PaneSource = "auto") -> dict:
+    """Evaluates a run, writes `results.json`, `per_view.json`, sheets and overview; returns the results.
+
+    Raises:
+        InputError: the capture does not say where its panes are in this way.
+    """
+    regions = pane_regions(stored.dataset, panes)
     settings, path = stored.directory.settings(), stored.directory.path
     blend = stored.renderer.blend if isinstance(stored.renderer, Planar) else None
     report = Report(path, stored.dataset, blend)
-    evaluation: Evaluation = evaluate(stored.scene, stored.renderer, stored.dataset, listen=report.add)
+    evaluation: Evaluation = evaluate(stored.scene, stored.renderer, stored.dataset, regions=regions, listen=report.add)
     results = {
         "method": stored.recipe.method,
         "iterations": stored.iterations,
@@ -97,6 +107,8 @@ def results_table(*results: dict) -> Table:
 def plane_text(plane: dict) -> str:
     """A pane in one line: its reflectance, and its errors where the truth is known."""
     text = f"R0 {written(plane['base_reflectance'], PLANE_COLUMNS['base_reflectance'].pattern)}"
+    if plane.get("normal_drift_deg") is not None:
+        text += f", {plane['normal_drift_deg']:.2f}° from the plane of the masks"
     if plane.get("normal_error_deg") is None:
         return text
     return (

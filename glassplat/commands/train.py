@@ -100,10 +100,12 @@ class Train(Generic[RecipeKind]):
 def describe(dataset: Dataset, console: Console) -> None:
     """Says what was loaded, with the loader's warnings."""
     annotated = sum(view.is_annotated for view in dataset.train)
+    given = f", {len(dataset.planes)} in planes.json" if dataset.planes is not None else ""
     say(
         console,
         f"{dataset.root}: {len(dataset.train)} training and {len(dataset.test)} test views, "
-        f"{len(dataset.points.positions)} points, {annotated} annotated views with {len(dataset.pane_labels)} panes",
+        f"{len(dataset.points.positions)} points, {annotated} annotated views with {len(dataset.pane_labels)} panes"
+        f"{given}",
     )
     for warning in dataset.warnings:
         warn(console, warning)

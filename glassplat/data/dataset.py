@@ -14,11 +14,13 @@ from glassplat.data import colmap, mirror_nerf, transforms
 from glassplat.data.axes import axes_evidence
 from glassplat.data.capture import Capture, Loader, PointCloud, Shot
 from glassplat.data.errors import InputError, first_names, input_checked
+from glassplat.data.given_planes import given_planes
 from glassplat.data.masks import MaskSet, Polarity, find_masks, known_masks
 from glassplat.data.random_points import points_in_view
 from glassplat.data.view import WHITE, PreparedView, Rgb, View, ViewOptions, prepare_view
 from glassplat.files.fields import LARGEST_COORDINATE
 from glassplat.files.images import is_transparent
+from glassplat.scene.plane import Planes
 
 __all__ = ["Dataset", "PointCloud", "View", "load_dataset"]
 
@@ -54,6 +56,7 @@ class Dataset:
         split: how the test views were chosen.
         measured_points: False if `points` are random ones, which carry no geometry.
         background: sRGB that is seen through transparent photographs; None where none is transparent.
+        planes: panes that the capture gives as rectangles; their masks, if any, only refine them.
     """
 
     root: Path
@@ -67,6 +70,7 @@ class Dataset:
     split: str = ""
     measured_points: bool = True
     background: Rgb | None = None
+    planes: Planes | None = None
 
 
 def load_dataset(
@@ -119,6 +123,7 @@ def load_dataset(
         split=split,
         measured_points=measured,
         background=background if transparent else None,
+        planes=given_planes(root, [view.camera for view in train]),
     )
 
 

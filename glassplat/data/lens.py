@@ -199,6 +199,11 @@ def _is_pinhole(model: str, parameters: tuple[float, ...]) -> bool:
     return model in PERSPECTIVE and not any(parameters[first_extra:])
 
 
+def undistorted(pixels: NDArray[np.uint8], lens: Any) -> NDArray[np.uint8]:
+    """[H, W, 3] as the pinhole camera of `pycolmap.undistort_camera` shows it, which may have another size."""
+    return _undistort(pixels, lens, "BILINEAR")
+
+
 def _intrinsics(lens: Any) -> Pinhole:
     return Pinhole(
         fx=float(lens.focal_length_x),

@@ -19,6 +19,14 @@ from glassplat.evaluate.environment_metrics import environment_metrics, learned_
 from glassplat.evaluate.lpips import Lpips, load_lpips
 from glassplat.evaluate.metrics import psnr, quantized, reflection_gain, ssim
 from glassplat.evaluate.outcome import NO_WEIGHTS, SMALLEST_REGION, Outcome, plain
+from glassplat.evaluate.pane_regions import (
+    NO_TRUTH,
+    NO_VIEW_TRUTH,
+    MarkedRegions,
+    PaneRegions,
+    RenderedRegions,
+    TrueRegions,
+)
 from glassplat.evaluate.plane_errors import missing_panes, plane_table
 from glassplat.evaluate.surface_metrics import surface_metrics
 from glassplat.evaluate.surface_truth import TrueSurface, true_surface
@@ -28,8 +36,6 @@ from glassplat.scene.scene import Scene
 
 MIRROR_STRENGTH = 0.999
 """From this true strength on, nothing is transmitted."""
-NO_TRUTH = "the data set has no ground truth"
-NO_VIEW_TRUTH = "the ground truth lacks this view"
 TOO_FEW = f"fewer than {SMALLEST_REGION} pixels show a pane"
 
 Truths = tuple[GroundTruth | None, TrueView | None]
@@ -90,6 +96,7 @@ def evaluate(
     dataset: Dataset,
     *,
     lpips_weights: Path | None = None,
+    regions: PaneRegions | None = None,
     listen: ViewListener = _nobody,
 ) -> Evaluation:
     """Renders every test view and measures it, on uint8-quantised sRGB at the data set's resolution.
@@ -97,10 +104,10 @@ def evaluate(
     `psnr`, `ssim` and `lpips` are means over the views. The region metrics are means over the views in
     which the region has at least 100 pixels: `pane_psnr` over the pane's pixels, `transmission_psnr` over
     those that transmit (true strength below 0.999) against `gt/trans`, `reflection_psnr` against `gt/refl`
-    after one gain for the whole scene. The pane is `gt/`'s where there is one, else the rendered mask above
-    0.5; `pane_region` says which. A method without layers is scored with its image as its transmission:
-    that is what its user has.
+    after one gain for the whole scene. The pane is what `regions` say; `pane_region` names them. A method without
+    layers is scored with its image as its transmission: that is what its user has.
 
+    `reflective_psnr` is that over the pixels of which more than half is mirrored, where the true strength is known.
     `normal_error_deg` is the mean angle between the layer `normal` and the true normals over the pixels that show a
     surface, `reflective_normal_error_deg` the same where it mirrors more than half, `strength_error` the mean
     difference of the layer `strength` from the true one. `environment_psnr` compares the learned environment with the
@@ -111,6 +118,7 @@ def evaluate(
         renderer: how; called under `no_grad`. The median of its times is `seconds_per_frame`.
         dataset: the test views; ground truth is read where it has some.
         lpips_weights: folder with LPIPS weights; None looks in the usual places.
+        regions: which pixels show a pane; those of the ground truth if None, or else of the rendered mask.
         listen: called once per view with its frame, which is not kept afterwards; draws pictures of it.
 
     Raises:
@@ -120,6 +128,7 @@ def evaluate(
         raise InputError(f"{dataset.root} has no test views; expected at least one image to compare with")
     truth = load_truth(dataset.truth)
     lpips = _available_lpips(lpips_weights)
+    regions = regions or (RenderedRegions() if truth is None else TrueRegions())
     # The first frame may wait for the compiler; it must not count.
     timed_render(renderer, scene, dataset.test[0])
     measurements = {}
@@ -127,7 +136,8 @@ def evaluate(
         frame, seconds = timed_render(renderer, scene, view)
         true_view = truth.view(view.name, view.camera.width, view.camera.height) if truth else None
         surface = true_surface(view)
-        measured = _measure(frame, seconds, view.photo, truth=(truth, true_view), surface=surface, lpips=lpips)
+        pane = regions.of(view, frame, true_view)
+        measured = _measure(frame, seconds, view.photo, pane, truth=(truth, true_view), surface=surface, lpips=lpips)
         measurements[view.name] = measured
         listen(EvaluatedView(view, frame, true_view, surface, plain(measured.metrics)))
     gain = _add_reflection(measurements.values())
@@ -137,8 +147,9 @@ def evaluate(
     results |= plain({"peak_memory_mib": peak_memory_mib()})
     results |= plain(_means([m.metrics for m in measurements.values()]))
     results |= plain(environment_metrics(learned_environment(scene), true_environment(dataset.root), lpips))
-    results |= _footnotes(results, lpips, truth, gain)
-    results["planes"] = plane_table(scene.planes, truth, dataset.extent)
+    results |= _footnotes(results, lpips, regions, gain)
+    marked = regions.planes if isinstance(regions, MarkedRegions) else None
+    results["planes"] = plane_table(scene.planes, truth, dataset.extent, marked)
     if len(scene.planes):
         results["missing_panes"] = missing_panes(scene.planes, truth)
     return Evaluation(results, per_view)
@@ -182,28 +193,25 @@ def _available_lpips(folder: Path | None) -> Lpips | str:
 
 
 def _measure(
-    frame: Frame, seconds: float, photo: Tensor, *, truth: Truths, surface: TrueSurface | None, lpips: Lpips | str
+    frame: Frame,
+    seconds: float,
+    photo: Tensor,
+    pane: Tensor | str,
+    *,
+    truth: Truths,
+    surface: TrueSurface | None,
+    lpips: Lpips | str,
 ) -> _Measurement:
     """Every metric of one view except the reflection's, which needs all views."""
-    pane = _pane(frame, *truth)
     metrics: dict[str, Outcome] = {
         "psnr": psnr(frame.rgb, photo),
         "ssim": ssim(frame.rgb, photo),
         "lpips": NO_WEIGHTS if isinstance(lpips, str) else lpips(quantized(frame.rgb), quantized(photo)),
         "pane_psnr": pane if isinstance(pane, str) else _region_psnr(frame.rgb, photo, pane, TOO_FEW),
         "transmission_psnr": _transmission_psnr(frame, *truth),
-        **surface_metrics(frame, surface),
+        **surface_metrics(frame, photo, surface),
     }
     return _Measurement(metrics, seconds, _reflection_pixels(frame, *truth))
-
-
-def _pane(frame: Frame, truth: GroundTruth | None, true_view: TrueView | None) -> Tensor | str:
-    """Pixels of the pane [H, W]; one source for the whole data set, so that means do not mix two."""
-    if truth is not None:
-        return true_view.labels > 0 if true_view is not None else NO_VIEW_TRUTH
-    if "mask" in frame.layers:
-        return frame.layers["mask"] > 0.5
-    return f"{NO_TRUTH}, and the method renders no mask"
 
 
 def _region_psnr(image: Tensor, target: Tensor, region: Tensor, reason: str) -> Outcome:
@@ -265,13 +273,14 @@ def _description(scene: Scene, dataset: Dataset) -> dict[str, Any]:
         "resolution": ", ".join(sizes),
         "split": dataset.split,
         "num_test_views": len(dataset.test),
-        "num_gaussians": len(scene.primary) + len(scene.glass),
+        "num_gaussians": sum(len(part) for part in scene.gaussian_sets().values()),
         "num_glass_gaussians": len(scene.glass),
+        "num_surroundings_gaussians": len(scene.surroundings),
     }
 
 
 def _footnotes(
-    results: Mapping[str, Any], lpips: Lpips | str, truth: GroundTruth | None, gain: float | None
+    results: Mapping[str, Any], lpips: Lpips | str, regions: PaneRegions, gain: float | None
 ) -> dict[str, Any]:
     """What the reader of the metrics must know: backbone, region, gain."""
     if isinstance(lpips, str):
@@ -281,6 +290,6 @@ def _footnotes(
     if results["pane_psnr"] is None:
         region = plain({"pane_region": results["pane_psnr_reason"]})
     else:
-        region = {"pane_region": "ground-truth pane labels" if truth else "rendered mask > 0.5"}
+        region = {"pane_region": regions.source}
     gain_outcome = results["reflection_psnr_reason"] if gain is None else gain
     return backbone | region | plain({"reflection_gain": gain_outcome})

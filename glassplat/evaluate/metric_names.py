@@ -27,6 +27,9 @@ METRICS = {
     ),
 }
 SURFACE_METRICS = {
+    "reflective_psnr": Metric(
+        "PSNR, reflective", "{:.2f} dB", "PSNR of the pixels of which the surface mirrors more than half"
+    ),
     "normal_error_deg": Metric("normal error", "{:.2f}°", "mean angle between rendered and true surface normals"),
     "reflective_normal_error_deg": Metric(
         "normal error, reflective", "{:.2f}°", "the same where the surface mirrors more than half"
@@ -65,6 +68,10 @@ PLANE_COLUMNS = {
         "radius of the training cameras",
     ),
     "base_reflectance_error": Metric("R0 error", "{:.3f}", "difference from the true R0"),
+    "normal_drift_deg": Metric("normal drift", "{:.2f}°", "angle between the trained plane and that of the masks"),
+    "offset_drift": Metric(
+        "offset drift, of the extent", "{:.3%}", "distance of the centre of the masks' plane from the trained plane"
+    ),
 }
 
 

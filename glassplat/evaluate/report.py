@@ -149,9 +149,9 @@ def _defined(metrics: Mapping[str, Metric]) -> str:
 def _plane_table(planes: list[Mapping[str, Any]]) -> str:
     if not planes:
         return ""
-    columns = PLANE_COLUMNS.items()
-    rows = [[_formatted(plane.get(name), column.pattern) for name, column in columns] for plane in planes]
-    return _table([column.label for _, column in columns], rows)
+    columns = {n: column for n, column in PLANE_COLUMNS.items() if any(plane.get(n) is not None for plane in planes)}
+    rows = [[_formatted(plane.get(name), column.pattern) for name, column in columns.items()] for plane in planes]
+    return _table([column.label for column in columns.values()], rows)
 
 
 def _view_table(per_view: Mapping[str, Mapping[str, Any]], sheets: Mapping[str, str]) -> str:

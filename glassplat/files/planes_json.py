@@ -35,6 +35,8 @@ LEAST_LENGTH = 1e-6
 LEAST_ANGLE = 1e-3
 """Between tangent and normal, in radians: below it the rectangle's sides have no direction."""
 LEAST_HALF_SIZE = 1e-9
+GLASS_REFLECTANCE = 0.2
+"""That learning starts at, where nobody says."""
 HIGHEST_LABEL = 255
 VECTOR = Items(COORDINATE, 3)
 LOGIT = Number(-1e3, 1e3)
@@ -45,7 +47,7 @@ PLANE: dict[str, Field] = {
     "normal": VECTOR,
     "tangent": VECTOR,
     "half_sizes": Items(Number(LEAST_HALF_SIZE, LARGEST_COORDINATE), 2),
-    "base_reflectance": Number(0, 1),
+    "base_reflectance": Optional(Number(0, 1), default=GLASS_REFLECTANCE),
     "raw_normal": Optional(VECTOR),
     "logit_reflectance": Optional(LOGIT),
 }

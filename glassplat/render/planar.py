@@ -17,6 +17,7 @@ from glassplat.render.glazing import Blend, Glazed, glazed, layer_slopes, own_ma
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
     check_colored,
+    check_ellipsoids,
     joined_probe,
     joined_splats,
     mean_depth,
@@ -138,6 +139,7 @@ class Planar:
     def check(self, scene: Scene) -> None:
         """Raises ValueError where a scene lacks colours, or its panes what they need; there may be no panes."""
         check_colored(scene.primary)
+        check_ellipsoids(scene.primary)
         if len(scene.planes) and "log_intensity" not in scene.primary.channels:
             raise ValueError(
                 f"the Gaussians have the channels {sorted(scene.primary.channels)}; expected log_intensity, as "

@@ -90,6 +90,16 @@ class Planes:
         labels = tuple(self.labels[k] for k in rows)
         return Planes(**chosen, labels=labels, mirrors=tuple(label for label in self.mirrors if label in labels))
 
+    def joined(self, other: Planes) -> Planes:
+        """These planes and others, in the order of their labels."""
+        mine, theirs = self.tensors(), other.tensors()
+        together = Planes(
+            **{name: torch.cat([mine[name], theirs[name]]) for name in mine},
+            labels=(*self.labels, *other.labels),
+            mirrors=(*self.mirrors, *other.mirrors),
+        )
+        return together.select(sorted(range(len(together)), key=together.labels.__getitem__))
+
     def to(self, device: torch.device | str) -> Planes:
         """The same planes on another device."""
         return self.with_tensors({name: tensor.to(device) for name, tensor in self.tensors().items()})

@@ -18,7 +18,7 @@ from glassplat.files.planes_json import HIGHEST_LABEL
 from glassplat.files.scene_folder import EXTENT, SH_DEGREE
 from glassplat.files.tensors_file import TensorsFile, opened_tensors, write_tensors
 from glassplat.scene.environment import Environment
-from glassplat.scene.gaussians import PER_GAUSSIAN, Gaussians
+from glassplat.scene.gaussians import DISC_SCALES, PER_GAUSSIAN, Gaussians
 from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
 from glassplat.train.optimizer import Optimizer
@@ -42,7 +42,7 @@ HEADER: dict[str, Field] = {
     "records": Optional(ByName(Number()), {}),
 }
 """What is `Optional` was added after the first checkpoints were written."""
-GAUSSIAN_SHAPES = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": ()}
+GAUSSIAN_SHAPES = {"means": (3,), "quats": (4,), "log_scales": None, "logit_opacities": ()}
 PLANE_SHAPES = {
     "centers": (3,),
     "raw_normals": (3,),
@@ -50,6 +50,7 @@ PLANE_SHAPES = {
     "tangents": (3,),
     "half_sizes": (2,),
 }
+SCALE_SHAPES = [(DISC_SCALES,), (DISC_SCALES + 1,)]
 SH_SHAPES = [(count, 3) for count in (0, 1, 4, 9, 16)]
 
 
@@ -221,6 +222,8 @@ def restored_gaussians(tensors: Mapping[str, Tensor], part: str, active_sh_degre
     check_shapes(tensors, {**GAUSSIAN_SHAPES, "sh": None, **dict.fromkeys(channels, ())}, part)
     if tuple(main["sh"].shape[1:]) not in SH_SHAPES:
         raise InputError(f"sh of {part} has shape {list(main['sh'].shape)}; expected [N, 0, 1, 4, 9 or 16, 3]")
+    if tuple(main["log_scales"].shape[1:]) not in SCALE_SHAPES:
+        raise InputError(f"log_scales of {part} has shape {list(main['log_scales'].shape)}; expected [N, 2 or 3]")
     return Gaussians(**main, channels=channels, active_sh_degree=active_sh_degree)
 
 

@@ -213,11 +213,11 @@ class PlanarRecipe:
             PlaneFitError: the masks do not do. The planes are fitted to the measured points once and forgotten,
                 because a bad mask should end a run before the first iteration and not at the second stage.
         """
-        if not dataset.pane_labels:
+        if not dataset.pane_labels and dataset.planes is None:
             raise PlaneFitError(
                 f"{self._lack_of_masks(dataset)}, and planar needs to know where the panes are: expected masks of 3 to "
                 f"10 photographs in {dataset.root / 'masks'}, named <photograph's name>.png, each pixel the label 1, "
-                "2, ... of a pane, or 0. `glassplat train splat` needs none"
+                "2, ... of a pane, or 0 (`glassplat annotate` writes them). `glassplat train splat` needs none"
             )
         if dataset.measured_points:
             fitted_planes(dataset, None, self.plane_fit)

@@ -57,9 +57,7 @@ class PlaneEntry:
         glass = glass_gaussians(planes, count=self.glass_count, seed=self.seed)
         scene = replace(state.scene, planes=planes, glass=glass)
         if self.detect_mirrors and not self.fit.mirror_labels:
-            found = yield from mirrors_found(scene, dataset)
-            log.info("mirrors among the panes: %s", ", ".join(map(str, found)) or "none")
-            planes = with_mirrors(planes, found, self.fit.mirror_reflectance)
+            planes = yield from self._with_mirrors_found(scene, dataset)
         if not self.fixed_mirrors:
             planes = replace(planes, mirrors=())
         state.scene = replace(scene, planes=planes)
@@ -72,9 +70,20 @@ class PlaneEntry:
                 yield from seed_reflection(state, dataset, planes.select([row]))
         return True
 
+    def _with_mirrors_found(self, scene: Scene, dataset: Dataset) -> Generator[Working, None, Planes]:
+        """The scene's planes, with those as mirrors that look like it; of given ones the capture says what they are."""
+        given = Planes.empty() if dataset.planes is None else dataset.planes
+        told = [label for label in scene.planes.labels if label in given.labels]
+        if len(told) == len(scene.planes):
+            return scene.planes
+        found = yield from mirrors_found(scene, dataset)
+        mirrors = tuple(label for label in found if label not in told)
+        log.info("mirrors among the panes: %s", ", ".join(map(str, mirrors)) or "none")
+        return with_mirrors(scene.planes, (*given.mirrors, *mirrors), self.fit.mirror_reflectance)
+
 
 def fitted_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Planes:
-    """The planes of the panes that a capture's masks name.
+    """The planes of all panes: those that the capture gives, and those that only its masks name, fitted to them.
 
     Args:
         dataset: the capture.
@@ -84,16 +93,29 @@ def fitted_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Pl
     Raises:
         PlaneFitError: the masks do not do.
     """
+    given = Planes.empty() if dataset.planes is None else _as_given(dataset.planes, fit)
+    labels = [label for label in dataset.pane_labels if label not in given.labels]
+    if not labels and len(given):
+        return given if centers is None else given.to(centers.device)
     shown = [(view.name, view.camera, view.pane_labels) for view in dataset.train if view.pane_labels is not None]
     points = dataset.points.positions
-    return fit_planes(
+    fitted = fit_planes(
         points if centers is None else centers,
         [(camera, labels) for _, camera, labels in shown],
         extent=dataset.extent,
         measured=points if dataset.measured_points and centers is not None else None,
         names=[name for name, _, _ in shown],
+        labels=labels or None,
         options=fit,
     )
+    return fitted if not len(given) else given.to(fitted.centers.device).joined(fitted)
+
+
+def _as_given(planes: Planes, fit: PlaneFit) -> Planes:
+    """Given rectangles with the margin that fitted ones get, and mirrors as mirrors."""
+    mirrors = tuple(dict.fromkeys((*planes.mirrors, *fit.mirror_labels)))
+    log.info("panes %s lie where the capture's planes.json says", ", ".join(map(str, planes.labels)))
+    return with_mirrors(replace(planes, half_sizes=fit.margin * planes.half_sizes), mirrors, fit.mirror_reflectance)
 
 
 def mirrors_found(scene: Scene, dataset: Dataset) -> Generator[Working, None, tuple[int, ...]]:

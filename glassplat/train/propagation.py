@@ -13,8 +13,8 @@ from glassplat.data.dataset import Dataset
 from glassplat.data.ranges import Count, Several, Share
 from glassplat.densify.propagate import NormalPropagation
 from glassplat.densify.reflectors import Search
-from glassplat.render.deferred import Deferred
 from glassplat.render.environment import resized
+from glassplat.render.frame import Renderer
 from glassplat.train.actions import Densify, GrowSh, ResetOpacity
 from glassplat.train.optimizer import Rate
 from glassplat.train.stage import Clock, Every
@@ -73,7 +73,7 @@ class Propagate:
         when: the beats at which it happens; whether to go on is asked at those that it skips, too.
         propagation: what it does.
         schedule: when it ends.
-        renderer: that of the stage.
+        renderer: that of the stage; its frames have a layer `base`.
         matte_rates: factors on learning rates before the first beat at which normals may be propagated, and after the
             last one where nothing reflective was found, by dotted parameter name; of them the value for a run of this
             length is taken.
@@ -83,7 +83,7 @@ class Propagate:
     when: Every
     propagation: NormalPropagation
     schedule: PropagationSchedule
-    renderer: Deferred
+    renderer: Renderer
     matte_rates: Mapping[str, Rate] = field(default_factory=dict)
     search: Search = field(default_factory=Search)
     name: str = "propagate normals"

@@ -17,6 +17,7 @@ from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Stage
+from glassplat.train.traced_recipe import TracedRecipe
 
 
 class Recipe(Protocol):
@@ -47,7 +48,9 @@ class Recipe(Protocol):
 
 REMEDY = "Train again, or use the version that wrote it"
 Preset = Literal["glassplat", "paper"]
-RECIPES: dict[str, type] = {recipe.method: recipe for recipe in (SplatRecipe, PlanarRecipe, DeferredRecipe)}
+RECIPES: dict[str, type] = {
+    recipe.method: recipe for recipe in (SplatRecipe, PlanarRecipe, DeferredRecipe, TracedRecipe)
+}
 
 
 def recipe_of(method: str, preset: Preset = "glassplat") -> Any:

@@ -194,3 +194,11 @@ def test_mutated_files_are_read_or_refused(tmp_path_factory: pytest.TempPathFact
     path.write_bytes(bytes(data) if kind else gzip.compress(bytes(data)))
     with suppress(ValueError):
         assert all(bool(tensor.isfinite().all()) for tensor in read_spz(path).tensors().values())
+
+
+def test_discs_become_as_flat_as_the_format_can_say(tmp_path: Path) -> None:
+    solid = typical()
+    write_spz(tmp_path / "a.spz", replace(solid, log_scales=solid.log_scales[:, :2].contiguous()))
+    after = read_spz(tmp_path / "a.spz")
+    torch.testing.assert_close(after.log_scales[:, :2], solid.log_scales[:, :2], rtol=0, atol=1 / 31)
+    assert float(after.log_scales[:, 2].max()) == -10.0

@@ -5,14 +5,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from glassplat.kernels.discs import FLAT, SOLID
 from glassplat.kernels.maths.blending import ALPHA_MIN
 from glassplat.kernels.maths.ray_hit import MOST_DEVIATIONS
 from glassplat.kernels.project.reference import rotations
 from glassplat.kernels.splats import RawGaussians
 from glassplat.kernels.trace.records import Shapes
 
-FLAT, SOLID = 2, 3
-"""Scales of a disc and of an ellipsoid."""
+__all__ = ["FLAT", "SOLID", "shapes_of"]
+
 MOST_LOG_SCALE = 40.0
 """Beyond, squares of deviations and of their inverses leave the range of float32."""
 

@@ -1,0 +1,206 @@
+"""Scalar maths of discs on screen (2DGS): where a pixel's ray meets a disc, the region it covers, and the adjoints.
+
+A disc is its centre m and two tangents p, q of unit length in camera space, with the deviations s_u, s_v along them.
+The ray through the pixel at offset (dx, dy) from the centre's own pixel meets its plane at m + u s_u p + v s_v q with
+
+    u = (u_x dx + u_y dy) / e,   v = (v_x dx + v_y dy) / e,   e = 1 + w_x dx + w_y dy,   depth = m_z / e
+
+Measured from the centre, none of these cancels, however small the disc. The six numbers are its *map*.
+
+Every function is pure and typed by its factory, so that one source compiles for the CPU and for CUDA.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
+from glassplat.kernels.maths.projection import vector_maths
+from glassplat.kernels.maths.ray_hit import EDGE_ON, MOST_DEVIATIONS
+
+LOW_PASS = math.sqrt(0.5)
+"""Standard deviation in pixels of the falloff around its centre on screen that a disc has at least (2DGS, Eq. 11)."""
+MAP = 6
+"""Numbers of a map: u_x, u_y, v_x, v_y, w_x, w_y."""
+SLACK = 1.002
+"""By how much an outline is wider than what it encloses, so that no pixel is lost to rounding."""
+
+
+class DiscMaths(NamedTuple):
+    """Steps for one disc in one camera; vectors are tuples.
+
+    Attributes:
+        crossed: (q x m, m x p, p x q) from tangents and centre.
+        faces: whether a disc is seen from anywhere but its edge, from p x q and the centre.
+        map_of: the map from crossed vectors, centre, inverse deviations and focal lengths.
+        map_gradient: gradients of tangents, centre and the logarithms of the deviations from those of the map.
+    """
+
+    crossed: Scalar
+    faces: Scalar
+    map_of: Scalar
+    map_gradient: Scalar
+
+
+def cross_maths() -> Scalar:
+    """Builds the cross product of two tuples."""
+
+    @inlined
+    def cross(a, b):  # type: ignore[no-untyped-def]
+        return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+    return cross
+
+
+def disc_maths(real: type) -> DiscMaths:
+    """Builds the functions for `real`, np.float32 or np.float64."""
+    return DiscMaths(*_shape(real), _map_gradient(real))
+
+
+def _shape(real: type) -> tuple[Scalar, Scalar, Scalar]:
+    dot, cross = vector_maths().dot, cross_maths()
+    edge_on, largest = real(EDGE_ON), real(np.finfo(real).max)
+
+    @inlined
+    def crossed(p, q, m):  # type: ignore[no-untyped-def]
+        return cross(q, m), cross(m, p), cross(p, q)
+
+    @inlined
+    def faces(n, m):  # type: ignore[no-untyped-def]
+        slope = dot(n, m)
+        # Written so that NaN fails the comparison.
+        return edge_on * edge_on * dot(n, n) * dot(m, m) < slope * slope <= largest
+
+    @inlined
+    def map_of(a, b, n, m, inverse_u, inverse_v, fx, fy):  # type: ignore[no-untyped-def]
+        k = m[2] / dot(n, m)
+        x, y = k / fx, k / fy
+        return (
+            a[0] * inverse_u * x,
+            a[1] * inverse_u * y,
+            b[0] * inverse_v * x,
+            b[1] * inverse_v * y,
+            n[0] * x,
+            n[1] * y,
+        )
+
+    return crossed, faces, map_of
+
+
+def _map_gradient(real: type) -> Scalar:
+    dot, blend, cross = vector_maths().dot, vector_maths().blend, cross_maths()
+    zero, one = real(0.0), real(1.0)
+
+    @inlined
+    def plus(a, b):  # type: ignore[no-untyped-def]
+        return blend(one, a, one, b)
+
+    @inlined
+    def map_gradient(p, q, m, n, found, inverse_u, inverse_v, fx, fy, g):  # type: ignore[no-untyped-def]
+        slope = dot(n, m)
+        k = m[2] / slope
+        x, y = k / fx, k / fy
+        along_u, along_v = g[0] * found[0] + g[1] * found[1], g[2] * found[2] + g[3] * found[3]
+        total = along_u + along_v + g[4] * found[4] + g[5] * found[5]
+        g_a = g[0] * inverse_u * x, g[1] * inverse_u * y, zero
+        g_b = g[2] * inverse_v * x, g[3] * inverse_v * y, zero
+        g_slope = -total / slope
+        g_n = blend(g_slope, m, one, (g[4] * x, g[5] * y, zero))
+        g_p = plus(cross(g_b, m), cross(q, g_n))
+        g_q = plus(cross(m, g_a), cross(g_n, p))
+        g_m = blend(g_slope, n, one, plus(cross(g_a, q), cross(p, g_b)))
+        return g_p, g_q, (g_m[0], g_m[1], g_m[2] + total / m[2]), -along_u, -along_v
+
+    return map_gradient
+
+
+class OutlineMaths(NamedTuple):
+    """The region of the screen that a disc covers, as an ellipse for `bin_tiles`, in double precision.
+
+    Attributes:
+        reach: squared deviations up to which a disc of some opacity is met; negative where nowhere.
+        outline: (dx, dy, xx, xy, yy, half width, half height): an ellipse that encloses what the disc covers, its
+            centre as an offset from the disc's and its conic such that opacity exp(-q / 2) falls to 1/255 on it. A
+            conic of zeros is the whole image: the disc crosses the near plane.
+    """
+
+    reach: Scalar
+    outline: Scalar
+
+
+def outline_maths() -> OutlineMaths:
+    """Builds the functions."""
+    most, low_pass = MOST_DEVIATIONS**2, LOW_PASS
+    clamped = _clamped_ellipse()
+
+    @inlined
+    def reach(opacity):  # type: ignore[no-untyped-def]
+        visible = np.float64(opacity) / ALPHA_MIN
+        if not visible > 1.0:
+            return -1.0
+        return min(2.0 * math.log(visible), most)
+
+    @inlined
+    def outline(found, opacity, nearest, near, width, height):  # type: ignore[no-untyped-def]
+        """`nearest` is the smallest depth of what the disc covers."""
+        squared = reach(opacity)
+        u_x, u_y, v_x, v_y = np.float64(found[0]), np.float64(found[1]), np.float64(found[2]), np.float64(found[3])
+        w_x, w_y = np.float64(found[4]), np.float64(found[5])
+        # On the contour |u|^2 + |v|^2 = squared: a quadratic form of the offset, completed to a square.
+        xx = u_x * u_x + v_x * v_x - squared * w_x * w_x
+        xy = u_x * u_y + v_x * v_y - squared * w_x * w_y
+        yy = u_y * u_y + v_y * v_y - squared * w_y * w_y
+        determinant = xx * yy - xy * xy
+        if not (nearest > near and determinant > 0.0 and xx > 0.0):
+            return 0.0, 0.0, 0.0, 0.0, 0.0, np.float64(width), np.float64(height)
+        dx = squared * (yy * w_x - xy * w_y) / determinant
+        dy = squared * (xx * w_y - xy * w_x) / determinant
+        size = (squared + squared * (w_x * dx + w_y * dy)) / determinant
+        least = low_pass * math.sqrt(squared) + math.sqrt(dx * dx + dy * dy)
+        s_xx, s_xy, s_yy = clamped(yy * size, -xy * size, xx * size, least * least)
+        scale = 2.0 * math.log(np.float64(opacity) / ALPHA_MIN) / (s_xx * s_yy - s_xy * s_xy)
+        return dx, dy, s_yy * scale, -s_xy * scale, s_xx * scale, math.sqrt(s_xx), math.sqrt(s_yy)
+
+    return OutlineMaths(reach, outline)
+
+
+def _clamped_ellipse() -> Scalar:
+    """An ellipse {d : d^T S^-1 d <= 1}, none of its half axes shorter than the root of `least`, and a little wider."""
+
+    @inlined
+    def clamped(xx, xy, yy, least):  # type: ignore[no-untyped-def]
+        middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+        apart = math.sqrt(half * half + xy * xy)
+        large, small = max(middle + apart, least), max(middle - apart, least)
+        # S = mean of the eigenvalues + half their difference along the axes.
+        center, share = 0.5 * (large + small), 0.0
+        if apart > 0.0:
+            share = 0.5 * (large - small) / apart
+        wider = SLACK * SLACK
+        return wider * (center + share * half), wider * share * xy, wider * (center - share * half)
+
+    return clamped
+
+
+def meet_maths(real: type) -> tuple[Scalar, Scalar]:
+    """Builds what pixels need: `meet` and `slopes`; offsets may be vectors of numbers (`kernels/cpu/vector.py`).
+
+    `meet` gives the numerators of u and v, and e. `slopes` turns the gradients of all three into that of the offset.
+    """
+    one = real(1.0)
+
+    @inlined
+    def meet(found, dx, dy):  # type: ignore[no-untyped-def]
+        u_x, u_y, v_x, v_y, w_x, w_y = found
+        return dx * u_x + dy * u_y, dx * v_x + dy * v_y, dx * w_x + dy * w_y + one
+
+    @inlined
+    def slopes(found, g_u, g_v, g_e):  # type: ignore[no-untyped-def]
+        u_x, u_y, v_x, v_y, w_x, w_y = found
+        return g_u * u_x + g_v * v_x + g_e * w_x, g_u * u_y + g_v * v_y + g_e * w_y
+
+    return meet, slopes

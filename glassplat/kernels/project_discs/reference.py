@@ -1,0 +1,147 @@
+"""Projection of discs in plain PyTorch: the definition of `glassplat.kernels.project_discs.project_discs`."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from glassplat.kernels.discs import ProjectedDiscs
+from glassplat.kernels.maths.blending import ALPHA_MIN
+from glassplat.kernels.maths.disc import LOW_PASS, SLACK
+from glassplat.kernels.maths.ray_hit import EDGE_ON, MOST_DEVIATIONS
+from glassplat.kernels.project.reference import rotations, sh_basis
+from glassplat.kernels.splats import CameraBatch, RawGaussians
+from glassplat.kernels.trace.shapes import MOST_LOG_SCALE
+
+SMOOTH = ("means2d", "maps", "depths", "opacities", "colors", "normals")
+
+
+def project_discs(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, near: float) -> ProjectedDiscs:
+    """Projects discs into cameras; see `glassplat.kernels.project_discs.project_discs`."""
+    with torch.no_grad():
+        visible = _visible(_project_all(gaussians, cameras, sh_degree, near), gaussians, cameras, near)
+    # Where nothing is seen the arithmetic runs on harmless stand-ins: a NaN masked afterwards would still reach the
+    # gradients, as NaN times zero.
+    seen = visible.any(dim=0)
+    harmless = RawGaussians(*(_where(seen, tensor, torch.ones_like(tensor)) for tensor in gaussians))
+    projected = _project_all(harmless, cameras, sh_degree, near, visible)
+    projected = projected._replace(colors=projected.colors.clamp(min=0))
+    return ProjectedDiscs(*(_where(visible, tensor, torch.zeros_like(tensor)) for tensor in projected))
+
+
+def _where(mask: Tensor, value: Tensor, other: Tensor) -> Tensor:
+    """`torch.where` with a mask over the leading dimensions."""
+    return torch.where(mask.reshape(mask.shape + (1,) * (value.dim() - mask.dim())), value, other)
+
+
+def _project_all(
+    gaussians: RawGaussians, cameras: CameraBatch, sh_degree: int, near: float, visible: Tensor | None = None
+) -> ProjectedDiscs:
+    """Everything projected, culled or not."""
+    linear, offset = cameras.cam_from_world[:, :3, :3], cameras.cam_from_world[:, :3, 3]
+    focal, middle = cameras.intrinsics[:, None, :2], cameras.intrinsics[:, None, 2:]
+    centers = gaussians.means @ linear.mT + offset[:, None]
+    turned = rotations(gaussians.quats)
+    p, q = (torch.einsum("cij,nj->cni", linear, turned[..., i]) for i in range(2))
+    if visible is not None:
+        harmless = torch.eye(3, dtype=centers.dtype)
+        p, q, centers = (
+            _where(visible, value, harmless[i].expand_as(value)) for i, value in enumerate((p, q, centers))
+        )
+    inverse = torch.exp(-gaussians.log_scales)
+    n = torch.linalg.cross(p, q)
+    per_slope = (centers[..., 2] / (n * centers).sum(-1))[..., None] / focal
+    maps = torch.cat(
+        [
+            torch.linalg.cross(q, centers)[..., :2] * inverse[:, :1] * per_slope,
+            torch.linalg.cross(centers, p)[..., :2] * inverse[:, 1:] * per_slope,
+            n[..., :2] * per_slope,
+        ],
+        dim=-1,
+    )
+    depths = centers[..., 2]
+    opacities = torch.sigmoid(gaussians.logit_opacities).expand(depths.shape)
+    with torch.no_grad():
+        ahead = torch.stack([p[..., 2], q[..., 2]], dim=-1) * torch.exp(gaussians.log_scales)
+        nearest = depths - _squared_reach(opacities).sqrt() * ahead.norm(dim=-1)
+        outlines = _outlines(maps, opacities, nearest > near, cameras.width, cameras.height)
+    towards = -(linear.mT @ offset[..., None])[..., 0][:, None] - gaussians.means
+    side = torch.where((towards * turned[..., 2]).sum(-1, keepdim=True) < 0, -1.0, 1.0).to(depths.dtype)
+    means2d = centers[..., :2] / depths[..., None] * focal + middle
+    shift, conics, radii = (tensor.to(depths.dtype) for tensor in outlines)
+    return ProjectedDiscs(
+        means2d, maps, depths, opacities, _colors(gaussians, -towards, sh_degree), side * turned[..., 2],
+        means2d.detach() + shift, conics, radii,
+    )  # fmt: skip
+
+
+def _squared_reach(opacities: Tensor) -> Tensor:
+    """Squared deviations up to which discs are met; zero where nowhere."""
+    return (2 * torch.log(opacities / ALPHA_MIN)).clamp(min=0, max=MOST_DEVIATIONS**2)
+
+
+def _outlines(maps: Tensor, opacities: Tensor, whole: Tensor, width: int, height: int) -> tuple[Tensor, ...]:
+    """Shift of the centre [C, N, 2], conics [C, N, 3] and half extents [C, N, 2] of the ellipses, float64."""
+    maps, opacities = maps.double(), opacities.double()
+    squared = _squared_reach(opacities)
+    rows = maps.unflatten(-1, (3, 2))
+    u, v, w = (rows[..., i, :] for i in range(3))
+    outer = [x[..., :, None] * x[..., None, :] for x in (u, v, w)]
+    form = outer[0] + outer[1] - squared[..., None, None] * outer[2]
+    determinant = form[..., 0, 0] * form[..., 1, 1] - form[..., 0, 1] ** 2
+    whole = whole & (determinant > 0) & (form[..., 0, 0] > 0) & (squared > 0)
+    inverse = torch.linalg.inv(_where(whole, form, torch.eye(2, dtype=form.dtype)))
+    shift = squared[..., None] * (inverse @ w[..., None])[..., 0]
+    covariance = (squared * (1 + (w * shift).sum(-1)))[..., None, None] * inverse
+    least = LOW_PASS * squared.sqrt() + shift.norm(dim=-1)
+    values, axes = torch.linalg.eigh(torch.where(covariance.isfinite(), covariance, 0))
+    values = torch.maximum(values, least[..., None].square()) * SLACK**2
+    wide = axes @ torch.diag_embed(values) @ axes.mT
+    conic = torch.linalg.inv(_where(whole, wide, torch.eye(2, dtype=form.dtype)))
+    conic = conic * (2 * torch.log(opacities / ALPHA_MIN))[..., None, None]
+    entries = torch.stack([conic[..., 0, 0], conic[..., 0, 1], conic[..., 1, 1]], dim=-1)
+    radii = wide.diagonal(dim1=-2, dim2=-1).sqrt()
+    image = torch.tensor([width, height], dtype=radii.dtype).expand_as(radii)
+    nothing = torch.zeros_like(entries)
+    return _where(whole, shift, nothing[..., :2]), _where(whole, entries, nothing), _where(whole, radii, image)
+
+
+def _colors(gaussians: RawGaussians, outwards: Tensor, sh_degree: int) -> Tensor:
+    """Colours [C, N, 3] before the clamp; zero where there are no coefficients."""
+    if gaussians.sh.shape[1] == 0:
+        return torch.zeros_like(outwards)
+    basis = sh_basis(outwards / outwards.square().sum(-1, keepdim=True).sqrt())
+    count = (sh_degree + 1) ** 2
+    return 0.5 + torch.einsum("cnk,nkd->cnd", basis[..., :count], gaussians.sh[:, :count])
+
+
+def _visible(projected: ProjectedDiscs, gaussians: RawGaussians, cameras: CameraBatch, near: float) -> Tensor:
+    """What is in front of the near plane, not seen from its edge, on the kept side and in the window [C, N]."""
+    raw = torch.cat([*gaussians[:3], gaussians.logit_opacities[:, None]], dim=-1)
+    norm = gaussians.quats.square().sum(-1)
+    usable = raw.isfinite().all(dim=-1) & norm.isfinite() & (norm > 0)
+    usable &= (gaussians.log_scales.abs() <= MOST_LOG_SCALE).all(dim=-1)
+    visible = usable & (projected.depths > near)
+    visible = visible & projected.maps.isfinite().all(dim=-1) & projected.colors.isfinite().all(dim=-1)
+    visible = visible & projected.depths.isfinite() & _faces(gaussians, cameras)
+    visible = visible & (projected.opacities > ALPHA_MIN)
+    if cameras.clip_planes is not None:
+        visible &= cameras.clip_planes[:, :3] @ gaussians.means.T + cameras.clip_planes[:, 3:] > 0
+    windows = cameras.windows
+    if windows is None:
+        windows = torch.tensor([[0, 0, cameras.width, cameras.height]], dtype=projected.means2d.dtype)
+    first, last = windows[:, None, :2], windows[:, None, 2:]
+    low, high = projected.outline_centers - projected.radii, projected.outline_centers + projected.radii
+    everywhere = (projected.outline_conics == 0).all(dim=-1)
+    return visible & (everywhere | ((high > first) & (low < last)).all(dim=-1))
+
+
+def _faces(gaussians: RawGaussians, cameras: CameraBatch) -> Tensor:
+    """Whether discs are seen from anywhere but their edge [C, N]."""
+    linear, offset = cameras.cam_from_world[:, :3, :3], cameras.cam_from_world[:, :3, 3]
+    centers = gaussians.means @ linear.mT + offset[:, None]
+    turned = rotations(gaussians.quats)
+    n = torch.linalg.cross(*(torch.einsum("cij,nj->cni", linear, turned[..., i]) for i in range(2)))
+    slope = (n * centers).sum(-1)
+    limit = EDGE_ON**2 * n.square().sum(-1) * centers.square().sum(-1)
+    return (slope.square() > limit) & slope.square().isfinite()

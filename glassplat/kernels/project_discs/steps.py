@@ -1,0 +1,181 @@
+"""How one camera sees one disc: what the kernels of the projection share, on the CPU and on a GPU."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
+from glassplat.kernels.maths.disc import MAP, disc_maths, outline_maths
+from glassplat.kernels.maths.projection import shape_maths, vector_maths
+from glassplat.kernels.project.cpu_view import view_steps
+from glassplat.kernels.trace.shapes import MOST_LOG_SCALE
+
+
+class DiscSteps(NamedTuple):
+    """Parts of the kernels, which read and write the arrays that the scalar maths does not know.
+
+    Attributes:
+        shape: (usable, opacity, unit quaternion, inverse norm, axes, deviations) of a disc.
+        cull: writes zeros for one disc in one camera.
+        place: fills everything but the colour, where the disc is visible; `radii` says whether it is.
+        place_gradient: gradients of (the centre in camera space, the three rows of the pose without the centre's part,
+            the three axes, both log scales).
+    """
+
+    shape: Scalar
+    cull: Scalar
+    place: Scalar
+    place_gradient: Scalar
+
+
+def disc_steps(real: type) -> DiscSteps:
+    """Builds the parts for `real`, np.float32 or np.float64."""
+    return DiscSteps(_shape(real), _cull(real), _place(real), _place_gradient(real))
+
+
+def _shape(real: type) -> Scalar:
+    sigmoid, is_finite, unit_quat, rotation, _ = shape_maths(real)
+    zero, most = real(0.0), real(MOST_LOG_SCALE)
+
+    @inlined
+    def shape(means, quats, log_scales, logit_opacities, n):  # type: ignore[no-untyped-def]
+        quat, inverse_norm = unit_quat(quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3])
+        raw = abs(means[n, 0]) + abs(means[n, 1]) + abs(means[n, 2]) + abs(logit_opacities[n])
+        usable = is_finite(raw) and inverse_norm > zero and is_finite(inverse_norm)
+        usable = usable and abs(log_scales[n, 0]) <= most and abs(log_scales[n, 1]) <= most
+        deviations = math.exp(log_scales[n, 0]), math.exp(log_scales[n, 1])
+        return usable, sigmoid(logit_opacities[n]), quat, inverse_norm, rotation(quat), deviations
+
+    return shape
+
+
+def _cull(real: type) -> Scalar:
+    zero = real(0.0)
+
+    @inlined
+    def cull(c, n, outputs):  # type: ignore[no-untyped-def]
+        means2d, maps, depths, opacities, colors, normals, centers, conics, radii = outputs
+        depths[c, n] = opacities[c, n] = zero
+        for j in range(2):
+            means2d[c, n, j] = centers[c, n, j] = radii[c, n, j] = zero
+        for j in range(3):
+            colors[c, n, j] = normals[c, n, j] = conics[c, n, j] = zero
+        for j in range(MAP):
+            maps[c, n, j] = zero
+
+    return cull
+
+
+def _tangents(real: type) -> Scalar:
+    along = vector_maths().along
+    dot = vector_maths().dot
+
+    @inlined
+    def tangents(rows, offset, mean, axes):  # type: ignore[no-untyped-def]
+        """Both tangents and the centre in camera space."""
+        p = along(axes[0], rows[0], rows[1], rows[2])
+        q = along(axes[1], rows[0], rows[1], rows[2])
+        m = dot(rows[0], mean) + offset[0], dot(rows[1], mean) + offset[1], dot(rows[2], mean) + offset[2]
+        return p, q, m
+
+    return tangents
+
+
+def _towards(real: type) -> Scalar:
+    dot = vector_maths().dot
+    zero, one = real(0.0), real(1.0)
+
+    @inlined
+    def towards(axis, mean, lens, c):  # type: ignore[no-untyped-def]
+        """1 where a disc's axis points to the camera, else -1."""
+        back = lens[c, 4] - mean[0], lens[c, 5] - mean[1], lens[c, 6] - mean[2]
+        return -one if dot(back, axis) < zero else one
+
+    return towards
+
+
+def _place(real: type) -> Scalar:
+    tangents, towards, pose = _tangents(real), _towards(real), view_steps(real).pose
+    crossed, faces, map_of, _ = disc_maths(real)
+    is_finite, outline = shape_maths(real).is_finite, outline_maths().outline
+    reach = outline_maths().reach
+    one, alpha_min = real(1.0), real(ALPHA_MIN)
+
+    @inlined
+    def place(c, n, mean, opacity, axes, deviations, cam_from_world, intrinsics, lens, windows, size, near, outputs):  # type: ignore[no-untyped-def]
+        means2d, maps, depths, opacities, _, normals, centers, conics, radii = outputs
+        row_x, row_y, row_z, offset = pose(cam_from_world, c)
+        p, q, m = tangents((row_x, row_y, row_z), offset, mean, axes)
+        a, b, across = crossed(p, q, m)
+        if not (faces(across, m) and opacity > alpha_min and is_finite(m[2])):
+            return
+        fx, fy = intrinsics[c, 0], intrinsics[c, 1]
+        found = map_of(a, b, across, m, one / deviations[0], one / deviations[1], fx, fy)
+        total = abs(found[0]) + abs(found[1]) + abs(found[2]) + abs(found[3]) + abs(found[4]) + abs(found[5])
+        if not is_finite(total):
+            return
+        slope_u, slope_v = np.float64(p[2] * deviations[0]), np.float64(q[2] * deviations[1])
+        nearest = np.float64(m[2]) - math.sqrt(reach(opacity) * (slope_u * slope_u + slope_v * slope_v))
+        dx, dy, xx, xy, yy, wide, high = outline(found, opacity, nearest, np.float64(near), size[0], size[1])
+        u, v = fx * m[0] / m[2] + intrinsics[c, 2], fy * m[1] / m[2] + intrinsics[c, 3]
+        x, y = u + real(dx), v + real(dy)
+        across_window = x + real(wide) > windows[c, 0] and x - real(wide) < windows[c, 2]
+        down_window = y + real(high) > windows[c, 1] and y - real(high) < windows[c, 3]
+        # Written so that NaN fails every comparison and the disc stays culled.
+        if not ((across_window and down_window) or (xx == 0.0 and is_finite(u) and is_finite(v))):
+            return
+        side = towards(axes[2], mean, lens, c)
+        means2d[c, n, 0], means2d[c, n, 1], depths[c, n], opacities[c, n] = u, v, m[2], opacity
+        centers[c, n, 0], centers[c, n, 1], radii[c, n, 0], radii[c, n, 1] = x, y, real(wide), real(high)
+        conics[c, n, 0], conics[c, n, 1], conics[c, n, 2] = real(xx), real(xy), real(yy)
+        for j in range(3):
+            normals[c, n, j] = side * axes[2][j]
+        maps[c, n, 0], maps[c, n, 1], maps[c, n, 2] = found[0], found[1], found[2]
+        maps[c, n, 3], maps[c, n, 4], maps[c, n, 5] = found[3], found[4], found[5]
+
+    return place
+
+
+def _place_gradient(real: type) -> Scalar:
+    tangents, towards, pose = _tangents(real), _towards(real), view_steps(real).pose
+    crossed, _, _, map_gradient = disc_maths(real)
+    blend, scaled_sum = vector_maths().blend, vector_maths().scaled_sum
+    one = real(1.0)
+
+    @inlined
+    def six(array, c, n):  # type: ignore[no-untyped-def]
+        return array[c, n, 0], array[c, n, 1], array[c, n, 2], array[c, n, 3], array[c, n, 4], array[c, n, 5]
+
+    @inlined
+    def place_gradient(  # type: ignore[no-untyped-def]
+        c, n, mean, axes, deviations, cam_from_world, intrinsics, lens, maps, g_means2d, g_maps, g_depths, g_normals
+    ):  # fmt: skip
+        row_x, row_y, row_z, offset = pose(cam_from_world, c)
+        rows = row_x, row_y, row_z
+        p, q, m = tangents(rows, offset, mean, axes)
+        across = crossed(p, q, m)[2]
+        fx, fy, inverse = intrinsics[c, 0], intrinsics[c, 1], one / m[2]
+        g_p, g_q, g_m, g_u, g_v = map_gradient(
+            p, q, m, across, six(maps, c, n), one / deviations[0], one / deviations[1], fx, fy, six(g_maps, c, n)
+        )
+        g_x, g_y = g_means2d[c, n, 0] * fx * inverse, g_means2d[c, n, 1] * fy * inverse
+        behind = (g_x * m[0] + g_y * m[1]) * inverse
+        g_center = g_m[0] + g_x, g_m[1] + g_y, g_m[2] + g_depths[c, n] - behind
+        side = towards(axes[2], mean, lens, c)
+        g_axes = (
+            scaled_sum(g_p, row_x, row_y, row_z),
+            scaled_sum(g_q, row_x, row_y, row_z),
+            (side * g_normals[c, n, 0], side * g_normals[c, n, 1], side * g_normals[c, n, 2]),
+        )
+        g_rows = (
+            blend(g_p[0], axes[0], g_q[0], axes[1]),
+            blend(g_p[1], axes[0], g_q[1], axes[1]),
+            blend(g_p[2], axes[0], g_q[2], axes[1]),
+        )
+        return g_center, g_rows, g_axes, (g_u, g_v)
+
+    return place_gradient

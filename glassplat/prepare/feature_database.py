@@ -1,0 +1,196 @@
+"""COLMAP's database of one attempt: cameras, photographs, their features and what of them matches.
+
+Photographs go by numbers in it, whatever they are called. What is in it stays: a call that was interrupted goes on.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from glassplat.data.colmap_library import pycolmap
+from glassplat.files.atomic import atomic_write
+from glassplat.prepare.messages import Listener, Progress
+from glassplat.prepare.native_call import interruptible
+from glassplat.prepare.photographs import Photograph, read_photograph
+
+Lens = Literal["simple_pinhole", "simple_radial", "radial", "opencv", "opencv_fisheye"]
+"""COLMAP's camera models, the simplest first: two fish-eyes aside, each next one bends lines in more ways."""
+
+USUAL_FOCAL = 1.2
+"""Focal length in longer image sides, where a photograph does not tell: roughly a telephone's main lens."""
+SEED = 0
+
+
+@dataclass(frozen=True)
+class Features:
+    """How places are recognised in photographs.
+
+    Attributes:
+        most: features of one photograph.
+        least_contrast: of a feature, as COLMAP's peak threshold.
+        from_enlarged: look at twice the size as well, which finds the smallest ones.
+        guided: match a second time along the lines that the first matches lead to.
+    """
+
+    most: int
+    least_contrast: float
+    from_enlarged: bool = True
+    guided: bool = False
+
+
+@dataclass(frozen=True)
+class FeatureDatabase:
+    """The database of one attempt.
+
+    Attributes:
+        path: of the file.
+        pictures: folder of the grey pictures that features are found in.
+        photographs: in the order of their numbers.
+    """
+
+    path: Path
+    pictures: Path
+    photographs: Sequence[Photograph]
+
+    def picture_name(self, index: int) -> str:
+        """What a photograph is called in the database."""
+        return f"{index:06d}.png"
+
+    def create(self, lens: Lens) -> None:
+        """Writes cameras and photographs, if they are not there yet."""
+        with closing(pycolmap.Database.open(self.path)) as database:
+            if database.num_images() == len(self.photographs):
+                return
+            database.clear_all_tables()
+            keys = dict.fromkeys(map(_camera_key, self.photographs))
+            rigs = {key: _new_rig(database, lens, key, self._focal(key)) for key in keys}
+            for index, photograph in enumerate(self.photographs):
+                _add_image(database, self.picture_name(index), *rigs[_camera_key(photograph)])
+
+    def write_pictures(self, listen: Listener) -> None:
+        """Writes the grey pictures that are missing: upright, reduced."""
+        self.pictures.mkdir(parents=True, exist_ok=True)
+        targets = [self.pictures / self.picture_name(index) for index in range(len(self.photographs))]
+        missing = [index for index, target in enumerate(targets) if not target.is_file()]
+        for done, index in enumerate(missing):
+            listen(Progress("reading the photographs", done, len(missing)))
+            with atomic_write(targets[index]) as temporary:
+                pixels = read_photograph(self.photographs[index])
+                Image.fromarray(pixels).convert("L").save(temporary, compress_level=1)
+
+    def extract(self, features: Features, listen: Listener, threads: int) -> None:
+        """Finds the features of the photographs that have none yet."""
+        options = pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False)
+        options.sift.max_num_features = features.most
+        options.sift.peak_threshold = features.least_contrast
+        options.sift.first_octave = -1 if features.from_enlarged else 0
+
+        def work(token: Any) -> None:
+            pycolmap.extract_features(
+                self.path,
+                self.pictures,
+                extraction_options=options,
+                device=pycolmap.Device.cpu,
+                cancellation_token=token,
+            )
+
+        counted = self._counted("looking for features", "keypoints", len(self.photographs), listen)
+        interruptible(work, counted)
+
+    def match(self, pairs: Sequence[tuple[int, int]], features: Features, listen: Listener, threads: int) -> None:
+        """Matches pairs of photographs, by number, that are not matched yet."""
+        listed = self.path.with_suffix(".pairs.txt")
+        names = [(self.picture_name(one), self.picture_name(other)) for one, other in pairs]
+        listed.write_text("".join(f"{one} {other}\n" for one, other in names), encoding="utf-8")
+        matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
+        matching.guided_matching = features.guided
+        verification = pycolmap.TwoViewGeometryOptions()
+        verification.ransac.random_seed = SEED
+
+        def work(token: Any) -> None:
+            pycolmap.match_image_pairs(
+                self.path,
+                matching_options=matching,
+                pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed),
+                verification_options=verification,
+                device=pycolmap.Device.cpu,
+                cancellation_token=token,
+            )
+
+        interruptible(work, self._counted("matching photographs", "two_view_geometries", len(pairs), listen))
+
+    def feature_counts(self) -> NDArray[np.int64]:
+        """[P] features of each photograph."""
+        with closing(pycolmap.Database.open(self.path)) as database:
+            ids = {image.name: image.image_id for image in database.read_all_images()}
+            names = map(self.picture_name, range(len(self.photographs)))
+            return np.array([database.num_keypoints_for_image(ids[name]) for name in names], dtype=np.int64)
+
+    def descriptors(self) -> list[NDArray[np.uint8]]:
+        """[F, 128] of each photograph, the order of the features as found."""
+        with closing(pycolmap.Database.open(self.path)) as database:
+            ids = {image.name: image.image_id for image in database.read_all_images()}
+            names = map(self.picture_name, range(len(self.photographs)))
+            return [np.asarray(database.read_descriptors(ids[name]).data) for name in names]
+
+    def inliers(self) -> dict[tuple[int, int], int]:
+        """How many matches of each pair of photographs, by number, agree on how the camera moved; pairs with any."""
+        with closing(pycolmap.Database.open(self.path)) as database:
+            numbers = {image.image_id: int(Path(image.name).stem) for image in database.read_all_images()}
+            keys, counts = database.read_two_view_geometry_num_inliers()
+        pairs = ((pycolmap.pair_id_to_image_pair(key), count) for key, count in zip(keys, counts, strict=True))
+        return {
+            (min(a, b), max(a, b)): int(count)
+            for (a, b), count in (((numbers[one], numbers[other]), count) for (one, other), count in pairs)
+            if count
+        }
+
+    def _focal(self, key: tuple[str, int, int]) -> float | None:
+        """What the photographs of one camera say of its focal length, the middle one; None where none does."""
+        told = [one.focal for one in self.photographs if _camera_key(one) == key and one.focal is not None]
+        return float(np.median(told)) if told else None
+
+    def _counted(self, what: str, table: str, total: int, listen: Listener) -> Callable[[], None]:
+        """Tells how many rows a table has while COLMAP writes it."""
+
+        def look() -> None:
+            # COLMAP may hold the file, or not have made it yet: then the next look tells.
+            with suppress(sqlite3.Error), closing(sqlite3.connect(self.path, timeout=0.05)) as connection:
+                (rows,) = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()
+                listen(Progress(what, min(int(rows), total), total))
+
+        return look
+
+
+def _camera_key(photograph: Photograph) -> tuple[str, int, int]:
+    return photograph.device, photograph.width, photograph.height
+
+
+def _new_rig(database: Any, lens: Lens, key: tuple[str, int, int], focal: float | None) -> tuple[int, int]:
+    """Adds the camera of a device, alone on its rig; the ids of both."""
+    _, width, height = key
+    model = getattr(pycolmap.CameraModelId, lens.upper())
+    camera = pycolmap.Camera.create_from_model_id(0, model, focal or USUAL_FOCAL * max(width, height), width, height)
+    camera.has_prior_focal_length = focal is not None
+    camera.camera_id = database.write_camera(camera)
+    rig = pycolmap.Rig()
+    rig.add_ref_sensor(camera.sensor_id)
+    return camera.camera_id, database.write_rig(rig)
+
+
+def _add_image(database: Any, name: str, camera_id: int, rig_id: int) -> None:
+    image = pycolmap.Image(name=name, camera_id=camera_id)
+    image.image_id = database.write_image(image)
+    frame = pycolmap.Frame()
+    frame.rig_id = rig_id
+    frame.add_data_id(image.data_id)
+    database.write_frame(frame)

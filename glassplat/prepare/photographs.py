@@ -1,0 +1,197 @@
+"""Photographs as cameras and telephones leave them: which there are, what they are called, which way is up."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import ExifTags, Image, ImageOps
+
+from glassplat.data.errors import InputError, first_names
+from glassplat.files.images import IMAGE_SUFFIXES, SHADES_16, image_size, opened, read_image
+from glassplat.files.picture_paths import picture_paths
+from glassplat.files.reading import reading
+from glassplat.prepare.messages import Listener, Progress
+
+UNREADABLE = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
+"""Photographs that Pillow cannot read: those of telephones that nobody told otherwise, and raw ones."""
+LEAST_SIDE = 64
+"""Pixels of the shorter side; a smaller picture holds too few places to recognise."""
+FEWEST = 3
+FILM_DIAGONAL = math.hypot(36, 24)
+"""Millimetres, of the film that focal lengths are converted to."""
+SIDEWAYS = (5, 6, 7, 8)
+"""Values of the EXIF orientation that turn a photograph by a quarter."""
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """One photograph to place.
+
+    Attributes:
+        path: the file.
+        name: in the capture, with `/` between folders.
+        width, height: upright and reduced, as it is used.
+        device: what took it; photographs of one device and size share a lens.
+        focal: in pixels of the reduced photograph; None where the file does not tell.
+    """
+
+    path: Path
+    name: str
+    width: int
+    height: int
+    device: str
+    focal: float | None
+
+
+def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photograph]:
+    """The photographs below a folder in the order in which they were numbered; every one is decoded once, to check it.
+
+    Raises:
+        InputError: there are too few, one is broken or too small, or they are of a kind that cannot be read.
+    """
+    paths = _photograph_paths(folder)
+    names = capture_names(paths, folder)
+    found: dict[bytes, Photograph] = {}
+    twins: list[str] = []
+    for done, path in enumerate(paths):
+        listen(Progress("looking at the photographs", done, len(paths)))
+        photograph, contents = _examined(path, names[path], max_size)
+        if contents in found:
+            twins.append(f"{path.name} (as {found[contents].path.name})")
+        else:
+            found[contents] = photograph
+    if len(found) < FEWEST:
+        same = f", and {first_names(twins)} the same again" if twins else ""
+        raise InputError(
+            f"{folder} holds {len(found)} photographs{same}; expected at least {FEWEST}, and better 30 or more, taken "
+            "from places a step apart"
+        )
+    return list(found.values())
+
+
+def capture_names(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
+    """What each photograph is called in the capture: its own name below the folder, as a JPEG.
+
+    All differ without suffix, too, as masks need it. Names that are no text, or have line breaks, are made readable.
+    """
+    spoken = {path: _readable(path.relative_to(folder).as_posix()) for path in paths}
+    # Two files may become one name, as when both held bytes that are no text.
+    counts: Counter[str] = Counter()
+    for path, name in spoken.items():
+        counts[name] += 1
+        if counts[name] > 1:
+            spoken[path] = f"{name}-{counts[name]}"
+    pictures = picture_paths(list(spoken.values()))
+    return {path: pictures[name].with_suffix(".jpg").as_posix() for path, name in spoken.items()}
+
+
+def _readable(name: str) -> str:
+    return re.sub(r"[\x00-\x1f\x7f\ud800-\udfff]", "_", name)
+
+
+def read_photograph(photograph: Photograph) -> NDArray[np.uint8]:
+    """[H, W, 3] sRGB, upright, reduced; transparent parts black.
+
+    Raises:
+        InputError: the file has changed since it was looked at, or cannot be read.
+    """
+    try:
+        image = _upright(photograph.path).resize(
+            (photograph.width, photograph.height), Image.Resampling.LANCZOS, reducing_gap=3
+        )
+    except (ValueError, FileNotFoundError) as error:
+        raise InputError(str(error)) from error
+    return np.ascontiguousarray(image, dtype=np.uint8)
+
+
+def _upright(path: Path) -> Image.Image:
+    """The picture as eight-bit RGB, turned as its EXIF tag says."""
+    with opened(path) as image:
+        orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+        if image.mode not in SHADES_16:
+            return ImageOps.exif_transpose(image).convert("RGB")
+    grey = Image.fromarray(read_image(path)[:, :, 0])
+    grey.getexif()[ExifTags.Base.Orientation] = orientation
+    return ImageOps.exif_transpose(grey).convert("RGB")
+
+
+def _photograph_paths(folder: Path) -> list[Path]:
+    """Image files below a folder by their numbers: 2.jpg before 10.jpg.
+
+    Raises:
+        InputError: there are none, or some that cannot be read.
+    """
+    if not folder.is_dir():
+        raise InputError(f"no folder or video {folder}; expected a folder of photographs, or a video file")
+    files = [path for path in folder.rglob("*") if path.is_file() and not _is_hidden(path, folder)]
+    unreadable = sorted(path.name for path in files if path.suffix.lower() in UNREADABLE)
+    if unreadable:
+        kinds = "/".join(sorted({Path(name).suffix[1:].upper() for name in unreadable}))
+        raise InputError(
+            f"{len(unreadable)} photographs in {folder} are {kinds} files, which cannot be read "
+            f"({first_names(unreadable)}); save them as JPEG and remove these (a telephone does so by itself with "
+            "'most compatible' in the camera's settings)"
+        )
+    paths = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
+    if not paths:
+        found = first_names(sorted(path.name for path in files)) or "nothing"
+        raise InputError(f"no photograph in {folder}; expected {', '.join(IMAGE_SUFFIXES)} files, found {found}")
+    return sorted(paths, key=lambda path: _numbers_as_such(path.relative_to(folder).as_posix()))
+
+
+def _is_hidden(path: Path, folder: Path) -> bool:
+    return any(part.startswith(".") for part in path.relative_to(folder).parts)
+
+
+def _numbers_as_such(name: str) -> tuple[tuple[int, int, str], ...]:
+    """A key that sorts the numbers in a name by their value."""
+    parts = re.findall(r"\d+|\D+", name)
+    return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts)
+
+
+def _examined(path: Path, name: str, max_size: int) -> tuple[Photograph, bytes]:
+    """A photograph and a fingerprint of its file; decoded at a small size, which finds files that are cut off."""
+    try:
+        size = image_size(path)
+        with opened(path) as image:
+            exif = image.getexif()
+            sideways = exif.get(ExifTags.Base.Orientation) in SIDEWAYS
+            tags = dict(exif) | dict(exif.get_ifd(ExifTags.IFD.Exif))
+            image.draft("RGB", (LEAST_SIDE, LEAST_SIDE))
+            image.load()
+        with reading(path):
+            contents = hashlib.blake2b(path.read_bytes(), digest_size=16).digest()
+    except (ValueError, FileNotFoundError) as error:
+        raise InputError(str(error)) from error
+    if min(size) < LEAST_SIDE:
+        raise InputError(
+            f"{path} is {size[0]}x{size[1]} pixels large; expected a photograph, {LEAST_SIDE} pixels at least along "
+            "each side: remove it"
+        )
+    width, height = size[::-1] if sideways else size
+    scale = min(1.0, max_size / max(size))
+    width, height = round(width * scale), round(height * scale)
+    return Photograph(path, name, width, height, _device(tags), _focal(tags, width, height)), contents
+
+
+def _device(tags: dict) -> str:
+    """Maker, model, lens and zoom, as far as the file tells."""
+    kinds = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.LensModel, ExifTags.Base.FocalLength)
+    return " ".join(str(tags[kind]).strip("\0 ") for kind in kinds if tags.get(kind))
+
+
+def _focal(tags: dict, width: int, height: int) -> float | None:
+    """The focal length in pixels of the reduced photograph, from that converted to 35 mm film."""
+    try:
+        focal = float(tags.get(ExifTags.Base.FocalLengthIn35mmFilm) or 0)
+    except (TypeError, ValueError):
+        return None
+    return focal / FILM_DIAGONAL * math.hypot(width, height) if 5 <= focal <= 2000 else None

@@ -1,0 +1,42 @@
+"""Photographs of the bundled scene as people bring them: alone, without poses."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from glassplat.commands.demo import SCENE
+from glassplat.prepare.messages import Note, Progress
+
+CONNECTED = ("0000", "0001", "0003", "0004", "0006", "0007", "0009", "0010", "0012", "0013")
+"""Of the bundled scene, photographs that show enough of the same."""
+
+
+def copy_photographs(folder: Path) -> Path:
+    """Copies the connected photographs under names with spaces and letters beyond ASCII."""
+    folder.mkdir(parents=True)
+    for name in CONNECTED:
+        shutil.copy(SCENE / "images" / f"{name}.jpg", folder / f"Bild ä {name}.jpg")
+    return folder
+
+
+@pytest.fixture
+def photographs(tmp_path: Path) -> Path:
+    return copy_photographs(tmp_path / "my photographs")
+
+
+class Heard(list):
+    """Keeps what a preparation says."""
+
+    def __call__(self, message: Progress | Note) -> None:
+        self.append(message)
+
+    def whats(self) -> set[str]:
+        return {message.what for message in self if isinstance(message, Progress)}
+
+
+@pytest.fixture
+def heard() -> Heard:
+    return Heard()

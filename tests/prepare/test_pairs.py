@@ -1,0 +1,44 @@
+"""Few photographs are all compared; of many, neighbours and those that look alike."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from glassplat.prepare.pairs import MOST_EXHAUSTIVE, alike_pairs, all_pairs, chosen_pairs, neighbouring_pairs
+
+
+def walk_round(count: int, *, places: int = 30) -> list[np.ndarray]:
+    """Descriptors along a walk that comes back to where it began: each place has features of its own."""
+    rng = np.random.default_rng(0)
+    features = rng.integers(0, 120, (count, places, 128))
+    shown = [np.concatenate([features[(k + step) % count] for step in range(3)]) for k in range(count)]
+    return [np.clip(one + rng.integers(-3, 4, one.shape), 0, 255).astype(np.uint8) for one in shown]
+
+
+def test_all_pairs_are_each_once() -> None:
+    pairs = all_pairs(5)
+    assert len(pairs) == len({frozenset(pair) for pair in pairs}) == 10
+
+
+def test_few_photographs_are_all_compared() -> None:
+    assert len(chosen_pairs([np.zeros((0, 128), np.uint8)] * MOST_EXHAUSTIVE)) == MOST_EXHAUSTIVE * 79 // 2
+
+
+def test_of_many_a_loop_is_closed_by_what_looks_alike() -> None:
+    count = 100
+    descriptors = walk_round(count)
+    pairs = set(chosen_pairs(descriptors))
+    assert set(neighbouring_pairs(count)) <= pairs
+    assert (count - 1, 0) in pairs and (count - 1, 0) not in neighbouring_pairs(count)
+    assert len(pairs) < count * (count - 1) / 4
+    assert all(one > other for one, other in pairs)
+
+
+def test_the_likest_share_features() -> None:
+    found = {frozenset(pair) for pair in alike_pairs(walk_round(60))}
+    assert all(frozenset((k, (k + 1) % 60)) in found for k in range(60))
+
+
+def test_photographs_without_features_are_no_obstacle() -> None:
+    descriptors = [*walk_round(90), np.zeros((0, 128), np.uint8)]
+    assert chosen_pairs(descriptors) == chosen_pairs(descriptors)

@@ -1,0 +1,186 @@
+"""Photographs as devices leave them are read upright, in colour, and named so that masks can be named after them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+from glassplat.data.errors import InputError
+from glassplat.prepare.photographs import Photograph, capture_names, photographs_in, read_photograph
+from tests.prepare.conftest import Heard
+
+SIZE = (120, 90)
+
+
+def picture(seed: int = 0, size: tuple[int, int] = SIZE) -> Image.Image:
+    """Noise with a red corner at the upper left."""
+    pixels = np.random.default_rng(seed).integers(0, 100, (size[1], size[0], 3), dtype=np.uint8)
+    pixels[: size[1] // 3, : size[0] // 3] = (250, 10, 10)
+    return Image.fromarray(pixels)
+
+
+def three(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for seed in range(3):
+        picture(seed).save(folder / f"{seed}.png")
+    return folder
+
+
+def found(folder: Path, heard: Heard, max_size: int = 1600) -> dict[str, Photograph]:
+    return {one.path.name: one for one in photographs_in(folder, max_size, heard)}
+
+
+def corner(photograph: Photograph) -> tuple[int, ...]:
+    """The colour near the upper left."""
+    return tuple(int(value) for value in read_photograph(photograph)[10, 10])
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_photographs_stand_upright(orientation: int, tmp_path: Path, heard: Heard) -> None:
+    folder, upright = three(tmp_path / "in"), picture(9)
+    undone = {
+        2: Image.Transpose.FLIP_LEFT_RIGHT,
+        3: Image.Transpose.ROTATE_180,
+        4: Image.Transpose.FLIP_TOP_BOTTOM,
+        5: Image.Transpose.TRANSPOSE,
+        6: Image.Transpose.ROTATE_90,
+        7: Image.Transpose.TRANSVERSE,
+        8: Image.Transpose.ROTATE_270,
+    }
+    stored = upright.transpose(undone[orientation]) if orientation in undone else upright
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    stored.save(folder / "turned.jpg", exif=exif, quality=95)
+    photograph = found(folder, heard)["turned.jpg"]
+    assert (photograph.width, photograph.height) == SIZE
+    assert corner(photograph)[0] > 200 and corner(photograph)[1] < 60
+
+
+@pytest.mark.parametrize("mode", ["CMYK", "L", "RGBA", "P", "I;16"])
+def test_every_kind_of_pixel_becomes_colour(mode: str, tmp_path: Path, heard: Heard) -> None:
+    folder = three(tmp_path / "in")
+    if mode == "I;16":
+        image = Image.fromarray((np.asarray(picture(9).convert("L")).astype(np.uint16)) * 257)
+    else:
+        image = picture(9).convert(mode)
+    image.save(folder / "other.tif")
+    pixels = read_photograph(found(folder, heard)["other.tif"])
+    assert pixels.shape == (90, 120, 3) and pixels.dtype == np.uint8
+    corner, elsewhere = pixels[:30, :40].mean(axis=(0, 1)), pixels[40:].mean(axis=(0, 1))
+    assert corner[0] > elsewhere[0] + 20
+    if mode not in ("L", "I;16"):
+        assert corner[0] > 200 and corner[1] < 60
+
+
+def test_photographs_are_reduced_and_the_focal_length_with_them(tmp_path: Path, heard: Heard) -> None:
+    folder = three(tmp_path / "in")
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 26
+    picture(9, (800, 600)).save(folder / "large.jpg", exif=exif)
+    photograph = found(folder, heard, max_size=400)["large.jpg"]
+    assert (photograph.width, photograph.height) == (400, 300)
+    assert photograph.focal == pytest.approx(26 / 43.2666 * 500, rel=1e-3)
+    assert read_photograph(photograph).shape == (300, 400, 3)
+    assert found(folder, heard)["0.png"].focal is None
+
+
+def test_devices_are_told_apart(tmp_path: Path, heard: Heard) -> None:
+    folder = three(tmp_path / "in")
+    for seed, model in enumerate(("one", "one", "other"), start=5):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Model] = model
+        picture(seed).save(folder / f"{seed}.jpg", exif=exif)
+    shots = found(folder, heard)
+    assert shots["5.jpg"].device == shots["6.jpg"].device != shots["7.jpg"].device
+
+
+def test_numbers_are_sorted_by_value_and_folders_stay(tmp_path: Path, heard: Heard) -> None:
+    folder = three(tmp_path / "in")
+    three(folder / "left")
+    for seed, name in enumerate(("10.png", "9.png", "left/10.png"), start=20):
+        picture(seed).save(folder / name)
+    (folder / ".hidden.png").write_text("no picture")
+    (folder / "notes.txt").write_text("about them")
+    for path in sorted(folder.glob("left/?.png")):
+        picture(40 + int(path.stem)).save(path)
+    names = [one.name for one in photographs_in(folder, 1600, heard)]
+    flat = ["0.jpg", "1.jpg", "2.jpg", "9.jpg", "10.jpg"]
+    assert names == [*flat, "left/0.jpg", "left/1.jpg", "left/2.jpg", "left/10.jpg"]
+
+
+def test_names_differ_without_suffix_too(tmp_path: Path) -> None:
+    paths = [tmp_path / name for name in ("a.jpg", "a.png", "b.tif", "c\n.jpg", "B.tif")]
+    names = capture_names(paths, tmp_path)
+    stems = {Path(name).stem.casefold() for name in names.values()}
+    assert len(stems) == len(paths)
+    assert all(name.endswith(".jpg") and "\n" not in name for name in names.values())
+
+
+def test_names_that_are_no_text_can_be_written(tmp_path: Path, heard: Heard) -> None:
+    folder = three(tmp_path / "in")
+    for seed, name in enumerate((b"caf\xe9.png", b"caf\xea.png"), start=7):
+        picture(seed).save(tmp_path / "x.png")
+        os.rename(tmp_path / "x.png", os.path.join(os.fsencode(folder), name))
+    names = [one.name for one in photographs_in(folder, 1600, heard)]
+    assert len({name.encode() for name in names}) == 5
+
+
+def test_the_same_photograph_counts_once(tmp_path: Path, heard: Heard) -> None:
+    folder = three(tmp_path / "in")
+    (folder / "copy.png").write_bytes((folder / "1.png").read_bytes())
+    assert sorted(found(folder, heard)) == ["0.png", "1.png", "2.png"]
+
+
+def broken(folder: Path) -> None:
+    data = (folder / "1.png").read_bytes()
+    (folder / "1.png").write_bytes(data[: len(data) // 2])
+
+
+def no_picture(folder: Path) -> None:
+    (folder / "1.png").write_text("<html>not found</html>")
+
+
+def tiny(folder: Path) -> None:
+    picture(5, (30, 20)).save(folder / "thumbnail.png")
+
+
+def heic(folder: Path) -> None:
+    (folder / "IMG_1.HEIC").write_bytes(b"....ftypheic")
+
+
+def too_few(folder: Path) -> None:
+    (folder / "1.png").unlink()
+
+
+def only_twins(folder: Path) -> None:
+    for name in ("1.png", "2.png"):
+        (folder / name).write_bytes((folder / "0.png").read_bytes())
+
+
+def nothing(folder: Path) -> None:
+    for path in list(folder.iterdir()):
+        path.unlink()
+    (folder / "notes.txt").write_text("")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "expected"),
+    [
+        (broken, r"cannot read .*1\.png as an image"),
+        (no_picture, r"cannot read .*1\.png as an image"),
+        (tiny, r"thumbnail\.png is 30x20 pixels large; expected a photograph, 64"),
+        (heic, r"1 photographs in .* are HEIC files.*IMG_1\.HEIC.*save them as JPEG"),
+        (too_few, r"holds 2 photographs; expected at least 3"),
+        (only_twins, r"holds 1 photographs, and 1\.png \(as 0\.png\), 2\.png \(as 0\.png\) the same again"),
+        (nothing, r"no photograph in .*found notes\.txt"),
+    ],
+)
+def test_what_cannot_be_used_is_named(spoil: object, expected: str, tmp_path: Path, heard: Heard) -> None:
+    folder = three(tmp_path / "in")
+    spoil(folder)  # type: ignore[operator]
+    with pytest.raises(InputError, match=expected):
+        photographs_in(folder, 1600, heard)

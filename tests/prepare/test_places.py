@@ -1,0 +1,65 @@
+"""What lies in the way of a preparation is named, and stays as it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from glassplat.cli import main
+
+
+def refused(source: Path, output: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    assert main(["prepare", str(source), "--output", str(output)]) == 2
+    return " ".join(capsys.readouterr().err.split())
+
+
+def test_a_folder_that_holds_something_else_stays(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "diary.txt").write_text("dear diary")
+    assert "not from `glassplat prepare` (it holds diary.txt)" in refused(photographs, tmp_path / "mine", capsys)
+    assert main(["prepare", str(photographs), "--output", str(tmp_path / "mine"), "--force"]) == 2
+    assert (tmp_path / "mine" / "diary.txt").read_text() == "dear diary"
+
+
+def test_something_else_in_the_place_of_work_stays(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "capture.partial").mkdir()
+    (tmp_path / "capture.partial" / "diary.txt").write_text("dear diary")
+    assert main(["prepare", str(photographs), "--output", str(tmp_path / "capture"), "--force"]) == 2
+    assert "capture.partial is in the way" in " ".join(capsys.readouterr().err.split())
+    assert (tmp_path / "capture.partial" / "diary.txt").read_text() == "dear diary"
+
+
+def test_the_output_may_not_lie_among_the_photographs(photographs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for output in (photographs, photographs / "capture"):
+        assert "lies inside of the photographs' folder" in refused(photographs, output, capsys)
+    assert len(list(photographs.iterdir())) == 10
+
+
+def test_a_file_that_is_no_video_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "notes.txt").write_text("")
+    assert "expected a folder of photographs, or a video" in refused(tmp_path / "notes.txt", tmp_path / "c", capsys)
+    assert "no folder or video" in refused(tmp_path / "nowhere", tmp_path / "c", capsys)
+
+
+def test_photographs_that_cannot_be_used_leave_nothing_behind(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (photographs / "broken.jpg").write_bytes(b"\xff\xd8\xff\xe0 cut off")
+    assert "broken.jpg as an image" in refused(photographs, tmp_path / "capture", capsys)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [photographs.name]
+
+
+def test_too_little_texture_says_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from PIL import Image
+
+    (tmp_path / "in").mkdir()
+    for shade in range(100, 105):
+        Image.new("RGB", (320, 240), (shade, shade, shade)).save(tmp_path / "in" / f"{shade}.png")
+    message = refused(tmp_path / "in", tmp_path / "capture", capsys)
+    assert "5 of 5 photographs show fewer than 50 places" in message
+    assert not (tmp_path / "capture").exists()

@@ -1,0 +1,137 @@
+"""Photographs alone become a capture with the right poses, or one message that says why not."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageOps
+
+from glassplat.cli import main
+from glassplat.commands.demo import SCENE
+from glassplat.data.dataset import Dataset, load_dataset
+from glassplat.data.errors import InputError
+from glassplat.prepare.messages import Note, Progress
+from glassplat.prepare.preparation import Preparation, prepare
+from glassplat.prepare.reconstruction import Settings
+from tests.prepare.conftest import CONNECTED, Heard, copy_photographs
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The capture that the command makes, once for all that look at it."""
+    folder = tmp_path_factory.mktemp("prepared")
+    source = copy_photographs(folder / "photographs")
+    assert main(["prepare", str(source), "--output", str(folder / "the capture")]) == 0
+    return folder / "the capture"
+
+
+def centers(dataset: Dataset) -> dict[str, np.ndarray]:
+    """Camera centres by the number of the photograph."""
+    return {Path(v.name).stem[-4:]: v.camera.center.double().numpy() for v in (*dataset.train, *dataset.test)}
+
+
+def aligned(points: np.ndarray, onto: np.ndarray) -> np.ndarray:
+    """The points after the similarity that brings them closest to others (Umeyama 1991)."""
+    one, other = points - points.mean(0), onto - onto.mean(0)
+    u, sizes, vt = np.linalg.svd(other.T @ one)
+    signs = np.array([1, 1, np.linalg.det(u @ vt)])
+    scale = (sizes * signs).sum() / (one**2).sum()
+    return scale * one @ (u * signs @ vt).T + onto.mean(0)
+
+
+def test_every_photograph_is_placed_where_it_was_taken(prepared: Path) -> None:
+    found, truth = centers(load_dataset(prepared)), centers(load_dataset(SCENE))
+    assert sorted(found) == sorted(CONNECTED)
+    expected = np.stack([truth[name] for name in sorted(found)])
+    away = aligned(np.stack([found[name] for name in sorted(found)]), expected) - expected
+    radius = np.linalg.norm(expected - expected.mean(0), axis=1).max()
+    assert np.linalg.norm(away, axis=1).max() < 0.03 * radius
+
+
+def test_the_focal_length_is_found(prepared: Path) -> None:
+    camera = load_dataset(prepared).train[0].camera
+    assert camera.fx == pytest.approx(166.4, rel=0.03)
+
+
+def test_the_model_fits_the_straightened_photographs(prepared: Path) -> None:
+    from glassplat.data.colmap_library import pycolmap
+
+    model = pycolmap.Reconstruction(prepared / "sparse" / "0")
+    model.update_point_3d_errors()
+    assert model.compute_mean_reprojection_error() < 1
+    assert {camera.model_name for camera in model.cameras.values()} == {"PINHOLE"}
+
+
+def test_points_have_the_colours_of_the_photographs(prepared: Path) -> None:
+    dataset = load_dataset(prepared)
+    differences = []
+    for view in dataset.train:
+        pixels, depth = view.camera.project(dataset.points.positions)
+        inside = (pixels >= 0).all(1) & (pixels < pixels.new_tensor(view.photo.shape[1::-1])).all(1) & (depth > 0)
+        column, row = pixels[inside].long().T
+        differences.append((view.photo[row, column].int() - dataset.points.colors[inside].int()).abs().float().mean())
+    assert float(np.mean(differences)) < 40  # Grey, or the colours of other points, would be twice as far off.
+
+
+def test_the_record_holds_the_report_and_nothing_else_is_left(prepared: Path) -> None:
+    record = json.loads((prepared / "prepare.json").read_text())
+    assert record["report"]["registered"] == len(CONNECTED)
+    assert sorted(path.name for path in prepared.iterdir()) == ["images", "prepare.json", "sparse"]
+    assert not prepared.with_name("the capture.partial").exists()
+
+
+def test_a_capture_is_replaced_only_by_force(prepared: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = prepared.parent / "photographs"
+    before = (prepared / "sparse" / "0" / "images.bin").read_bytes()
+    assert main(["prepare", str(source), "--output", str(prepared)]) == 2
+    assert "--force" in capsys.readouterr().err
+    (prepared / "masks").mkdir()
+    assert main(["prepare", str(source), "--output", str(prepared), "--force"]) == 2
+    assert "which somebody made" in " ".join(capsys.readouterr().err.split())
+    (prepared / "masks").rmdir()
+    assert (prepared / "sparse" / "0" / "images.bin").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "phase", ["looking for features", "matching photographs", "placing the photographs", "writing"]
+)
+def test_what_was_interrupted_goes_on(phase: str, photographs: Path, tmp_path: Path, heard: Heard) -> None:
+    task = Preparation(photographs, tmp_path / "capture")
+
+    def interrupt(message: Progress | Note) -> None:
+        if isinstance(message, Progress) and message.what.startswith(phase):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        prepare(task, interrupt)
+    assert not task.output.exists()
+    with pytest.raises(InputError, match="--resume"):
+        prepare(task, heard)
+    with pytest.raises(InputError, match="another max-size"):
+        prepare(Preparation(photographs, task.output, max_size=640), heard, resume=True)
+    heard.clear()
+    assert prepare(task, heard, resume=True).registered == len(CONNECTED)
+    assert "reading the photographs" not in heard.whats()
+    assert len(load_dataset(task.output).train) == 8
+
+
+def test_the_global_mapper_places_them_too(photographs: Path, tmp_path: Path, heard: Heard) -> None:
+    task = Preparation(photographs, tmp_path / "capture", settings=Settings(mapper="global"))
+    assert prepare(task, heard).registered >= 8
+
+
+def test_photographs_of_two_places_are_refused_with_their_groups(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # A mirrored negative is another place to whoever looks for the same features; the negative, as panes mirror too.
+    for path in sorted(photographs.iterdir()):
+        with Image.open(path) as image:
+            ImageOps.invert(ImageOps.mirror(image)).save(path.with_name(f"other {path.name}"), quality=95)
+    assert main(["prepare", str(photographs), "--output", str(tmp_path / "capture")]) == 2
+    message = " ".join(capsys.readouterr().err.split())
+    assert "of 20 photographs could be placed, expected at least 80%" in message
+    assert "groups that share nothing" in message and "--least-registered" in message
+    assert not (tmp_path / "capture").exists()
