@@ -45,6 +45,11 @@ COMMANDS = {
         "Dereflect",
         "Take the reflections out of a planar run's photographs; one PNG per photograph, under its name.",
     ),
+    "import": Listed(
+        "import_splats",
+        "Import",
+        "Read a splat file (PLY, compressed PLY, SPZ, .splat) of any program as a scene to look at, film and export.",
+    ),
     "export": Listed(
         "export",
         "Export",

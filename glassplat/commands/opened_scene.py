@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from glassplat.commands.stored_run import Split
+from glassplat.data.dataset import TEST_EVERY
 from glassplat.data.errors import InputError, input_checked
 from glassplat.files.cameras_json import read_cameras
 from glassplat.kernels.devices import DeviceName, chosen_device
@@ -16,7 +17,6 @@ from glassplat.train.background import BLACK, with_background
 from glassplat.train.run_directory import RunDirectory
 
 NamedCameras = tuple[tuple[str, Camera], ...]
-TEST_EVERY = 8
 
 
 class OpenedScene(NamedTuple):
