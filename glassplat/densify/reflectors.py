@@ -19,6 +19,9 @@ from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import SH_ZERO
 from glassplat.scene.scene import Scene
 
+LEAST_SHOWN = 0.1
+"""Pixels, of all views together, below which a Gaussian is not seen."""
+
 
 @dataclass(frozen=True)
 class Search:
@@ -50,6 +53,13 @@ class Search:
         shown, spreads = residual_spreads(scene, self._chosen(views), renderer)
         reflects = scene.primary.channels["logit_strength"] > logit(self.strength)
         return mean_in_region(scene, shown, ~reflects & (spreads > self.spread))
+
+    @torch.no_grad()
+    def matte(self, scene: Scene, views: Sequence[View], renderer: Renderer) -> Tensor:
+        """[N] bool: which primary Gaussians are seen, do not reflect and do not look as if they should."""
+        shown, spreads = residual_spreads(scene, self._chosen(views), renderer)
+        reflects = scene.primary.channels["logit_strength"] > logit(self.strength)
+        return (shown > LEAST_SHOWN) & ~reflects & (spreads <= self.spread)
 
     def _chosen(self, views: Sequence[View]) -> list[View]:
         """Evenly among all of them."""
@@ -96,5 +106,5 @@ def residual_sums(scene: Scene, view: View, renderer: Renderer) -> Tensor:
         sh = scene.primary.sh.detach().requires_grad_()
         frame = renderer(scene.with_parameters({"primary.sh": sh}), view.camera)
         residual = view.photo.to(frame.rgb) / 255 - frame.rgb.detach()
-        (gradient,) = torch.autograd.grad((residual * frame.layers["base"]).sum(), sh)
+        (gradient,) = torch.autograd.grad((residual * frame.layers.get("base", frame.rgb)).sum(), sh)
     return gradient[:, 0] / SH_ZERO

@@ -66,17 +66,14 @@ def surroundings_in_box(
     )
 
 
-def copied_surroundings(primary: Gaussians, *, most_strength: float, least_opacity: float, sh_degree: int) -> Gaussians:
-    """Copies of what is opaque and hardly reflects: what stands around in the picture is what mirrors show.
+def copied_surroundings(primary: Gaussians, chosen: Tensor, *, sh_degree: int) -> Gaussians:
+    """Copies of what stands in the scene and does not reflect: that is what mirrors show of it.
 
     Args:
-        primary: with a channel `logit_strength`.
-        most_strength: what reflects more is left out; a mirror does not show itself where it is convex.
-        least_opacity: what is less opaque is left out.
+        primary: the scene's Gaussians.
+        chosen: [N] bool, which ones to copy.
         sh_degree: highest degree to make room for; degree 0 is active.
     """
-    strengths, opacities = primary.channels["logit_strength"], primary.logit_opacities
-    chosen = (strengths < logit(most_strength)) & (opacities > logit(least_opacity))
     kept = primary.select(chosen)
     coefficients = (sh_degree + 1) ** 2
     sh = kept.sh.new_zeros(len(kept), coefficients, 3)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 from glassplat.data.dataset import Dataset
-from glassplat.data.ranges import ESSENTIAL, InnerShare, Range
+from glassplat.data.ranges import ESSENTIAL, InnerShare, Range, Share
 from glassplat.densify.edit import apply_edit
 from glassplat.densify.order import in_morton_order
+from glassplat.densify.reflectors import Search
 from glassplat.init.surroundings import (
     copied_surroundings,
     joined,
@@ -16,6 +17,7 @@ from glassplat.init.surroundings import (
     suitable_cells,
     surroundings_in_box,
 )
+from glassplat.render.frame import Renderer
 from glassplat.scene.gaussians import Gaussians
 from glassplat.train.state import TrainState
 
@@ -32,7 +34,8 @@ class SurroundingsStart:
         outside: share of the points left out of the box at either end of each axis.
         opacity: of those in the box.
         copied_strength: what reflects more is not copied.
-        copied_opacity: what is less opaque is not copied.
+        copied_spread: what differs from the photographs by residuals that spread by more over the views is not copied:
+            it mirrors, and has what it mirrors painted on, which rays would meet first.
     """
 
     source: Annotated[Literal["box", "scene", "both"], ESSENTIAL] = "both"
@@ -41,7 +44,7 @@ class SurroundingsStart:
     outside: Annotated[float, Range(0, 0.45)] = 0.005
     opacity: InnerShare = 0.1
     copied_strength: InnerShare = 0.1
-    copied_opacity: InnerShare = 0.3
+    copied_spread: Share = 0.04
 
 
 @dataclass(frozen=True)
@@ -51,10 +54,12 @@ class AddSurroundings:
     Attributes:
         start: what they are.
         sh_degree: highest degree of their colours.
+        renderer: that of the stage before.
     """
 
-    start: SurroundingsStart = field(default_factory=SurroundingsStart)
-    sh_degree: int = 2
+    start: SurroundingsStart
+    sh_degree: int
+    renderer: Renderer
 
     def __call__(self, state: TrainState, dataset: Dataset) -> None:
         """Edits `state`."""
@@ -67,14 +72,9 @@ class AddSurroundings:
     def _parts(self, state: TrainState, dataset: Dataset) -> list[Gaussians]:
         parts = []
         if self.start.source != "box":
-            parts.append(
-                copied_surroundings(
-                    state.scene.primary,
-                    most_strength=self.start.copied_strength,
-                    least_opacity=self.start.copied_opacity,
-                    sh_degree=self.sh_degree,
-                )
-            )
+            search = Search(strength=self.start.copied_strength, spread=self.start.copied_spread)
+            matte = search.matte(state.scene, dataset.train, self.renderer)
+            parts.append(copied_surroundings(state.scene.primary, matte, sh_degree=self.sh_degree))
         if self.start.source != "scene":
             parts.append(self._in_box(state, dataset))
         return parts

@@ -25,6 +25,7 @@ from glassplat.densify.propagate import NormalPropagation
 from glassplat.losses.monocular import MonocularNormals
 from glassplat.losses.term import LossTerm, weighted
 from glassplat.render.deferred import INVISIBLE, Deferred
+from glassplat.render.splat import Splat
 from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene.gaussians import SH_ZERO
 from glassplat.scene.scene import Scene
@@ -213,7 +214,8 @@ class TracedRecipe:
         if self.mirrors == "environment":
             return bootstrap, distant, refinement
         near = self._tracing(distant)
-        around = AddSurroundings(self.surroundings.start, self.surroundings.sh_degree)
+        seen_by = Splat(self.background or BLACK) if self.mirrors == "surroundings" else distant.renderer
+        around = AddSurroundings(self.surroundings.start, self.surroundings.sh_degree, seen_by)
         near = replace(near, name="2 reflection", entry=around)
         refinement = self._tracing(refinement)
         if self.mirrors == "surroundings":

@@ -65,18 +65,15 @@ def test_small_photographs_get_fewer_cells(pixels: int, cells: int) -> None:
     assert suitable_cells(pixels, 5) == cells
 
 
-def test_what_reflects_or_is_faint_is_not_copied() -> None:
+def test_copies_keep_as_many_harmonics_as_they_may() -> None:
     primary = in_single_precision(showcase()).primary
-    strengths = torch.full((len(primary),), -6.0)
-    strengths[:5] = 2.0
-    opacities = torch.full((len(primary),), 2.0)
-    opacities[5:8] = -2.0
-    primary = replace(primary.with_tensors({"logit_opacities": opacities}), channels={"logit_strength": strengths})
-    found = copied_surroundings(primary, most_strength=0.1, least_opacity=0.3, sh_degree=1)
+    chosen = torch.arange(len(primary)) >= 8
+    found = copied_surroundings(primary, chosen, sh_degree=1)
     assert torch.equal(found.means, primary.means[8:]) and not found.channels
     assert torch.equal(found.sh, primary.sh[8:, :4]) and found.active_sh_degree == 1
-    more = copied_surroundings(primary, most_strength=0.1, least_opacity=0.3, sh_degree=3)
+    more = copied_surroundings(primary, chosen, sh_degree=3)
     assert torch.equal(more.sh[:, :9], primary.sh[8:]) and int(more.sh[:, 9:].count_nonzero()) == 0
+    assert more.means.data_ptr() != primary.means.data_ptr()
 
 
 def test_sets_are_joined_in_order() -> None:

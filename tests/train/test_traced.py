@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.densify.default import DefaultDensify, ScreenStatistics, accumulate_in_space
+from glassplat.densify.default import DefaultDensify, ScreenStatistics
 from glassplat.render.deferred import Deferred
+from glassplat.render.splat import Splat
 from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene.gaussians import Gaussians
 from glassplat.train.actions import Densify, PruneIdle, ResetOpacity
@@ -34,7 +35,7 @@ RECIPE = TracedRecipe(
     bootstrap=0.2,
     surroundings=SurroundingsOptions(
         begin=0.3,
-        start=SurroundingsStart(cells=2, copied_strength=0.9, copied_opacity=0.05),
+        start=SurroundingsStart(cells=2, copied_strength=0.9, copied_spread=1.0),
         densify=DefaultDensify(split_by="gradient", interval=5, whole_passes=False, stop=0.6, gradient_threshold=1e-7),
     ),
     texels=4,
@@ -53,7 +54,7 @@ def fresh_state(recipe: TracedRecipe = RECIPE) -> TrainState:
 def surrounded_state(start: SurroundingsStart | None = None) -> TrainState:
     """With surroundings, as their stage begins, but for what was learned before."""
     state = fresh_state()
-    AddSurroundings(start or RECIPE.surroundings.start, sh_degree=1)(state, tiny_capture())
+    AddSurroundings(start or RECIPE.surroundings.start, 1, Splat())(state, tiny_capture())
     return state
 
 
@@ -134,20 +135,18 @@ def test_surroundings_have_to_begin_between_bootstrap_and_the_end_of_propagation
 
 def test_surroundings_are_copied_spread_or_both() -> None:
     copied, spread, both = (
-        surrounded_state(
-            SurroundingsStart(source, cells=2, copied_strength=0.9, copied_opacity=0.05)
-        ).scene.surroundings
+        surrounded_state(SurroundingsStart(source, cells=2, copied_strength=0.9, copied_spread=1.0)).scene.surroundings
         for source in ("scene", "box", "both")
     )
-    assert len(spread) == 40 and len(copied) == len(fresh_state().scene.primary) and len(both) == 40 + len(copied)
-    assert sorted(copied.means[:, 0].tolist()) == sorted(fresh_state().scene.primary.means[:, 0].tolist())
+    assert len(spread) == 40 and len(copied) > 10 and len(both) == 40 + len(copied)
+    assert set(copied.means[:, 0].tolist()) <= set(fresh_state().scene.primary.means[:, 0].tolist())
 
 
 def test_where_everything_reflects_there_is_nothing_to_copy() -> None:
     state = fresh_state()
     channels = {"logit_strength": torch.full((len(state.scene.primary),), 3.0)}
     state.scene = replace(state.scene, primary=replace(state.scene.primary, channels=channels))
-    AddSurroundings(SurroundingsStart("scene", cells=2), sh_degree=1)(state, tiny_capture())
+    AddSurroundings(SurroundingsStart("scene", cells=2), 1, Splat())(state, tiny_capture())
     assert len(state.scene.surroundings) == 40
 
 
@@ -155,7 +154,7 @@ def test_gradients_in_space_count_by_half_the_distance() -> None:
     statistics = ScreenStatistics.zeros(3)
     gradient = torch.tensor([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     for _ in range(2):
-        statistics = accumulate_in_space(statistics, gradient, torch.tensor([2.0, 5.0, 4.0]))
+        statistics.add_in_space(gradient, torch.tensor([2.0, 5.0, 4.0]))
     assert statistics.mean_gradient.tolist() == [5.0, 0.0, 2.0]
     assert statistics.view_count.tolist() == [[2.0, 0.0, 2.0]] * 2
 
