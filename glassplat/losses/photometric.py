@@ -27,4 +27,4 @@ class PhotometricLoss:
         """The loss of a view, in the colours of its photograph; scalar."""
         image = scene.exposures.applied(frame.rgb, view.name)
         found = photometric(image, moved(view.photo, image.device))
-        return (1 - self.ssim_weight) * found.l1 + self.ssim_weight * (1 - found.ssim)
+        return found.l1.lerp(1 - found.ssim, self.ssim_weight)
