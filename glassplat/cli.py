@@ -48,7 +48,7 @@ COMMANDS = {
     "export": Listed(
         "export",
         "Export",
-        "Write a scene in the formats that others read: PLY, SPZ, and planes and environment beside them.",
+        "Write a scene as others read it: PLY, SPZ, a web page with live panes, and the panes beside them.",
     ),
     "info": Listed("info", "Info", "Say what a folder or file is, whether it is healthy, and what to do next."),
     "demo": Listed(
