@@ -102,8 +102,8 @@ def disc_costs() -> Table:
     table = Table(
         f"Discs beside ellipsoids, {COUNT // 1000}k Gaussians, {WIDTH}x{HEIGHT}",
         ("step", "ellipsoids, ms", "discs, ms", "ratio"),
-        f"{solid.pairs:,} (tile, splat) pairs of ellipsoids with 4 channels, {flat.pairs:,} of discs with 6 and depths, "
-        "in processor time.",
+        f"{solid.pairs:,} (tile, splat) pairs of ellipsoids with 4 channels, {flat.pairs:,} of discs with 6 and depths "
+        "besides; processor time.",
     )
     for name, work in solid.works.items():
         one, other = least_milliseconds([work, flat.works[name]])
