@@ -38,7 +38,7 @@ class SurroundingsStart:
             it mirrors, and has what it mirrors painted on, which rays would meet first.
     """
 
-    source: Annotated[Literal["box", "scene", "both"], ESSENTIAL] = "both"
+    source: Annotated[Literal["box", "scene", "both"], ESSENTIAL] = "scene"
     cells: Annotated[int, Range(1, 256)] | None = None
     per_cell: Annotated[int, Range(1, 1000)] = 5
     outside: Annotated[float, Range(0, 0.45)] = 0.005

@@ -35,7 +35,7 @@ RECIPE = TracedRecipe(
     bootstrap=0.2,
     surroundings=SurroundingsOptions(
         begin=0.3,
-        start=SurroundingsStart(cells=2, copied_strength=0.9, copied_spread=1.0),
+        start=SurroundingsStart("both", cells=2, copied_strength=0.9, copied_spread=1.0),
         densify=DefaultDensify(split_by="gradient", interval=5, whole_passes=False, stop=0.6, gradient_threshold=1e-7),
     ),
     texels=4,
