@@ -19,6 +19,7 @@ from glassplat.init.surroundings import (
 )
 from glassplat.render.frame import Renderer
 from glassplat.scene.gaussians import Gaussians
+from glassplat.train.propagation import search_anew
 from glassplat.train.state import TrainState
 
 
@@ -68,6 +69,7 @@ class AddSurroundings:
         found = joined(*(parts or [self._in_box(state, dataset)]))
         ordered, _ = apply_edit(found, {}, in_morton_order(found.means), part="surroundings")
         state.scene = replace(state.scene, surroundings=ordered)
+        search_anew(state)
 
     def _parts(self, state: TrainState, dataset: Dataset) -> list[Gaussians]:
         parts = []

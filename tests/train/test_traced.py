@@ -17,7 +17,15 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.train.actions import Densify, PruneIdle, ResetOpacity
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
-from glassplat.train.propagation import Propagate, PropagationSchedule, RefineEnvironment
+from glassplat.train.propagation import (
+    ENDED,
+    GREW,
+    MOST,
+    Propagate,
+    PropagationSchedule,
+    RefineEnvironment,
+    has_ended,
+)
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
@@ -140,6 +148,15 @@ def test_surroundings_are_copied_spread_or_both() -> None:
     )
     assert len(spread) == 40 and len(copied) > 10 and len(both) == 40 + len(copied)
     assert set(copied.means[:, 0].tolist()) <= set(fresh_state().scene.primary.means[:, 0].tolist())
+
+
+@pytest.mark.parametrize(("most", "goes_on"), [(0.2, True), (0.01, False)])
+def test_propagation_goes_on_where_something_reflective_was_found(most: float, goes_on: bool) -> None:
+    state = fresh_state()
+    state.step, state.records = 12, {ENDED: 9.0, MOST: most, GREW: 4.0}
+    AddSurroundings(SurroundingsStart("box", cells=2), 1, Splat())(state, tiny_capture())
+    assert has_ended(state) != goes_on
+    assert state.records[GREW] == (12 if goes_on else 4)
 
 
 def test_where_everything_reflects_there_is_nothing_to_copy() -> None:
