@@ -1,4 +1,4 @@
-"""The command line: `glassplat prepare | train | eval | render | dereflect | export | demo | bench`.
+"""The command line: `glassplat prepare | annotate | train | eval | render | dereflect | export | demo | bench`.
 
 A command's module is imported when the command is chosen, and nothing before that which takes long: the list of
 commands appears at once, and Ctrl-C works from the beginning.
@@ -30,6 +30,11 @@ class Listed(NamedTuple):
 
 COMMANDS = {
     "prepare": Listed("prepare", "Prepare", "Find out where photographs were taken, and make a capture of them."),
+    "annotate": Listed(
+        "annotate",
+        "Annotate",
+        "Mark the panes of a capture in the browser: corners in a few photographs, and what stands before them.",
+    ),
     "train": Listed("train", "Train", "Train a scene from photographs."),
     "eval": Listed("evaluate", "Evaluate", "Measure a run on its test views and write comparison sheets."),
     "render": Listed(

@@ -26,4 +26,4 @@ class PhotometricLoss:
     def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor:
         """The loss of a view; scalar."""
         found = photometric(frame.rgb, moved(view.photo, frame.rgb.device))
-        return (1 - self.ssim_weight) * found.l1 + self.ssim_weight * (1 - found.ssim)
+        return found.l1.lerp(1 - found.ssim, self.ssim_weight)

@@ -65,7 +65,8 @@ def joined_splats(*parts: Projected) -> Splats:
 
 def shown(projected: Projected | ProjectedDiscs) -> Tensor:
     """[N] bool: which Gaussians reach a pixel of some of the cameras."""
-    return (projected.radii[..., 0] > 0).any(dim=0)
+    reached = projected.radii[..., 0] > 0
+    return reached[0] if len(reached) == 1 else reached.any(dim=0)
 
 
 def screen_pass(part: str, projected: Projected | ProjectedDiscs, *, direct: bool = True) -> ScreenPass:
@@ -76,7 +77,8 @@ def screen_pass(part: str, projected: Projected | ProjectedDiscs, *, direct: boo
 
 def joined_probe(screen: Sequence[ScreenPass]) -> Tensor | None:
     """The probe [C, G, 2] that `composite` wants for the parts in this order; None where nothing is probed."""
-    return torch.cat([record.probe for record in screen], dim=1) if screen else None
+    probes = [record.probe for record in screen]
+    return torch.cat(probes, dim=1) if len(probes) > 1 else next(iter(probes), None)
 
 
 def over_background(image: Tensor, alpha: Tensor, background: tuple[float, ...]) -> Tensor:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.densify.default import DefaultDensify, ScreenStatistics, accumulate_in_space
+from glassplat.densify.default import DefaultDensify, ScreenStatistics
 from glassplat.render.deferred import Deferred
 from glassplat.render.splat import Splat
 from glassplat.render.traced import Traced, mirrored_contributions
@@ -171,7 +171,7 @@ def test_gradients_in_space_count_by_half_the_distance() -> None:
     statistics = ScreenStatistics.zeros(3)
     gradient = torch.tensor([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     for _ in range(2):
-        statistics = accumulate_in_space(statistics, gradient, torch.tensor([2.0, 5.0, 4.0]))
+        statistics.add_in_space(gradient, torch.tensor([2.0, 5.0, 4.0]))
     assert statistics.mean_gradient.tolist() == [5.0, 0.0, 2.0]
     assert statistics.view_count.tolist() == [[2.0, 0.0, 2.0]] * 2
 
