@@ -10,6 +10,7 @@ from glassplat.data.ranges import ESSENTIAL, InnerShare, Range, Share
 from glassplat.densify.edit import apply_edit
 from glassplat.densify.order import in_morton_order
 from glassplat.densify.reflectors import Search
+from glassplat.init.points import as_discs
 from glassplat.init.surroundings import (
     copied_surroundings,
     joined,
@@ -84,7 +85,7 @@ class AddSurroundings:
     def _in_box(self, state: TrainState, dataset: Dataset) -> Gaussians:
         camera = dataset.train[0].camera
         cells = self.start.cells or suitable_cells(camera.width * camera.height, self.start.per_cell)
-        return surroundings_in_box(
+        found = surroundings_in_box(
             percentile_box(dataset.points, self.start.outside),
             cells=cells,
             per_cell=self.start.per_cell,
@@ -92,3 +93,4 @@ class AddSurroundings:
             opacity=self.start.opacity,
             generator=state.generator("surroundings"),
         )
+        return as_discs(found, seed=state.seed) if state.scene.primary.are_discs else found

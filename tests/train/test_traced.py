@@ -13,6 +13,7 @@ from glassplat.densify.default import DefaultDensify, ScreenStatistics
 from glassplat.render.deferred import Deferred
 from glassplat.render.splat import Splat
 from glassplat.render.traced import Traced, mirrored_contributions
+from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import Gaussians
 from glassplat.train.actions import Densify, PruneIdle, ResetOpacity
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
@@ -74,7 +75,11 @@ def losses(messages: Sequence[Message]) -> list[float]:
     return [m.losses["photometric"] for m in messages if isinstance(m, StepDone)]
 
 
-@pytest.mark.parametrize("recipe", [RECIPE, PAPER, replace(RECIPE, mirrors="environment")], ids=lambda r: r.mirrors)
+DISCS = replace(RECIPE, primitive="disc")
+EVERY = [RECIPE, PAPER, replace(RECIPE, mirrors="environment"), DISCS, replace(DISCS, mirrors="environment")]
+
+
+@pytest.mark.parametrize("recipe", EVERY, ids=lambda recipe: f"{recipe.mirrors} {recipe.primitive}")
 def test_a_short_run_learns(recipe: TracedRecipe) -> None:
     state = fresh_state(recipe)
     found = losses(run(recipe, state))
@@ -83,6 +88,10 @@ def test_a_short_run_learns(recipe: TracedRecipe) -> None:
     assert bool(len(state.scene.surroundings)) == (recipe.mirrors != "environment")
     assert state.scene.environment.is_empty == (recipe.mirrors == "surroundings")
     recipe.renderer().check(state.scene)
+    assert {len(part) and part.are_discs for part in (state.scene.primary, state.scene.surroundings)} <= {
+        0,
+        recipe.primitive == "disc",
+    }
 
 
 def test_the_environment_is_mirrored_first_and_near_things_later() -> None:
@@ -223,6 +232,6 @@ def test_the_preset_resets_surroundings_where_it_resets_the_scene() -> None:
 
 
 def test_a_scene_without_surroundings_is_refused() -> None:
-    scene = replace(surrounded_state().scene, surroundings=Gaussians.empty())
+    scene = replace(surrounded_state().scene, surroundings=Gaussians.empty(), environment=Environment.empty())
     with pytest.raises(ValueError, match="has no surroundings; expected one trained with `traced`"):
         RECIPE.renderer().check(scene)
