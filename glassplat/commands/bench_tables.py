@@ -31,6 +31,8 @@ class Column:
 
 COLUMNS = (
     Column("psnr", "psnr", ".2f"),
+    Column("corrected_psnr", "colours corrected", ".2f"),
+    Column("right_half_psnr", "right halves", ".2f"),
     Column("ssim", "ssim", ".4f"),
     Column("lpips", "lpips", ".4f"),
     Column("pane_psnr", "pane psnr", ".2f"),

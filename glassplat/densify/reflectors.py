@@ -105,6 +105,7 @@ def residual_sums(scene: Scene, view: View, renderer: Renderer) -> Tensor:
     with torch.enable_grad():
         sh = scene.primary.sh.detach().requires_grad_()
         frame = renderer(scene.with_parameters({"primary.sh": sh}), view.camera)
-        residual = view.photo.to(frame.rgb) / 255 - frame.rgb.detach()
+        image = scene.exposures.applied(frame.rgb.detach(), view.name)
+        residual = view.photo.to(image) / 255 - image
         (gradient,) = torch.autograd.grad((residual * frame.layers.get("base", frame.rgb)).sum(), sh)
     return gradient[:, 0] / SH_ZERO

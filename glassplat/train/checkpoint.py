@@ -18,6 +18,7 @@ from glassplat.files.planes_json import HIGHEST_LABEL
 from glassplat.files.scene_folder import EXTENT, SH_DEGREE
 from glassplat.files.tensors_file import TensorsFile, opened_tensors, write_tensors
 from glassplat.scene.environment import Environment
+from glassplat.scene.exposure import Exposures
 from glassplat.scene.gaussians import DISC_SCALES, PER_GAUSSIAN, Gaussians
 from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
@@ -40,6 +41,7 @@ HEADER: dict[str, Field] = {
     "paused": Optional(ByName(Whole(0)), {}),
     "hurried": Optional(ByName(Number(0)), {}),
     "records": Optional(ByName(Number()), {}),
+    "photographs": Optional(Items(Text()), ()),
 }
 """What is `Optional` was added after the first checkpoints were written."""
 GAUSSIAN_SHAPES = {"means": (3,), "quats": (4,), "log_scales": None, "logit_opacities": ()}
@@ -67,6 +69,8 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
     tensors |= {f"scene/planes/{name}": t for name, t in scene.planes.tensors().items()}
     if not scene.environment.is_empty:
         tensors |= {f"scene/environment/{name}": t for name, t in scene.environment.tensors().items()}
+    if len(scene.exposures):
+        tensors |= {f"scene/exposures/{name}": t for name, t in scene.exposures.tensors().items()}
     for name, (first, second) in state.optimizer.moments.items():
         tensors |= {f"first/{name}": first, f"second/{name}": second}
     for part, statistics in state.statistics.items():
@@ -87,6 +91,7 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
         "paused": state.optimizer.paused,
         "hurried": state.optimizer.hurried,
         "records": state.records,
+        "photographs": list(scene.exposures.names),
     }
     write_tensors(path, tensors, header)
 
@@ -207,10 +212,13 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     distant = under(tensors, "scene/environment/")
     check_shapes(distant, {"raw": None} if distant else {}, "environment")
     environment = Environment(**distant, region=header["region"]) if distant else empty.environment
+    exposed = under(tensors, "scene/exposures/")
+    check_shapes(exposed, {"affine": (3, 4)} if exposed else {}, "exposures")
     return Scene(
         extent=header["extent"],
         planes=Planes(**planes, labels=header["labels"], mirrors=header["mirrors"]),
         environment=environment,
+        exposures=Exposures(**exposed, names=tuple(header["photographs"])) if exposed else empty.exposures,
         **sets,
     )
 

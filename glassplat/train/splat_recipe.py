@@ -19,6 +19,7 @@ from glassplat.scene.scene import Scene
 from glassplat.train.actions import GrowSh
 from glassplat.train.background import BLACK
 from glassplat.train.optimizer import Rate
+from glassplat.train.photo_exposure import PhotoExposure
 from glassplat.train.stage import Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
 
@@ -113,6 +114,7 @@ class SplatRecipe:
         densify: when and how Gaussians are added and pruned under `default`.
         mcmc: when and how Gaussians are relocated and added under `mcmc`.
         discs: what keeps discs on one surface.
+        exposure: whether the exposure of each photograph is learned.
     """
 
     method: ClassVar[str] = "splat"
@@ -128,6 +130,7 @@ class SplatRecipe:
     densify: DefaultDensify = field(default_factory=DefaultDensify)
     mcmc: McmcDensify = field(default_factory=McmcDensify)
     discs: DiscTerms = field(default_factory=DiscTerms)
+    exposure: PhotoExposure = field(default_factory=PhotoExposure)
 
     @classmethod
     def paper(cls) -> SplatRecipe:
@@ -142,7 +145,8 @@ class SplatRecipe:
     def initialise(self, dataset: Dataset) -> Scene:
         """The first scene: one Gaussian per point."""
         first = self._population().initial(dataset.points, self.sh_degree)
-        return Scene(as_discs(first) if self.primitive == "disc" else first, dataset.extent)
+        scene = Scene(as_discs(first) if self.primitive == "disc" else first, dataset.extent)
+        return self.exposure.begun(scene, dataset)
 
     def renderer(self) -> Splat:
         """The renderer of the finished scene, with all its layers."""
@@ -170,7 +174,7 @@ class SplatRecipe:
             name = f"{last.name}, {term.name}"
             stages.append(replace(last, name=name, renderer=self._bare(normal=with_normals), losses=losses))
             began = start
-        return (*stages[:-1], replace(stages[-1], share=1 - began))
+        return self.exposure.learnt_in((*stages[:-1], replace(stages[-1], share=1 - began)))
 
     def _bare(self, *, normal: bool = False) -> Splat:
         """The renderer with what the losses need and no more."""

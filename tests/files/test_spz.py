@@ -28,6 +28,7 @@ FLIP = torch.tensor([1.0, -1.0, -1.0])
 def typical(coefficients: int = 16, count: int = 50) -> Gaussians:
     """Gaussians within what the format holds."""
     gaussians = random_gaussians(coefficients, count=count)
+    gaussians = replace(gaussians, active_sh_degree=gaussians.max_sh_degree)
     return gaussians.with_tensors({"sh": (gaussians.sh * 0.25).clamp(-0.9, 0.9)})
 
 

@@ -131,7 +131,7 @@ export class Drawing {
   }
 
   #guide(line, corner, color) {
-    this.context.globalAlpha = 0.6;
+    this.context.globalAlpha = 0.9;
     this.context.lineWidth = 1;
     this.#line(line, color, [6, 4]);
     this.context.globalAlpha = 1;
