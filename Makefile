@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check --no-input
 
-.PHONY: help setup demo test lint format bench clean
+.PHONY: help setup browser demo test lint format bench clean
 .DEFAULT_GOAL := help
 
 help:
@@ -17,6 +17,7 @@ help:
 	@echo "make format  rewrite the sources in the project's format"
 	@echo "make bench   measure the kernels and the methods"
 	@echo "make setup   only create .venv"
+	@echo "make browser install Chromium for the tests of pages, from Debian's packages (asks for sudo where needed)"
 	@echo "make clean   remove .venv and every cache"
 
 setup: $(STAMP)
@@ -29,6 +30,12 @@ $(STAMP): pyproject.toml constraints.txt
 	@"$(PYTHON)" -m venv --clear $(VENV)
 	@$(PIP) install --constraint constraints.txt --editable '.[dev]'
 	@touch $@
+
+# Tests of pages are skipped, and said to be, where there is no Chromium.
+browser:
+	@command -v chromium >/dev/null && command -v chromedriver >/dev/null || \
+		{ as_root=$$([ "$$(id -u)" = 0 ] || echo sudo); $$as_root apt-get update -q && \
+		$$as_root apt-get install -q -y chromium chromium-driver; }
 
 demo: $(STAMP)
 	$(BIN)/glassplat demo

@@ -77,11 +77,11 @@ def succeeds(part: str, options: list[str]) -> bool:
 
 def launch(arguments: argparse.Namespace) -> str:
     """The least that has to work: one kernel is compiled, loaded and launched, and does what it should."""
-    from glassplat.kernels.adam import adam
+    from glassplat.kernels.adam import Update, adam
 
     parameter = torch.ones(1000, 3, device="cuda")
     gradient, first, second = torch.ones_like(parameter), torch.zeros_like(parameter), torch.zeros_like(parameter)
-    adam(parameter, gradient, first, second, lr=0.25, step=1)
+    adam([Update(parameter, gradient, first, second, 0.25, 1)])
     torch.testing.assert_close(parameter, torch.full_like(parameter, 0.75))
     return "A kernel was compiled, loaded and launched."
 

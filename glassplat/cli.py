@@ -1,4 +1,4 @@
-"""The command line: `glassplat prepare | train | eval | render | dereflect | export | demo | bench`.
+"""The command line: `glassplat prepare | annotate | train | eval | render | dereflect | export | info | demo | bench`.
 
 A command's module is imported when the command is chosen, and nothing before that which takes long: the list of
 commands appears at once, and Ctrl-C works from the beginning.
@@ -30,6 +30,11 @@ class Listed(NamedTuple):
 
 COMMANDS = {
     "prepare": Listed("prepare", "Prepare", "Find out where photographs were taken, and make a capture of them."),
+    "annotate": Listed(
+        "annotate",
+        "Annotate",
+        "Mark the panes of a capture in the browser: corners in a few photographs, and what stands before them.",
+    ),
     "train": Listed("train", "Train", "Train a scene from photographs."),
     "eval": Listed("evaluate", "Evaluate", "Measure a run on its test views and write comparison sheets."),
     "render": Listed(
@@ -43,14 +48,19 @@ COMMANDS = {
     "export": Listed(
         "export",
         "Export",
-        "Write a scene in the formats that others read: PLY, SPZ, and planes and environment beside them.",
+        "Write a scene as others read it: PLY, SPZ, a web page with live panes, and the panes beside them.",
     ),
+    "info": Listed("info", "Info", "Say what a folder or file is, whether it is healthy, and what to do next."),
     "demo": Listed(
         "demo",
         "Demo",
         "Train planar and splat on the bundled showcase and compare them; goes on where it was interrupted.",
     ),
-    "bench": Listed("bench", "Bench", "Compare methods over scenes, or the parts of a method with each other."),
+    "bench": Listed(
+        "bench",
+        "Bench",
+        "Compare methods over scenes or in a given time, or the parts of a method with each other.",
+    ),
 }
 
 

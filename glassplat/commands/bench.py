@@ -13,6 +13,7 @@ import tyro
 from rich.console import Console
 
 from glassplat.commands.bench_runs import RUNS, FinishedRun, PlannedRun, earlier_runs, execute, scene_names
+from glassplat.commands.bench_seconds import BenchSeconds, Method
 from glassplat.commands.bench_tables import (
     Measured,
     Pair,
@@ -34,7 +35,6 @@ from glassplat.train.ablations import ABLATIONS, Ablated, Ablation, Switch
 from glassplat.train.recipe import RECIPES, Preset, recipe_of
 from glassplat.train.run_directory import write_text
 
-Method = Literal["splat", "planar", "deferred"]
 Strategy = Literal["default", "mcmc"]
 FULL = "full"
 SPREAD_NOTE = "Means over the seeds ± their standard deviation."
@@ -136,13 +136,15 @@ class BenchAblation:
 
 
 AnyBench = (
-    Annotated[BenchScenes, tyro.conf.subcommand("scenes")] | Annotated[BenchAblation, tyro.conf.subcommand("ablation")]
+    Annotated[BenchScenes, tyro.conf.subcommand("scenes")]
+    | Annotated[BenchAblation, tyro.conf.subcommand("ablation")]
+    | Annotated[BenchSeconds, tyro.conf.subcommand("seconds")]
 )
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Compare methods over scenes, or the parts of a method with each other.
+    """Compare methods over scenes or in a given time, or the parts of a method with each other.
 
     Attributes:
         comparison: what to compare.
@@ -182,7 +184,7 @@ def compared_variants() -> list[tuple[str, str]]:
         (variant_name(method, strategy, preset), variant_name("splat", strategy, preset))
         for preset in presets
         for strategy in strategies
-        for method in ("planar", "deferred")
+        for method in ("planar", "deferred", "traced")
     ]
     changes = [
         (variant_name(method, strategy), variant_name(method, strategy, "paper"))

@@ -55,6 +55,10 @@ class PlannedRun:
         """What the progress calls it."""
         return f"{self.scene}, {self.variant}, seed {self.train.seed}"
 
+    def of_length(self, iterations: int) -> PlannedRun:
+        """The same run of another length."""
+        return replace(self, train=replace(self.train, iterations=iterations))
+
     def begun(self) -> bool:
         """Whether there is something to go on from."""
         return self.directory.checkpoint.is_file() or self.directory.results.is_file()
@@ -193,7 +197,7 @@ def execute(
         waiting = [other for other in runs[number - 1 :] if other.results() is None]
         console.rule(Text(f"run {number} of {len(runs)}: {printable(run.title)} ({clock.left(waiting)})"))
         try:
-            clock.measure(run, lambda run=run: _train_and_evaluate(run, console))  # type: ignore[misc]
+            clock.measure(run, lambda run=run: train_and_evaluate(run, console))  # type: ignore[misc]
         except (PlaneFitError, TrainingDivergedError) as error:
             # One scene that cannot be trained must not cost the night that the others take.
             failures.append(f"{run.title}: {error}")
@@ -219,7 +223,7 @@ def _check_captures(runs: Sequence[PlannedRun]) -> None:
         load_dataset(train.data, downscale=train.downscale, mask_polarity=train.mask_polarity)
 
 
-def _train_and_evaluate(run: PlannedRun, console: Console) -> None:
+def train_and_evaluate(run: PlannedRun, console: Console) -> None:
     """What `train` and `eval` do, from the checkpoint where there is one."""
     run.train.resuming(run.directory.checkpoint.is_file()).run(console)
     with console.status("evaluating"):

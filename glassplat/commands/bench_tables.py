@@ -31,11 +31,14 @@ class Column:
 
 COLUMNS = (
     Column("psnr", "psnr", ".2f"),
+    Column("corrected_psnr", "colours corrected", ".2f"),
+    Column("right_half_psnr", "right halves", ".2f"),
     Column("ssim", "ssim", ".4f"),
     Column("lpips", "lpips", ".4f"),
     Column("pane_psnr", "pane psnr", ".2f"),
     Column("transmission_psnr", "transmission psnr", ".2f"),
     Column("reflection_psnr", "reflection psnr", ".2f"),
+    Column("reflective_psnr", "reflective psnr", ".2f"),
     Column("normal_error_deg", "normal error, deg", ".2f"),
     Column("reflective_normal_error_deg", "reflective normal error, deg", ".2f"),
     Column("strength_error", "strength error", ".3f"),

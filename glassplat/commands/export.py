@@ -15,7 +15,7 @@ from glassplat.commands.messages import say, warn
 from glassplat.commands.opened_scene import OpenedScene, cameras_of, open_scene
 from glassplat.commands.output_folder import check_targets, claim_folder
 from glassplat.commands.scene_edits import SceneEdits
-from glassplat.data.errors import InputError
+from glassplat.data.errors import InputError, input_checked
 from glassplat.evaluate.metrics import psnr
 from glassplat.files.atomic import atomic_write
 from glassplat.files.environment_image import write_equirect
@@ -23,6 +23,7 @@ from glassplat.files.planes_json import write_planes
 from glassplat.files.ply import write_gaussians
 from glassplat.files.spz import write_spz
 from glassplat.kernels.devices import DeviceName
+from glassplat.publish.web_page import write_page
 from glassplat.render.baked import baked
 from glassplat.render.environment import equirect_from_environment
 from glassplat.render.splat import Splat
@@ -30,22 +31,23 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane_edits import without_glass
 from glassplat.scene.scene import Scene
 
-Format = Literal["ply", "spz"]
+Format = Literal["ply", "spz", "html"]
 COMPARED_VIEWS = 12
 
 
 @dataclass(frozen=True)
 class Export:
-    """Write a scene in the formats that others read: PLY, SPZ, and planes and environment beside them.
+    """Write a scene as others read it: PLY, SPZ, a web page with live panes, and the panes beside them.
 
     Attributes:
         run_directory: the run's directory.
         output: where the files go; a new folder, or one that this command wrote.
-        formats: which files.
+        formats: which files; html is a page that shows the scene in any browser, by itself and without a server.
         layer: all is the scene with its panes beside it, as planes.json and glass.ply; transmission is the place
             without its panes and what they reflect.
         bake_reflections: put what the panes reflect behind them, as Gaussians, for viewers that know nothing of
             panes; says how far that is from the true render.
+        title: of the page; the run's name if not given.
         spz_version: 3, which every reader knows, or 4.
         edits: changes to the panes.
         device: where to render what has to be rendered; auto takes an NVIDIA GPU where one can be used.
@@ -53,9 +55,10 @@ class Export:
 
     run_directory: tyro.conf.Positional[Path]
     output: Path
-    formats: tuple[Format, ...] = ("ply", "spz")
+    formats: tuple[Format, ...] = ("ply", "spz", "html")
     layer: Literal["all", "transmission"] = "all"
     bake_reflections: bool = False
+    title: str | None = None
     spz_version: Literal[3, 4] = 3
     edits: Annotated[SceneEdits, tyro.conf.arg(name="")] = field(default_factory=SceneEdits)
     device: DeviceName = "auto"
@@ -63,10 +66,10 @@ class Export:
     def run(self, console: Console) -> None:
         """Writes the files."""
         if not self.formats:
-            raise InputError("nothing to write without --formats; expected ply, spz or both")
+            raise InputError("nothing to write without --formats; expected ply, spz or html")
         opened = open_scene(self.run_directory, self.device)
         opened = opened._replace(scene=self._chosen(self.edits.applied(opened.scene)))
-        targets = [self.output / name for name in ("scene.ply", "scene.spz", "glass.ply", "planes.json")]
+        targets = [self.output / name for name in ("index.html", "scene.ply", "scene.spz", "glass.ply", "planes.json")]
         check_targets(self.output, targets, [])
         if claim_folder(self.output, "export", self.run_directory):
             say(console, f"replacing the files of an earlier run of this command in {self.output}")
@@ -76,6 +79,8 @@ class Export:
         else:
             self._write_beside(opened.scene, console)
         self._write_gaussians(gaussians, console)
+        if "html" in self.formats:
+            self._write_page(opened, console)
 
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""
@@ -110,6 +115,13 @@ class Export:
             path = self.output / "scene.spz"
             write_spz(path, gaussians, self.spz_version)
             say(console, f"{path.stat().st_size / 1e6:.2f} MB, version {self.spz_version} -> {path}")
+
+    def _write_page(self, opened: OpenedScene, console: Console) -> None:
+        """The page shows the panes themselves, so that it needs nothing baked."""
+        path = self.output / "index.html"
+        with input_checked():
+            write_page(path, opened.scene, opened.renderer, cameras_of(opened, "all"), self.title or opened.name)
+        say(console, f"{path.stat().st_size / 1e6:.2f} MB, open it in a browser -> {path}")
 
     def _write_beside(self, scene: Scene, console: Console) -> None:
         """Planes, glass and environment, where there are any."""

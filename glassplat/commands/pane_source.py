@@ -40,7 +40,7 @@ def _best_regions(dataset: Dataset) -> PaneRegions:
 
 def _marked_regions(dataset: Dataset) -> MarkedRegions:
     """Those of the masks, with planes fitted as any method would begin, so that all are measured alike."""
-    if not dataset.pane_labels:
+    if not dataset.pane_labels and dataset.planes is None:
         raise InputError(f"{dataset.root} has no masks that name a pane; use --panes rendered, or add masks")
     try:
         # The rectangle's margin is for training, which must not cut into a pane.

@@ -56,7 +56,7 @@ class Prepare:
         for line in report.lines():
             (warn if line.startswith("advice") else say)(console, line)
         say(console, f"capture: {self.output}")
-        say(console, f"next: mark panes in {self.output / 'masks'}, then glassplat train planar --data {self.output}")
+        say(console, f"next: glassplat annotate {self.output}")
 
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -23,6 +23,7 @@ from glassplat.files.images import write_image
 from glassplat.kernels.devices import DeviceName
 from glassplat.render.deferred import Deferred
 from glassplat.render.frame import Frame
+from glassplat.render.traced import Traced
 
 Layer = Literal[
     "rgb",
@@ -36,14 +37,20 @@ Layer = Literal[
     "base",
     "normal",
     "environment",
+    "surroundings",
+    "median_depth",
 ]
 
 LAYERS: dict[str, tuple[Layer, ...]] = {
     "splat": ("rgb", "depth", "alpha"),
     "planar": ("rgb", "transmission", "without_panes", "reflection", "strength", "mask", "depth", "alpha"),
     "deferred": ("rgb", "base", "reflection", "strength", "normal", "environment", "depth", "alpha"),
+    "traced": ("rgb", "base", "reflection", "strength", "normal", "surroundings", "depth", "alpha"),
 }
 """What each method renders that is worth looking at; its frames hold more for the losses."""
+
+DISC_LAYERS: tuple[Layer, ...] = ("rgb", "normal", "depth", "median_depth", "alpha")
+"""What `splat` renders of discs."""
 
 
 @dataclass(frozen=True)
@@ -71,11 +78,13 @@ class Render:
     def run(self, console: Console) -> None:
         """Renders."""
         stored = open_run(self.run_directory, self.device, self.data)
-        check_layers(self.layers, stored.recipe.method)
+        check_layers(self.layers, stored.recipe)
         scene = self.edits.applied(stored.scene)
         renderer = stored.renderer
         if "environment" in self.layers and isinstance(renderer, Deferred):
             renderer = replace(renderer, environment=True)
+        if "surroundings" in self.layers and isinstance(renderer, Traced):
+            renderer = replace(renderer, surroundings=True)
         views = chosen_views(stored.dataset, self.split)
         paths = pictures_of(stored.dataset)
         targets = [self.output / layer / paths[view.name] for layer in self.layers for view in views]
@@ -97,13 +106,14 @@ class Render:
         return f"images already written to {self.output} are whole: repeat the command for all of them"
 
 
-def check_layers(layers: Sequence[str], method: str) -> None:
+def check_layers(layers: Sequence[str], recipe: Any) -> None:
     """Refuses layers that a method does not render, before anything is rendered.
 
     Raises:
         InputError: there are such, or none is asked for.
     """
-    known = LAYERS[method]
+    discs = getattr(recipe, "primitive", None) == "disc"
+    known, method = DISC_LAYERS if discs else LAYERS[recipe.method], recipe.method
     foreign = [layer for layer in layers if layer not in known]
     if foreign or not layers:
         asked = f"renders no layer {', '.join(foreign)}" if foreign else "renders nothing without --layers"
@@ -117,4 +127,6 @@ def layer_image(frame: Frame, layer: str) -> Tensor:
     image = frame.layers[layer]
     if layer == "normal":
         return normal_colors(image)
-    return depth_colors(image, frame.layers["alpha"]) if layer == "depth" else image.clamp(0, 1)
+    if layer in ("depth", "median_depth"):
+        return depth_colors(image, frame.layers["alpha"])
+    return image.clamp(0, 1)

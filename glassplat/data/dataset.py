@@ -13,7 +13,7 @@ import torch
 from glassplat.data import colmap, mirror_nerf, transforms
 from glassplat.data.axes import axes_evidence
 from glassplat.data.capture import Capture, Loader, PointCloud, Shot
-from glassplat.data.errors import InputError, first_names, input_checked
+from glassplat.data.errors import InputError, UnknownFormatError, first_names, input_checked
 from glassplat.data.given_planes import given_planes
 from glassplat.data.masks import MaskSet, Polarity, find_masks, known_masks
 from glassplat.data.random_points import points_in_view
@@ -137,7 +137,7 @@ def _load_capture(root: Path) -> Capture:
             return capture
     looked_for = "; ".join(text for _, text in LOADERS)
     found = first_names(sorted(path.name for path in root.iterdir()), limit=8) or "nothing"
-    raise InputError(f"{root} is no capture that can be read. Looked for: {looked_for}. Found: {found}.")
+    raise UnknownFormatError(f"{root} is no capture that can be read. Looked for: {looked_for}. Found: {found}.")
 
 
 def _masks(root: Path, capture: Capture, shots: list[Shot], polarity: Polarity) -> MaskSet:

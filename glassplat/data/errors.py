@@ -10,6 +10,10 @@ class InputError(ValueError):
     """The data set cannot be used as it is; the message says what was expected, what came and what to do."""
 
 
+class UnknownFormatError(InputError):
+    """A folder holds no capture of any format that is read."""
+
+
 @contextmanager
 def input_checked(where: object = None) -> Iterator[None]:
     """Turns the ValueError of a reader or an edit, whose message says what is wrong, into an InputError.

@@ -11,23 +11,26 @@ from torch import Tensor
 
 from glassplat.data.ranges import ESSENTIAL, Ascending, Count, NotNegative, Positive, PositiveShare, Several, Share
 from glassplat.densify.edit import Edit, Moments, apply_edit, clone, forget, keep, split
+from glassplat.kernels.screen_statistics import Sums, Views, add_views
 from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.transfer import constant
 
 
 @dataclass(frozen=True)
 class ScreenStatistics:
     """What the views since the last densification saw of each Gaussian.
 
-    Gradients are in normalised device coordinates: the image spans [-1, 1] both ways. Sums and counts have two rows,
-    over all views and over those that see the Gaussian directly. In a mirror it is farther away: whether it is too
-    coarse is seen where it is close, and in mirrors only where no view shows it directly.
+    Gradients are in normalised device coordinates, in which the image spans [-1, 1] both ways: thresholds do not
+    depend on its resolution. Sums and counts have two rows, over all views and over those that see the Gaussian
+    directly. In a mirror it is farther away: whether it is too coarse is seen where it is close, and in mirrors only
+    where no view shows it directly.
 
     Attributes:
         gradient_sum: [2, N] sum over views of the norm of the loss gradient with respect to the centre on screen.
         pull_sum: [2, N] the same of what single pixels contribute to that gradient, added up without signs.
-        view_count: [2, N] number of views that saw the Gaussian; one in or through a pane counts by its `weight`.
+        view_count: [2, N] number of views that saw the Gaussian; one in or through a pane counts by how much of what is
+            drawn is left in the image. Gradients are smaller by as much; counted as a full view, a weak reflection
+            would look as if it needed no more detail.
         max_radius: [N] largest radius on screen, as a share of the longer image side.
     """
 
@@ -42,6 +45,26 @@ class ScreenStatistics:
         gradients, pulls, views = torch.zeros(3, 2, count, device=device)
         return ScreenStatistics(gradients, pulls, views, torch.zeros(count, device=device))
 
+    def add(self, views: Views) -> None:
+        """Adds the views of one training step, in place."""
+        add_views(Sums(self.gradient_sum, self.pull_sum, self.view_count, self.max_radius), views)
+
+    @torch.no_grad()
+    def add_in_space(self, means_gradient: Tensor, distances: Tensor) -> None:
+        """Adds a training step in which rays met the Gaussians in space, in place (EnvGS, Section 5.1).
+
+        A gradient times half of the distance at which a Gaussian was met is what on a screen would be one in normalised
+        device coordinates; without that factor, what is far away would get too few Gaussians.
+
+        Args:
+            means_gradient: [N, 3] gradient of one view's loss with respect to the centres.
+            distances: [N] at which they were met, world units.
+        """
+        norms = means_gradient.norm(dim=-1)
+        pulls = 0.5 * distances * norms
+        for total, added in ((self.gradient_sum, pulls), (self.pull_sum, pulls), (self.view_count, norms > 0)):
+            total += added
+
     @property
     def mean_gradient(self) -> Tensor:
         """[N] mean gradient norm over the views that saw the Gaussian, direct ones if there are any; 0 if none did."""
@@ -55,51 +78,6 @@ class ScreenStatistics:
     def _mean(self, total: Tensor) -> Tensor:
         over_all, over_direct = total / self.view_count.clamp(min=1)
         return torch.where(self.view_count[1] > 0, over_direct, over_all)
-
-
-@torch.no_grad()
-def accumulate(
-    statistics: ScreenStatistics,
-    means2d_gradient: Tensor,
-    probe_gradient: Tensor,
-    radii: Tensor,
-    *,
-    width: int,
-    height: int,
-    weight: float | Tensor = 1.0,
-    direct: bool = True,
-) -> ScreenStatistics:
-    """The statistics with the views of one training step added.
-
-    A shift by one pixel is 2 / width in normalised device coordinates, so gradients per pixel are
-    multiplied by width / 2 and height / 2; that makes the thresholds independent of resolution.
-
-    Args:
-        statistics: the record so far.
-        means2d_gradient: [C, N, 2] gradient of one view's loss with respect to `means2d` in pixels.
-        probe_gradient: [C, N, 2] that of the probe of `composite`: the same without signs.
-        radii: [C, N, 2] bounds on screen in pixels; 0 where a view does not see the Gaussian.
-        width: image width in pixels.
-        height: image height in pixels.
-        weight: how much of what is drawn is left in the image, of all or [C, N] of each. Gradients are smaller by as
-            much; counted as a full view, a weak reflection would look as if it needed no more detail.
-        direct: whether the views see the Gaussians themselves, and not their mirror images.
-    """
-    visible = (radii > 0).all(dim=-1)
-    like = means2d_gradient.dtype, means2d_gradient.device
-    pixels_per_unit = constant((width / 2, height / 2), *like)
-
-    def norms(gradient: Tensor) -> Tensor:
-        return torch.where(visible, (gradient * pixels_per_unit).norm(dim=-1), 0).sum(dim=0)
-
-    rows = constant(((1.0,), (float(direct),)), *like)
-    shares = torch.where(visible, radii.amax(dim=-1) / max(width, height), 0)
-    return ScreenStatistics(
-        gradient_sum=statistics.gradient_sum + rows * norms(means2d_gradient),
-        pull_sum=statistics.pull_sum + rows * norms(probe_gradient),
-        view_count=statistics.view_count + rows * (weight * visible).sum(dim=0),
-        max_radius=torch.maximum(statistics.max_radius, shares.amax(dim=0).to(statistics.max_radius.dtype)),
-    )
 
 
 @dataclass(frozen=True)

@@ -92,15 +92,15 @@ def split(
     fresh = torch.arange(source.shape[0], device=index.device) >= count - index.shape[0]
 
     means, log_scales = gaussians.means[source], gaussians.log_scales[source]
-    means[fresh] += _drawn_offsets(gaussians.quats[parents], gaussians.log_scales[parents], generator)
+    means[fresh] += _drawn_offsets(gaussians.quats[parents], gaussians.deviations[parents], generator)
     log_scales[fresh] -= math.log(shrink)
     return Edit(source, fresh, {"means": means, "log_scales": log_scales})
 
 
-def _drawn_offsets(quats: Tensor, log_scales: Tensor, generator: torch.Generator) -> Tensor:
+def _drawn_offsets(quats: Tensor, deviations: Tensor, generator: torch.Generator) -> Tensor:
     """[N, 3] one random offset from the centre of each Gaussian, distributed as the Gaussian."""
-    unit = torch.randn(log_scales.shape, generator=generator, dtype=log_scales.dtype, device=log_scales.device)
-    return (rotation_from_quat(quats) @ (unit * log_scales.exp())[..., None]).squeeze(-1)
+    unit = torch.randn(deviations.shape, generator=generator, dtype=deviations.dtype, device=deviations.device)
+    return (rotation_from_quat(quats) @ (unit * deviations)[..., None]).squeeze(-1)
 
 
 @torch.no_grad()

@@ -135,7 +135,7 @@ class McmcDensify:
         shape, kind = gaussians.means.shape, gaussians.means.dtype
         unit = torch.randn(shape, generator=generator, dtype=kind, device=gaussians.means.device)
         rotations = rotation_from_quat(gaussians.quats)
-        variances = (2 * gaussians.log_scales).exp()
+        variances = gaussians.deviations.square()
         along_axes = (rotations.transpose(1, 2) @ unit[..., None]).squeeze(-1) * variances
         directions = (rotations @ along_axes[..., None]).squeeze(-1) / extent
         opacities = torch.sigmoid(gaussians.logit_opacities)

@@ -27,7 +27,7 @@ class NormalPropagation:
         least_opacity: every opacity is raised to this, so that every visible Gaussian counts.
         least_strength: every reflection strength is raised to this, so that it has a gradient.
         reflective: Gaussians of at least this strength grow (paper: 0.1; its code: 0.02).
-        growth: factor on their two longer axes; the shortest is the normal and stays.
+        growth: factor on their two longer axes, or both of a disc; the shortest is the normal and stays.
         sabotage: half width of the uniform noise on the constant colour (paper: 0.1; its code: 0.4 on the constant
             coefficient, which is 0.113); 0 switches it off (ablation).
         sabotaged: Gaussians of at most this strength are disturbed (paper: 0.1; its code: 0.05).
@@ -49,8 +49,7 @@ class NormalPropagation:
         opacities = gaussians.logit_opacities.clamp(min=logit(self.least_opacity))
         strengths = gaussians.channels["logit_strength"].clamp(min=logit(self.least_strength))
         grows = strengths >= logit(self.reflective)
-        shortest = torch.nn.functional.one_hot(gaussians.log_scales.argmin(dim=1), 3).bool()
-        log_scales = gaussians.log_scales + math.log(self.growth) * (grows[:, None] & ~shortest)
+        log_scales = gaussians.log_scales + math.log(self.growth) * (grows[:, None] & _within_surface(gaussians))
         changed = {"logit_opacities": opacities, "logit_strength": strengths, "log_scales": log_scales}
         return gaussians.with_tensors(changed), forget(moments, [f"primary.{name}" for name in changed])
 
@@ -70,3 +69,10 @@ class NormalPropagation:
     def count_reflective(self, gaussians: Gaussians) -> int:
         """How many Gaussians reflect, by the measure of the paper's criterion for the end (strength above 0.1)."""
         return int((gaussians.channels["logit_strength"] > logit(0.1)).sum())
+
+
+def _within_surface(gaussians: Gaussians) -> Tensor:
+    """[N, 3] or of discs [N, 2] bool: which axes lie within the surface, all but the shortest and all of a disc's."""
+    if gaussians.are_discs:
+        return torch.ones_like(gaussians.log_scales, dtype=torch.bool)
+    return ~torch.nn.functional.one_hot(gaussians.log_scales.argmin(dim=1), 3).bool()

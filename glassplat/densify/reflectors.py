@@ -14,10 +14,13 @@ from torch import Tensor
 
 from glassplat.data.view import View
 from glassplat.render.contribution import contributions
-from glassplat.render.deferred import Deferred
+from glassplat.render.frame import Renderer
 from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import SH_ZERO
 from glassplat.scene.scene import Scene
+
+LEAST_SHOWN = 0.1
+"""Pixels, of all views together, below which a Gaussian is not seen."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +48,18 @@ class Search:
         return mean_in_region(scene, shown, torch.sigmoid(scene.primary.channels["logit_strength"]))
 
     @torch.no_grad()
-    def turning(self, scene: Scene, views: Sequence[View], renderer: Deferred) -> float:
+    def turning(self, scene: Scene, views: Sequence[View], renderer: Renderer) -> float:
         """Share of what is seen that does not reflect, although its residual turns with the view."""
         shown, spreads = residual_spreads(scene, self._chosen(views), renderer)
         reflects = scene.primary.channels["logit_strength"] > logit(self.strength)
         return mean_in_region(scene, shown, ~reflects & (spreads > self.spread))
+
+    @torch.no_grad()
+    def matte(self, scene: Scene, views: Sequence[View], renderer: Renderer) -> Tensor:
+        """[N] bool: which primary Gaussians are seen, do not reflect and do not look as if they should."""
+        shown, spreads = residual_spreads(scene, self._chosen(views), renderer)
+        reflects = scene.primary.channels["logit_strength"] > logit(self.strength)
+        return (shown > LEAST_SHOWN) & ~reflects & (spreads <= self.spread)
 
     def _chosen(self, views: Sequence[View]) -> list[View]:
         """Evenly among all of them."""
@@ -72,7 +82,7 @@ def in_region(scene: Scene) -> Tensor:
     return (means - means.new_tensor(center)).norm(dim=1) <= radius
 
 
-def residual_spreads(scene: Scene, views: Sequence[View], renderer: Deferred) -> tuple[Tensor, Tensor]:
+def residual_spreads(scene: Scene, views: Sequence[View], renderer: Renderer) -> tuple[Tensor, Tensor]:
     """Of each primary Gaussian what the views show, in pixels, and how its residual spreads over them; [N] each."""
     count, device = len(scene.primary), scene.primary.means.device
     shown, squares = torch.zeros(2, count, device=device)
@@ -87,7 +97,7 @@ def residual_spreads(scene: Scene, views: Sequence[View], renderer: Deferred) ->
     return shown, (variance.clamp(min=0) / 3).sqrt()
 
 
-def residual_sums(scene: Scene, view: View, renderer: Deferred) -> Tensor:
+def residual_sums(scene: Scene, view: View, renderer: Renderer) -> Tensor:
     """[N, 3] photograph minus render, summed over the pixels of each primary Gaussian by its blending weights.
 
     That is the gradient with respect to its colour of the sum over pixels of residual times render.
@@ -95,6 +105,7 @@ def residual_sums(scene: Scene, view: View, renderer: Deferred) -> Tensor:
     with torch.enable_grad():
         sh = scene.primary.sh.detach().requires_grad_()
         frame = renderer(scene.with_parameters({"primary.sh": sh}), view.camera)
-        residual = view.photo.to(frame.rgb) / 255 - frame.rgb.detach()
-        (gradient,) = torch.autograd.grad((residual * frame.layers["base"]).sum(), sh)
+        image = scene.exposures.applied(frame.rgb.detach(), view.name)
+        residual = view.photo.to(image) / 255 - image
+        (gradient,) = torch.autograd.grad((residual * frame.layers.get("base", frame.rgb)).sum(), sh)
     return gradient[:, 0] / SH_ZERO

@@ -17,7 +17,7 @@ from glassplat.data.dataset import Dataset, View
 from glassplat.data.errors import InputError
 from glassplat.evaluate.environment_metrics import environment_metrics, learned_environment, true_environment
 from glassplat.evaluate.lpips import Lpips, load_lpips
-from glassplat.evaluate.metrics import psnr, quantized, reflection_gain, ssim
+from glassplat.evaluate.metrics import color_corrected, psnr, quantized, reflection_gain, ssim
 from glassplat.evaluate.outcome import NO_WEIGHTS, SMALLEST_REGION, Outcome, plain
 from glassplat.evaluate.pane_regions import (
     NO_TRUTH,
@@ -101,12 +101,15 @@ def evaluate(
 ) -> Evaluation:
     """Renders every test view and measures it, on uint8-quantised sRGB at the data set's resolution.
 
-    `psnr`, `ssim` and `lpips` are means over the views. The region metrics are means over the views in
-    which the region has at least 100 pixels: `pane_psnr` over the pane's pixels, `transmission_psnr` over
+    `psnr`, `ssim` and `lpips` are means over the views, and so are `corrected_psnr`, after the affine transform of
+    colours that brings each render closest to its photograph, and `right_half_psnr`, of the right halves after that of
+    the left ones: how a photograph that nobody trained on was exposed is not known. The region metrics are means over
+    the views in which the region has at least 100 pixels: `pane_psnr` over the pane's pixels, `transmission_psnr` over
     those that transmit (true strength below 0.999) against `gt/trans`, `reflection_psnr` against `gt/refl`
     after one gain for the whole scene. The pane is what `regions` say; `pane_region` names them. A method without
     layers is scored with its image as its transmission: that is what its user has.
 
+    `reflective_psnr` is that over the pixels of which more than half is mirrored, where the true strength is known.
     `normal_error_deg` is the mean angle between the layer `normal` and the true normals over the pixels that show a
     surface, `reflective_normal_error_deg` the same where it mirrors more than half, `strength_error` the mean
     difference of the layer `strength` from the true one. `environment_psnr` compares the learned environment with the
@@ -204,13 +207,22 @@ def _measure(
     """Every metric of one view except the reflection's, which needs all views."""
     metrics: dict[str, Outcome] = {
         "psnr": psnr(frame.rgb, photo),
+        "corrected_psnr": psnr(color_corrected(frame.rgb, photo), photo),
+        "right_half_psnr": _right_half_psnr(frame.rgb, photo),
         "ssim": ssim(frame.rgb, photo),
         "lpips": NO_WEIGHTS if isinstance(lpips, str) else lpips(quantized(frame.rgb), quantized(photo)),
         "pane_psnr": pane if isinstance(pane, str) else _region_psnr(frame.rgb, photo, pane, TOO_FEW),
         "transmission_psnr": _transmission_psnr(frame, *truth),
-        **surface_metrics(frame, surface),
+        **surface_metrics(frame, photo, surface),
     }
     return _Measurement(metrics, seconds, _reflection_pixels(frame, *truth))
+
+
+def _right_half_psnr(image: Tensor, photo: Tensor) -> float:
+    """Of the right half, in the colours that the left half tells (as is done for NeRF in the Wild)."""
+    middle = max(photo.shape[1] // 2, 1)
+    corrected = color_corrected(image, photo, slice(0, middle))
+    return psnr(corrected[:, middle - 1 :], photo[:, middle - 1 :])
 
 
 def _region_psnr(image: Tensor, target: Tensor, region: Tensor, reason: str) -> Outcome:
@@ -272,8 +284,9 @@ def _description(scene: Scene, dataset: Dataset) -> dict[str, Any]:
         "resolution": ", ".join(sizes),
         "split": dataset.split,
         "num_test_views": len(dataset.test),
-        "num_gaussians": len(scene.primary) + len(scene.glass),
+        "num_gaussians": sum(len(part) for part in scene.gaussian_sets().values()),
         "num_glass_gaussians": len(scene.glass),
+        "num_surroundings_gaussians": len(scene.surroundings),
     }
 
 

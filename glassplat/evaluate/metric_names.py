@@ -16,6 +16,14 @@ class Metric(NamedTuple):
 
 METRICS = {
     "psnr": Metric("PSNR", "{:.2f} dB", "peak signal-to-noise ratio of the test images; higher is better"),
+    "corrected_psnr": Metric(
+        "PSNR, colours corrected",
+        "{:.2f} dB",
+        "the same after the affine transform of colours that brings each image closest to its photograph",
+    ),
+    "right_half_psnr": Metric(
+        "PSNR, right halves", "{:.2f} dB", "of the right half of each image after the transform found on its left half"
+    ),
     "ssim": Metric("SSIM", "{:.4f}", "structural similarity, 1 for equal images; higher is better"),
     "lpips": Metric("LPIPS", "{:.4f}", "perceptual distance by a trained network, 0 for equal images; lower is better"),
     "pane_psnr": Metric("PSNR, pane", "{:.2f} dB", "the same of the pixels that show a pane"),
@@ -27,6 +35,9 @@ METRICS = {
     ),
 }
 SURFACE_METRICS = {
+    "reflective_psnr": Metric(
+        "PSNR, reflective", "{:.2f} dB", "PSNR of the pixels of which the surface mirrors more than half"
+    ),
     "normal_error_deg": Metric("normal error", "{:.2f}°", "mean angle between rendered and true surface normals"),
     "reflective_normal_error_deg": Metric(
         "normal error, reflective", "{:.2f}°", "the same where the surface mirrors more than half"

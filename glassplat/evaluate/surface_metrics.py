@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from glassplat.evaluate.metrics import psnr
 from glassplat.evaluate.outcome import SMALLEST_REGION, Outcome
 from glassplat.evaluate.surface_truth import NOTHING_KNOWN, TrueSurface
 from glassplat.render.frame import Frame
@@ -20,16 +21,18 @@ UNCOVERED = f"fewer than {SMALLEST_REGION} pixels show a surface"
 UNREFLECTIVE = f"fewer than {SMALLEST_REGION} pixels reflect more than half"
 
 
-def surface_metrics(frame: Frame, truth: TrueSurface | None) -> dict[str, Outcome]:
-    """`normal_error_deg`, `reflective_normal_error_deg` and `strength_error` of one view.
+def surface_metrics(frame: Frame, photo: Tensor, truth: TrueSurface | None) -> dict[str, Outcome]:
+    """`reflective_psnr`, `normal_error_deg`, `reflective_normal_error_deg` and `strength_error` of one view.
 
     Args:
-        frame: its layers `normal` [H, W, 3], world axes, of any length, and `strength` [H, W] are measured.
+        frame: its image, and its layers `normal` [H, W, 3], world axes, of any length, and `strength` [H, W].
+        photo: [H, W, 3] uint8.
         truth: the true surface at the frame's size, None where nothing is known.
     """
     truth = truth or NOTHING_KNOWN
     normal_errors = _normal_errors(frame, truth)
     return {
+        "reflective_psnr": _reflective_psnr(frame, photo, truth),
         "normal_error_deg": _mean(normal_errors, truth.covered, UNCOVERED),
         "reflective_normal_error_deg": _mean(normal_errors, _reflective(truth), UNREFLECTIVE),
         "strength_error": _mean(_strength_errors(frame, truth), truth.covered, UNCOVERED),
@@ -43,6 +46,13 @@ def angular_errors_deg(vectors: Tensor, truth: Tensor) -> Tensor:
     angles = torch.rad2deg(torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(dim=-1)))
     lengths = a.norm(dim=-1) * b.norm(dim=-1)
     return torch.where((lengths > 0) & torch.isfinite(lengths), angles, NO_DIRECTION_DEG)
+
+
+def _reflective_psnr(frame: Frame, photo: Tensor, truth: TrueSurface) -> Outcome:
+    region = _reflective(truth)
+    if isinstance(region, str):
+        return region
+    return psnr(frame.rgb, photo, region) if int(region.sum()) >= SMALLEST_REGION else UNREFLECTIVE
 
 
 def _normal_errors(frame: Frame, truth: TrueSurface) -> Tensor | str:

@@ -11,24 +11,26 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.files.ply_table import PlyTable, read_table, write_table
-from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.gaussians import DISC_SCALES, Gaussians
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
 COLOR = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
-REQUIRED = (*POSITION, "opacity", *SCALE, *ROTATION)
+DISC_SCALE = SCALE[:DISC_SCALES]
+REQUIRED = (*POSITION, "opacity", *DISC_SCALE, *ROTATION)
+"""A file without the third scale holds discs, as those of 2DGS do."""
 CHANNEL_PREFIXES = ("log_", "logit_", "raw_")
 """Raw values are named after their activation, so these prefixes tell our channels from foreign properties."""
 SH_COEFFICIENTS = (1, 4, 9, 16)
 
 
 def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
-    """Writes a set of Gaussians as a standard 3DGS PLY: float32, binary little endian, atomically.
+    """Writes a set of Gaussians as a standard 3DGS or, of discs, 2DGS PLY: float32, binary little endian, atomically.
 
     The properties are x y z, nx ny nz (zero), f_dc_*, f_rest_* (channel-major), opacity (logit),
-    scale_* (log), rot_* (`wxyz`), then one property per channel, which other readers skip.
+    scale_* (log; two of a disc), rot_* (`wxyz`), then one property per channel, which other readers skip.
     Gaussians without colour (K = 0) have neither f_dc nor f_rest.
 
     Raises:
@@ -40,7 +42,8 @@ def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
             f"cannot store channels {unreadable}: a raw channel's name begins with one of {CHANNEL_PREFIXES}"
         )
     color_names, colors = _color_columns(gaussians.sh)
-    names = [*POSITION, *NORMAL, *color_names, "opacity", *SCALE, *ROTATION, *gaussians.channels]
+    scale_names = DISC_SCALE if gaussians.are_discs else SCALE
+    names = [*POSITION, *NORMAL, *color_names, "opacity", *scale_names, *ROTATION, *gaussians.channels]
     normals = torch.zeros_like(gaussians.means)
     columns = [gaussians.means, normals, colors, gaussians.logit_opacities[:, None], gaussians.log_scales]
     columns += [gaussians.quats, *(channel[:, None] for channel in gaussians.channels.values())]
@@ -49,7 +52,7 @@ def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
 
 
 def read_gaussians(path: Path | str) -> Gaussians:
-    """Reads a 3DGS PLY as raw float32 tensors, bit for bit as stored.
+    """Reads a 3DGS PLY, or one of 2DGS with two scales, as raw float32 tensors, bit for bit as stored.
 
     Properties may come in any order, in ascii or either byte order, with SH degree 0 to 3 or no colour
     at all. Properties that begin with `log_`, `logit_` or `raw_` become channels; normals and other
@@ -67,7 +70,7 @@ def read_gaussians(path: Path | str) -> Gaussians:
     return Gaussians(
         means=_stacked(columns, POSITION),
         quats=_stacked(columns, ROTATION),
-        log_scales=_stacked(columns, SCALE),
+        log_scales=_stacked(columns, SCALE if SCALE[-1] in columns else DISC_SCALE),
         logit_opacities=columns["opacity"],
         sh=sh,
         channels={name: column for name, column in columns.items() if name.startswith(CHANNEL_PREFIXES)},

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from glassplat.files.atomic import atomic_write
 from glassplat.files.environment_file import read_environment, write_environment
+from glassplat.files.exposures_json import read_exposures, write_exposures
 from glassplat.files.fields import LARGEST_COORDINATE, Choice, Field, Items, Number, Optional, Whole, checked
 from glassplat.files.json_text import read_json
 from glassplat.files.planes_json import read_planes, write_planes
@@ -17,7 +18,7 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
 PRIMARY, GLASS, PLANES, SCENE = "point_cloud.ply", "glass.ply", "planes.json", "scene.json"
-ENVIRONMENT, SURROUNDINGS = "environment.safetensors", "surroundings.ply"
+ENVIRONMENT, SURROUNDINGS, EXPOSURES = "environment.safetensors", "surroundings.ply", "exposures.json"
 LARGEST_COLOR = 1e6
 LARGEST_LOG = 40.0
 """Of a logarithm: its exponential, squared, fits float32."""
@@ -27,7 +28,7 @@ HEADER: dict[str, Field] = {
     "extent": EXTENT,
     "active_sh_degree": SH_DEGREE,
     "surroundings_sh_degree": Optional(SH_DEGREE),
-    "files": Optional(Items(Choice((PRIMARY, GLASS, PLANES, ENVIRONMENT, SURROUNDINGS)))),
+    "files": Optional(Items(Choice((PRIMARY, GLASS, PLANES, ENVIRONMENT, SURROUNDINGS, EXPOSURES)))),
 }
 """`files` is what the scene consists of, so that one that is lost is missed; folders of earlier versions lack it."""
 
@@ -37,8 +38,8 @@ def write_scene(folder: Path, scene: Scene) -> None:
 
     `point_cloud.ply` holds the primary Gaussians, which any splat viewer shows without the reflections;
     `glass.ply` and `planes.json` hold what a viewer that knows panes needs on top, `environment.safetensors` the raw
-    texels of the environment's cube map, `surroundings.ply` the Gaussians that reflections show. Each is there only
-    where the scene has it.
+    texels of the environment's cube map, `surroundings.ply` the Gaussians that reflections show, `exposures.json` how
+    the photographs were exposed. Each is there only where the scene has it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = [PRIMARY]
@@ -55,6 +56,9 @@ def write_scene(folder: Path, scene: Scene) -> None:
         write_gaussians(folder / SURROUNDINGS, scene.surroundings)
         header["surroundings_sh_degree"] = scene.surroundings.active_sh_degree
         files += [SURROUNDINGS]
+    if len(scene.exposures):
+        write_exposures(folder / EXPOSURES, scene.exposures)
+        files += [EXPOSURES]
     with atomic_write(folder / SCENE) as temporary:
         temporary.write_text(json.dumps(header, indent=2) + "\n", encoding="utf-8")
 
@@ -76,6 +80,8 @@ def read_scene(folder: Path) -> Scene:
         scene = replace(scene, environment=read_environment(folder / ENVIRONMENT))
     if (folder / SURROUNDINGS).is_file():
         scene = replace(scene, surroundings=_colored(folder, SURROUNDINGS, header["surroundings_sh_degree"]))
+    if (folder / EXPOSURES).is_file():
+        scene = replace(scene, exposures=read_exposures(folder / EXPOSURES))
     return scene
 
 

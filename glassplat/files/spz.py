@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,7 @@ def spz_bytes(gaussians: Gaussians, version: int = 3) -> bytes:
     broken = [name for name, tensor in gaussians.tensors().items() if not bool(tensor.isfinite().all())]
     if broken:
         raise ValueError(f"Gaussians whose {', '.join(broken)} are not all finite cannot be written as SPZ")
+    gaussians = replace(gaussians, sh=gaussians.sh[:, : (gaussians.active_sh_degree + 1) ** 2])
     layout = Layout(version, len(gaussians), gaussians.max_sh_degree, fractional_bits_for(gaussians.means))
     sections = [section.tobytes() for section in packed_sections(gaussians, layout)]
     head = (MAGIC, version, layout.number, layout.degree, layout.fractional_bits, 0)

@@ -72,10 +72,17 @@ def packed_sections(gaussians: Gaussians, layout: Layout) -> list[Bytes]:
         _packed_positions(means * flip, layout.fractional_bits),
         _rounded(_numpy(opacities) * 255),
         _rounded(_numpy(gaussians.sh[:, 0]) * (COLOR_SCALE * 255) + 127.5),
-        _rounded((_numpy(gaussians.log_scales) - LOWEST_LOG_SCALE) * STEPS_PER_LOG),
+        _rounded((_numpy(_three_log_scales(gaussians)) - LOWEST_LOG_SCALE) * STEPS_PER_LOG),
         _packed_rotations(quats * np.concatenate([[np.float32(1)], flip])),
         _rounded(harmonics * 128 + 128),
     ]
+
+
+def _three_log_scales(gaussians: Gaussians) -> Tensor:
+    """[N, 3] log scales; the format knows no discs, which become as flat as it can say."""
+    if not gaussians.are_discs:
+        return gaussians.log_scales
+    return torch.nn.functional.pad(gaussians.log_scales, (0, 1), value=LOWEST_LOG_SCALE)
 
 
 def unpacked(sections: list[Bytes], layout: Layout) -> Gaussians:

@@ -1,6 +1,8 @@
-"""Points to Gaussians: one small sphere a point, as 3DGS starts."""
+"""Points to Gaussians: one small sphere a point, as 3DGS starts, or one disc, as 2DGS does."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -10,7 +12,7 @@ from torch import Tensor
 
 from glassplat.data.capture import PointCloud
 from glassplat.scene.activations import logit
-from glassplat.scene.gaussians import SH_ZERO, Gaussians
+from glassplat.scene.gaussians import DISC_SCALES, SH_ZERO, Gaussians
 
 NEIGHBOURS = 3
 SMALLEST_SCALE = 1e-6
@@ -58,6 +60,14 @@ def gaussians_from_points(
         sh=sh,
         channels={"log_intensity": torch.zeros(count)},
     )
+
+
+def as_discs(spheres: Gaussians, *, seed: int = 0) -> Gaussians:
+    """Discs as large as the spheres, turned at random: nothing is known yet of the surface that they lie on."""
+    generator = torch.Generator().manual_seed(seed)
+    quats = torch.randn(spheres.quats.shape, generator=generator).to(spheres.quats)
+    log_scales = spheres.log_scales[:, :DISC_SCALES].contiguous()
+    return replace(spheres, quats=torch.nn.functional.normalize(quats, dim=1), log_scales=log_scales)
 
 
 def morton_order(positions: NDArray[np.float32]) -> NDArray[np.int64]:

@@ -24,6 +24,7 @@ class PhotometricLoss:
     ssim_weight: float
 
     def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor:
-        """The loss of a view; scalar."""
-        found = photometric(frame.rgb, moved(view.photo, frame.rgb.device))
-        return (1 - self.ssim_weight) * found.l1 + self.ssim_weight * (1 - found.ssim)
+        """The loss of a view, in the colours of its photograph; scalar."""
+        image = scene.exposures.applied(frame.rgb, view.name)
+        found = photometric(image, moved(view.photo, image.device))
+        return found.l1.lerp(1 - found.ssim, self.ssim_weight)

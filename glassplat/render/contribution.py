@@ -10,10 +10,12 @@ from torch import Tensor
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
 from glassplat.kernels.splats import Projected
+from glassplat.render.discs import blended_discs, projected_discs
 from glassplat.render.planar import detached, project_mirrored
 from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, project_gaussians
-from glassplat.render.seen_panes import nearest_hits, seen_panes
+from glassplat.render.seen_panes import nearest_hits, panes_in_camera, seen_panes
 from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
 
@@ -31,8 +33,10 @@ def contributions(scene: Scene, camera: Camera) -> Tensor:
     camera = camera.to(scene.primary.means.device)
     # Colours do not matter here.
     primary, near = replace(detached(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
+    if primary.are_discs:
+        return _disc_weight_sums(primary, camera, near)
     most = _weight_sums(project_gaussians(primary, camera, near=near), camera)
-    seen = seen_panes(scene.planes, camera, nearest_hits(scene.planes, camera))
+    seen = seen_panes(scene.planes, camera, nearest_hits(panes_in_camera(scene.planes, camera), camera))
     if seen is None:
         return most
     mirrored = project_mirrored(primary, camera, seen, near=near)
@@ -47,3 +51,13 @@ def _weight_sums(projected: Projected, camera: Camera, tiles: Tensor | None = No
         image = composite(splats, ones, bin_tiles(splats, camera.width, camera.height, tiles)).image
         (sums,) = torch.autograd.grad(image.sum(), ones)
     return sums[..., 0].amax(dim=0)
+
+
+def _disc_weight_sums(discs: Gaussians, camera: Camera, near: float) -> Tensor:
+    """As `_weight_sums`, of discs."""
+    projected = projected_discs(discs, camera, near=near)
+    with torch.enable_grad():
+        ones = torch.ones_like(projected.depths)[..., None].requires_grad_()
+        image = blended_discs(projected, ones, camera, near=near).image
+        (sums,) = torch.autograd.grad(image.sum(), ones)
+    return sums[0, :, 0]

@@ -19,6 +19,7 @@ from glassplat.render.frame import Frame
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
     check_colored,
+    check_ellipsoids,
     joined_probe,
     joined_splats,
     mean_depth,
@@ -86,6 +87,7 @@ class Deferred:
     def check(self, scene: Scene) -> None:
         """Raises ValueError where a scene lacks colours, or what reflection needs."""
         check_colored(scene.primary)
+        check_ellipsoids(scene.primary)
         check_reflective(scene)
 
     def _channels_of(self, gaussians: Gaussians, camera: Camera, projected: Projected) -> Tensor:

@@ -38,6 +38,22 @@ class ScreenPass:
 
 
 @dataclass(frozen=True)
+class SpacePass:
+    """How far away the Gaussians of one scene part were met that rays found in space, where there is no screen.
+
+    The gradient of a loss with respect to their centres, times half of that distance, is what on a screen would be the
+    gradient in normalised device coordinates (EnvGS, Section 5.1).
+
+    Attributes:
+        part: name of the scene part, as in `Scene.gaussian_sets`.
+        distances: [N] from the mean origin of the rays, world units.
+    """
+
+    part: str
+    distances: Tensor
+
+
+@dataclass(frozen=True)
 class Frame:
     """A rendered view and its layers.
 
@@ -47,6 +63,7 @@ class Frame:
         direct: [N] bool, which primary Gaussians reach a pixel themselves; None where the renderer does not say.
         mirrored: [N] bool, which ones reach a pixel as mirror images; None where nothing is mirrored.
         screen: one record per rasterised part and pass of a probed frame.
+        space: one record per traced part of a probed frame.
     """
 
     rgb: Tensor
@@ -54,6 +71,7 @@ class Frame:
     direct: Tensor | None = None
     mirrored: Tensor | None = None
     screen: tuple[ScreenPass, ...] = ()
+    space: tuple[SpacePass, ...] = ()
 
     @property
     def visible(self) -> Tensor | None:

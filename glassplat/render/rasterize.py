@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from glassplat.kernels.discs import ProjectedDiscs
 from glassplat.kernels.project import project
 from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians, Splats
 from glassplat.render.frame import ScreenPass
@@ -37,17 +40,20 @@ def project_gaussians(
         clip_planes: [C, 4] world planes (n, d); a Gaussian whose centre has n . x + d <= 0 is culled.
         windows: [C, 4] left, top, right and bottom edge of the part of each image that is wanted, pixels.
     """
+    cameras = camera_batch(camera, poses)._replace(clip_planes=clip_planes, windows=windows)
+    return project(raw_gaussians(gaussians), cameras, sh_degree=gaussians.active_sh_degree, near=near)
+
+
+def raw_gaussians(gaussians: Gaussians) -> RawGaussians:
+    """The tensors of a set as the kernels take them."""
+    return RawGaussians(gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh)
+
+
+def camera_batch(camera: Camera, poses: Tensor | None = None) -> CameraBatch:
+    """One camera as the kernels take it, or several of its intrinsics at the `poses` [C, 4, 4]."""
     poses = camera.cam_from_world[None] if poses is None else poses
-    raw = RawGaussians(gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh)
-    cameras = CameraBatch(
-        poses,
-        camera.intrinsics.expand(poses.shape[0], 4).contiguous(),
-        camera.width,
-        camera.height,
-        clip_planes,
-        windows,
-    )
-    return project(raw, cameras, sh_degree=gaussians.active_sh_degree, near=near)
+    intrinsics = camera.intrinsics.expand(poses.shape[0], 4).contiguous()
+    return CameraBatch(poses, intrinsics, camera.width, camera.height)
 
 
 def joined_splats(*parts: Projected) -> Splats:
@@ -59,12 +65,13 @@ def joined_splats(*parts: Projected) -> Splats:
     return Splats(*(torch.cat([getattr(part, name) for part in parts], dim=1) for name in names))
 
 
-def shown(projected: Projected) -> Tensor:
+def shown(projected: Projected | ProjectedDiscs) -> Tensor:
     """[N] bool: which Gaussians reach a pixel of some of the cameras."""
-    return (projected.radii[..., 0] > 0).any(dim=0)
+    reached = projected.radii[..., 0] > 0
+    return reached[0] if len(reached) == 1 else reached.any(dim=0)
 
 
-def screen_pass(part: str, projected: Projected, *, direct: bool = True) -> ScreenPass:
+def screen_pass(part: str, projected: Projected | ProjectedDiscs, *, direct: bool = True) -> ScreenPass:
     """The record of a projected scene part, with a probe that asks for a gradient."""
     probe = torch.zeros_like(projected.means2d).requires_grad_()
     return ScreenPass(part, projected.means2d, probe, projected.radii, direct=direct)
@@ -72,19 +79,42 @@ def screen_pass(part: str, projected: Projected, *, direct: bool = True) -> Scre
 
 def joined_probe(screen: Sequence[ScreenPass]) -> Tensor | None:
     """The probe [C, G, 2] that `composite` wants for the parts in this order; None where nothing is probed."""
-    return torch.cat([record.probe for record in screen], dim=1) if screen else None
+    probes = [record.probe for record in screen]
+    return torch.cat(probes, dim=1) if len(probes) > 1 else next(iter(probes), None)
 
 
 def over_background(image: Tensor, alpha: Tensor, background: tuple[float, ...]) -> Tensor:
     """Adds a constant background [D] behind an image [..., D] with coverage alpha [...]."""
     if not any(background):
         return image
-    return image + (1 - alpha)[..., None] * constant(tuple(background), image.dtype, image.device)
+    added: Tensor = _OverBackground.apply(image, alpha, constant(tuple(background), image.dtype, image.device))
+    return added
+
+
+class _OverBackground(torch.autograd.Function):
+    """One node: PyTorch's own four would go through an image for each."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
+        ctx.save_for_backward(background)
+        return torch.addcmul(image, (1 - alpha)[..., None], background)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_image: Tensor) -> tuple[Tensor, Tensor, None]:
+        (background,) = ctx.saved_tensors
+        return v_image, -(v_image @ background), None
 
 
 def mean_depth(depth_sum: Tensor, alpha: Tensor) -> Tensor:
     """Blended depth (TR-Gaussians, Eq. 4): weighted depth sum over total weight; 0 where nothing is."""
     return torch.where(alpha > 1e-6, depth_sum / alpha.clamp(min=1e-6), 0)
+
+
+def check_ellipsoids(gaussians: Gaussians) -> None:
+    """Raises ValueError where a set that is splatted as ellipsoids holds discs."""
+    if gaussians.are_discs:
+        raise ValueError("the Gaussians are discs, with two scales; expected three scales, as this method trains them")
 
 
 def check_colored(gaussians: Gaussians) -> None:

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from glassplat.kernels.build_bvh import build_bvh
+from glassplat.kernels.cube_lookup import cube_lookup
 from glassplat.kernels.splats import RawGaussians
 from glassplat.kernels.trace import Rays, trace
+from glassplat.kernels.trace.records import Traced as Found
 from glassplat.kernels.trace.shapes import FLAT, shapes_of
-from glassplat.render.frame import Frame
-from glassplat.render.rasterize import NEAR_PER_EXTENT, over_background, project_gaussians, screen_pass, shown
+from glassplat.render.deferred import INVISIBLE
+from glassplat.render.frame import Frame, SpacePass
+from glassplat.render.rasterize import (
+    NEAR_PER_EXTENT,
+    check_colored,
+    over_background,
+    project_gaussians,
+    screen_pass,
+    shown,
+)
 from glassplat.render.surface import Surface, reflected_rays, seen_surface, view_directions
 from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import SH_ZERO, Gaussians
 from glassplat.scene.scene import Scene
 
 START_PER_EXTENT = 0.005
@@ -30,17 +41,17 @@ class Traced:
         d_ref = d - 2 (d . n) n,    n = N / |N|                                 (Eq. 4)
         c = (1 - beta) c_base + beta c_ref                                      (Eq. 5)
 
-    c_ref is what the ray from x along d_ref meets of the scene's `surroundings`, a set of Gaussians of their own. n_i
-    is the shortest axis of a Gaussian, turned to the camera. Colours are sRGB, as in the paper.
+    c_ref is what the ray from x along d_ref meets of the scene's `surroundings`, a set of Gaussians of their own, and
+    behind these the `environment` where the scene has one (not in the paper), else the background. n_i is the shortest
+    axis of a Gaussian, turned to the camera. Colours are sRGB, as in the paper.
 
-    Layers: `base`, `reflection` [H, W, 3], the reflection black where it is not traced; `normal` [H, W, 3] in world
-    axes, blended and not normalised; `strength`, `depth`, `alpha` [H, W]; `surroundings` [H, W, 3], those behind each
-    pixel, if asked for.
+    Layers: `base`, `reflection` [H, W, 3]; `normal` [H, W, 3] in world axes, blended and not normalised; `strength`,
+    `depth`, `alpha` [H, W]; `surroundings` [H, W, 3], with the environment those behind each pixel, if asked for.
 
     Attributes:
-        background: colour behind everything, also behind the surroundings, sRGB.
-        least_strength: rays are traced where the strength is larger (Table 6). Not for training, where a strength
-            learns from what it would reflect.
+        background: colour behind everything, also behind surroundings without an environment, sRGB.
+        least_strength: rays are traced where the strength is larger (Table 6). Elsewhere the environment alone is
+            mirrored, and nothing where there is none.
         joint: False keeps the reflection's gradient from the surfaces (Table 4, ablation).
         surroundings: also render the layer `surroundings`.
     """
@@ -62,34 +73,96 @@ class Traced:
         screen = (screen_pass("primary", projected),) if probed else ()
         surface = seen_surface(scene.primary, camera, projected, background=self.background, screen=screen)
         chosen = (surface.strength > self.least_strength) & (surface.depth > 0)
-        reflection = self._reflection(scene, camera, surface, chosen)
-        share = torch.where(chosen, surface.strength, torch.zeros_like(surface.strength))[..., None]
-        layers = surface.layers() | {"reflection": reflection}
-        if self.surroundings:
-            d = view_directions(camera).reshape(-1, 3)
-            origins = camera.center.expand_as(d).contiguous()
-            seen = traced_colors(scene, origins, d, NEAR_PER_EXTENT * scene.extent, self.background)
-            layers["surroundings"] = seen.reshape(camera.height, camera.width, 3)
-        return Frame((1 - share) * surface.base + share * reflection, layers, direct=shown(projected), screen=screen)
-
-    def _reflection(self, scene: Scene, camera: Camera, surface: Surface, chosen: Tensor) -> Tensor:
-        """[H, W, 3] what the chosen pixels mirror, black elsewhere."""
         places, directions = reflected_rays(surface, camera, chosen)
         if not self.joint:
             places, directions = places.detach(), directions.detach()
-        colors = traced_colors(scene, places, directions, START_PER_EXTENT * scene.extent, self.background)
-        return torch.zeros_like(surface.base).index_put(torch.where(chosen), colors)
+        near = START_PER_EXTENT * scene.extent
+        colors = traced_colors(scene, places, directions, near, self.background)
+        reflection, mirrors = self._elsewhere(scene, camera, surface, chosen)
+        reflection = reflection.index_put(torch.where(chosen), colors)
+        share = torch.where(mirrors, surface.strength, torch.zeros_like(surface.strength))[..., None]
+        layers = surface.layers() | {"reflection": reflection}
+        if self.surroundings:
+            layers["surroundings"] = self._behind(scene, camera)
+        return Frame(
+            rgb=(1 - share) * surface.base + share * reflection,
+            layers=layers,
+            direct=shown(projected),
+            screen=screen,
+            space=(space_pass(scene, places),) if probed else (),
+        )
+
+    def check(self, scene: Scene) -> None:
+        """Raises ValueError where a scene lacks colours, or what reflection needs."""
+        check_colored(scene.primary)
+        check_surrounded(scene)
+
+    def _elsewhere(self, scene: Scene, camera: Camera, surface: Surface, chosen: Tensor) -> tuple[Tensor, Tensor]:
+        """[H, W, 3] what pixels mirror where no ray is traced, and [H, W] which ones mirror anything."""
+        black = torch.zeros_like(surface.base)
+        if scene.environment.is_empty:
+            return black, chosen
+        others = ~chosen & (surface.strength > INVISIBLE) & (surface.depth > 0)
+        _, directions = reflected_rays(surface, camera, others)
+        distant = torch.sigmoid(cube_lookup(scene.environment.raw, directions if self.joint else directions.detach()))
+        return black.index_put(torch.where(others), distant), chosen | others
+
+    def _behind(self, scene: Scene, camera: Camera) -> Tensor:
+        """[H, W, 3] the surroundings that a ray through each pixel meets."""
+        d = view_directions(camera).reshape(-1, 3)
+        origins = camera.center.expand_as(d).contiguous()
+        seen = traced_colors(scene, origins, d, NEAR_PER_EXTENT * scene.extent, self.background)
+        return seen.reshape(camera.height, camera.width, 3)
 
 
 def traced_colors(
     scene: Scene, origins: Tensor, directions: Tensor, near: float, background: tuple[float, float, float]
 ) -> Tensor:
-    """Colours [R, 3] of the surroundings along rays, from `near` lengths of their directions on."""
-    part = scene.surroundings
+    """Colours [R, 3] of the surroundings along rays, from `near` lengths of their directions on.
+
+    Behind them is the scene's environment, or without one the background.
+    """
+    found = traced_surroundings(scene.surroundings, origins, directions, near)
+    if scene.environment.is_empty:
+        return over_background(found.colors, found.alphas, background)
+    return found.colors + (1 - found.alphas)[:, None] * torch.sigmoid(cube_lookup(scene.environment.raw, directions))
+
+
+def traced_surroundings(part: Gaussians, origins: Tensor, directions: Tensor, near: float) -> Found:
+    """What rays [R, 3] meet of a set of Gaussians."""
     raw = RawGaussians(part.means, part.quats, part.log_scales, part.logit_opacities, part.sh)
     bvh = build_bvh(shapes_of(raw), flat=part.log_scales.shape[1] == FLAT)
-    found = trace(raw, Rays(origins, directions), bvh, sh_degree=part.active_sh_degree, near=near)
-    return over_background(found.colors, found.alphas, background)
+    return trace(raw, Rays(origins, directions), bvh, sh_degree=part.active_sh_degree, near=near)
+
+
+@torch.no_grad()
+def space_pass(scene: Scene, places: Tensor) -> SpacePass:
+    """The record that densification reads of surroundings which were mirrored at `places` [R, 3]."""
+    means = scene.surroundings.means
+    if not len(places):
+        return SpacePass("surroundings", torch.zeros_like(means[:, 0]))
+    return SpacePass("surroundings", (means - places.mean(dim=0)).norm(dim=1))
+
+
+def mirrored_contributions(scene: Scene, camera: Camera) -> Tensor:
+    """[N] how many pixels' worth each Gaussian of the surroundings adds to a view: its blending weights times strength.
+
+    Rays are traced where the strength can be seen.
+    """
+    camera = camera.to(scene.primary.means.device)
+    part = scene.surroundings
+    with torch.no_grad():
+        projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
+        surface = seen_surface(scene.primary, camera, projected, background=(0.0, 0.0, 0.0))
+        chosen = (surface.strength > INVISIBLE) & (surface.depth > 0)
+        places, directions = reflected_rays(surface, camera, chosen)
+    with torch.enable_grad():
+        # The blending weight is what a constant colour has for a gradient; that of this one is 1.
+        ones = torch.full_like(part.sh[:, :1], 0.5 / SH_ZERO).requires_grad_()
+        plain = replace(part.with_tensors({n: t.detach() for n, t in part.tensors().items()}), active_sh_degree=0)
+        found = traced_surroundings(replace(plain, sh=ones), places, directions, START_PER_EXTENT * scene.extent)
+        (sums,) = torch.autograd.grad((found.colors[:, 0] * surface.strength[chosen]).sum(), ones)
+    return sums[:, 0, 0] / SH_ZERO
 
 
 def check_surrounded(scene: Scene) -> None:

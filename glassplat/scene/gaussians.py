@@ -1,4 +1,4 @@
-"""A set of 3D Gaussians, as raw (unactivated) tensors."""
+"""A set of Gaussians, ellipsoids or discs, as raw (unactivated) tensors."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 SH_ZERO = 0.28209479177387814  # value of the constant spherical harmonic
+DISC_SCALES = 2
+"""Scales of a disc; an ellipsoid has one more."""
 PER_GAUSSIAN = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
 
@@ -19,7 +21,8 @@ class Gaussians:
     Attributes:
         means: [N, 3] centres, world units.
         quats: [N, 4] orientation `wxyz`, not necessarily unit; normalised where used.
-        log_scales: [N, 3] logarithm of the standard deviation along each principal axis.
+        log_scales: logarithm of the standard deviation along each principal axis: [N, 3] for ellipsoids (3DGS), [N, 2]
+            for discs (2DGS), whose third axis is their normal.
         logit_opacities: [N] opacity before the sigmoid.
         sh: [N, K, 3] spherical-harmonic colour coefficients, K in {0, 1, 4, 9, 16}; K = 0 for
             Gaussians without a colour of their own (glass).
@@ -54,6 +57,17 @@ class Gaussians:
     def max_sh_degree(self) -> int:
         """Highest degree the coefficients can hold; -1 when there are none."""
         return round(self.sh.shape[1] ** 0.5) - 1
+
+    @property
+    def are_discs(self) -> bool:
+        """Whether they are flat, with two scales each (2DGS)."""
+        return self.log_scales.shape[1] == DISC_SCALES
+
+    @property
+    def deviations(self) -> Tensor:
+        """[N, 3] standard deviation along each axis, activated; 0 along the normal of a disc."""
+        found = self.log_scales.exp()
+        return torch.nn.functional.pad(found, (0, 1)) if self.are_discs else found
 
     def tensors(self) -> dict[str, Tensor]:
         """All per-Gaussian tensors by name, channels included."""

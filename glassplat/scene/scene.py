@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from glassplat.scene.environment import Environment
+from glassplat.scene.exposure import Exposures
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import TRAINABLE, Planes
 
 GAUSSIAN_SETS = ("primary", "glass", "surroundings")
-PARTS = (*GAUSSIAN_SETS, "planes", "environment")
+PARTS = (*GAUSSIAN_SETS, "planes", "environment", "exposures")
 """Fields of `Scene` that hold tensors."""
 
 
@@ -30,6 +31,7 @@ class Scene:
         environment: what shiny surfaces mirror from far away; empty for most methods.
         surroundings: Gaussians that shiny surfaces mirror from near by, and nothing else shows (EnvGS); empty for most
             methods.
+        exposures: how the photographs were exposed that it was trained on; empty where all are taken as alike.
     """
 
     primary: Gaussians
@@ -38,6 +40,7 @@ class Scene:
     planes: Planes = field(default_factory=Planes.empty)
     environment: Environment = field(default_factory=Environment.empty)
     surroundings: Gaussians = field(default_factory=Gaussians.empty)
+    exposures: Exposures = field(default_factory=Exposures.neutral)
 
     def gaussian_sets(self) -> dict[str, Gaussians]:
         """The sets of Gaussians by name; the surroundings are among them where there are any."""
@@ -47,12 +50,14 @@ class Scene:
     def parameters(self) -> dict[str, Tensor]:
         """Every trainable tensor by dotted name (`primary.means`, `planes.centers`, ...).
 
-        The environment (`environment.raw`) is among them where there is one.
+        The environment (`environment.raw`) and the exposures are among them where there are any.
         """
         found = {f"{part}.{name}": t for part, g in self.gaussian_sets().items() for name, t in g.tensors().items()}
         found |= {f"planes.{name}": getattr(self.planes, name) for name in TRAINABLE}
         distant = {} if self.environment.is_empty else self.environment.tensors()
-        return found | {f"environment.{name}": tensor for name, tensor in distant.items()}
+        found |= {f"environment.{name}": tensor for name, tensor in distant.items()}
+        exposed = self.exposures.tensors() if len(self.exposures) else {}
+        return found | {f"exposures.{name}": tensor for name, tensor in exposed.items()}
 
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> Scene:
         """The same scene with some tensors replaced by dotted name."""

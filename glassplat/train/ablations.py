@@ -1,13 +1,17 @@
-"""The parts of methods that can be switched off one at a time (TR-Gaussians, Table IV; 3DGS-DR, Tables 1 and 5)."""
+"""The parts of methods that can be switched off one at a time.
+
+TR-Gaussians, Table IV; 3DGS-DR, Tables 1 and 5; EnvGS, Table 4.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.traced_recipe import TracedRecipe
 
 Switch = Literal[
     "multi-stage",
@@ -31,8 +35,15 @@ Switch = Literal[
     "deferred-shading",
     "coarse-to-fine",
     "strength-price",
+    "joint",
+    "surroundings",
+    "environment",
+    "copied-surroundings",
+    "monocular-normals",
+    "normal-consistency",
+    "culling",
 ]
-Ablated = Literal["planar", "deferred"]
+Ablated = Literal["planar", "deferred", "traced"]
 
 
 @dataclass(frozen=True)
@@ -68,12 +79,20 @@ def _with_published_rates(recipe: PlanarRecipe) -> PlanarRecipe:
     return replace(recipe, rates=replace(recipe.rates, short_run_power=0.0))
 
 
-def _without_propagation(recipe: DeferredRecipe) -> DeferredRecipe:
+Reflective = TypeVar("Reflective", DeferredRecipe, TracedRecipe)
+
+
+def _without_propagation(recipe: Reflective) -> Reflective:
     return replace(recipe, propagation=replace(recipe.propagation, propagates=False))
 
 
-def _without_sabotage(recipe: DeferredRecipe) -> DeferredRecipe:
+def _without_sabotage(recipe: Reflective) -> Reflective:
     return replace(recipe, propagation=replace(recipe.propagation, sabotage=0.0))
+
+
+def _spread_over_the_box(recipe: TracedRecipe) -> TracedRecipe:
+    start = replace(recipe.surroundings.start, source="box")
+    return replace(recipe, surroundings=replace(recipe.surroundings, start=start))
 
 
 PLANAR: dict[Switch, Ablation] = {
@@ -105,4 +124,18 @@ DEFERRED: dict[Switch, Ablation] = {
 }
 """The rows of 3DGS-DR's Table 5 and its forward variant (Table 1, `ball`), and what the paper does not have."""
 
-ABLATIONS: dict[Ablated, dict[Switch, Ablation]] = {"planar": PLANAR, "deferred": DEFERRED}
+TRACED: dict[Switch, Ablation] = {
+    "joint": Ablation("w/o joint optimization", lambda r: replace(r, joint=False), -0.58),
+    "monocular-normals": Ablation("w/o mono normal loss", lambda r: replace(r, monocular_weight=0.0), -0.51),
+    "surroundings": Ablation("w/ environment map alone", lambda r: replace(r, mirrors="environment"), -0.47),
+    "sabotage": Ablation("w/o color sabotage", _without_sabotage, -0.35),
+    "propagation": Ablation("w/o normal propagation", _without_propagation, -0.43),
+    "environment": Ablation("surroundings alone (the paper's)", lambda r: replace(r, mirrors="surroundings")),
+    "copied-surroundings": Ablation("surroundings spread over the box (the paper's)", _spread_over_the_box),
+    "normal-consistency": Ablation("w/o normal consistency", lambda r: replace(r, consistency_weight=0.0)),
+    "culling": Ablation("rays wherever anything reflects", lambda r: replace(r, least_strength=0.0)),
+}
+"""The first five are the rows of EnvGS's Table 4, but for its perceptual loss, which needs a network's weights; the
+others are what the paper does not have or does not ablate in training."""
+
+ABLATIONS: dict[Ablated, dict[Switch, Ablation]] = {"planar": PLANAR, "deferred": DEFERRED, "traced": TRACED}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,7 +16,9 @@ from glassplat.densify.mcmc import McmcDensify
 from glassplat.densify.order import in_morton_order
 from glassplat.densify.perturb import perturb_opacities
 from glassplat.render.contribution import contributions
+from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Scene
 from glassplat.scene.sight import behind_panes
 from glassplat.train.messages import Working
 from glassplat.train.optimizer import Rate
@@ -110,13 +113,24 @@ class Densify:
 
 @dataclass(frozen=True)
 class PruneIdle:
-    """Removes the primary Gaussians that add next to nothing to any training view.
+    """Removes the Gaussians of one set that add next to nothing to any training view.
 
     What stood behind a pane for a reflection, and has lost that to the mirrored image, ends as such.
+
+    Attributes:
+        densifier: holds what is next to nothing, and when.
+        part: the set.
+        measure: [N] what each of its Gaussians adds to a view, in pixels.
     """
 
     densifier: DefaultDensify
-    name: str = "prune idle primary"
+    part: str = "primary"
+    measure: Callable[[Scene, Camera], Tensor] = contributions
+
+    @property
+    def name(self) -> str:
+        """What the log calls it."""
+        return f"prune idle {self.part}"
 
     def due(self, clock: Clock) -> bool:
         """Whether to act after this step."""
@@ -125,16 +139,18 @@ class PruneIdle:
     @torch.no_grad()
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
         """Edits `state`, if there is anything to edit, and tells how far it is."""
-        most = torch.zeros_like(state.scene.primary.logit_opacities)
+        gaussians = state.scene.gaussian_sets()[self.part]
+        most = torch.zeros_like(gaussians.logit_opacities)
         for done, view in enumerate(dataset.train):
             yield Working("looking for Gaussians that no view needs", done, len(dataset.train))
-            most = torch.maximum(most, contributions(state.scene, view.camera))
+            most = torch.maximum(most, self.measure(state.scene, view.camera))
         busy = most >= self.densifier.least_contribution
-        if bool(busy.all()):
+        # A scene without Gaussians is reported; surroundings that nothing mirrors yet may still be needed.
+        if bool(busy.all()) or (self.part != "primary" and not bool(busy.any())):
             return False
-        primary, state.optimizer.moments = apply_edit(state.scene.primary, state.optimizer.moments, keep(busy))
-        state.scene = replace(state.scene, primary=primary)
-        state.statistics.pop("primary", None)
+        kept, state.optimizer.moments = apply_edit(gaussians, state.optimizer.moments, keep(busy), part=self.part)
+        state.scene = state.scene.with_gaussians(self.part, kept)
+        state.statistics.pop(self.part, None)
         return True
 
 

@@ -18,7 +18,8 @@ from glassplat.files.planes_json import HIGHEST_LABEL
 from glassplat.files.scene_folder import EXTENT, SH_DEGREE
 from glassplat.files.tensors_file import TensorsFile, opened_tensors, write_tensors
 from glassplat.scene.environment import Environment
-from glassplat.scene.gaussians import PER_GAUSSIAN, Gaussians
+from glassplat.scene.exposure import Exposures
+from glassplat.scene.gaussians import DISC_SCALES, PER_GAUSSIAN, Gaussians
 from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
 from glassplat.train.optimizer import Optimizer
@@ -40,9 +41,10 @@ HEADER: dict[str, Field] = {
     "paused": Optional(ByName(Whole(0)), {}),
     "hurried": Optional(ByName(Number(0)), {}),
     "records": Optional(ByName(Number()), {}),
+    "photographs": Optional(Items(Text()), ()),
 }
 """What is `Optional` was added after the first checkpoints were written."""
-GAUSSIAN_SHAPES = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": ()}
+GAUSSIAN_SHAPES = {"means": (3,), "quats": (4,), "log_scales": None, "logit_opacities": ()}
 PLANE_SHAPES = {
     "centers": (3,),
     "raw_normals": (3,),
@@ -50,6 +52,7 @@ PLANE_SHAPES = {
     "tangents": (3,),
     "half_sizes": (2,),
 }
+SCALE_SHAPES = [(DISC_SCALES,), (DISC_SCALES + 1,)]
 SH_SHAPES = [(count, 3) for count in (0, 1, 4, 9, 16)]
 
 
@@ -66,6 +69,8 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
     tensors |= {f"scene/planes/{name}": t for name, t in scene.planes.tensors().items()}
     if not scene.environment.is_empty:
         tensors |= {f"scene/environment/{name}": t for name, t in scene.environment.tensors().items()}
+    if len(scene.exposures):
+        tensors |= {f"scene/exposures/{name}": t for name, t in scene.exposures.tensors().items()}
     for name, (first, second) in state.optimizer.moments.items():
         tensors |= {f"first/{name}": first, f"second/{name}": second}
     for part, statistics in state.statistics.items():
@@ -86,6 +91,7 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
         "paused": state.optimizer.paused,
         "hurried": state.optimizer.hurried,
         "records": state.records,
+        "photographs": list(scene.exposures.names),
     }
     write_tensors(path, tensors, header)
 
@@ -206,10 +212,13 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     distant = under(tensors, "scene/environment/")
     check_shapes(distant, {"raw": None} if distant else {}, "environment")
     environment = Environment(**distant, region=header["region"]) if distant else empty.environment
+    exposed = under(tensors, "scene/exposures/")
+    check_shapes(exposed, {"affine": (3, 4)} if exposed else {}, "exposures")
     return Scene(
         extent=header["extent"],
         planes=Planes(**planes, labels=header["labels"], mirrors=header["mirrors"]),
         environment=environment,
+        exposures=Exposures(**exposed, names=tuple(header["photographs"])) if exposed else empty.exposures,
         **sets,
     )
 
@@ -221,6 +230,8 @@ def restored_gaussians(tensors: Mapping[str, Tensor], part: str, active_sh_degre
     check_shapes(tensors, {**GAUSSIAN_SHAPES, "sh": None, **dict.fromkeys(channels, ())}, part)
     if tuple(main["sh"].shape[1:]) not in SH_SHAPES:
         raise InputError(f"sh of {part} has shape {list(main['sh'].shape)}; expected [N, 0, 1, 4, 9 or 16, 3]")
+    if tuple(main["log_scales"].shape[1:]) not in SCALE_SHAPES:
+        raise InputError(f"log_scales of {part} has shape {list(main['log_scales'].shape)}; expected [N, 2 or 3]")
     return Gaussians(**main, channels=channels, active_sh_degree=active_sh_degree)
 
 

@@ -99,6 +99,8 @@ class DeferredRecipe:
         consistency_weight: weight of the difference between normals and the slope of the depths, while normals spread.
         propagation: how normals spread and colours are sabotaged.
         schedule: when they do.
+        least_iterations: of the shortest run in which anything reflects. A shorter one would be over before the colours
+            have learnt what the reflections leave to them; it trains like one of `splat`.
         hurry_matte: raise the learning rates to those of `splat` for the rest of a run in which nothing was found that
             reflects, and for all of one that is too short to look for it.
         propagation_interval: steps between densifications while normals spread; None keeps `densify.interval`.
@@ -130,6 +132,7 @@ class DeferredRecipe:
     consistency_weight: NotNegative = 0.3
     propagation: NormalPropagation = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
+    least_iterations: Several = 6000
     hurry_matte: bool = True
     propagation_interval: Several | None = None
     rates: GaussianRates = field(default_factory=partial(GaussianRates, short_run_power=0.0))
@@ -151,9 +154,8 @@ class DeferredRecipe:
             strength_weight=0.0,
             consistency_weight=0.0,
             propagation=NormalPropagation(sabotage=0.4 * SH_ZERO),
-            schedule=PropagationSchedule(
-                end="fixed", stop=24_000 / CODE_ITERATIONS, pause=200, last_reset=False, least=1
-            ),
+            schedule=PropagationSchedule(end="fixed", stop=24_000 / CODE_ITERATIONS, pause=200, last_reset=False),
+            least_iterations=1,
             hurry_matte=False,
             propagation_interval=500,
             rates=GaussianRates(decay=30_000 / CODE_ITERATIONS, short_run_power=0.0),
@@ -187,7 +189,7 @@ class DeferredRecipe:
 
     def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
         """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has one stage."""
-        if iterations < self.schedule.least:
+        if iterations < self.least_iterations:
             return self._matte_stages(seed, iterations)
         population = self._population()
         image = image_terms(self.ssim_weight, self.view_dependence_weight)
@@ -251,7 +253,7 @@ class DeferredRecipe:
             mcmc=self.mcmc,
         )
         (stage,) = plain.stages(seed)
-        entry = StayMatte(iterations, self.schedule.least, self._entry())
+        entry = StayMatte(iterations, self.least_iterations, self._entry())
         return (replace(stage, name="as splat", entry=entry),)
 
     def _entry(self) -> AddEnvironment:

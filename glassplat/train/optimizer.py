@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from glassplat.kernels.adam import adam
+from glassplat.kernels.adam import Update, adam
 
 PUBLISHED_ITERATIONS = 30_000
 """Length of the runs for which 3DGS, and TR-Gaussians after it, chose their learning rates."""
@@ -72,20 +72,14 @@ class Optimizer:
         self, parameters: Mapping[str, Tensor], gradients: Mapping[str, Tensor], rates: Mapping[str, float | Tensor]
     ) -> None:
         """Updates `parameters` in place for every name in `gradients`."""
-        for name, gradient in gradients.items():
-            parameter = parameters[name]
-            if parameter.numel() == 0 or self._waits(name):
-                continue
-            first, second = self.moments_of(name, parameter)
-            self.updates[name] = self.updates.get(name, 0) + 1
-            adam(
-                parameter,
-                gradient,
-                first,
-                second,
-                lr=rates[name] * self.hurried.get(name, 1.0),
-                step=self.updates[name],
-            )
+        learning = [name for name in gradients if parameters[name].numel() > 0 and not self._waits(name)]
+        adam([self._update(name, parameters[name], gradients[name], rates[name]) for name in learning])
+
+    def _update(self, name: str, parameter: Tensor, gradient: Tensor, rate: float | Tensor) -> Update:
+        """The next step of a parameter; counts it."""
+        moments = self.moments_of(name, parameter)
+        self.updates[name] = self.updates.get(name, 0) + 1
+        return Update(parameter, gradient, *moments, lr=rate * self.hurried.get(name, 1.0), step=self.updates[name])
 
     def _waits(self, name: str) -> bool:
         """Whether a parameter is paused; counts the step."""

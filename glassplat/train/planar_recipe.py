@@ -32,6 +32,7 @@ from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, GrowSh, PerturbOpacity, ResetOpacity
 from glassplat.train.background import BLACK
 from glassplat.train.optimizer import PUBLISHED_ITERATIONS, Rate
+from glassplat.train.photo_exposure import PhotoExposure
 from glassplat.train.plane_entry import PlaneEntry, fitted_planes
 from glassplat.train.splat_recipe import GaussianRates, image_terms
 from glassplat.train.stage import Every, Stage
@@ -151,6 +152,7 @@ class PlanarRecipe:
             images where none does, each counting by what panes leave of it; or all views and mirror images alike.
         densify: when and how Gaussians are added and pruned under `default`.
         mcmc: when and how Gaussians are relocated and added under `mcmc`.
+        exposure: whether the exposure of each photograph is learned.
     """
 
     method: ClassVar[str] = "planar"
@@ -182,6 +184,7 @@ class PlanarRecipe:
     densify_by: Literal["direct", "all"] = "direct"
     densify: DefaultDensify = field(default_factory=DefaultDensify)
     mcmc: McmcDensify = field(default_factory=McmcDensify)
+    exposure: PhotoExposure = field(default_factory=PhotoExposure)
 
     @classmethod
     def paper(cls) -> PlanarRecipe:
@@ -221,7 +224,8 @@ class PlanarRecipe:
             )
         if dataset.measured_points:
             fitted_planes(dataset, None, self.plane_fit)
-        return Scene(self._population().initial(dataset.points, self.sh_degree), dataset.extent)
+        scene = Scene(self._population().initial(dataset.points, self.sh_degree), dataset.extent)
+        return self.exposure.begun(scene, dataset)
 
     @staticmethod
     def _lack_of_masks(dataset: Dataset) -> str:
@@ -261,8 +265,10 @@ class PlanarRecipe:
             densify_until=population.densify_until,
         )
         if not self.multi_stage:
-            return initialisation, replace(self._joint(second + third), entry=entry)
-        return initialisation, self._adjustment(second, entry), self._joint(third)
+            stages: tuple[Stage, ...] = (initialisation, replace(self._joint(second + third), entry=entry))
+        else:
+            stages = (initialisation, self._adjustment(second, entry), self._joint(third))
+        return self.exposure.learnt_in(stages)
 
     def _adjustment(self, share: float, entry: PlaneEntry) -> Stage:
         """Stage 2: the reflection's gradient reaches the planes, not the Gaussians."""

@@ -13,8 +13,8 @@ from glassplat.data.dataset import Dataset
 from glassplat.data.ranges import Count, Several, Share
 from glassplat.densify.propagate import NormalPropagation
 from glassplat.densify.reflectors import Search
-from glassplat.render.deferred import Deferred
 from glassplat.render.environment import resized
+from glassplat.render.frame import Renderer
 from glassplat.train.actions import Densify, GrowSh, ResetOpacity
 from glassplat.train.optimizer import Rate
 from glassplat.train.stage import Clock, Every
@@ -58,8 +58,6 @@ class PropagationSchedule:
         pause: steps for which raised opacities are held.
         last_reset: after the end, reset opacities only if they have been raised since the last time; if not, regular
             resets go on as if nothing had been propagated.
-        least: iterations of the shortest run in which normals are propagated. Shorter ones would be over before the
-            colours have learnt what the reflections leave to them; they train like those of `splat`.
     """
 
     end: Literal["settled", "fixed"] = "settled"
@@ -67,7 +65,6 @@ class PropagationSchedule:
     patience: Several = 5
     pause: Count = 100
     last_reset: bool = True
-    least: Several = 6000
 
 
 @dataclass(frozen=True)
@@ -80,7 +77,7 @@ class Propagate:
         when: the beats at which it happens; whether to go on is asked at those that it skips, too.
         propagation: what it does.
         schedule: when it ends.
-        renderer: that of the stage.
+        renderer: that of the stage; its frames have a layer `base`.
         matte_rates: factors on learning rates before the first beat at which normals may be propagated, and after the
             last one where nothing reflective was found, by dotted parameter name; of them the value for a run of this
             length is taken.
@@ -90,7 +87,7 @@ class Propagate:
     when: Every
     propagation: NormalPropagation
     schedule: PropagationSchedule
-    renderer: Deferred
+    renderer: Renderer
     matte_rates: Mapping[str, Rate] = field(default_factory=dict)
     search: Search = field(default_factory=Search)
     name: str = "propagate normals"

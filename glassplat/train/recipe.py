@@ -18,6 +18,7 @@ from glassplat.train.optimizer import PUBLISHED_ITERATIONS
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Stage
+from glassplat.train.traced_recipe import TracedRecipe
 
 
 class Recipe(Protocol):
@@ -48,7 +49,9 @@ class Recipe(Protocol):
 
 REMEDY = "Train again, or use the version that wrote it"
 Preset = Literal["glassplat", "paper"]
-RECIPES: dict[str, type] = {recipe.method: recipe for recipe in (SplatRecipe, PlanarRecipe, DeferredRecipe)}
+RECIPES: dict[str, type] = {
+    recipe.method: recipe for recipe in (SplatRecipe, PlanarRecipe, DeferredRecipe, TracedRecipe)
+}
 
 
 def recipe_of(method: str, preset: Preset = "glassplat") -> Any:

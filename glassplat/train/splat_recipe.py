@@ -1,14 +1,16 @@
-"""The recipe of `splat`: 3D Gaussian Splatting."""
+"""The recipe of `splat`: 3D Gaussian Splatting, or 2D Gaussian Splatting with discs."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Annotated, ClassVar
+from dataclasses import dataclass, field, replace
+from typing import Annotated, ClassVar, Literal
 
 from glassplat.data.dataset import Dataset
 from glassplat.data.ranges import ESSENTIAL, Color, LearningRate, NotNegative, PositiveShare, Range, Share, ShDegree
 from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
+from glassplat.init.points import as_discs
+from glassplat.losses.discs import disc_normals, distortion
 from glassplat.losses.parsimony import view_dependence
 from glassplat.losses.photometric import PhotometricLoss
 from glassplat.losses.term import LossTerm, weighted
@@ -17,6 +19,7 @@ from glassplat.scene.scene import Scene
 from glassplat.train.actions import GrowSh
 from glassplat.train.background import BLACK
 from glassplat.train.optimizer import PUBLISHED_ITERATIONS, Rate
+from glassplat.train.photo_exposure import PhotoExposure
 from glassplat.train.stage import Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
 
@@ -66,11 +69,41 @@ def image_terms(ssim_weight: float, view_dependence_weight: float) -> tuple[Loss
     )
 
 
+Primitive = Literal["ellipsoid", "disc"]
+
+
 @dataclass(frozen=True)
-class SplatRecipe:
-    """Plain 3D Gaussian Splatting, the baseline.
+class DiscTerms:
+    """What keeps discs on one surface (2DGS, Section 4.2); ellipsoids know none of it.
 
     Attributes:
+        distortion_weight: of how far apart along a ray lies what a pixel shows; 2DGS takes 1000 for bounded scenes.
+        distortion_start: share of the run after which it counts.
+        normal_weight: of how far the discs' normals are from those of their depths.
+        normal_start: share of the run after which it counts.
+    """
+
+    distortion_weight: NotNegative = 100.0
+    distortion_start: Share = 3_000 / 30_000
+    normal_weight: NotNegative = 0.05
+    normal_start: Share = 7_000 / 30_000
+
+    def by_start(self) -> tuple[tuple[float, LossTerm], ...]:
+        """The terms that count at all, with the shares of the run after which they do, in order."""
+        terms = (
+            (self.distortion_start, LossTerm("distortion", self.distortion_weight, distortion)),
+            (self.normal_start, LossTerm("normals", self.normal_weight, disc_normals)),
+        )
+        wanted = [(start, term) for start, term in terms if term.weight > 0 and start < 1]
+        return tuple(sorted(wanted, key=lambda pair: pair[0]))
+
+
+@dataclass(frozen=True)
+class SplatRecipe:
+    """Plain Gaussian Splatting, the baseline: of ellipsoids (3DGS) or discs (2DGS).
+
+    Attributes:
+        primitive: what the scene is made of: ellipsoids, or discs, which have normals and lie on surfaces.
         sh_degree: highest degree of the view-dependent colour.
         ssim_weight: lambda, share of D-SSIM in the photometric loss.
         view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
@@ -80,10 +113,13 @@ class SplatRecipe:
         strategy: what decides how many Gaussians there are and where; `densify` or `mcmc` holds its options.
         densify: when and how Gaussians are added and pruned under `default`.
         mcmc: when and how Gaussians are relocated and added under `mcmc`.
+        discs: what keeps discs on one surface.
+        exposure: whether the exposure of each photograph is learned.
     """
 
     method: ClassVar[str] = "splat"
 
+    primitive: Annotated[Primitive, ESSENTIAL] = "ellipsoid"
     sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
     ssim_weight: Share = 0.2
     view_dependence_weight: NotNegative = 0.0
@@ -93,10 +129,12 @@ class SplatRecipe:
     strategy: Annotated[Strategy, ESSENTIAL] = "default"
     densify: DefaultDensify = field(default_factory=DefaultDensify)
     mcmc: McmcDensify = field(default_factory=McmcDensify)
+    discs: DiscTerms = field(default_factory=DiscTerms)
+    exposure: PhotoExposure = field(default_factory=PhotoExposure)
 
     @classmethod
     def paper(cls) -> SplatRecipe:
-        """As published: 3DGS, or 3DGS-MCMC with that strategy (docs/splat.md)."""
+        """As published: 3DGS, or 3DGS-MCMC with that strategy, or 2DGS with discs (docs/splat.md)."""
         return cls(
             rates=GaussianRates(short_run_power=0.0),
             rhythm=Rhythm(averaged_passes=0.0),
@@ -106,27 +144,41 @@ class SplatRecipe:
 
     def initialise(self, dataset: Dataset) -> Scene:
         """The first scene: one Gaussian per point."""
-        return Scene(self._population().initial(dataset.points, self.sh_degree), dataset.extent)
+        first = self._population().initial(dataset.points, self.sh_degree)
+        scene = Scene(as_discs(first) if self.primitive == "disc" else first, dataset.extent)
+        return self.exposure.begun(scene, dataset)
 
     def renderer(self) -> Splat:
         """The renderer of the finished scene, with all its layers."""
         return Splat(self.background or BLACK)
 
     def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
-        """One stage."""
+        """One stage; of discs a new one whenever one of their terms begins to count."""
         population = self._population()
-        return (
-            Stage(
-                name="splat",
-                share=1.0,
-                renderer=Splat(self.background or BLACK, depth=False),
-                losses=(*image_terms(self.ssim_weight, self.view_dependence_weight), *population.terms),
-                rates=self.rates.of("primary"),
-                actions=(*population.edits, GrowSh(Every(self.rhythm.sh)), *population.resets),
-                motions=population.motions,
-                densify_until=population.densify_until,
-            ),
+        first = Stage(
+            name="splat",
+            share=1.0,
+            renderer=self._bare(),
+            losses=(*image_terms(self.ssim_weight, self.view_dependence_weight), *population.terms),
+            rates=self.rates.of("primary"),
+            actions=(*population.edits, GrowSh(Every(self.rhythm.sh)), *population.resets),
+            motions=population.motions,
+            densify_until=population.densify_until,
         )
+        stages, began = [first], 0.0
+        for start, term in self.discs.by_start() if self.primitive == "disc" else ():
+            last = stages.pop()
+            stages += [replace(last, share=start - began)] if start > began else []
+            losses = (*last.losses, term)
+            with_normals = any(known.function is disc_normals for known in losses)
+            name = f"{last.name}, {term.name}"
+            stages.append(replace(last, name=name, renderer=self._bare(normal=with_normals), losses=losses))
+            began = start
+        return self.exposure.learnt_in((*stages[:-1], replace(stages[-1], share=1 - began)))
+
+    def _bare(self, *, normal: bool = False) -> Splat:
+        """The renderer with what the losses need and no more."""
+        return Splat(self.background or BLACK, depth=False, normal=normal)
 
     def _population(self) -> Population:
         means_rate = self.rates.of("primary")["primary.means"]

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from glassplat.data.dataset import Dataset, View
-from glassplat.densify.default import ScreenStatistics, accumulate
-from glassplat.render.frame import Frame, ScreenPass
+from glassplat.densify.default import ScreenStatistics
+from glassplat.kernels.screen_statistics import Views
+from glassplat.render.frame import Frame, ScreenPass, SpacePass
 from glassplat.scene.scene import Scene
+from glassplat.scene.transfer import constant
 from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
 from glassplat.train.optimizer import rate_tensor
 from glassplat.train.stage import Clock, Stage, carried_out, stage_starts
@@ -36,12 +39,13 @@ WHERE_TO_LOOK = (
 class Differentiated(NamedTuple):
     """One view's losses and their gradients; of each pass on screen those of its centres and of its probe.
 
-    `visible` is the frame's.
+    `space` and `visible` are the frame's.
     """
 
     losses: dict[str, float]
     gradients: dict[str, Tensor]
     screen: list[tuple[ScreenPass, Tensor, Tensor]]
+    space: tuple[SpacePass, ...]
     visible: Tensor | None
 
 
@@ -86,6 +90,7 @@ def advance(stage: Stage, dataset: Dataset, state: TrainState, iterations: int, 
     sight.note(result.visible, state.step)
     update(stage, state, result.gradients, iterations)
     collect_statistics(state, result.screen, view)
+    collect_in_space(state, result)
     state.step += 1
     clock = Clock(state.step, iterations, len(dataset.train))
     for motion in stage.motions:
@@ -152,10 +157,16 @@ class Sight:
 
 def scheduled_view(dataset: Dataset, state: TrainState) -> View:
     """The view of this step: every view once per pass, in an order drawn anew for each pass."""
-    count = len(dataset.train)
-    number, position = divmod(state.step, count)
-    generator = torch.Generator().manual_seed(state.seed * 1_000_003 + number)
-    return dataset.train[int(torch.randperm(count, generator=generator)[position])]
+    number, position = divmod(state.step, len(dataset.train))
+    return dataset.train[order_of_views(len(dataset.train), state.seed, number)[position]]
+
+
+@lru_cache(maxsize=8)
+def order_of_views(count: int, seed: int, number: int) -> list[int]:
+    """The order of so many views in one pass over them."""
+    generator = torch.Generator().manual_seed(seed * 1_000_003 + number)
+    order: list[int] = torch.randperm(count, generator=generator).tolist()
+    return order
 
 
 def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Differentiated:
@@ -170,25 +181,32 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Di
     }
     learning = scene.with_parameters(leaves)
     frame = stage.renderer(learning, view.camera, probed=probed)
-    terms = weighted_terms(stage, frame, view, learning)
-    stacked = torch.stack(list(terms.values()))
-    total = stacked.sum()
+    terms, weights = loss_terms(stage, frame, view, learning)
     tracked = [record for record in frame.screen if record.means2d.requires_grad and record.means2d.numel() > 0]
     centers, probes = [record.means2d for record in tracked], [record.probe for record in tracked]
-    found = torch.autograd.grad(total, [*leaves.values(), *centers, *probes], allow_unused=True)
+    sloped = [(term, weight) for term, weight in zip(terms.values(), weights, strict=True) if term.requires_grad]
+    # The weights enter as the gradients that the terms begin with: no sum over the terms has to be made for it.
+    found = torch.autograd.grad(
+        [term for term, _ in sloped],
+        [*leaves.values(), *centers, *probes],
+        [weight for _, weight in sloped],
+        allow_unused=True,
+    )
     gradients = {name: g for name, g in zip(leaves, found[: len(leaves)], strict=True) if g is not None}
     on_screen = found[len(leaves) :]
     pulls = zip(tracked, on_screen[: len(tracked)], on_screen[len(tracked) :], strict=True)
     screen = [(s, v_means, v_probe) for s, v_means, v_probe in pulls if v_means is not None and v_probe is not None]
-    losses = dict(zip(terms, stacked.tolist(), strict=True))
-    return Differentiated(losses, gradients, screen, frame.visible)
+    values = torch.stack([term.detach() for term in terms.values()]) * weights
+    losses = dict(zip(terms, values.tolist(), strict=True))
+    return Differentiated(losses, gradients, screen, frame.space, frame.visible)
 
 
-def weighted_terms(stage: Stage, frame: Frame, view: View, scene: Scene) -> dict[str, Tensor]:
-    """Every loss term that applies to the view, times its weight."""
+def loss_terms(stage: Stage, frame: Frame, view: View, scene: Scene) -> tuple[dict[str, Tensor], Tensor]:
+    """Every loss term that applies to the view, and the weights of these terms, in the same order."""
     values = {term.name: term.function(frame, view, scene) for term in stage.losses}
-    weights = {term.name: term.weight for term in stage.losses}
-    return {name: weights[name] * value for name, value in values.items() if value is not None}
+    terms = {name: value for name, value in values.items() if value is not None}
+    weights = tuple(term.weight for term in stage.losses if term.name in terms)
+    return terms, constant(weights, frame.rgb.dtype, frame.rgb.device)
 
 
 def update(stage: Stage, state: TrainState, gradients: Mapping[str, Tensor], iterations: int) -> None:
@@ -202,20 +220,26 @@ def update(stage: Stage, state: TrainState, gradients: Mapping[str, Tensor], ite
 
 def collect_statistics(state: TrainState, screen: list[tuple[ScreenPass, Tensor, Tensor]], view: View) -> None:
     """Adds the step's screen gradients to the statistics that densification reads."""
+    size = view.camera.width, view.camera.height
     for record, v_means, v_probe in screen:
-        known = state.statistics.get(record.part)
-        if known is None:
-            known = ScreenStatistics.zeros(record.means2d.shape[1], device=v_means.device)
-        state.statistics[record.part] = accumulate(
-            known,
-            v_means,
-            v_probe,
-            record.radii,
-            width=view.camera.width,
-            height=view.camera.height,
-            weight=record.weight,
-            direct=record.direct,
-        )
+        known = statistics_of(state, record.part, v_means.shape[1], v_means.device)
+        known.add(Views(v_means, v_probe, record.radii, *size, record.weight, record.direct))
+
+
+def collect_in_space(state: TrainState, result: Differentiated) -> None:
+    """Adds the step's gradients in space, of what rays met, to the statistics that densification reads."""
+    for record in result.space:
+        gradient = result.gradients.get(f"{record.part}.means")
+        if gradient is not None:
+            known = statistics_of(state, record.part, gradient.shape[0], gradient.device)
+            known.add_in_space(gradient, record.distances)
+
+
+def statistics_of(state: TrainState, part: str, count: int, device: torch.device) -> ScreenStatistics:
+    """What the state has collected of a part of the scene; of so many Gaussians, where that begins."""
+    if part not in state.statistics:
+        state.statistics[part] = ScreenStatistics.zeros(count, device=device)
+    return state.statistics[part]
 
 
 def counts_of(scene: Scene) -> dict[str, int]:

@@ -29,7 +29,16 @@ def run(tmp_path: Path) -> Path:
     """A run of a few steps, whose capture knows its environment."""
     capture = write_object_capture(tmp_path / "ball")
     write_equirect(capture / "environment.exr", 0.2 + 0.6 * torch.rand(8, 16, 3))
-    options = ["--data", str(capture), "--output", str(tmp_path / "run"), "--iterations", "12", "--schedule.least", "1"]
+    options = [
+        "--data",
+        str(capture),
+        "--output",
+        str(tmp_path / "run"),
+        "--iterations",
+        "12",
+        "--least-iterations",
+        "1",
+    ]
     assert main(["train", "deferred", *options, "--sh-degree", "1", "--texels", "8", "--first-texels", "4"]) == 0
     return tmp_path / "run"
 

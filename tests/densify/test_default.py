@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from glassplat.densify.default import DefaultDensify, ScreenStatistics, accumulate, reset_opacity
+from glassplat.densify.default import DefaultDensify, ScreenStatistics, reset_opacity
+from glassplat.kernels.screen_statistics import Views
 from glassplat.scene.gaussians import Gaussians
 
 EXTENT = 2.0
@@ -35,26 +36,12 @@ def densified(options: DefaultDensify, gaussians: Gaussians, statistics: ScreenS
     return options.densify(gaussians, {}, statistics, extent=EXTENT, generator=rng, **extra)[0]
 
 
-def test_accumulate_counts_visible_views_in_device_coordinates() -> None:
-    gradient = torch.tensor([[[3.0, 0.0], [0.0, 1.0], [5.0, 5.0]], [[0.0, 1.0], [9.0, 9.0], [5.0, 5.0]]])
-    radii = torch.tensor([[[4, 2], [1, 1], [0, 0]], [[8, 40], [0, 3], [0, 0]]])
-    statistics = accumulate(ScreenStatistics.zeros(3), gradient, 2 * gradient, radii, width=400, height=200)
-    assert statistics.gradient_sum.tolist() == [[3 * 200 + 1 * 100, 100, 0]] * 2
-    assert statistics.pull_sum.tolist() == [[2 * (3 * 200 + 1 * 100), 200, 0]] * 2
-    assert statistics.view_count.tolist() == [[2, 1, 0]] * 2
-    assert statistics.max_radius.tolist() == pytest.approx([0.1, 1 / 400, 0])
-    assert statistics.mean_gradient.tolist() == [350, 100, 0]
-    assert statistics.mean_pull.tolist() == [700, 200, 0]
-
-
 def test_mirror_images_count_only_for_what_is_not_seen_directly() -> None:
-    statistics, radii = ScreenStatistics.zeros(2), torch.full((1, 2, 2), 6)
+    statistics, radii = ScreenStatistics.zeros(2), torch.full((1, 2, 2), 6.0)
     for weight, gradients in ((1.0, [8.0, 0.0]), (1.0, [4.0, 0.0]), (0.5, [90.0, 3.0])):
         gradient = torch.tensor(gradients)[None, :, None] * torch.tensor([0.01, 0.0])
         seen_here = radii * (gradient != 0).any(dim=-1, keepdim=True) if weight == 1 else radii
-        statistics = accumulate(
-            statistics, gradient, 2 * gradient, seen_here, width=200, height=100, weight=weight, direct=weight == 1
-        )
+        statistics.add(Views(gradient, 2 * gradient, seen_here, 200, 100, weight, direct=weight == 1))
     assert statistics.view_count.tolist() == [[2.5, 0.5], [2, 0]]
     # The first one is seen twice directly, the second only in the mirror.
     assert statistics.mean_gradient.tolist() == pytest.approx([6, 3])
@@ -62,9 +49,10 @@ def test_mirror_images_count_only_for_what_is_not_seen_directly() -> None:
 
 
 def test_statistics_do_not_depend_on_the_resolution() -> None:
-    gradient, radii = torch.rand(1, 5, 2), torch.full((1, 5, 2), 6)
-    small = accumulate(ScreenStatistics.zeros(5), gradient, gradient, radii, width=100, height=80)
-    large = accumulate(ScreenStatistics.zeros(5), gradient / 2, gradient / 2, radii * 2, width=200, height=160)
+    gradient, radii = torch.rand(1, 5, 2), torch.full((1, 5, 2), 6.0)
+    small, large = ScreenStatistics.zeros(5), ScreenStatistics.zeros(5)
+    small.add(Views(gradient, gradient, radii, 100, 80))
+    large.add(Views(gradient / 2, gradient / 2, radii * 2, 200, 160))
     assert torch.allclose(small.gradient_sum, large.gradient_sum)
     assert torch.allclose(small.max_radius, large.max_radius)
 

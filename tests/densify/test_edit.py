@@ -7,6 +7,7 @@ import torch
 
 from glassplat.densify.edit import Edit, append, apply_edit, clone, forget, keep, split
 from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.pose import rotation_from_quat
 
 
 def make_gaussians(count: int, seed: int = 0) -> Gaussians:
@@ -144,3 +145,18 @@ def test_empty_sets_survive_every_edit(count: int) -> None:
 def test_an_edit_with_rows_missing_is_refused() -> None:
     with pytest.raises(ValueError, match="means has 2 rows where source has 3"):
         Edit(torch.arange(3), torch.zeros(3, dtype=torch.bool), {"means": torch.zeros(2, 3)})
+
+
+def test_children_of_discs_lie_in_their_plane() -> None:
+    discs = Gaussians(
+        means=torch.zeros(50, 3),
+        quats=torch.tensor([0.9, 0.1, -0.3, 0.2]).repeat(50, 1),
+        log_scales=torch.zeros(50, 2),
+        logit_opacities=torch.zeros(50),
+        sh=torch.zeros(50, 1, 3),
+    )
+    edit = split(discs, torch.arange(50), generator=torch.Generator().manual_seed(0))
+    means = edit.result(discs, "means")
+    normal = rotation_from_quat(discs.quats)[0, :, 2]
+    assert edit.result(discs, "log_scales").shape == (100, 2)
+    assert float((means @ normal).abs().max()) < 1e-5 < 0.3 < float(means.norm(dim=1).mean())

@@ -185,3 +185,11 @@ def test_noise_does_not_depend_on_the_units_of_the_capture() -> None:
 def test_ranks_count_earlier_equals() -> None:
     assert rank_among_equals(torch.tensor([4, 7, 4, 4, 7, 1])).tolist() == [0, 0, 1, 2, 1, 0]
     assert rank_among_equals(torch.zeros(0, dtype=torch.int64)).shape == (0,)
+
+
+def test_noise_leaves_discs_in_their_plane() -> None:
+    solid = make_gaussians([0.01] * 40)
+    discs = Gaussians(**{**vars(solid), "log_scales": solid.log_scales[:, :2].contiguous()})
+    offsets = McmcDensify().noise(discs, rate=1.0, extent=1.0, generator=torch.Generator().manual_seed(0))
+    normals = rotation_from_quat(discs.quats)[:, :, 2]
+    assert float((offsets * normals).sum(1).abs().max()) < 1e-4 * float(offsets.norm(dim=1).max())

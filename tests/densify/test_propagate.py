@@ -74,3 +74,12 @@ def test_switched_off_they_change_nothing() -> None:
 
 def test_reflective_gaussians_are_counted_above_a_tenth() -> None:
     assert NormalPropagation().count_reflective(gaussians()) == 2
+
+
+def test_reflective_discs_grow_along_both_axes() -> None:
+    solid = gaussians()
+    discs = Gaussians(**{**vars(solid), "log_scales": solid.log_scales[:, :2].contiguous()})
+    change = NormalPropagation().propagate(discs, {})[0].log_scales - discs.log_scales
+    grows = torch.sigmoid(discs.channels["logit_strength"]) >= 0.02
+    torch.testing.assert_close(change[grows], torch.full_like(change[grows], math.log(1.5)))
+    assert bool(grows.any()) and not change[~grows].any()

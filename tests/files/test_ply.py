@@ -136,7 +136,7 @@ def test_a_compressed_file_says_how_to_export_it(tmp_path: Path) -> None:
     ("names", "message"),
     [
         (["x", "y", "z"], "looks like a point cloud and lacks opacity .*Give a trained splat"),
-        ([name for name in PLAIN if name != "scale_2"], "lacks scale_2; expected .*another kind of method"),
+        ([name for name in PLAIN if name != "scale_1"], "lacks scale_1; expected .*another kind of method"),
         ([*PLAIN, "f_dc_0", "f_dc_1"], "lacks the colour properties \\['f_dc_2'\\]"),
         ([*PLAIN, "f_dc_0", "f_dc_1", "f_dc_2", "f_rest_0"], "has 1 f_rest properties; expected 0, 9, 24 or 45"),
         ([*PLAIN, "x"], "property 'x' appears twice"),
@@ -200,3 +200,24 @@ def test_a_channel_that_could_not_be_read_back_is_refused(tmp_path: Path) -> Non
     with pytest.raises(ValueError, match="cannot store channels \\['intensity'\\]"):
         write_gaussians(tmp_path / "a.ply", random_gaussians(1, ("intensity",)))
     assert not list(tmp_path.iterdir())
+
+
+def test_discs_have_two_scales_in_the_file_and_when_read_back(tmp_path: Path) -> None:
+    solid = random_gaussians(4, ("logit_strength",))
+    original = Gaussians(**{**vars(solid), "log_scales": solid.log_scales[:, :2].contiguous()})
+    write_gaussians(tmp_path / "a.ply", original)
+    names = [line.split()[-1] for line in header_of(tmp_path / "a.ply") if line.startswith("property")]
+    assert [name for name in names if name.startswith("scale")] == ["scale_0", "scale_1"]
+    read = read_gaussians(tmp_path / "a.ply")
+    assert read.are_discs
+    for name, tensor in original.tensors().items():
+        assert torch.equal(read.tensors()[name], tensor), name
+
+
+def test_a_file_of_discs_from_elsewhere_is_read(tmp_path: Path) -> None:
+    names = [name for name in PLAIN if name != "scale_2"]
+    body = np.arange(3 * len(names), dtype="<f4")
+    write_ply(tmp_path / "a.ply", "binary_little_endian", names, body.tobytes(), 3)
+    read = read_gaussians(tmp_path / "a.ply")
+    assert read.are_discs and len(read) == 3
+    assert read.log_scales[0].tolist() == [names.index("scale_0"), names.index("scale_1")]

@@ -6,6 +6,7 @@ import gzip
 import struct
 import tracemalloc
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import gsply
@@ -27,6 +28,7 @@ FLIP = torch.tensor([1.0, -1.0, -1.0])
 def typical(coefficients: int = 16, count: int = 50) -> Gaussians:
     """Gaussians within what the format holds."""
     gaussians = random_gaussians(coefficients, count=count)
+    gaussians = replace(gaussians, active_sh_degree=gaussians.max_sh_degree)
     return gaussians.with_tensors({"sh": (gaussians.sh * 0.25).clamp(-0.9, 0.9)})
 
 
@@ -192,3 +194,11 @@ def test_mutated_files_are_read_or_refused(tmp_path_factory: pytest.TempPathFact
     path.write_bytes(bytes(data) if kind else gzip.compress(bytes(data)))
     with suppress(ValueError):
         assert all(bool(tensor.isfinite().all()) for tensor in read_spz(path).tensors().values())
+
+
+def test_discs_become_as_flat_as_the_format_can_say(tmp_path: Path) -> None:
+    solid = typical()
+    write_spz(tmp_path / "a.spz", replace(solid, log_scales=solid.log_scales[:, :2].contiguous()))
+    after = read_spz(tmp_path / "a.spz")
+    torch.testing.assert_close(after.log_scales[:, :2], solid.log_scales[:, :2], rtol=0, atol=1 / 31)
+    assert float(after.log_scales[:, 2].max()) == -10.0

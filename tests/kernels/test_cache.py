@@ -17,7 +17,7 @@ import gc
 
 import torch
 
-from glassplat.kernels.adam import adam
+from glassplat.kernels.adam import Update, adam
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.blend_panes import blend_panes
 from glassplat.kernels.composite import composite
@@ -56,7 +56,7 @@ surfaces = torch.cat([blended.rgb, directions, result.alpha[0][..., None]], dim=
 shaded = shade_environment(surfaces, result.alpha[0], texels, intrinsics, torch.eye(3))
 loss = loss + shaded.rgb.sum() + cube_lookup(texels, directions).sum()
 loss.backward()
-adam(means, raw.means.grad, torch.zeros(2, 3), torch.zeros(2, 3), lr=1e-3, step=1)
+adam([Update(means, raw.means.grad, torch.zeros(2, 3), torch.zeros(2, 3), 1e-3, 1)])
 
 used = [k for k in gc.get_objects() if type(k) is Kernel and k.dispatcher.signatures]
 missed = [k.name for k in used if k.compilations]

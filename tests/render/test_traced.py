@@ -8,10 +8,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from glassplat.render.deferred import INVISIBLE, Deferred
 from glassplat.render.splat import Splat
 from glassplat.render.surface import view_directions
-from glassplat.render.traced import Traced
+from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene.camera import Camera
+from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 from tests.render.tiny_scene import camera_at, random_gaussians
@@ -144,3 +146,61 @@ def test_a_scene_without_surroundings_is_refused() -> None:
 def test_directions_go_through_pixel_centres() -> None:
     camera = camera_at(0.0, 0.0, 0.0)
     assert view_directions(camera)[0, 0].tolist() == pytest.approx([(0.5 - 20.3) / 30, (0.5 - 13.8) / 31, 1.0])
+
+
+def lit(scene: Scene) -> Scene:
+    environment = Environment.random(4, generator=torch.Generator().manual_seed(3))
+    return replace(scene, environment=replace(environment, raw=2 * environment.raw.double()))
+
+
+def test_the_environment_is_behind_the_surroundings() -> None:
+    scene, camera = lit(glossy()), camera_at(0.1, -0.1, 0.0)
+    frame = Traced(surroundings=True)(scene, camera)
+    transparent = scene.surroundings.with_tensors({"logit_opacities": torch.full((16,), -30.0, dtype=torch.float64)})
+    distant = Deferred(environment=True)(scene, camera)
+    without = Traced(surroundings=True)(replace(scene, surroundings=transparent), camera)
+    for traced, shaded in (("reflection", "reflection"), ("surroundings", "environment")):
+        # `deferred` finds no direction where next to nothing is.
+        seen = frame.layers["alpha"] > 0.01
+        torch.testing.assert_close(without.layers[traced][seen], distant.layers[shaded][seen], atol=1e-6, rtol=0)
+    assert not torch.allclose(frame.layers["reflection"], distant.layers["reflection"], atol=0.05)
+
+
+def test_where_no_ray_is_traced_the_environment_alone_is_mirrored() -> None:
+    scene, camera = lit(glossy()), camera_at(0.0, 0.0, 0.0)
+    some, every = Traced(least_strength=0.2)(scene, camera), Traced()(scene, camera)
+    distant = Deferred()(scene, camera)
+    faint = some.layers["strength"] <= 0.2
+    seen = faint & (some.layers["strength"] > 0.01)
+    assert bool(seen.any()) and not bool(faint.all())
+    assert torch.equal(some.rgb[~faint], every.rgb[~faint])
+    torch.testing.assert_close(some.rgb[seen], distant.rgb[seen], atol=1e-6, rtol=0)
+
+
+def test_a_probed_frame_says_how_far_away_the_surroundings_were_met() -> None:
+    scene, camera = glossy(), camera_at(0.0, 0.0, 0.0)
+    assert Traced()(scene, camera).space == ()
+    (record,) = Traced()(scene, camera, probed=True).space
+    # Things are three units before the camera, and the surroundings one and a half behind it.
+    expected = (scene.surroundings.means - torch.tensor([0.0, 0.0, 3.0])).norm(dim=1)
+    torch.testing.assert_close(record.distances, expected, atol=0.7, rtol=0)
+    assert record.part == "surroundings"
+
+
+def test_contributions_of_surroundings_are_their_share_of_the_image() -> None:
+    scene, camera = glossy(), camera_at(0.0, 0.0, 0.0)
+    found = mirrored_contributions(scene, camera)
+    white = scene.surroundings.with_tensors({"sh": torch.zeros_like(scene.surroundings.sh)})
+    frame = Traced()(replace(scene, surroundings=replace(white, active_sh_degree=0)), camera)
+    mirrored = frame.layers["strength"] * frame.layers["reflection"][..., 0] / 0.5
+    assert float(found.sum()) == pytest.approx(float(mirrored[frame.layers["strength"] > INVISIBLE].sum()), rel=1e-6)
+    assert bool((found >= 0).all()) and float(found.max()) > 0.01
+
+
+def test_a_view_of_nothing_reflects_nothing() -> None:
+    scene = glossy()
+    away = replace(camera_at(0.0, 0.0, 0.0), cam_from_world=torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double())
+    for each in (scene, lit(scene)):
+        frame = Traced(background=(0.2, 0.3, 0.4))(each, replace(away, cam_from_world=away.cam_from_world), probed=True)
+        assert bool(frame.rgb.isfinite().all()) and int(frame.layers["reflection"].count_nonzero()) == 0
+        assert int(frame.space[0].distances.count_nonzero()) == 0

@@ -285,14 +285,13 @@ def test_a_run_too_short_for_normals_is_one_of_splat_and_says_so(
 ) -> None:
     # Of the opacity resets, the first falls into the longer run.
     choices: dict[str, Any] = {"sh_degree": 1, "strategy": strategy, "rhythm": Rhythm(reset_stop=1.0)}
-    short = PropagationSchedule(least=iterations + 1)
-    matte = DeferredRecipe(**choices, schedule=short, region=(0.0, 0.0, 3.5, 1.0))
+    matte = DeferredRecipe(**choices, least_iterations=iterations + 1, region=(0.0, 0.0, 3.5, 1.0))
     plain = scene_after(SplatRecipe(**choices), iterations, tmp_path / "splat")
     assert not caplog.records
     found = scene_after(matte, iterations, tmp_path / "deferred")
     (warning,) = [record.getMessage() for record in caplog.records]
     assert f"{iterations} iterations are too few" in warning
-    assert f"need {iterations + 1} --iterations" in warning and "--schedule.least 1" in warning
+    assert f"need {iterations + 1} --iterations" in warning and "--least-iterations 1" in warning
     for name in ("means", "sh", "log_scales", "quats", "logit_opacities"):
         assert torch.equal(getattr(found.primary, name), getattr(plain.primary, name)), name
     camera = tiny_capture().test[0].camera
@@ -302,7 +301,7 @@ def test_a_run_too_short_for_normals_is_one_of_splat_and_says_so(
 
 
 def test_a_run_long_enough_for_normals_has_all_stages(tmp_path: Path) -> None:
-    recipe = replace(RECIPE, schedule=replace(RECIPE.schedule, least=20))
+    recipe = replace(RECIPE, least_iterations=20)
     assert len(recipe.stages(0, 19)) == 1 and len(recipe.stages(0, 20)) == len(recipe.stages(0)) == 3
     strengths = scene_after(recipe, 20, tmp_path).primary.channels["logit_strength"]
     assert bool((strengths != logit(recipe.first_strength)).any())

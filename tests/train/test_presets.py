@@ -36,6 +36,7 @@ from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Clock, Stage, stage_starts
 from glassplat.train.state import TrainState
 from glassplat.train.strategy import mcmc_population
+from glassplat.train.surroundings_entry import SurroundingsStart
 from glassplat.train.trainer import differentiate, train
 from tests.densify.test_default import densified, make_gaussians, seen
 from tests.render.test_seen_panes import CAMERA, vitrine
@@ -101,6 +102,9 @@ def test_a_short_run_of_a_preset_learns(method: str, strategy: Any) -> None:
     recipe = replace(recipe, rhythm=replace(recipe.rhythm, beat=8 / 60, least=2, sh=0.1))
     if method == "deferred":
         recipe = replace(recipe, texels=8, first_texels=8, schedule=replace(recipe.schedule, stop=0.9))
+    if method == "traced":
+        around = replace(recipe.surroundings, start=SurroundingsStart(source="box", cells=3))
+        recipe = replace(recipe, surroundings=around, schedule=replace(recipe.schedule, stop=0.9))
     stages = [
         replace(s, entry=place_true_planes if isinstance(s.entry, PlaneEntry) else s.entry) for s in recipe.stages(0)
     ]
@@ -112,7 +116,9 @@ def test_a_short_run_of_a_preset_learns(method: str, strategy: Any) -> None:
     # The first and the second pass over the six views, before anything is disturbed.
     assert sum(losses[6:12]) < sum(losses[:6])
     done = {message.action for message in messages if isinstance(message, ActionDone)}
-    assert {"splat": set(), "planar": {"perturb opacity"}, "deferred": {"propagate normals"}}[method] <= done
+    reflective = {"propagate normals"}
+    expected = {"splat": set(), "planar": {"perturb opacity"}, "deferred": reflective, "traced": reflective}
+    assert expected[method] <= done
 
 
 def planeless(recipe: PlanarRecipe) -> Scene:

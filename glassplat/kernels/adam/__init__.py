@@ -1,5 +1,6 @@
-"""Adam, in place and in one pass, with a learning rate per column where wanted."""
+"""Adam, in place and in one pass over all parameters, with a learning rate per column where wanted."""
 
 from glassplat.kernels.adam.operation import adam
+from glassplat.kernels.adam.update import Update
 
-__all__ = ["adam"]
+__all__ = ["Update", "adam"]

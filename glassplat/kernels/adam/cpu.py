@@ -1,4 +1,4 @@
-"""Adam on the CPU: one pass over parameter, gradient and both moments."""
+"""Adam on the CPU: one pass over parameters, gradients and moments, whatever their number."""
 
 from __future__ import annotations
 
@@ -10,46 +10,66 @@ import numpy as np
 from numba import prange
 from torch import Tensor
 
+from glassplat.kernels.adam.update import Update
+from glassplat.kernels.cpu.addresses import array_at
 from glassplat.kernels.cpu.jit import Kernel, kernel
 from glassplat.kernels.tensor_checks import REAL_OF
 
 BLOCK = 4096
-"""Elements per task, about."""
+"""Elements per task, about: whole rows of a tensor whose columns have rates of their own."""
+
+# Columns of the table of updates: addresses of the four tensors, their size, and the number of their step sizes.
+PARAMETER, GRADIENT, FIRST, SECOND, SIZE, COLUMNS = range(6)
 
 
-def adam(
-    flat: Sequence[Tensor], lr: float | Tensor, betas: tuple[float, float], eps: float,
-    *, corrections: tuple[float, float],
-) -> None:  # fmt: skip
-    """Updates flat parameter and moments; `corrections` are the factors on the step size and on the root moment."""
-    real = REAL_OF[flat[0].dtype]
-    rates = lr.detach().numpy().astype(np.float64) if isinstance(lr, Tensor) else np.full(1, lr)
-    rates = repeated_rates((rates * corrections[0]).astype(real), BLOCK)
+def adam(flat: Sequence[Update], betas: tuple[float, float], eps: float) -> None:
+    """Takes the updates, whose tensors are flat."""
+    real = REAL_OF[flat[0].parameter.dtype]
+    table, step_sizes, roots = [], [], []
+    for update in flat:
+        step_correction, root = update.corrections(betas)
+        rates = update.lr.tolist() if isinstance(update.lr, Tensor) else [update.lr]
+        table.append([*(tensor.data_ptr() for tensor in update[:4]), update.parameter.numel(), len(rates)])
+        step_sizes += [rate * step_correction for rate in rates]
+        roots.append(root)
     # 1 - 0.999 loses half of its digits in single precision, so the gains are rounded from the double.
     decays, gains = tuple(real(b) for b in betas), tuple(real(1 - b) for b in betas)
-    adam_step(real)(*(t.numpy() for t in flat), rates, decays, gains, real(corrections[1]), real(eps))
+    adam_step(real)(np.array(table), np.array(step_sizes, real), np.array(roots, real), decays, gains, real(eps))
 
 
 @cache
 def adam_step(real: type) -> Kernel:
-    """Updates flat arrays in place; `rates` holds the step sizes of consecutive elements and repeats over them."""
+    """Updates flat arrays in place; `step_sizes` of the columns of each follow one another."""
+    at = array_at(real)
 
     @kernel("adam", real)
-    def step(parameter, gradient, first, second, rates, betas, gains, second_scale, eps):
-        count, block = parameter.size, rates.size
-        for b in prange((count + block - 1) // block):
-            # Slices from zero, because an index with an offset might be negative for all the compiler knows, and wrap.
-            begin, end = b * block, min(count, (b + 1) * block)
-            p, g, m, v = parameter[begin:end], gradient[begin:end], first[begin:end], second[begin:end]
-            for i in range(end - begin):
+    def step(table, step_sizes, roots, betas, gains, eps):
+        # What a task needs of its tensor: which tasks are before it, and a step size for each of its elements.
+        count, known = table.shape[0], 0
+        tasks, begins = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)
+        for k in range(count):
+            block = table[k, COLUMNS] * max(1, BLOCK // table[k, COLUMNS])
+            tasks[k + 1] = tasks[k] + (table[k, SIZE] + block - 1) // block
+            begins[k + 1] = begins[k] + block
+        repeated = np.empty(begins[count], real)
+        for k in range(count):
+            for begin in range(begins[k], begins[k + 1], table[k, COLUMNS]):
+                for column in range(table[k, COLUMNS]):
+                    repeated[begin + column] = step_sizes[known + column]
+            known += table[k, COLUMNS]
+        for task in prange(tasks[count]):
+            k = 0
+            while tasks[k + 1] <= task:
+                k += 1
+            rates, root = repeated[begins[k] : begins[k + 1]], roots[k]
+            first = (task - tasks[k]) * rates.size
+            size = min(rates.size, table[k, SIZE] - first)
+            p, g = at(table[k, PARAMETER], first, size), at(table[k, GRADIENT], first, size)
+            m, v = at(table[k, FIRST], first, size), at(table[k, SECOND], first, size)
+            for i in range(size):
                 mean = betas[0] * m[i] + gains[0] * g[i]
                 square = betas[1] * v[i] + gains[1] * g[i] * g[i]
                 m[i], v[i] = mean, square
-                p[i] -= rates[i] * mean / (math.sqrt(square) * second_scale + eps)
+                p[i] -= rates[i] * mean / (math.sqrt(square) * root + eps)
 
     return step
-
-
-def repeated_rates(rates: np.ndarray, elements: int) -> np.ndarray:
-    """The rates over and over, as a whole number of rows, up to about the given number of elements."""
-    return np.tile(rates, max(1, elements // max(1, rates.size)))

@@ -10,27 +10,27 @@ import torch
 from numba import cuda
 from torch import Tensor
 
+from glassplat.kernels.adam.update import Update
 from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
 from glassplat.kernels.tensor_checks import REAL_OF
 
 THREADS = 256
 
 
-def adam(
-    flat: Sequence[Tensor], lr: float | Tensor, betas: tuple[float, float], eps: float,
-    *, corrections: tuple[float, float],
-) -> None:  # fmt: skip
+def adam(flat: Sequence[Update], betas: tuple[float, float], eps: float) -> None:
     """As `glassplat.kernels.adam.cpu.adam`."""
-    parameter = flat[0]
-    rates, rate = None, 0.0
-    if isinstance(lr, Tensor):
-        rates = (lr.detach().to(parameter.device, torch.float64) * corrections[0]).to(parameter.dtype).contiguous()
-    else:
-        rate = lr * corrections[0]
-    adam_step(REAL_OF[parameter.dtype])(
-        blocks_for(parameter.numel(), THREADS), THREADS, *flat, rates, rate,
-        betas[0], betas[1], 1 - betas[0], 1 - betas[1], corrections[1], eps,
-    )  # fmt: skip
+    for update in flat:
+        parameter, lr, (step_correction, root) = update.parameter, update.lr, update.corrections(betas)
+        rates, rate = None, 0.0
+        if isinstance(lr, Tensor):
+            in_double = lr.detach().to(parameter.device, torch.float64)
+            rates = (in_double * step_correction).to(parameter.dtype).contiguous()
+        else:
+            rate = lr * step_correction
+        adam_step(REAL_OF[parameter.dtype])(
+            blocks_for(parameter.numel(), THREADS), THREADS, *update[:4], rates, rate,
+            betas[0], betas[1], 1 - betas[0], 1 - betas[1], root, eps,
+        )  # fmt: skip
 
 
 @cache

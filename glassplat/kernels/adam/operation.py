@@ -1,71 +1,57 @@
-"""Adam, in place and in one pass, with a learning rate per column where wanted."""
+"""Adam, in place and in one pass over all parameters, with a learning rate per column where wanted."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from glassplat.kernels.adam.update import Update
 from glassplat.kernels.devices import kernels_for
 from glassplat.kernels.tensor_checks import check_tensors
 
+TENSORS = Update._fields[:4]
+CHANGED = ("parameter", "first_moment", "second_moment")
+
 
 @torch.no_grad()
-def adam(
-    parameter: Tensor,
-    gradient: Tensor,
-    first_moment: Tensor,
-    second_moment: Tensor,
-    *,
-    lr: float | Tensor,
-    betas: tuple[float, float] = (0.9, 0.999),
-    eps: float = 1e-15,
-    step: int,
-) -> None:
-    """Takes one Adam step with bias correction, as `torch.optim.Adam` does; changes all but the gradient in place.
+def adam(updates: Sequence[Update], *, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15) -> None:
+    """Takes one Adam step with bias correction, as `torch.optim.Adam` does; changes all but the gradients in place.
 
     Args:
-        parameter: [N, ...] float32 or float64, contiguous.
-        gradient: as `parameter`.
-        first_moment: running mean of the gradient, as `parameter`, contiguous.
-        second_moment: running mean of the squared gradient, as `parameter`, contiguous.
-        lr: learning rate, or one for each element of a row of the parameter, [columns] with columns the
-            product of all dimensions after the first.
+        updates: the parameters, all of one floating-point type and on one device, no two of them in the same memory.
         betas: decay of the two running means.
         eps: added to the root of the second moment.
-        step: number of this step, from 1; the bias correction depends on it.
 
     Raises:
-        ValueError: shapes differ, `lr` has not one entry per column, `step` is below 1, or a tensor
-            that changes in place is not contiguous.
+        ValueError: shapes differ, a rate has not one entry per column, a step is below 1, or a tensor that changes in
+            place is not contiguous.
         TypeError: floating-point types differ or are not supported, or tensors are on different devices.
     """
-    columns = math.prod(parameter.shape[1:])
-    _check(parameter, gradient, first_moment, second_moment, lr, columns, step)
-    if parameter.numel() == 0:
-        return
-    flat = [t.detach().reshape(-1) for t in (parameter, gradient.contiguous(), first_moment, second_moment)]
-    corrections = 1 / (1 - betas[0] ** step), 1 / math.sqrt(1 - betas[1] ** step)
-    kernels_for("adam", parameter.device).adam(flat, lr, betas, eps, corrections=corrections)
+    for update in updates:
+        _check(update, updates[0].parameter)
+    flat = [_flat(update) for update in updates if update.parameter.numel()]
+    if flat:
+        kernels_for("adam", flat[0].parameter.device).adam(flat, betas, eps)
 
 
-def _check(
-    parameter: Tensor,
-    gradient: Tensor,
-    first_moment: Tensor,
-    second_moment: Tensor,
-    lr: float | Tensor,
-    columns: int,
-    step: int,
-) -> None:
-    changed = {"parameter": parameter, "first_moment": first_moment, "second_moment": second_moment}
-    shape = tuple(parameter.shape)
-    check_tensors({name: (tensor, shape) for name, tensor in (changed | {"gradient": gradient}).items()})
-    for name, tensor in changed.items():
-        if not tensor.is_contiguous():
+def _check(update: Update, like: Tensor) -> None:
+    shape = tuple(update.parameter.shape)
+    tensors = {name: (getattr(update, name), shape) for name in TENSORS}
+    check_tensors({"the first parameter": (like, tuple(like.shape)), **tensors})
+    for name in CHANGED:
+        if not getattr(update, name).is_contiguous():
             raise ValueError(f"{name} is changed in place and must be contiguous; pass {name}.contiguous()")
-    if isinstance(lr, Tensor) and tuple(lr.shape) != (columns,):
-        raise ValueError(f"lr has shape {tuple(lr.shape)}; expected one number or one per column, ({columns},)")
-    if step < 1:
-        raise ValueError(f"step is {step}; steps count from 1")
+    columns = (math.prod(shape[1:]),)
+    if isinstance(update.lr, Tensor) and tuple(update.lr.shape) != columns:
+        raise ValueError(f"lr has shape {tuple(update.lr.shape)}; expected one number or one per column, {columns}")
+    if update.step < 1:
+        raise ValueError(f"step is {update.step}; steps count from 1")
+
+
+def _flat(update: Update) -> Update:
+    """The same update of one row of elements each."""
+    contiguous = update._replace(gradient=update.gradient.contiguous())
+    return contiguous._replace(**{name: getattr(contiguous, name).detach().view(-1) for name in TENSORS})

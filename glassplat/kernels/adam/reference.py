@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
+from glassplat.kernels.adam.update import Update
+
 
 @torch.no_grad()
-def adam(
-    parameter: Tensor,
-    gradient: Tensor,
-    first_moment: Tensor,
-    second_moment: Tensor,
-    *,
-    lr: float | Tensor,
-    betas: tuple[float, float] = (0.9, 0.999),
-    eps: float = 1e-15,
-    step: int,
-) -> None:
+def adam(updates: Sequence[Update], *, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15) -> None:
     """Takes one Adam step in place; see `glassplat.kernels.adam.adam`."""
-    first_moment.mul_(betas[0]).add_(gradient, alpha=1 - betas[0])
-    second_moment.mul_(betas[1]).add_(gradient * gradient, alpha=1 - betas[1])
-    mean = first_moment / (1 - betas[0] ** step)
-    deviation = torch.sqrt(second_moment / (1 - betas[1] ** step)) + eps
-    rates = lr.reshape(parameter.shape[1:]) if isinstance(lr, Tensor) else lr
-    parameter.sub_(rates * mean / deviation)
+    for parameter, gradient, first_moment, second_moment, lr, step in updates:
+        first_moment.mul_(betas[0]).add_(gradient, alpha=1 - betas[0])
+        second_moment.mul_(betas[1]).add_(gradient * gradient, alpha=1 - betas[1])
+        mean = first_moment / (1 - betas[0] ** step)
+        deviation = torch.sqrt(second_moment / (1 - betas[1] ** step)) + eps
+        rates = lr.reshape(parameter.shape[1:]) if isinstance(lr, Tensor) else lr
+        parameter.sub_(rates * mean / deviation)

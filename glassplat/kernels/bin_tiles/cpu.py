@@ -46,7 +46,7 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
         order, starts, spans, span_offsets, first_rows, splat_offsets, mask, rows, columns
     )
     tiles = num_cameras * rows * columns
-    active = torch.arange(tiles) if active_tiles is None else active_tiles.flatten().nonzero()[:, 0]
+    active = torch.arange(tiles, dtype=torch.int32) if active_tiles is None else active_tiles.flatten().nonzero()[:, 0]
     return TileBins(
         pair_splats=torch.from_numpy(pair_splats),
         tile_offsets=torch.from_numpy(tile_offsets),

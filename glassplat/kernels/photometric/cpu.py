@@ -55,8 +55,8 @@ def photometric(image: Tensor, target: Tensor, *, with_gradient: bool) -> tuple[
     pull = image.new_empty(image.shape if with_gradient else (0, 0, CHANNELS))
     sums = np.zeros((-(-height // ROWS) * -(-width * CHANNELS // COLUMNS), 2), np.float64)
     _forward(REAL_OF[image.dtype])(_rows(image), _rows(target), _rows(pull), sums)
-    l1, ssim = sums.sum(axis=0) / image.numel()
-    return image.new_tensor(l1), image.new_tensor(ssim), pull
+    l1, ssim = (torch.tensor(total / image.numel(), dtype=image.dtype) for total in sums.sum(axis=0))
+    return l1, ssim, pull
 
 
 def photometric_gradient(image: Tensor, target: Tensor, pull: Tensor, v_l1: Tensor, v_ssim: Tensor) -> Tensor:

@@ -37,7 +37,7 @@ def test_the_kernel_compiles_and_fits(kernel) -> None:
 def test_every_operation_has_its_kernels() -> None:
     names = {kernel.name.rsplit("_", 1)[0] for kernel in KERNELS}
     both_ways = {"project", "composite", "blend_panes", "photometric", "cube_lookup"}
-    both_ways |= {"shade_environment", "surface_channels"}
+    both_ways |= {"shade_environment", "surface_channels", "project_discs", "composite_discs"}
     expected = {f"{name}_{way}" for name in both_ways for way in ("forward", "backward")} | {"adam", "pane_hits"}
     assert all(any(name.startswith(want) for name in names) for want in expected | {"count_tiles", "emit_tiles"})
 

@@ -422,8 +422,8 @@ def test_adam(columns: bool, dtype: torch.dtype) -> None:
     found = [tensor.clone().to(DEVICE) for tensor in expected]
     lr = torch.linspace(0.1, 0.6, 6, dtype=dtype) if columns else 0.3
     for step in (1, 2, 3):
-        adam_operation.adam(*found, lr=lr, step=step)
-        adam_twin.adam(*expected, lr=lr, step=step)
+        adam_operation.adam([adam_operation.Update(*found, lr, step)])
+        adam_twin.adam([adam_operation.Update(*expected, lr, step)])
     for value, want in zip(found, expected, strict=True):
         close(value, want)
 

@@ -1,0 +1,337 @@
+// The page: photographs, panes, tools and keys; the server is told of every change, and says what follows.
+
+import { Drawing, colorOf } from "/drawing.js";
+import { Marking, distance } from "/marking.js";
+
+const element = (id) => document.getElementById(id);
+const REACH = 11; // Pixels of the screen around a corner that belong to it.
+const HINTS = {
+  corner: "click the corners of the pane, one after the other round it; beside the photograph too",
+  edge: "drag along an edge, in the direction round the pane",
+  polygon: "click round what stands before the pane; Enter or a double click closes it",
+  brush: "paint over what stands before the pane; [ and ] change the brush",
+  restore: "paint the pane back where too much was cut; [ and ] change the brush",
+};
+
+let capture, marking, drawing;
+let current = 0, tool = "corner", radius = 20, pending = null, drag = null, gestures = 0;
+let answers = {}, sending = false, waiting = false, saveTimer = null, spaceHeld = false;
+const images = new Map();
+
+async function ask(path, body) {
+  const options = body === undefined ? {} : { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
+  const response = await fetch(path, options);
+  const answer = await response.json();
+  if (!response.ok) throw new Error(answer.error || response.statusText);
+  return answer;
+}
+
+function tell(text, isBad = false) {
+  element("status").textContent = text;
+  element("status").className = isBad ? "bad" : "";
+}
+
+// Sends the document a moment after the last change; one request at a time.
+function changed() {
+  document.body.dataset.state = "changed";
+  clearTimeout(saveTimer);
+  saveTimer = setTimeout(send, 120);
+  refresh();
+}
+
+async function send() {
+  if (sending) { waiting = true; return; }
+  sending = true;
+  try {
+    const answer = await ask("/document", marking.document);
+    answers = Object.fromEntries(answer.panes.map((pane) => [pane.label, pane]));
+    if (!waiting) document.body.dataset.state = "saved";
+    tell("saved");
+  } catch (error) {
+    document.body.dataset.state = "failed";
+    tell(`not saved: ${error.message}`, true);
+  }
+  sending = false;
+  if (waiting) { waiting = false; send(); }
+  refresh();
+}
+
+function refresh() {
+  drawViews();
+  drawPanes();
+  element("undo").disabled = !marking.done.length;
+  element("redo").disabled = !marking.undone.length;
+  document.querySelectorAll("[data-tool]").forEach((button) => button.setAttribute("aria-pressed", button.dataset.tool === tool));
+  element("hint").textContent = hint();
+  draw();
+}
+
+function hint() {
+  if (!marking.pane) return "add a pane first";
+  const number = marking.nextCorner(view().name);
+  if (tool === "corner" && number === null) return "all corners are marked here; drag them, or go to another photograph";
+  return tool === "corner" ? `corner ${number + 1}: ${HINTS.corner}` : HINTS[tool];
+}
+
+const view = () => capture.views[current];
+
+function draw() {
+  drawing.draw(marking.document.panes, answers, marking.active, pending);
+}
+
+function suggested() {
+  const answer = answers[marking.active];
+  return answer ? answer.next : [];
+}
+
+function drawViews() {
+  const marked = marking.viewsMarked();
+  const next = suggested().map((one) => one.view);
+  capture.views.forEach((one, number) => {
+    const button = element("views").children[number];
+    const star = next.indexOf(number) === 0 ? "★" : next.includes(number) ? "☆" : "";
+    button.className = [marked.has(one.name) ? "marked" : "", star ? "suggested" : ""].join(" ");
+    button.setAttribute("aria-current", number === current);
+    button.querySelector("b").textContent = star || (marked.has(one.name) ? "✓" : "");
+  });
+}
+
+function make(tag, properties = {}, ...children) {
+  const made = Object.assign(document.createElement(tag), properties);
+  made.append(...children);
+  return made;
+}
+
+function choice(pane, key, values) {
+  const select = make("select", { title: key });
+  values.forEach((value) => select.append(make("option", { value, textContent: value, selected: pane[key] === value })));
+  select.addEventListener("change", () => marking.set(pane.label, key, select.value));
+  return select;
+}
+
+function drawPanes() {
+  element("panes").replaceChildren(...marking.document.panes.map((pane) => {
+    const answer = answers[pane.label];
+    const swatch = make("i");
+    swatch.style.background = colorOf(pane.label);
+    const remove = make("button", { textContent: "×", title: "remove this pane" });
+    remove.addEventListener("click", (event) => { event.stopPropagation(); marking.removePane(pane.label); });
+    const card = make("div", { className: `pane ${pane.label === marking.active ? "active" : ""}` },
+      make("h2", {}, swatch, `pane ${pane.label}`, remove), choice(pane, "material", ["glass", "mirror", "screen"]), " ", choice(pane, "shape", ["rectangle", "polygon"]));
+    card.addEventListener("click", () => { if (marking.active !== pane.label) { marking.active = pane.label; refresh(); } });
+    for (const [text, kind] of judgement(answer)) card.append(make("p", { textContent: text, className: kind }));
+    return card;
+  }));
+}
+
+function judgement(answer) {
+  if (!answer) return [];
+  if (!answer.solved) return [[answer.message, "poor"]];
+  const lines = [[`marks fit to ${answer.error.toFixed(1)} pixels; the plane is sure to ${answer.doubt.toFixed(answer.doubt < 1 ? 2 : 1)}°`, answer.doubt < 2 ? "good" : "poor"]];
+  if (answer.message) lines.push([answer.message, "poor"]);
+  const best = answer.next[0];
+  if (best && answer.doubt > 0.3) lines.push([`marking ${capture.views[best.view].name} would make it ${best.doubt.toFixed(best.doubt < 1 ? 2 : 1)}°`, ""]);
+  return lines;
+}
+
+async function show(number) {
+  current = (number + capture.views.length) % capture.views.length;
+  pending = drag = null;
+  drawing.show({ ...view(), number: current }, images.get(current) || null);
+  refresh();
+  element("views").children[current].scrollIntoView({ block: "nearest" });
+  document.body.dataset.view = "loading";
+  const image = await load(current);
+  if (image && view() === capture.views[drawing.view.number]) drawing.image = images.get(current);
+  document.body.dataset.view = images.has(current) ? String(current) : "failed";
+  draw();
+  load((current + 1) % capture.views.length);
+}
+
+async function load(number) {
+  if (images.has(number)) return images.get(number);
+  const image = new Image();
+  image.src = `/photo/${number}`;
+  try {
+    await image.decode();
+  } catch {
+    tell(`photograph ${capture.views[number].name} cannot be shown`, true);
+    return null;
+  }
+  images.set(number, image);
+  if (images.size > 40) images.delete(images.keys().next().value);
+  return image;
+}
+
+const spot = (event) => { const box = drawing.canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
+
+function pressed(event) {
+  drawing.canvas.focus();
+  drawing.canvas.setPointerCapture(event.pointerId);
+  const at = spot(event), place = drawing.toView(at);
+  if (event.button !== 0 || spaceHeld) { drag = { kind: "move", at }; return; }
+  if (!marking.pane) return;
+  if (tool === "corner") pressCorner(place);
+  else if (tool === "edge") { pending = { kind: "edge", points: [place, place] }; drag = { kind: "edge" }; }
+  else if (tool === "polygon") pressPolygon(place);
+  else { pending = { kind: "brush", effect: tool === "brush" ? "cut" : "keep", radius: radius / drawing.scale, points: [place] }; drag = { kind: "brush" }; }
+  draw();
+}
+
+function pressCorner(place) {
+  const reach = REACH / drawing.scale;
+  let number = drawing.cornerAt(marking.pane, answers[marking.active], place, reach);
+  if (number < 0) number = marking.nextCorner(view().name);
+  if (number === null) return;
+  gestures += 1;
+  drag = { kind: "corner", number, gesture: `drag ${gestures}` };
+  // Pressing a corner that only the fit knows here says that it is in the right place.
+  const known = marking.pane.corners[number];
+  if (!known || !(view().name in known)) marking.setCorner(view().name, number, place, drag.gesture);
+}
+
+function pressPolygon(place) {
+  if (!pending) pending = { kind: "polygon", points: [place, place] };
+  else pending.points.splice(-1, 1, place, place);
+}
+
+function moved(event) {
+  const at = spot(event), place = drawing.toView(at);
+  if (!drag) {
+    if (pending && pending.kind === "polygon") { pending.points[pending.points.length - 1] = place; draw(); }
+    drawing.pointer = place;
+    return;
+  }
+  if (drag.kind === "move") { drawing.move([at[0] - drag.at[0], at[1] - drag.at[1]]); drag.at = at; }
+  else if (drag.kind === "corner") marking.setCorner(view().name, drag.number, place, drag.gesture);
+  else if (drag.kind === "edge") pending.points[1] = place;
+  else if (distance(pending.points[pending.points.length - 1], place) * drawing.scale > 3) pending.points.push(place);
+  draw();
+}
+
+function released() {
+  if (drag && drag.kind === "edge" && distance(...pending.points) * drawing.scale > 10) {
+    const number = marking.nextEdge(view().name);
+    if (number !== null) marking.setEdge(view().name, number, pending.points);
+  }
+  if (drag && drag.kind === "brush") marking.addStroke(view().name, pending);
+  if (!pending || pending.kind !== "polygon") pending = null;
+  drag = null;
+  draw();
+}
+
+function closePolygon() {
+  if (!pending || pending.kind !== "polygon") return;
+  const points = pending.points.slice(0, -1).filter((point, index, all) => !index || distance(point, all[index - 1]) * drawing.scale > 2);
+  pending = null;
+  if (points.length > 2) marking.addStroke(view().name, { kind: "polygon", effect: "cut", radius: 1, points });
+  draw();
+}
+
+function choose(name) { tool = name; pending = null; refresh(); }
+
+function nextPane() {
+  const labels = marking.document.panes.map((pane) => pane.label);
+  if (!labels.length) return;
+  marking.active = labels[(labels.indexOf(marking.active) + 1) % labels.length];
+  refresh();
+}
+
+const KEYS = {
+  ArrowLeft: () => show(current - 1),
+  ArrowRight: () => show(current + 1),
+  s: () => { const next = suggested()[0]; if (next) show(next.view); },
+  a: () => marking.addPane(),
+  0: () => { drawing.fit(); draw(); },
+  1: () => choose("corner"),
+  2: () => choose("edge"),
+  3: () => choose("polygon"),
+  4: () => choose("brush"),
+  5: () => choose("restore"),
+  "[": () => { radius = Math.max(2, radius / 1.25); tell(`brush of ${Math.round(radius)} pixels`); },
+  "]": () => { radius = Math.min(300, radius * 1.25); tell(`brush of ${Math.round(radius)} pixels`); },
+  Enter: closePolygon,
+  Escape: () => { pending = drag = null; draw(); },
+  Tab: nextPane,
+  Delete: () => { if (drawing.pointer) marking.removeAt(view().name, drawing.pointer, REACH / drawing.scale, (stroke, place) => drawing.covers(stroke, place)); },
+};
+KEYS.Backspace = KEYS.Delete;
+
+function keyed(event) {
+  if (event.target.closest("select, summary")) return;
+  if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z") {
+    event.preventDefault();
+    event.shiftKey ? marking.redo() : marking.undo();
+    return;
+  }
+  if (event.ctrlKey || event.metaKey || event.altKey) return;
+  if (event.key === " ") { spaceHeld = true; event.preventDefault(); return; }
+  const act = KEYS[event.key] || KEYS[event.key.toLowerCase()];
+  if (!act || (event.target.closest("button") && ["Enter", "Tab"].includes(event.key))) return;
+  event.preventDefault();
+  act();
+}
+
+async function write() {
+  tell("writing masks and planes ...");
+  document.body.dataset.written = "";
+  try {
+    await settled();
+    const { masks, planes } = await ask("/results", {});
+    tell(`written: ${masks.length} masks, ${planes.length} planes`);
+    document.body.dataset.written = `${masks.length} ${planes.length}`;
+  } catch (error) {
+    tell(error.message, true);
+    document.body.dataset.written = "failed";
+  }
+}
+
+// Resolves when the server knows everything.
+async function settled() {
+  while (document.body.dataset.state === "changed" || sending) await new Promise((next) => setTimeout(next, 50));
+}
+
+async function close() {
+  await settled();
+  await ask("/close", {});
+  document.body.replaceChildren(make("main", { textContent: "Saved. The command has ended; this page can be closed." }));
+  document.body.dataset.state = "closed";
+}
+
+function listen() {
+  const canvas = drawing.canvas;
+  canvas.addEventListener("pointerdown", pressed);
+  canvas.addEventListener("pointermove", moved);
+  canvas.addEventListener("pointerup", released);
+  canvas.addEventListener("dblclick", closePolygon);
+  canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+  canvas.addEventListener("wheel", (event) => { event.preventDefault(); drawing.zoom(spot(event), Math.exp(-event.deltaY / 400)); draw(); }, { passive: false });
+  window.addEventListener("keydown", keyed);
+  window.addEventListener("keyup", (event) => { if (event.key === " ") spaceHeld = false; });
+  window.addEventListener("beforeunload", (event) => { if (document.body.dataset.state === "changed") event.preventDefault(); });
+  new ResizeObserver(() => { drawing.fit(); draw(); }).observe(canvas);
+  document.querySelectorAll("[data-tool]").forEach((button) => button.addEventListener("click", () => choose(button.dataset.tool)));
+  for (const [id, act] of [["undo", () => marking.undo()], ["redo", () => marking.redo()], ["add", () => marking.addPane()], ["write", write], ["close", close]]) {
+    element(id).addEventListener("click", (event) => { act(); event.currentTarget.blur(); });
+  }
+}
+
+async function begin() {
+  capture = await ask("/capture");
+  document.title = `${capture.name}: mark panes`;
+  element("capture-name").textContent = capture.name;
+  element("views").replaceChildren(...capture.views.map((one, number) => {
+    const image = make("img", { src: `/thumbnail/${number}`, loading: "lazy", alt: "" });
+    const button = make("button", { title: one.name }, image, make("span", { textContent: one.name }), make("b"));
+    button.addEventListener("click", () => { show(number); button.blur(); });
+    return button;
+  }));
+  marking = new Marking(capture.document, changed);
+  drawing = new Drawing(element("canvas"));
+  listen();
+  if (!marking.document.panes.length) marking.addPane(); else send();
+  await show(capture.first);
+  document.body.dataset.ready = "yes";
+}
+
+begin().catch((error) => tell(error.message, true));

@@ -1,0 +1,271 @@
+"""Where a pane is, from what was marked of its outline in several photographs, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from glassplat.annotate.eye import Eye
+from glassplat.annotate.pane_shape import PaneShape, polygon_pane, rectangle_pane
+
+Array = NDArray[np.float64]
+Shape = Literal["rectangle", "polygon"]
+
+ACCURACY = 1.0 / 1000
+"""Of a mark, in image diagonals: how exactly somebody clicks, at best."""
+OUTLIER = 4.0
+"""Accuracies from which on a mark counts less and less."""
+LEAST_PARALLAX = np.radians(0.5)
+"""Between two sight lines on a corner; with less its distance is a guess."""
+DERIVATIVE_STEP = 1e-5
+
+
+class TooFewMarksError(ValueError):
+    """The marks leave the plane open; the message says which are missing."""
+
+
+@dataclass(frozen=True)
+class Marks:
+    """What was marked of one pane; views are numbered.
+
+    Attributes:
+        corners: for each corner, in order round the outline, its pixel (x, y) in every view that shows it.
+        edges: for each edge, the one after the corner of its number, two pixels on it in every view that shows it.
+    """
+
+    corners: Sequence[Mapping[int, Array]]
+    edges: Sequence[Mapping[int, Array]] = field(default_factory=tuple)
+
+    def views(self) -> list[int]:
+        """Views with any mark, ascending."""
+        return sorted({view for marks in (*self.corners, *self.edges) for view in marks})
+
+
+@dataclass(frozen=True)
+class PaneFit:
+    """A pane as the marks have it.
+
+    Attributes:
+        shape: the outline in the world.
+        error: root mean square distance of marks from it, in pixels.
+        errors: the largest distance of a mark in each view, in pixels.
+        information: [F, F] of the parameters of the shape, those of `stepped`: inverse of their covariance.
+    """
+
+    shape: PaneShape
+    error: float
+    errors: Mapping[int, float]
+    information: Array
+
+    @property
+    def doubt(self) -> float:
+        """Degrees by which the plane may be tilted, one standard deviation along its least certain axis."""
+        return tilt_deviation(self.information)
+
+
+def tilt_deviation(information: Array) -> float:
+    """Degrees, of the tilt that is least certain; 90 where nothing holds the plane."""
+    tilt, mixed, rest = information[:2, :2], information[:2, 2:], information[2:, 2:]
+    # What is left of the tilt's information when everything else is free; how far edges go may be open.
+    alone = tilt - mixed @ np.linalg.pinv(rest, rcond=1e-10, hermitian=True) @ mixed.T
+    least = float(np.linalg.eigvalsh(alone)[0])
+    return 90.0 if least <= np.degrees(1) ** -2 * 1e-4 else min(float(np.degrees(1 / np.sqrt(least))), 90.0)
+
+
+def fitted_pane(marks: Marks, eyes: Sequence[Eye], shape: Shape) -> PaneFit:
+    """The outline that lies closest to all marks; single marks that are far off count little.
+
+    Args:
+        marks: corners and edges, in numbered views.
+        eyes: the cameras of all views.
+        shape: a rectangle (of four corners), or any polygon.
+
+    Raises:
+        TooFewMarksError: a corner of too few is known from two places; the message says what to mark.
+    """
+    start = polygon_pane(_first_corners(marks, eyes))
+    begun: PaneShape = rectangle_pane(start) if shape == "rectangle" and len(marks.corners) == 4 else start
+
+    def residuals(step: Array) -> Array:
+        return mark_residuals(marks, eyes, begun.stepped(step))
+
+    step = np.zeros(begun.freedom)
+    for loss in ("soft_l1", "cauchy"):  # The second lets go of what is far off, and would stay there if it came first.
+        step = least_squares(residuals, step, loss=loss, f_scale=OUTLIER, x_scale="jac", max_nfev=100).x
+    fitted = begun.stepped(step)
+    away = mark_residuals(marks, eyes, fitted)
+    jacobian = _jacobian(marks, eyes, fitted)
+    spread = max(1.0, float(np.sqrt((away**2).sum() / max(len(away) - fitted.freedom, 1))))
+    pixels = _pixel_distances(marks, eyes, fitted)
+    largest = {view: max(one for number, one in pixels if number == view) for view in marks.views()}
+    error = float(np.sqrt(np.mean([one**2 for _, one in pixels])))
+    return PaneFit(fitted, error, largest, jacobian.T @ jacobian / spread**2)
+
+
+def mark_residuals(marks: Marks, eyes: Sequence[Eye], shape: PaneShape) -> Array:
+    """[R] distances of all marks from the shape, in accuracies; two for a corner, one for each pixel on an edge."""
+    parts = [away / (ACCURACY * eyes[view].diagonal) for view, away in _distances(marks, eyes, shape)]
+    return np.concatenate(parts)
+
+
+def corner_information(eye: Eye, shape: PaneShape) -> Array:
+    """[F, F] what marking every corner that a view holds would add to a fit's information."""
+    held = eye.holds(shape.corners())
+    marks = Marks([{0: pixel} if seen else {} for pixel, seen in zip(eye.project(shape.corners()), held, strict=True)])
+    if not held.any():
+        return np.zeros((shape.freedom, shape.freedom))
+    jacobian = _jacobian(marks, [eye], shape)
+    return jacobian.T @ jacobian
+
+
+def _jacobian(marks: Marks, eyes: Sequence[Eye], shape: PaneShape) -> Array:
+    """[R, F] by central differences."""
+    columns = []
+    for axis in np.eye(shape.freedom):
+        ahead, behind = (
+            mark_residuals(marks, eyes, shape.stepped(sign * DERIVATIVE_STEP * axis)) for sign in (1.0, -1.0)
+        )
+        columns.append((ahead - behind) / (2 * DERIVATIVE_STEP))
+    return np.stack(columns, axis=1)
+
+
+def _distances(marks: Marks, eyes: Sequence[Eye], shape: PaneShape) -> list[tuple[int, Array]]:
+    """The view and the distances, in pixels, of each mark: [2] of a corner, [2] across an edge."""
+    corners = shape.corners()
+    found = []
+    for number, places in enumerate(marks.corners):
+        found += [(view, eyes[view].project(corners[number]) - place) for view, place in places.items()]
+    for number, places in enumerate(marks.edges):
+        ends = corners[[number, (number + 1) % len(corners)]]
+        found += [(view, _across(eyes[view].project(ends), place)) for view, place in places.items()]
+    return found
+
+
+def _across(line: Array, places: Array) -> Array:
+    """[2] distances of two pixels from the line through two others."""
+    along = line[1] - line[0]
+    length = max(float(np.hypot(*along)), 1e-9)
+    away = places - line[0]
+    return np.asarray((along[0] * away[:, 1] - along[1] * away[:, 0]) / length)
+
+
+def _pixel_distances(marks: Marks, eyes: Sequence[Eye], shape: PaneShape) -> list[tuple[int, float]]:
+    return [(view, float(np.linalg.norm(away))) for view, away in _distances(marks, eyes, shape)]
+
+
+def _first_corners(marks: Marks, eyes: Sequence[Eye]) -> Array:
+    """[K, 3] every corner: triangulated, where two edges meet, on the plane of the others, or completing them.
+
+    Raises:
+        TooFewMarksError: fewer than three are known from two places.
+    """
+    lines = [_edge_line(places, eyes) for places in marks.edges] + [None] * (len(marks.corners) - len(marks.edges))
+    known = [
+        _triangulated(places, eyes) if len(places) > 1 else _meeting(lines[number - 1], lines[number])
+        for number, places in enumerate(marks.corners)
+    ]
+    points = [point for point in known if point is not None]
+    spanning = points + [point for line in lines if line is not None for point in line]
+    if len(spanning) < 3:
+        raise TooFewMarksError(_missing(marks, len(points)))
+    plane = polygon_pane(np.stack(spanning))
+    completed = [
+        point if point is not None else _on_plane(marks, number, eyes, plane.center, plane.frame[2])
+        for number, point in enumerate(known)
+    ]
+    return np.stack(_with_line_ends(completed, lines, marks))
+
+
+def _missing(marks: Marks, known: int) -> str:
+    views = marks.views()
+    if len(views) < 2:
+        return "mark the same corners in a second photograph, taken from another place"
+    return (
+        f"{known} corners are known from two places, expected at least 3: mark the same corners in two photographs "
+        "taken farther apart"
+    )
+
+
+def _triangulated(places: Mapping[int, Array], eyes: Sequence[Eye]) -> Array | None:
+    """[3] the point nearest to all sight lines; None where they are too parallel."""
+    centers = np.stack([eyes[view].center for view in places])
+    rays = np.stack([eyes[view].rays(np.asarray(place)) for view, place in places.items()])
+    if np.arccos(np.clip((rays @ rays.T).min(), -1, 1)) < LEAST_PARALLAX:
+        return None
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    return np.linalg.solve(across.sum(axis=0), np.einsum("vij,vj->i", across, centers))
+
+
+def _edge_line(places: Mapping[int, Array], eyes: Sequence[Eye]) -> tuple[Array, Array] | None:
+    """Two points of an edge in space, where the planes of sight through it meet, as far out as the marks lie."""
+    if len(places) < 2:
+        return None
+    rays = {view: eyes[view].rays(np.asarray(place)) for view, place in places.items()}
+    normals = np.stack([np.cross(*ends) for ends in rays.values()])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    _, sizes, axes = np.linalg.svd(normals)
+    if len(normals) < 2 or sizes[1] < LEAST_PARALLAX * sizes[0]:
+        return None
+    offsets = np.array([normal @ eyes[view].center for normal, view in zip(normals, places, strict=True)])
+    point, direction = np.linalg.lstsq(normals, offsets, rcond=1e-9)[0], axes[2]
+    view = next(iter(places))
+    first, second = (_nearest_on_line(point, direction, eyes[view].center, ray) for ray in rays[view])
+    return first, second
+
+
+def _nearest_on_line(point: Array, direction: Array, center: Array, ray: Array) -> Array:
+    """[3] the point of a line that is closest to a sight line."""
+    across = np.eye(3) - np.outer(ray, ray)
+    along = float(direction @ across @ direction)
+    return np.asarray(point + direction * (direction @ across @ (center - point)) / max(along, 1e-12))
+
+
+def _meeting(before: tuple[Array, Array] | None, after: tuple[Array, Array] | None) -> Array | None:
+    """[3] half-way between two lines where they are closest; None where one is missing or they are parallel."""
+    if before is None or after is None:
+        return None
+    one, other = (line[1] - line[0] for line in (before, after))
+    matrix = np.stack([one, -other], axis=1)
+    steps, _, _, sizes = np.linalg.lstsq(matrix, after[0] - before[0], rcond=None)
+    if sizes[1] < 0.05 * sizes[0]:
+        return None
+    first, second = before[0] + steps[0] * one, after[0] + steps[1] * other
+    return np.asarray((first + second) / 2)
+
+
+def _on_plane(marks: Marks, number: int, eyes: Sequence[Eye], center: Array, normal: Array) -> Array | None:
+    """[3] where the one sight line on a corner meets the plane of the others; None where nothing was marked."""
+    for view, place in marks.corners[number].items():
+        ray = eyes[view].rays(np.asarray(place))
+        slope = ray @ normal
+        if abs(slope) > 1e-3:
+            return np.asarray(eyes[view].center + ray * ((center - eyes[view].center) @ normal) / slope)
+    return None
+
+
+def _with_line_ends(corners: list[Array | None], lines: Sequence, marks: Marks) -> list[Array]:
+    """All corners: those that nothing tells are ends of a marked edge, or the fourth of a parallelogram.
+
+    Raises:
+        TooFewMarksError: some corners are told by nothing.
+    """
+    count = len(corners)
+    for number in range(count):
+        if corners[number] is None:
+            before, after = lines[number - 1], lines[number]
+            found = after[0] if after is not None else before[1] if before is not None else None
+            corners[number] = found
+    for number in range(count):
+        if corners[number] is None and count == 4:
+            a, b, c = (corners[(number + step) % 4] for step in (1, 2, 3))
+            if a is not None and b is not None and c is not None:
+                corners[number] = a + c - b
+    missing = [str(number + 1) for number, corner in enumerate(corners) if corner is None]
+    if missing:
+        raise TooFewMarksError(f"mark corner {', '.join(missing)} too, in one photograph at least")
+    return [corner for corner in corners if corner is not None]

@@ -1,0 +1,148 @@
+"""Masks and planes of marked panes, written into the capture."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from glassplat.annotate.document import MarkedPane
+from glassplat.annotate.eye import Eye
+from glassplat.annotate.outline import depths, filled, seen_outline, with_strokes
+from glassplat.annotate.pane_fit import PaneFit
+from glassplat.data.errors import InputError, first_names
+from glassplat.data.given_planes import PLANES
+from glassplat.data.masks import MASK_FOLDER
+from glassplat.data.view import PhotoFile, View
+from glassplat.files.atomic import atomic_write
+from glassplat.files.images import image_size, write_image
+from glassplat.files.json_text import read_json
+from glassplat.files.planes_json import GLASS_REFLECTANCE, write_planes
+from glassplat.init.rectangle import min_area_rectangle
+from glassplat.scene.activations import logit
+from glassplat.scene.plane import Planes
+
+Labels = NDArray[np.uint8]
+Solved = Sequence[tuple[MarkedPane, PaneFit]]
+
+RECORD = "annotated.json"
+"""In the folder of masks: which of them were made here, and may be replaced."""
+MIRROR_REFLECTANCE = 0.999
+
+
+def write_results(root: Path, views: Sequence[View], eyes: Sequence[Eye], panes: Solved) -> list[str]:
+    """Writes a mask for every photograph with a mark, and all planes; returns the masks' names.
+
+    A mask tells of every pane what of it a photograph shows, also of panes that were not marked in this one.
+
+    Raises:
+        InputError: the folder holds masks that were not made here.
+        OSError: something cannot be written.
+    """
+    folder = root / MASK_FOLDER
+    earlier = earlier_masks(root)
+    marked = set().union(*(pane.views() for pane, _ in panes))
+    shown = [(view, eye) for view, eye in zip(views, eyes, strict=True) if view.name in marked]
+    names = {view.name: PurePosixPath(view.name).with_suffix(".png").as_posix() for view, _ in shown}
+    if len(set(names.values())) < len(names):
+        names = {name: f"{name}.png" for name in names}
+    for view, eye in shown:
+        write_image(folder / names[view.name], in_photograph(view, pane_labels(view.name, eye, panes)))
+    for name in set(earlier) - set(names.values()):
+        (folder / name).unlink(missing_ok=True)
+    with atomic_write(folder / RECORD) as temporary:
+        temporary.write_text(json.dumps(sorted(names.values()), indent=1), encoding="utf-8")
+    write_planes(root / PLANES, planes_of(panes, eyes))
+    return sorted(names.values())
+
+
+def earlier_masks(root: Path) -> list[str]:
+    """Masks of a capture that were made here before.
+
+    Raises:
+        InputError: there are others.
+    """
+    folder = root / MASK_FOLDER
+    if not folder.is_dir():
+        return []
+    try:
+        known = [str(name) for name in read_json(folder / RECORD)]
+    except (OSError, ValueError, TypeError):
+        known = []
+    found = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
+    others = sorted(name for name in found if name not in known and os.path.basename(name) != RECORD)
+    if others:
+        raise InputError(
+            f"{folder} holds masks that were not made by `glassplat annotate` ({first_names(others)}), and one capture "
+            "needs all of one kind: train with them as they are, or move that folder away and mark the panes here"
+        )
+    return [name for name in known if not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts]
+
+
+def pane_labels(name: str, eye: Eye, panes: Solved) -> Labels:
+    """[H, W] label of the nearest pane at each pixel of a view, without what stands before it."""
+    width, height = int(eye.size[0]), int(eye.size[1])
+    labels, nearest = np.zeros((height, width), dtype=np.uint8), np.full((height, width), np.inf)
+    for pane, fit in panes:
+        corners = fit.shape.corners()
+        outline = filled(seen_outline(eye, corners), (width, height))
+        depth = np.where(outline, depths(eye, corners), np.inf)
+        first = depth < nearest
+        shown = with_strokes(outline, pane.strokes.get(name, ()))
+        labels[first] = np.where(shown, pane.label, labels)[first]
+        nearest = np.minimum(nearest, np.where(shown, depth, np.inf))
+    return labels
+
+
+def in_photograph(view: View, labels: Labels) -> Labels:
+    """[H, W] of the view's pixels to those of its photograph's file, which a lens may have bent."""
+    reader = view.read_photo
+    if not isinstance(reader, PhotoFile):
+        return labels
+    width, height = image_size(view.image_path)
+    lens = reader.pixel_map.lens
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    camera = view.camera
+    if lens is None:
+        column, row = x * camera.width / width, y * camera.height / height
+    else:
+        rays = np.asarray(lens.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1))).reshape(height, width, 2)
+        column, row = camera.fx * rays[..., 0] + camera.cx, camera.fy * rays[..., 1] + camera.cy
+    inside = (column >= 0) & (column < labels.shape[1]) & (row >= 0) & (row < labels.shape[0])
+    found = np.zeros((height, width), dtype=np.uint8)
+    found[inside] = labels[np.floor(row[inside]).astype(np.int64), np.floor(column[inside]).astype(np.int64)]
+    return found
+
+
+def planes_of(panes: Solved, eyes: Sequence[Eye]) -> Planes:
+    """A rectangle around each outline, its normal towards most cameras."""
+    rows = [_rectangle(fit, eyes) for _, fit in panes]
+    centers, normals, tangents, half_sizes = (
+        torch.tensor(np.stack(column), dtype=torch.float32) for column in zip(*rows, strict=True)
+    )
+    mirrors = tuple(pane.label for pane, _ in panes if pane.material == "mirror")
+    reflectances = [MIRROR_REFLECTANCE if pane.label in mirrors else GLASS_REFLECTANCE for pane, _ in panes]
+    return Planes(
+        centers=centers,
+        raw_normals=normals,
+        logit_reflectances=torch.tensor([logit(value) for value in reflectances]),
+        tangents=tangents,
+        half_sizes=half_sizes,
+        labels=tuple(pane.label for pane, _ in panes),
+        mirrors=mirrors,
+    )
+
+
+def _rectangle(fit: PaneFit, eyes: Sequence[Eye]) -> tuple[NDArray[np.float64], ...]:
+    """Centre, normal, tangent and half sizes."""
+    corners, axes = fit.shape.corners(), fit.shape.frame
+    middle = corners.mean(axis=0)
+    flat = min_area_rectangle((corners - middle) @ axes[:2].T)
+    facing = np.sign([(eye.center - middle) @ axes[2] for eye in eyes]).sum()
+    normal = axes[2] if facing >= 0 else -axes[2]
+    return middle + flat.center @ axes[:2], normal, flat.axis @ axes[:2], flat.half_sizes

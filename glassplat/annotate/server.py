@@ -1,0 +1,220 @@
+"""The page for marking panes, served to browsers on this computer only.
+
+Nothing but numbers of views and one document comes from the page; no path does. Who does not know the key, which is
+part of the address that the command prints, gets nothing: other users of the computer, and pages of other sites.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import secrets
+from collections.abc import Callable
+from functools import cached_property
+from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib import resources
+from threading import Thread
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from glassplat.annotate.session import SHOWN, THUMBNAIL, Session
+from glassplat.data.errors import InputError
+from glassplat.files.json_text import parse_json
+
+LOCAL = "127.0.0.1"
+LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
+"""Of the host that a browser may say that it talks to, with any port: over SSH it is another one than ours."""
+LARGEST_BODY = 8_000_000
+PAGE_FILES = {
+    "/page.js": ("page.js", "text/javascript"),
+    "/drawing.js": ("drawing.js", "text/javascript"),
+    "/marking.js": ("marking.js", "text/javascript"),
+    "/style.css": ("style.css", "text/css"),
+}
+POLICY = "default-src 'self'; img-src 'self' blob: data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+COOKIE = "glassplat_annotate"
+
+
+class RefusedError(Exception):
+    """A request that is not answered; `status` says why."""
+
+    def __init__(self, status: HTTPStatus, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+class AnnotationServer(ThreadingHTTPServer):
+    """Serves one session until it is told to stop.
+
+    Attributes:
+        session: the capture that is marked.
+        key: what a browser has to know.
+        is_finished: whether the page asked for the end.
+    """
+
+    daemon_threads = True
+
+    def __init__(self, session: Session, port: int) -> None:
+        """Listens; `port` 0 takes any that is free.
+
+        Raises:
+            InputError: the port is taken, or may not be listened on.
+        """
+        self.session = session
+        self.key = secrets.token_urlsafe(16)
+        self.is_finished = False
+        try:
+            super().__init__((LOCAL, port), PageHandler)
+        except OSError as error:
+            reason = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be used ({error.strerror})"
+            raise InputError(f"port {port} {reason}; choose another with --port, or 0 for any that is free") from error
+
+    @property
+    def address(self) -> str:
+        """What to open in the browser."""
+        return f"http://{LOCAL}:{self.server_address[1]}/?key={self.key}"
+
+    def finish(self) -> None:
+        """Stops serving; from any thread."""
+        Thread(target=self.shutdown, daemon=True).start()
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Nothing: a browser that goes away in the middle of an answer is none of our business."""
+
+
+class PageHandler(BaseHTTPRequestHandler):
+    """Answers one browser."""
+
+    server: AnnotationServer
+    server_version = "glassplat"
+    sys_version = ""
+    protocol_version = "HTTP/1.1"
+    timeout = 60
+
+    def do_GET(self) -> None:
+        """The page, its parts, photographs, and the capture."""
+        self._answer(self._get)
+
+    def do_POST(self) -> None:
+        """A changed document, and what to do with it."""
+        self._answer(self._post)
+
+    def log_message(self, format: str, *values: Any) -> None:
+        """Nothing: requests interest nobody."""
+
+    def _answer(self, work: Callable[[], None]) -> None:
+        try:
+            self._check_host()
+            work()
+        except RefusedError as refused:
+            self.close_connection = True
+            self._send_json({"error": str(refused)}, refused.status)
+        except (ValueError, OSError) as error:
+            self._send_json({"error": str(error)}, HTTPStatus.BAD_REQUEST)
+
+    def _get(self) -> None:
+        path = self._path.path
+        if path == "/":
+            self._send_page()
+            return
+        self._check_key()
+        if path in PAGE_FILES:
+            name, kind = PAGE_FILES[path]
+            self._send((resources.files("glassplat.annotate") / "page" / name).read_bytes(), kind)
+        elif path == "/capture":
+            self._send_json(self.server.session.described())
+        elif path.startswith("/photo/"):
+            self._send_picture(path.removeprefix("/photo/"), SHOWN)
+        elif path.startswith("/thumbnail/"):
+            self._send_picture(path.removeprefix("/thumbnail/"), THUMBNAIL)
+        else:
+            raise RefusedError(HTTPStatus.NOT_FOUND, "there is no such page")
+
+    def _post(self) -> None:
+        self._check_origin()
+        self._check_key()
+        path, session = self._path.path, self.server.session
+        body = self._body()
+        if path == "/document":
+            self._send_json(session.update(parse_json(body, "the document of the page")))
+        elif path == "/results":
+            self._send_json(session.finish())
+        elif path == "/close":
+            self.server.is_finished = True
+            self._send_json({})  # Before the end: nobody waits for this thread.
+            self.server.finish()
+        else:
+            raise RefusedError(HTTPStatus.NOT_FOUND, "there is no such page")
+
+    @cached_property
+    def _path(self) -> Any:
+        return urlsplit(self.path)
+
+    def _check_host(self) -> None:
+        """Refuse names that somebody else's name server may let point to this computer."""
+        self.__dict__.pop("_path", None)  # A connection is used for more than one request.
+        host = (self.headers.get("Host") or "").lower()
+        name = host.rpartition(":")[0] if host.rpartition(":")[2].isdecimal() else host
+        if name not in LOCAL_NAMES:
+            raise RefusedError(HTTPStatus.FORBIDDEN, "this page is served to this computer only")
+
+    def _check_origin(self) -> None:
+        """Refuse what pages of other sites have a browser send."""
+        origin = self.headers.get("Origin")
+        if origin is None or urlsplit(origin).netloc.lower() != (self.headers.get("Host") or "").lower():
+            raise RefusedError(HTTPStatus.FORBIDDEN, "a request of another site")
+
+    def _check_key(self) -> None:
+        try:
+            cookie = SimpleCookie(self.headers.get("Cookie") or "").get(COOKIE)
+        except CookieError:
+            cookie = None
+        known = "" if cookie is None else cookie.value
+        if not secrets.compare_digest(known.encode(), self.server.key.encode()):
+            raise RefusedError(HTTPStatus.FORBIDDEN, "open the address that the command printed, with its key")
+
+    def _body(self) -> str:
+        length = self.headers.get("Content-Length", "")
+        if not length.isdecimal() or int(length) > LARGEST_BODY:
+            raise RefusedError(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"expected at most {LARGEST_BODY} bytes")
+        return self.rfile.read(int(length)).decode("utf-8")
+
+    def _send_page(self) -> None:
+        given = parse_qs(self._path.query).get("key", [""])[0]
+        if given:
+            if not secrets.compare_digest(given.encode(), self.server.key.encode()):
+                raise RefusedError(HTTPStatus.FORBIDDEN, "the key is that of another session; take the printed address")
+            # The key leaves the address bar and the history.
+            cookie = f"{COOKIE}={self.server.key}; HttpOnly; SameSite=Strict; Path=/"
+            self._send(b"", "text/plain", HTTPStatus.SEE_OTHER, {"Set-Cookie": cookie, "Location": "/"})
+            return
+        self._check_key()
+        self._send((resources.files("glassplat.annotate") / "page" / "index.html").read_bytes(), "text/html")
+
+    def _send_picture(self, number: str, longest: int) -> None:
+        if not number.isdecimal() or len(number) > 9 or int(number) >= len(self.server.session.views):
+            raise RefusedError(HTTPStatus.NOT_FOUND, "there is no such view")
+        picture = self.server.session.picture(int(number), longest)
+        self._send(picture, "image/jpeg", headers={"Cache-Control": "private, max-age=3600"})
+
+    def _send_json(self, value: Any, status: HTTPStatus = HTTPStatus.OK) -> None:
+        self._send(json.dumps(value).encode(), "application/json", status)
+
+    def _send(
+        self, body: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK, headers: dict[str, str] | None = None
+    ) -> None:
+        self.send_response(status)
+        standard = {
+            "Content-Type": f"{kind}; charset=utf-8" if kind.startswith("text") else kind,
+            "Content-Length": str(len(body)),
+            "Content-Security-Policy": POLICY,
+            "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer",
+            "Cache-Control": "no-store",
+        }
+        for name, value in (standard | (headers or {})).items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)

@@ -1,0 +1,239 @@
+"""A capture while its panes are being marked."""
+
+from __future__ import annotations
+
+import io
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from glassplat.annotate.document import MarkedPane, parsed_document, read_document, write_document
+from glassplat.annotate.eye import Eye
+from glassplat.annotate.outline import seen_outline
+from glassplat.annotate.pane_fit import Marks, PaneFit, TooFewMarksError, fitted_pane
+from glassplat.annotate.results import earlier_masks, write_results
+from glassplat.annotate.view_advice import first_view, second_views, settling_views
+from glassplat.data.dataset import Dataset, load_dataset
+from glassplat.data.errors import InputError, input_checked
+from glassplat.data.view import View
+from glassplat.files.folders import check_folder
+
+Array = NDArray[np.float64]
+
+THUMBNAIL = 160
+SHOWN = 2400
+"""Pixels of the longer side of a photograph as it is sent to the page."""
+QUALITY = 90
+KEPT_BYTES = 200_000_000
+"""Of encoded photographs in memory."""
+POOR_RECTANGLE = 1.5
+"""Factor by which a free outline may fit better before a rectangle is called into question."""
+POINTS_USED = 20_000
+
+
+@dataclass(frozen=True)
+class SolvedPane:
+    """A pane with its fit, or why there is none."""
+
+    pane: MarkedPane
+    fit: PaneFit | None
+    problem: str = ""
+
+
+class Session:
+    """A capture, what was marked in it, and what follows.
+
+    Attributes:
+        root: the capture's folder.
+        views: all views, by name.
+        eyes: their cameras.
+    """
+
+    def __init__(self, dataset: Dataset) -> None:
+        self.root = dataset.root
+        self.views: tuple[View, ...] = tuple(sorted((*dataset.train, *dataset.test), key=lambda view: view.name))
+        self.eyes = [Eye.of(view.camera) for view in self.views]
+        points = dataset.points.positions.double().numpy() if dataset.measured_points else np.zeros((0, 3))
+        self._points: Array = points[:: max(1, len(points) // POINTS_USED)]
+        self._numbers = {view.name: number for number, view in enumerate(self.views)}
+        self._lock = Lock()
+        self._pictures: OrderedDict[tuple[int, int], bytes] = OrderedDict()
+        with input_checked():
+            self._document: Any = read_document(self.root)
+
+    @property
+    def document(self) -> Any:
+        """What was marked, as JSON."""
+        return self._document
+
+    def described(self) -> dict[str, Any]:
+        """The capture for the page."""
+        return {
+            "name": self.root.resolve().name,
+            "views": [
+                {"name": view.name, "width": view.camera.width, "height": view.camera.height} for view in self.views
+            ],
+            "first": first_view(self.eyes, self._points),
+            "document": self._document,
+        }
+
+    def picture(self, number: int, longest: int) -> bytes:
+        """A photograph as JPEG, without distortion, reduced to `longest` pixels.
+
+        Raises:
+            IndexError: there is no such view.
+        """
+        view = self.views[number]
+        with self._lock:
+            if (number, longest) in self._pictures:
+                self._pictures.move_to_end((number, longest))
+                return self._pictures[number, longest]
+        image = Image.fromarray(view.read_photo().numpy())
+        image.thumbnail((longest, longest), Image.Resampling.LANCZOS)
+        encoded = io.BytesIO()
+        image.save(encoded, "JPEG", quality=QUALITY)
+        with self._lock:
+            self._pictures[number, longest] = encoded.getvalue()
+            while sum(map(len, self._pictures.values())) > KEPT_BYTES:
+                self._pictures.popitem(last=False)
+        return encoded.getvalue()
+
+    def update(self, document: Any) -> dict[str, Any]:
+        """Takes a changed document over, saves it, and says what follows from it.
+
+        Raises:
+            ValueError: it is no document.
+            OSError: it cannot be saved.
+        """
+        panes = parsed_document(document, "the document of the page")
+        with self._lock:
+            write_document(self.root, document)
+            self._document = document
+        return {"panes": [self._answer(self.solve(pane)) for pane in panes]}
+
+    def solve(self, pane: MarkedPane) -> SolvedPane:
+        """Fits one pane."""
+        marks = pane.marks(self._numbers)
+        if len(marks.corners) < 3 or not marks.views():
+            return SolvedPane(pane, None, "mark the corners, one after the other round the pane")
+        try:
+            return SolvedPane(pane, fitted_pane(marks, self.eyes, pane.shape))
+        except TooFewMarksError as error:
+            return SolvedPane(pane, None, str(error))
+        except ValueError as error:
+            return SolvedPane(pane, None, f"{error}; check the order of the corners")
+
+    def finish(self) -> dict[str, Any]:
+        """Writes masks and planes of everything that is marked; says what was written.
+
+        Raises:
+            InputError: no pane is known yet, or a folder of masks holds some that were not made here.
+        """
+        panes = [self.solve(pane) for pane in parsed_document(self._document, "the document")]
+        solved = [(one.pane, one.fit) for one in panes if one.fit is not None]
+        if not solved:
+            raise InputError("no pane is known yet; mark the same corners in two photographs")
+        written = write_results(self.root, self.views, self.eyes, solved)
+        return {"masks": written, "planes": [pane.label for pane, _ in solved]}
+
+    def _answer(self, solved: SolvedPane) -> dict[str, Any]:
+        """What the page shows of a pane."""
+        pane, fit = solved.pane, solved.fit
+        marks = pane.marks(self._numbers)
+        if fit is None:
+            return {
+                "label": pane.label,
+                "solved": False,
+                "message": solved.problem,
+                "next": [{"view": number} for number in self._second_views(marks)],
+                "lines": self._sight_lines(marks),
+            }
+        corners = fit.shape.corners()
+        advice = settling_views(fit, self.eyes, marks.views())
+        return {
+            "label": pane.label,
+            "solved": True,
+            "message": self._judgement(pane, fit, marks),
+            "error": fit.error,
+            "doubt": fit.doubt,
+            "errors": fit.errors,
+            "outlines": [np.round(seen_outline(eye, corners), 2).tolist() for eye in self.eyes],
+            "corners": [_places(eye, corners) for eye in self.eyes],
+            "next": [{"view": number, "doubt": doubt} for number, doubt in advice],
+        }
+
+    def _judgement(self, pane: MarkedPane, fit: PaneFit, marks: Marks) -> str:
+        """A warning about a fit, or nothing."""
+        worst = max(fit.errors, key=fit.errors.__getitem__)
+        if pane.shape == "rectangle" and len(marks.corners) == 4 and fit.error > 2:
+            free = fitted_pane(marks, self.eyes, "polygon")
+            if fit.error > POOR_RECTANGLE * max(free.error, 1.0):
+                return (
+                    f"the corners do not form a rectangle ({fit.error:.1f} pixels off, {free.error:.1f} without that "
+                    "demand): check them, or choose polygon"
+                )
+        if fit.errors[worst] > 0.01 * self.eyes[worst].diagonal:
+            return f"the marks in {self.views[worst].name} are {fit.errors[worst]:.0f} pixels off: check them"
+        return ""
+
+    def _second_views(self, marks: Marks) -> list[int]:
+        views = marks.views()
+        if not views:
+            return []
+        outline = np.array([places[views[0]] for places in marks.corners if views[0] in places]).reshape(-1, 2)
+        found = second_views(outline, views[0], self.eyes, self._points)
+        return [number for number in found if number not in views[1:]]
+
+    def _sight_lines(self, marks: Marks) -> list[list[Any]]:
+        """For each corner that is marked in one view only: where it may lie in each view, a segment, or None."""
+        lines = []
+        for places in marks.corners:
+            segments: list[Any] = [None] * len(self.eyes)
+            if len(places) == 1:
+                ((view, place),) = places.items()
+                segments = [
+                    None if number == view else self._sight_line(view, place, eye)
+                    for number, eye in enumerate(self.eyes)
+                ]
+            lines.append(segments)
+        return lines
+
+    def _sight_line(self, view: int, place: Array, eye: Eye) -> list[list[float]] | None:
+        """The part of a sight line, from near to far, as another view sees it."""
+        source = self.eyes[view]
+        far = self._reach()
+        ends = source.center + source.rays(place) * np.geomspace(0.01 * far, 10 * far, 60)[:, None]
+        ends = ends[eye.in_camera(ends)[:, 2] > 0.005 * far]
+        if len(ends) < 2:
+            return None
+        return np.round(eye.project(ends[[0, -1]]), 1).tolist()
+
+    def _reach(self) -> float:
+        """How far things are from the cameras, roughly."""
+        centers = np.stack([eye.center for eye in self.eyes])
+        things = self._points if len(self._points) else centers
+        return max(float(np.median(np.linalg.norm(things - centers.mean(axis=0), axis=1))), 1e-6)
+
+
+def _places(eye: Eye, corners: Array) -> list[list[float] | None]:
+    """The pixels of corners; None for those behind the camera."""
+    places = np.round(eye.project(corners), 2).tolist()
+    return [place if depth > 0 else None for place, depth in zip(places, eye.in_camera(corners)[:, 2], strict=True)]
+
+
+def opened_session(root: Path) -> Session:
+    """The session of a capture.
+
+    Raises:
+        InputError: it cannot be read, or nothing may be written in it.
+    """
+    dataset = load_dataset(root)
+    check_folder(root)
+    earlier_masks(root)
+    return Session(dataset)

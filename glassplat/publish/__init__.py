@@ -1,0 +1,1 @@
+"""What leaves the house: pages and films of a scene."""

@@ -1,0 +1,272 @@
+"""The recipe of `traced`: EnvGS, environment Gaussians behind a ray tracer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
+from typing import Annotated, ClassVar, Literal
+
+from glassplat.data.dataset import Dataset
+from glassplat.data.ranges import (
+    ESSENTIAL,
+    Ascending,
+    Color,
+    Finite,
+    InnerShare,
+    NotNegative,
+    Positive,
+    Several,
+    Share,
+    ShDegree,
+)
+from glassplat.densify.default import DefaultDensify
+from glassplat.densify.mcmc import McmcDensify
+from glassplat.densify.propagate import NormalPropagation
+from glassplat.losses.monocular import MonocularNormals
+from glassplat.losses.term import LossTerm, weighted
+from glassplat.render.deferred import INVISIBLE, Deferred
+from glassplat.render.splat import Splat
+from glassplat.render.traced import Traced, mirrored_contributions
+from glassplat.scene.gaussians import SH_ZERO
+from glassplat.scene.scene import Scene
+from glassplat.train.actions import Densify, GrowSh, PruneIdle, ResetOpacity
+from glassplat.train.background import BLACK
+from glassplat.train.deferred_recipe import DeferredRecipe, ReflectionRates, Texels
+from glassplat.train.optimizer import PUBLISHED_ITERATIONS
+from glassplat.train.propagation import Propagate, PropagationSchedule, RefineEnvironment
+from glassplat.train.splat_recipe import GaussianRates
+from glassplat.train.stage import Action, Every, Stage
+from glassplat.train.strategy import Rhythm, Strategy
+from glassplat.train.surroundings_entry import AddSurroundings, SurroundingsStart
+
+CODE_ITERATIONS = 60_000
+"""Length of the longest runs of the public code."""
+Mirrors = Literal["both", "surroundings", "environment"]
+
+
+@dataclass(frozen=True)
+class SurroundingsOptions:
+    """How the surroundings learn.
+
+    Attributes:
+        begin: share of the run at which they join, where an environment was mirrored before; else with the end of the
+            bootstrap (paper).
+        start: what they are at first.
+        sh_degree: highest degree of the colours that turn with the ray.
+        rates: learning rates.
+        densify: when and how Gaussians are added and pruned, by gradients in space times half of the distance.
+        reset: also reset their opacities when those of the scene are (paper).
+    """
+
+    begin: Share = 0.25
+    start: SurroundingsStart = field(default_factory=SurroundingsStart)
+    sh_degree: ShDegree = 1
+    rates: GaussianRates = field(default_factory=GaussianRates)
+    densify: DefaultDensify = field(
+        default_factory=partial(
+            DefaultDensify, split_by="gradient", stop=0.7, least_contribution=0.02, contribution_moments=(0.5, 0.8)
+        )
+    )
+    reset: bool = False
+
+
+@dataclass(frozen=True)
+class TracedRecipe:
+    """EnvGS: a strength and a normal for every Gaussian, and a second set of Gaussians that reflections show.
+
+    Attributes:
+        sh_degree: highest degree of the view-dependent colour, which grows once propagation has ended.
+        ssim_weight: lambda, share of D-SSIM in the photometric loss.
+        view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
+        background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
+        mirrors: what is mirrored: `surroundings` (paper), an `environment` infinitely far away (ablation), or `both`,
+            the environment alone at first and later behind the surroundings.
+        joint: reflections also move the surfaces; without, they only teach the surroundings (ablation).
+        least_strength: rays are traced where the strength is larger; elsewhere the environment alone is mirrored.
+        bootstrap: share of the run without reflection.
+        surroundings: how the Gaussians learn that reflections show.
+        texels: edge length of the environment's cube faces in the end.
+        first_texels: edge length at the start.
+        refinements: shares of the run at which the edge length doubles for the first and for the last time.
+        first_strength: reflection strength of every Gaussian at the start.
+        region: only what lies in this sphere may reflect: centre and radius, world units. None leaves it to
+            `find_region`.
+        find_region: look for the place that the cameras stand around; if not, everything may reflect unless `region`
+            says otherwise, as in the paper.
+        outside_weight: weight of the mean strength outside of the region in the objective.
+        strength_weight: of the mean strength of all Gaussians in the objective, which the paper does not have.
+        consistency_weight: weight of the difference between normals and the slope of the depths.
+        consistency_to_end: keep that term after propagation (paper).
+        monocular_weight: of the difference between normals and those that lie in `normals/` beside the photographs;
+            nothing where there are none.
+        propagation: how normals spread and colours are sabotaged.
+        schedule: when they do.
+        hurry_matte: raise the learning rates to those of `splat` for the rest of a run in which nothing was found that
+            reflects.
+        propagation_interval: steps between densifications while normals spread; None keeps `densify.interval`.
+        rates: learning rates of the Gaussians.
+        reflection_rates: learning rates of strength and environment.
+        rhythm: when opacities are reset and the SH degree grows.
+        strategy: what decides how many Gaussians the scene has and where; `densify` or `mcmc` holds its options.
+        densify: when and how Gaussians are added and pruned under `default`.
+        mcmc: when and how Gaussians are relocated and added under `mcmc`.
+    """
+
+    method: ClassVar[str] = "traced"
+
+    sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
+    ssim_weight: Share = 0.2
+    view_dependence_weight: NotNegative = 0.0
+    background: Annotated[Color | None, ESSENTIAL] = None
+    mirrors: Annotated[Mirrors, ESSENTIAL] = "both"
+    joint: bool = True
+    least_strength: Annotated[Share, ESSENTIAL] = 0.02
+    bootstrap: Share = 0.043
+    surroundings: SurroundingsOptions = field(default_factory=SurroundingsOptions)
+    texels: Annotated[Texels, ESSENTIAL] = 64
+    first_texels: Texels = 16
+    refinements: Annotated[tuple[Share, Share], Ascending()] = (0.45, 0.65)
+    first_strength: InnerShare = 1e-3
+    region: Annotated[tuple[Finite, Finite, Finite, Positive] | None, ESSENTIAL] = None
+    find_region: bool = True
+    outside_weight: NotNegative = 0.4
+    strength_weight: NotNegative = 0.005
+    consistency_weight: NotNegative = 0.3
+    consistency_to_end: bool = False
+    monocular_weight: NotNegative = 0.01
+    propagation: NormalPropagation = field(default_factory=NormalPropagation)
+    schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
+    hurry_matte: bool = True
+    propagation_interval: Several | None = None
+    rates: GaussianRates = field(default_factory=partial(GaussianRates, short_run_power=0.0))
+    reflection_rates: ReflectionRates = field(default_factory=ReflectionRates)
+    rhythm: Rhythm = field(default_factory=lambda: Rhythm(beat=0.0214, least=150))
+    strategy: Annotated[Strategy, ESSENTIAL] = "default"
+    densify: DefaultDensify = field(default_factory=DefaultDensify)
+    mcmc: McmcDensify = field(default_factory=McmcDensify)
+
+    @classmethod
+    def paper(cls) -> TracedRecipe:
+        """As published, for real captures; what the paper leaves open is as in its code (docs/traced.md)."""
+        published = DefaultDensify.published()
+        plain = GaussianRates(decay=30_000 / CODE_ITERATIONS, short_run_power=0.0)
+        return cls(
+            sh_degree=2,
+            mirrors="surroundings",
+            least_strength=0.0,
+            bootstrap=3000 / CODE_ITERATIONS,
+            surroundings=SurroundingsOptions(
+                start=SurroundingsStart(source="box", cells=32),
+                sh_degree=2,
+                rates=plain,
+                densify=replace(
+                    published,
+                    interval=500,
+                    start=3000 / CODE_ITERATIONS,
+                    stop=21_000 / CODE_ITERATIONS,
+                    gradient_threshold=1e-4,
+                    cap=630_000,
+                ),
+                reset=True,
+            ),
+            find_region=False,
+            strength_weight=0.0,
+            consistency_weight=0.04,
+            consistency_to_end=True,
+            propagation=NormalPropagation(sabotage=0.4 * SH_ZERO),
+            schedule=PropagationSchedule(end="fixed", stop=18_000 / CODE_ITERATIONS, pause=200, last_reset=False),
+            hurry_matte=False,
+            rates=plain,
+            reflection_rates=ReflectionRates(strength=1e-2),
+            rhythm=Rhythm(
+                beat=1000 / CODE_ITERATIONS,
+                least=150,
+                reset_stop=15_000 / CODE_ITERATIONS,
+                sh=1000 / CODE_ITERATIONS,
+                averaged_passes=0.0,
+            ),
+            densify=replace(
+                published,
+                start=500 / CODE_ITERATIONS,
+                stop=15_000 / CODE_ITERATIONS,
+                prune_opacity=0.05,
+                prune_large_start=3000 / CODE_ITERATIONS,
+            ),
+            mcmc=McmcDensify.published(),
+        )
+
+    def initialise(self, dataset: Dataset) -> Scene:
+        """The first scene: one Gaussian per point that hardly reflects, and nothing to mirror yet."""
+        return self._distant().initialise(dataset)
+
+    def renderer(self) -> Traced | Deferred:
+        """The renderer of the finished scene, with all its layers."""
+        if self.mirrors == "environment":
+            return self._distant().renderer()
+        return Traced(self.background or BLACK, max(self.least_strength, INVISIBLE))
+
+    def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
+        """Bootstrap, distant reflections, near reflections, and everything without propagation."""
+        bootstrap, distant, refinement = self._distant().stages(seed)
+        if self.consistency_to_end:
+            refinement = replace(refinement, losses=distant.losses, renderer=distant.renderer)
+        guided = weighted(LossTerm("monocular normals", self.monocular_weight, MonocularNormals()))
+        distant, refinement = (replace(s, losses=(*s.losses, *guided)) for s in (distant, refinement))
+        if self.mirrors == "environment":
+            return bootstrap, distant, refinement
+        near = self._tracing(distant)
+        seen_by = Splat(self.background or BLACK) if self.mirrors == "surroundings" else distant.renderer
+        around = AddSurroundings(self.surroundings.start, self.surroundings.sh_degree, seen_by)
+        near = replace(near, name="2 reflection", entry=around)
+        refinement = self._tracing(refinement)
+        if self.mirrors == "surroundings":
+            return bootstrap, near, refinement
+        begin = self.surroundings.begin
+        distant = replace(distant, name="2 distant reflections", share=begin - self.bootstrap)
+        near = replace(near, name="3 near reflections", share=self.schedule.stop - begin)
+        return bootstrap, distant, near, replace(refinement, name="4 refinement")
+
+    def contradiction(self) -> str | None:
+        """What is wrong with the options together, if anything."""
+        begin = self.surroundings.begin
+        if self.mirrors == "both" and not self.bootstrap < begin < self.schedule.stop:
+            return (
+                f"--surroundings.begin is {begin}; expected a share of the run between --bootstrap {self.bootstrap} "
+                f"and --schedule.stop {self.schedule.stop}"
+            )
+        return self._distant().contradiction()
+
+    def _tracing(self, stage: Stage) -> Stage:
+        """A stage of `deferred` in which rays find what is mirrored."""
+        renderer = Traced(self.background or BLACK, self.least_strength, joint=self.joint)
+        return replace(
+            stage,
+            renderer=renderer,
+            rates={**stage.rates, **self.surroundings.rates.of("surroundings")},
+            actions=(*self._scene_actions(stage, renderer), *self._surroundings_actions(stage)),
+            densify_until=max(stage.densify_until, self.surroundings.densify.stop),
+        )
+
+    def _scene_actions(self, stage: Stage, renderer: Traced) -> list[Action]:
+        """Those of the stage of `deferred`, of which propagation looks at what is traced."""
+        kept = [a for a in stage.actions if self.mirrors == "both" or not isinstance(a, RefineEnvironment)]
+        return [replace(action, renderer=renderer) if isinstance(action, Propagate) else action for action in kept]
+
+    def _surroundings_actions(self, stage: Stage) -> list[Action]:
+        """What changes the surroundings, but for learning."""
+        options = self.surroundings
+        resets = [a for a in stage.actions if isinstance(a, ResetOpacity)] if options.reset else []
+        return [
+            Densify(options.densify, "surroundings"),
+            PruneIdle(options.densify, "surroundings", mirrored_contributions),
+            GrowSh(Every(self.rhythm.sh), "surroundings"),
+            *(ResetOpacity(reset.when, reset.ceiling, "surroundings") for reset in resets),
+        ]
+
+    def _distant(self) -> DeferredRecipe:
+        """The recipe of `deferred` with the options that both have."""
+        return DeferredRecipe(**{name: getattr(self, name) for name in SHARED})
+
+
+SHARED = tuple({f.name for f in fields(DeferredRecipe)} & {f.name for f in fields(TracedRecipe)})
+"""The options of `deferred` that `traced` has too."""

@@ -1,0 +1,178 @@
+// Where the camera is: turns about a point that it looks at, moves, snaps to photographs, and stays near them.
+
+const EASE = (t) => t * t * (3 - 2 * t);
+
+function makeNavigation(scene, changed) {
+  const { views, up, focus, reach } = scene;
+  const steepest = 0.35;  // radians between the line of sight and the vertical
+  let pose, pivot, flight = null, drift = null;
+  const velocity = { yaw: 0, pitch: 0 };
+
+  const poseOf = (view) => poseAt(view.rotation, view.position);
+  const forward = () => row(pose.rotation, 2);
+  const sight = () => Math.max(norm(minus(pivot, centerOf(pose))), 1e-3 * reach);
+
+  function pivotOf(view) {
+    const ahead = row(view.rotation, 2), depth = dot(minus(focus, view.position), ahead);
+    return plus(view.position, ahead, Math.max(depth, 0.2 * reach));
+  }
+
+  function set(next, target) {
+    pose = next;
+    pivot = target;
+    changed();
+  }
+
+  // The nearest place that is no further from a photograph than it may be.
+  function allowed(position) {
+    let best = null, least = Infinity;
+    for (const view of views) {
+      const distance = norm(minus(position, view.position));
+      if (distance < least) { least = distance; best = view.position; }
+    }
+    return least <= reach ? position : plus(best, unit(minus(position, best)), reach);
+  }
+
+  function moveTo(position, rotation, target) {
+    const kept = allowed(position);
+    const stopped = norm(minus(kept, position)) > 1e-6 * reach;
+    set(poseAt(stopped ? lookingAt(kept, target, levelUp(rotation)) : rotation, kept), target);
+  }
+
+  // The up that keeps how the camera is rolled: that of the place, unless the camera looks along it.
+  function levelUp(rotation) {
+    const roll = scaled(row(rotation, 1), -1);
+    return Math.abs(dot(row(rotation, 2), up)) > 0.98 ? roll : up;
+  }
+
+  function orbit(yaw, pitch) {
+    const angle = Math.acos(clamped(dot(forward(), up), -1, 1));
+    const held = clamped(angle + pitch, steepest, Math.PI - steepest) - angle;
+    const turn = product(rotationAbout(up, yaw), rotationAbout(row(pose.rotation, 0), -held));
+    const arm = turned(turn, minus(centerOf(pose), pivot));
+    const inverse = [turn[0], turn[3], turn[6], turn[1], turn[4], turn[7], turn[2], turn[5], turn[8]];
+    moveTo(plus(pivot, arm), product(pose.rotation, inverse), pivot);
+  }
+
+  function pan(right, down) {
+    const step = plus(scaled(row(pose.rotation, 0), right), row(pose.rotation, 1), down);
+    const moved = allowed(plus(centerOf(pose), step)), taken = minus(moved, centerOf(pose));
+    set(poseAt(pose.rotation, moved), plus(pivot, taken));
+  }
+
+  function dolly(factor) {
+    const center = centerOf(pose), distance = clamped(sight() * factor, 0.15 * reach, 1e3 * reach);
+    const next = allowed(minus(pivot, scaled(unit(minus(pivot, center)), distance)));
+    set(poseAt(pose.rotation, next), pivot);
+  }
+
+  function walk(ahead, right, rise) {
+    const step = plus(plus(scaled(forward(), ahead), row(pose.rotation, 0), right), up, rise);
+    const moved = allowed(plus(centerOf(pose), step));
+    set(poseAt(pose.rotation, moved), plus(pivot, minus(moved, centerOf(pose))));
+  }
+
+  function flyTo(view, seconds = 0.9) {
+    still();
+    flight = { from: pose, to: poseOf(view), pivots: [pivot, pivotOf(view)], seconds, passed: 0 };
+  }
+
+  // A slow sway about the first view, so that reflections glide over the glass before anybody touches anything.
+  function sway() { drift = { from: pose, target: pivot, passed: 0 }; }
+
+  function still() {
+    flight = drift = null;
+    velocity.yaw = velocity.pitch = 0;
+  }
+
+  function swayed({ from, target, passed }) {
+    const width = Math.min(0.45 * reach, 0.12 * norm(minus(target, centerOf(from))));
+    const fade = Math.min(1, passed / 3), right = row(from.rotation, 0), down = row(from.rotation, 1);
+    const place = plus(
+      plus(centerOf(from), right, width * fade * Math.sin(passed * 0.45)), down, 0.3 * width * fade * Math.sin(passed * 0.31));
+    set(poseAt(lookingAt(place, target, up), place), target);
+  }
+
+  function flown() {
+    const t = EASE(Math.min(1, flight.passed / flight.seconds));
+    const place = mixed(centerOf(flight.from), centerOf(flight.to), t);
+    set(poseAt(between(flight.from.rotation, flight.to.rotation, t), place), mixed(...flight.pivots, t));
+    if (t >= 1) flight = null;
+  }
+
+  // Moves on by a frame; whether anything is still moving.
+  function advance(seconds) {
+    if (flight) { flight.passed += seconds; flown(); return true; }
+    if (drift) {
+      drift.passed += seconds;
+      if (drift.passed > 45) drift = null; else swayed(drift);
+      return true;
+    }
+    if (Math.abs(velocity.yaw) + Math.abs(velocity.pitch) < 1e-3) return false;
+    orbit(velocity.yaw * seconds, velocity.pitch * seconds);
+    const brake = Math.exp(-6 * seconds);
+    velocity.yaw *= brake;
+    velocity.pitch *= brake;
+    return true;
+  }
+
+  set(poseOf(views[scene.first]), pivotOf(views[scene.first]));
+  return {
+    advance, orbit, pan, dolly, walk, flyTo, sway, still, velocity, sight,
+    place: (next) => { still(); set(next, pivot); },
+    pose: () => pose,
+    nearest: () => views.reduce((best, view, k) =>
+      norm(minus(view.position, centerOf(pose))) < norm(minus(views[best].position, centerOf(pose))) ? k : best, 0),
+  };
+}
+
+// Mouse, pen and fingers: one turns, the right button or two fingers move, wheel and pinch go nearer.
+function listenToPointers(canvas, navigation, touched) {
+  const held = new Map();
+  const middle = () => {
+    const points = [...held.values()];
+    const center = [0, 1].map((c) => points.reduce((sum, p) => sum + p[c], 0) / points.length);
+    return { center, spread: points.length > 1 ? Math.hypot(points[0][0] - points[1][0], points[0][1] - points[1][1]) : 0 };
+  };
+  let last = null, time = 0;
+
+  canvas.addEventListener('contextmenu', (event) => event.preventDefault());
+  canvas.addEventListener('pointerdown', (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    held.set(event.pointerId, [event.clientX, event.clientY, event.button]);
+    navigation.still();
+    last = middle();
+    touched();
+  });
+  canvas.addEventListener('pointermove', (event) => {
+    if (!held.has(event.pointerId)) return;
+    const button = held.get(event.pointerId)[2];
+    held.set(event.pointerId, [event.clientX, event.clientY, button]);
+    const now = middle(), dx = now.center[0] - last.center[0], dy = now.center[1] - last.center[1];
+    const seconds = Math.max((event.timeStamp - time) / 1000, 1e-3), perPixel = 3.2 / Math.min(canvas.clientWidth, canvas.clientHeight);
+    if (held.size > 1 || button === 2 || event.shiftKey) {
+      const step = navigation.sight() / canvas.clientHeight;
+      navigation.pan(-dx * step, -dy * step);
+      if (last.spread && now.spread) navigation.dolly(last.spread / now.spread);
+    } else {
+      navigation.orbit(-dx * perPixel, -dy * perPixel);
+      navigation.velocity.yaw = 0.6 * navigation.velocity.yaw + (0.4 * -dx * perPixel) / seconds;
+      navigation.velocity.pitch = 0.6 * navigation.velocity.pitch + (0.4 * -dy * perPixel) / seconds;
+    }
+    last = now;
+    time = event.timeStamp;
+  });
+  const released = (event) => {
+    if (!held.delete(event.pointerId)) return;
+    if (event.timeStamp - time > 80 || held.size) navigation.velocity.yaw = navigation.velocity.pitch = 0;
+    last = held.size ? middle() : null;
+  };
+  canvas.addEventListener('pointerup', released);
+  canvas.addEventListener('pointercancel', released);
+  canvas.addEventListener('wheel', (event) => {
+    event.preventDefault();
+    navigation.still();
+    navigation.dolly(Math.exp(0.0012 * event.deltaY * (event.deltaMode ? 20 : 1)));
+    touched();
+  }, { passive: false });
+}

@@ -1,0 +1,119 @@
+// The controls around the picture. They change a state and say that it changed; drawing is not their business.
+
+const element = (id) => document.getElementById(id);
+const STATE = { layer: 'rgb', compare: false, divider: 0.5, glass: 'real', pane: 'all' };
+
+function makePanel(scene, navigation, changed) {
+  const state = { ...STATE, reflectances: scene.panes.map((pane) => pane.reflectance) };
+  const body = document.body;
+  const chosen = () => scene.panes.map((_, k) => k).filter((k) => state.pane === 'all' || Number(state.pane) === k);
+  const percent = (share) => `${(100 * share).toFixed(share < 0.1 ? 1 : 0)} %`;
+  // The slider's middle is a third of all light, so that glass has room on it.
+  const shareOf = (value) => value ** 1.6, valueOf = (share) => share ** (1 / 1.6);
+
+  function show() {
+    for (const button of document.querySelectorAll('[data-set]')) {
+      const [key, value] = button.dataset.set.split('=');
+      button.setAttribute('aria-pressed', String(state[key] === value));
+    }
+    element('compare').setAttribute('aria-pressed', String(state.compare));
+    element('divider').hidden = !state.compare;
+    element('divider').style.left = `${100 * state.divider}%`;
+    const first = chosen()[0];
+    if (first !== undefined) {
+      element('reflectance').value = valueOf(state.reflectances[first]);
+      element('share').textContent = percent(state.reflectances[first]);
+    }
+    element('dock').dataset.glass = state.glass;
+    changed();
+  }
+
+  function set(key, value) {
+    state[key] = value;
+    show();
+  }
+
+  function snap(step) {
+    const at = (navigation.nearest() + step + scene.views.length) % scene.views.length;
+    navigation.flyTo(scene.views[at]);
+    element('photo').textContent = scene.views[at].name;
+    changed();
+  }
+
+  const actions = {
+    compare: () => set('compare', !state.compare),
+    before: () => snap(-1),
+    after: () => snap(1),
+    home: () => { navigation.flyTo(scene.views[scene.first]); changed(); },
+    full: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.()),
+    help: () => element('help').toggleAttribute('hidden'),
+    hide: () => body.classList.toggle('bare'),
+  };
+  const LAYER_KEYS = ['rgb', 'without_panes', 'reflection', 'strength'];
+  const KEYS = {
+    c: actions.compare, ArrowLeft: actions.before, ArrowRight: actions.after, Home: actions.home, r: actions.home,
+    f: actions.full, '?': actions.help, h: actions.hide, Escape: () => element('help').setAttribute('hidden', ''),
+    g: () => set('glass', state.glass === 'none' ? 'real' : 'none'),
+    m: () => set('glass', state.glass === 'mirror' ? 'real' : 'mirror'),
+  };
+
+  document.addEventListener('click', (event) => {
+    const button = event.target.closest('button');
+    if (!button) return;
+    if (button.dataset.set) set(...button.dataset.set.split('='));
+    if (button.dataset.do) actions[button.dataset.do]();
+  });
+  element('reflectance').addEventListener('input', ({ target }) => {
+    state.glass = 'real';
+    for (const k of chosen()) state.reflectances[k] = clamped(shareOf(Number(target.value)), 1e-4, 1 - 1e-4);
+    show();
+  });
+  element('reflectance').addEventListener('dblclick', () => {
+    for (const k of chosen()) state.reflectances[k] = scene.panes[k].reflectance;
+    show();
+  });
+  element('divider').addEventListener('pointerdown', (event) => element('divider').setPointerCapture(event.pointerId));
+  element('divider').addEventListener('pointermove', (event) => {
+    if (event.buttons) set('divider', clamped(event.clientX / window.innerWidth, 0.02, 0.98));
+  });
+
+  const walking = new Set();
+  window.addEventListener('blur', () => walking.clear());
+  window.addEventListener('keyup', (event) => walking.delete(event.key.toLowerCase()));
+  window.addEventListener('keydown', (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches('input')) return;
+    const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+    if ('wasdqe'.includes(key)) { walking.add(key); navigation.still(); changed(); }
+    else if (LAYER_KEYS[Number(key) - 1]) set('layer', LAYER_KEYS[Number(key) - 1]);
+    else if (KEYS[key]) KEYS[key](); else return;
+    event.preventDefault();
+  });
+
+  function walk(seconds) {
+    if (!walking.size) return false;
+    const step = 0.5 * navigation.sight() * seconds, held = (key) => (walking.has(key) ? step : 0);
+    navigation.walk(held('w') - held('s'), held('d') - held('a'), held('e') - held('q'));
+    return true;
+  }
+
+  // What draw() has to know of the state.
+  function wanted() {
+    const mirror = state.glass === 'mirror' ? chosen() : [];
+    const layers = state.compare ? [state.layer === 'without_panes' ? 'rgb' : state.layer, 'without_panes'] : [state.layer, state.layer];
+    return {
+      glass: state.glass !== 'none' && scene.panes.length > 0,
+      reflectances: state.reflectances.map((share, k) => (mirror.includes(k) ? 1 - 1e-6 : share)),
+      layers,
+      divider: state.compare ? state.divider : 2,
+    };
+  }
+
+  body.classList.toggle('panes', scene.panes.length > 0);
+  if (scene.panes.length > 1) {
+    const chip = (value, label) => `<button data-set="pane=${value}">${label}</button>`;
+    element('panes').innerHTML = chip('all', 'All') + scene.panes.map((pane, k) => chip(k, pane.label)).join('');
+    element('panes').parentElement.hidden = false;
+  }
+  show();
+  return { wanted, walk, set, state };
+}

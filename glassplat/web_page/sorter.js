@@ -1,0 +1,78 @@
+// Orders splats back to front, one order per camera; runs as a worker.
+function sorterOf(positions) {
+  const count = positions.length / 3, keys = new Int32Array(count), chosen = new Uint32Array(count);
+  const bits = new Int32Array(1), depth = new Float32Array(bits.buffer), counts = new Uint32Array(65537);
+
+  // The bits of a positive float grow with it, and their upper ones resolve near depths more finely than far ones.
+  function kept({ row, offset, near, clip, last }) {
+    let found = 0, lowest = 0x7fffffff, highest = 0;
+    for (let i = 0; i < last; i++) {
+      const x = positions[3 * i], y = positions[3 * i + 1], z = positions[3 * i + 2];
+      depth[0] = row[0] * x + row[1] * y + row[2] * z + offset;
+      if (!(depth[0] > near) || (clip && clip[0] * x + clip[1] * y + clip[2] * z + clip[3] <= 0)) continue;
+      const key = bits[0];
+      if (key < lowest) lowest = key;
+      if (key > highest) highest = key;
+      keys[found] = key;
+      chosen[found++] = i;
+    }
+    return { found, lowest, highest };
+  }
+
+  return function order(camera) {
+    const { found, lowest, highest } = kept(camera);
+    let shift = 0;
+    while ((highest - lowest) >> shift > 65535) shift++;
+    counts.fill(0);
+    for (let j = 0; j < found; j++) counts[((highest - keys[j]) >> shift) + 1]++;
+    for (let k = 0; k < 65536; k++) counts[k + 1] += counts[k];
+    const sorted = new Uint32Array(found);
+    for (let j = 0; j < found; j++) sorted[counts[(highest - keys[j]) >> shift]++] = chosen[j];
+    return sorted;
+  };
+}
+
+function sortingWorker() {
+  let order = null;
+  self.onmessage = ({ data }) => {
+    if (data.positions) { order = sorterOf(data.positions); return; }
+    const orders = data.cameras.map(order);
+    self.postMessage({ ticket: data.ticket, orders }, orders.map((sorted) => sorted.buffer));
+  };
+}
+
+// Asks the worker, or sorts here where a browser allows none; only the newest request waits while one is under way.
+function makeSorter(positions) {
+  let worker = null, here = null, ticket = 0, busy = false, waiting = null;
+  const answers = new Map();
+  try {
+    const source = `${sorterOf}\n(${sortingWorker})()`;
+    worker = new Worker(URL.createObjectURL(new Blob([source], { type: 'text/javascript' })));
+    worker.onerror = () => { worker = null; here = sorterOf(positions); busy = false; pump(); };
+    worker.onmessage = ({ data }) => {
+      busy = false;
+      answers.get(data.ticket)?.(data.orders);
+      answers.delete(data.ticket);
+      pump();
+    };
+    worker.postMessage({ positions });
+  } catch {
+    here = sorterOf(positions);
+  }
+
+  function pump() {
+    if (!waiting || busy) return;
+    const { cameras, resolve } = waiting;
+    waiting = null;
+    if (here) { resolve(cameras.map(here)); return; }
+    busy = true;
+    answers.set(++ticket, resolve);
+    worker.postMessage({ ticket, cameras });
+  }
+
+  return (cameras) => new Promise((resolve) => {
+    waiting?.resolve(null);
+    waiting = { cameras, resolve };
+    pump();
+  });
+}

@@ -1,0 +1,165 @@
+"""The page in a real browser: corners are clicked, a pane appears, is cut, undone and written; pixels are looked at."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from glassplat.data.dataset import load_dataset
+from glassplat.files.images import read_image
+from tests.annotate.browser_needed import needs_browser
+from tests.annotate.conftest import NAMES, true_corners
+from tests.init.pane_scene import FRONT
+from tools.browser import wait_until
+from tools.marking_page import MarkingPage, marking_page
+
+pytestmark = needs_browser
+
+
+class Page(MarkingPage):
+    """The page for marking, with what tests look at."""
+
+    @property
+    def root(self) -> Path:
+        return self.server.session.root
+
+    def mark_true(self, view: int) -> None:
+        """Clicks where the corners really are."""
+        self.mark(view, true_corners(view))
+
+    def color_at(self, place: tuple[float, float]) -> np.ndarray:
+        """[3] the colour that the window shows at a place of the photograph."""
+        ((x, y),) = self.on_screen(np.array([place]))
+        return self.window.picture()[round(y), round(x)].astype(int)
+
+    def document(self) -> dict:
+        return json.loads((self.root / "annotations.json").read_text())["panes"][0]
+
+
+@pytest.fixture
+def page(room: Path) -> Iterator[Page]:
+    with marking_page(room) as opened:
+        yield Page(opened.window, opened.server)
+
+
+def is_blue(color: np.ndarray) -> bool:
+    """Whether the first pane's colour lies over the grey photograph."""
+    return bool(color[2] > color[0] + 15)
+
+
+def test_a_pane_is_marked_cut_and_written(page: Page) -> None:
+    middle = true_corners(3).mean(axis=0)
+    page.show(3)
+    assert not is_blue(page.color_at(middle))
+    page.mark_true(0)
+    assert page.window.run("return document.querySelectorAll('#views .suggested').length") > 0
+    page.mark_true(1)
+    page.mark_true(2)
+    page.show(3)  # Nothing was clicked here: the pane shows where it must be.
+    assert is_blue(page.color_at(middle))
+    outside = true_corners(3)[0] - (12, 12)
+    assert not is_blue(page.color_at(tuple(outside)))
+    assert "pixels; the plane is sure to" in page.window.run("return document.getElementById('panes').textContent")
+
+    page.show(0)
+    corners = true_corners(0)
+    hedge = np.array([corners[3], corners[2], (corners[2] + corners[1]) / 2, (corners[3] + corners[0]) / 2])
+    inside = tuple((corners[3] + corners[2]) / 2 * 0.85 + corners.mean(axis=0) * 0.15)
+    assert is_blue(page.color_at(inside))
+    page.window.keys("3")
+    for x, y in page.on_screen(hedge):
+        page.window.click(x, y)
+    page.window.keys("Enter")
+    page.saved()
+    assert not is_blue(page.color_at(inside))
+    assert is_blue(page.color_at(tuple(corners[:2].mean(axis=0) * 0.8 + corners.mean(axis=0) * 0.2)))
+
+    assert page.write() == "written: 3 masks, 1 planes"
+    dataset = load_dataset(page.root)
+    assert dataset.planes is not None and dataset.pane_labels == (1,)
+    turned = math.degrees(math.acos(min(1.0, abs(float(dataset.planes.normals[0].double().numpy() @ FRONT.normal)))))
+    assert turned < 1
+    cut, whole = (read_image(page.root / "masks" / name)[:, :, 0] for name in NAMES[:2])
+    assert whole[tuple(true_corners(1).mean(axis=0).astype(int)[::-1])] == 1
+    assert cut[round(inside[1]), round(inside[0])] == 0
+    assert 0.35 < (cut == 1).sum() / (read_image(page.root / "images" / NAMES[0])[:, :, 0] == 150).sum() < 0.65
+
+
+def test_corners_are_dragged_undone_and_survive_a_reload(page: Page) -> None:
+    page.mark_true(0)
+    before = page.document()["corners"][2]["0.png"]
+    (start,) = page.on_screen(np.array([before]))
+    page.window.drag([start, (start[0] + 20, start[1] + 10), (start[0] + 40, start[1] + 20)])
+    page.saved()
+    dragged = page.document()["corners"][2]["0.png"]
+    assert dragged[0] > before[0] + 5 and dragged[1] > before[1] + 2
+    page.window.keys("Control", "z")  # One drag is one step.
+    wait_until(lambda: page.document()["corners"][2]["0.png"] == before, "the corner to be back")
+    page.window.press("#redo")
+    wait_until(lambda: page.document()["corners"][2]["0.png"] == dragged, "the corner to be dragged again")
+    page.open()
+    assert page.window.run("return document.querySelectorAll('#views .marked').length") == 1
+    assert page.document()["corners"][2]["0.png"] == dragged
+
+
+def test_a_corner_that_only_the_fit_knows_can_be_dragged(page: Page) -> None:
+    page.mark_true(0)
+    page.mark_true(1)
+    page.show(2)
+    (start,) = page.on_screen(true_corners(2)[1:2])
+    page.window.drag([start, (start[0] + 6, start[1])])
+    page.saved()
+    assert "2.png" in page.document()["corners"][1]
+
+
+def test_keys_choose_photographs_panes_and_brushes(page: Page) -> None:
+    page.mark_true(0)
+    page.mark_true(1)
+    page.show(0)
+    page.window.keys("Right")
+    page.window.wait("document.body.dataset.view === '1'", "the next photograph")
+    page.window.keys("4")
+    middle = true_corners(1).mean(axis=0)
+    ((x, y),) = page.on_screen(middle[None])
+    page.window.drag([(x - 30, y), (x, y), (x + 30, y)])
+    page.saved()
+    assert not is_blue(page.color_at(tuple(middle)))
+    assert page.document()["strokes"]["1.png"][0]["kind"] == "brush"
+    page.window.keys("5")
+    page.window.drag([(x - 30, y), (x, y), (x + 30, y)])
+    page.saved()
+    assert is_blue(page.color_at(tuple(middle)))
+    page.window.keys("a")
+    page.saved()
+    assert page.window.run("return document.querySelectorAll('.pane').length") == 2
+
+
+def test_edges_do_where_no_corner_shows(page: Page) -> None:
+    page.window.keys("2")
+    for view in (0, 1, 2):
+        page.show(view)
+        corners = true_corners(view)
+        for number in range(4):
+            one, other = corners[number], corners[(number + 1) % 4]
+            ends = np.stack([one + 0.3 * (other - one), one + 0.7 * (other - one)])
+            page.window.drag(page.on_screen(ends))
+        page.saved()
+    page.show(3)
+    assert is_blue(page.color_at(tuple(true_corners(3).mean(axis=0))))
+
+
+def test_the_page_asks_for_nothing_from_elsewhere(page: Page) -> None:
+    page.mark_true(0)
+    names = page.window.run("return performance.getEntriesByType('resource').map((one) => one.name)")
+    assert names and all(name.startswith(page.server.address.split("/?")[0]) for name in names)
+
+
+def test_done_ends_the_command(page: Page) -> None:
+    page.window.press("#close")
+    page.window.wait("document.body.dataset.state === 'closed'", "the end")
+    assert page.server.is_finished

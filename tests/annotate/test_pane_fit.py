@@ -1,0 +1,164 @@
+"""Corners and edges that somebody marked in a few photographs give the pane's plane and outline."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from glassplat.annotate.eye import Eye
+from glassplat.annotate.pane_fit import Marks, TooFewMarksError, corner_information, fitted_pane, tilt_deviation
+from glassplat.annotate.pane_shape import polygon_pane, rectangle_pane
+from tests.init.pane_scene import EYES, FRONT, SIDE, Pane, camera_from
+
+U, V = np.array([-1.0, 1, 1, -1]), np.array([-1.0, -1, 1, 1])
+
+
+def eyes_on(pane: Pane, places: Sequence[Sequence[float]] = EYES) -> list[Eye]:
+    return [Eye.of(camera_from(place, pane.center)) for place in places]
+
+
+def corner_marks(pane: Pane, eyes: Sequence[Eye], *, noise: float = 0.0, seed: int = 0) -> Marks:
+    """Every corner marked in every view."""
+    rng = np.random.default_rng(seed)
+    corners = pane.at(U, V)
+    return Marks(
+        [
+            {view: eye.project(corner) + noise * rng.standard_normal(2) for view, eye in enumerate(eyes)}
+            for corner in corners
+        ]
+    )
+
+
+def normal_off(frame: np.ndarray, pane: Pane) -> float:
+    """Degrees between planes, whichever way they face."""
+    return float(np.degrees(np.arccos(min(abs(frame[2] @ pane.normal), 1.0))))
+
+
+@pytest.mark.parametrize("pane", [FRONT, SIDE], ids=["front", "side"])
+@pytest.mark.parametrize("shape", ["rectangle", "polygon"])
+def test_exact_marks_give_the_pane(pane: Pane, shape: str) -> None:
+    eyes = eyes_on(pane)
+    fit = fitted_pane(corner_marks(pane, eyes), eyes, shape)  # type: ignore[arg-type]
+    np.testing.assert_allclose(fit.shape.corners(), pane.at(U, V), atol=1e-4)
+    assert fit.error < 1e-2 and normal_off(fit.shape.frame, pane) < 1e-2
+    np.testing.assert_allclose(fit.shape.frame @ fit.shape.frame.T, np.eye(3), atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_the_error_of_the_plane_is_as_large_as_the_doubt_says(count: int) -> None:
+    eyes = eyes_on(FRONT, EYES[:count])
+    fits = [fitted_pane(corner_marks(FRONT, eyes, noise=0.37, seed=seed), eyes, "rectangle") for seed in range(30)]
+    errors = np.array([normal_off(fit.shape.frame, FRONT) for fit in fits])
+    doubt = np.median([fit.doubt for fit in fits])
+    assert 0.3 * doubt < np.sqrt((errors**2).mean()) < 2 * doubt
+
+
+def test_another_view_lowers_the_doubt_as_foretold() -> None:
+    eyes = eyes_on(FRONT)
+    two = fitted_pane(corner_marks(FRONT, eyes[:2], noise=0.2), eyes[:2], "rectangle")
+    three = fitted_pane(corner_marks(FRONT, eyes, noise=0.2), eyes, "rectangle")
+    foretold = tilt_deviation(two.information + corner_information(eyes[2], two.shape))
+    assert three.doubt < two.doubt
+    assert foretold == pytest.approx(three.doubt, rel=0.3)
+
+
+def test_a_corner_outside_of_the_image_may_be_marked() -> None:
+    wide = FRONT.larger(2.5)
+    eyes = eyes_on(wide)
+    assert not all(eye.holds(wide.at(U, V)).all() for eye in eyes)
+    fit = fitted_pane(corner_marks(wide, eyes), eyes, "rectangle")
+    np.testing.assert_allclose(fit.shape.corners(), wide.at(U, V), atol=1e-3)
+
+
+@pytest.mark.parametrize("shape", ["rectangle", "polygon"])
+def test_one_wrong_mark_moves_the_plane_little(shape: str) -> None:
+    eyes = eyes_on(FRONT, [*EYES, (0.6, 0.7, -0.5)])
+    marks = corner_marks(FRONT, eyes)
+    marks.corners[1][2] = marks.corners[1][2] + 30.0
+    fit = fitted_pane(marks, eyes, shape)  # type: ignore[arg-type]
+    assert normal_off(fit.shape.frame, FRONT) < 0.5
+    assert max(fit.errors, key=fit.errors.__getitem__) == 2
+
+
+def test_a_corner_that_one_view_shows_is_enough_beside_three_others() -> None:
+    eyes = eyes_on(FRONT)
+    marks = corner_marks(FRONT, eyes)
+    kept = {1: marks.corners[3][1]}
+    fit = fitted_pane(Marks([*marks.corners[:3], kept]), eyes, "polygon")
+    np.testing.assert_allclose(fit.shape.corners(), FRONT.at(U, V), atol=1e-3)
+    hidden = fitted_pane(Marks([*marks.corners[:3], {}]), eyes, "rectangle")
+    np.testing.assert_allclose(hidden.shape.corners(), FRONT.at(U, V), atol=1e-3)
+
+
+def edge_marks(pane: Pane, eyes: Sequence[Eye], edges: Sequence[int], reach: float = 0.7) -> Marks:
+    """Two points on some edges in every view, without any corner."""
+    corners = pane.at(U, V)
+    found: list[dict[int, np.ndarray]] = [{} for _ in range(4)]
+    for number in edges:
+        one, other = corners[number], corners[(number + 1) % 4]
+        ends = np.stack([one + (1 - reach) * (other - one), one + reach * (other - one)])
+        found[number] = {view: eye.project(ends) for view, eye in enumerate(eyes)}
+    return Marks([{}, {}, {}, {}], found)
+
+
+def test_all_edges_without_a_corner_give_the_pane() -> None:
+    eyes = eyes_on(FRONT)
+    fit = fitted_pane(edge_marks(FRONT, eyes, range(4)), eyes, "rectangle")
+    np.testing.assert_allclose(fit.shape.corners(), FRONT.at(U, V), atol=1e-3)
+
+
+def test_two_edges_give_the_plane_and_as_much_of_the_pane_as_was_marked() -> None:
+    eyes = eyes_on(FRONT)
+    fit = fitted_pane(edge_marks(FRONT, eyes, (1, 3)), eyes, "rectangle")
+    assert normal_off(fit.shape.frame, FRONT) < 0.1
+    assert fit.doubt < 5
+    sizes = np.linalg.norm(np.diff(fit.shape.corners()[:3], axis=0), axis=1)
+    assert sizes[0] == pytest.approx(1.6, rel=0.02)
+
+
+def test_edges_of_five_corners_are_fitted_too() -> None:
+    eyes = eyes_on(FRONT)
+    outline = FRONT.at(np.array([-1, 1, 1, 0.2, -1.0]), np.array([-1, -1, 1, 0.4, 1.0]))
+    marks = Marks([{view: eye.project(corner) for view, eye in enumerate(eyes)} for corner in outline])
+    fit = fitted_pane(marks, eyes, "rectangle")  # Five corners are no rectangle.
+    np.testing.assert_allclose(fit.shape.corners(), outline, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("kept", "expected"),
+    [
+        ({0: 4}, "a second photograph, taken from another place"),
+        ({0: 4, 1: 2}, "2 corners are known from two places, expected at least 3"),
+    ],
+)
+def test_too_few_marks_say_what_is_missing(kept: dict[int, int], expected: str) -> None:
+    eyes = eyes_on(FRONT)
+    marks = corner_marks(FRONT, eyes)
+    some = Marks(
+        [
+            {view: place for view, place in places.items() if number < kept.get(view, 0)}
+            for number, places in enumerate(marks.corners)
+        ]
+    )
+    with pytest.raises(TooFewMarksError, match=expected):
+        fitted_pane(some, eyes, "rectangle")
+
+
+def test_views_from_one_place_are_not_enough() -> None:
+    eyes = eyes_on(FRONT, [EYES[0], EYES[0]])
+    with pytest.raises(TooFewMarksError, match="taken farther apart"):
+        fitted_pane(corner_marks(FRONT, eyes), eyes, "rectangle")
+
+
+def test_the_rectangle_of_a_polygon_keeps_its_order_and_hand() -> None:
+    for corners in (FRONT.at(U, V), FRONT.at(U, V)[::-1]):
+        rectangle = rectangle_pane(polygon_pane(corners))
+        np.testing.assert_allclose(rectangle.corners(), corners, atol=1e-9)
+        assert np.linalg.det(rectangle.frame) == pytest.approx(1)
+
+
+def test_corners_on_a_line_are_no_outline() -> None:
+    with pytest.raises(ValueError, match="lie on one line"):
+        polygon_pane(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]))

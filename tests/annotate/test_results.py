@@ -1,0 +1,182 @@
+"""What was marked becomes masks and planes that the rest of the package reads."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from glassplat.annotate.document import parsed_document
+from glassplat.annotate.eye import Eye
+from glassplat.annotate.outline import filled, seen_outline, with_strokes
+from glassplat.annotate.pane_fit import fitted_pane
+from glassplat.annotate.results import in_photograph, pane_labels
+from glassplat.annotate.session import opened_session
+from glassplat.cli import main
+from glassplat.data.dataset import load_dataset
+from glassplat.data.errors import InputError
+from glassplat.data.view import PhotoFile
+from glassplat.files.images import read_image
+from glassplat.init.planes import fit_planes
+from tests.annotate.conftest import NAMES, PLACES, marked_document
+from tests.init.pane_scene import FRONT, Pane, camera_from, label_image, normal_error, offset_error
+
+
+def finish(root: Path, document: dict) -> None:
+    session = opened_session(root)
+    session.update(document)
+    session.finish()
+
+
+def photographed_pane(root: Path, name: str) -> np.ndarray:
+    return np.asarray(read_image(root / "images" / name)[:, :, 0] == 150)
+
+
+def test_masks_show_the_pane_to_the_pixel(room: Path) -> None:
+    finish(room, marked_document())
+    for name in NAMES[:3]:
+        mask = read_image(room / "masks" / name)[:, :, 0] == 1
+        assert (mask != photographed_pane(room, name)).mean() < 0.001
+    assert not (room / "masks" / NAMES[3]).exists()
+
+
+def test_planes_and_masks_agree_with_each_other_and_the_truth(room: Path) -> None:
+    finish(room, marked_document())
+    dataset = load_dataset(room)
+    assert dataset.planes is not None
+    assert abs(normal_error(dataset.planes, 0, FRONT)) < 0.1 and offset_error(dataset.planes, 0, FRONT) < 1e-3
+    np.testing.assert_allclose(sorted(dataset.planes.half_sizes[0].tolist()), [0.5, 0.8], atol=1e-3)
+    annotations = [(view.camera, view.pane_labels) for view in dataset.train if view.pane_labels is not None]
+    fitted = fit_planes(dataset.points.positions, annotations, extent=dataset.extent)
+    assert abs(float(fitted.normals[0] @ dataset.planes.normals[0])) > 0.999
+
+
+@pytest.mark.parametrize("material", ["glass", "mirror", "screen"])
+def test_the_material_is_kept(material: str, room: Path) -> None:
+    finish(room, marked_document(material=material))
+    planes = load_dataset(room).planes
+    assert planes is not None and planes.mirrors == ((1,) if material == "mirror" else ())
+
+
+def test_what_stands_before_the_pane_is_cut_out(room: Path) -> None:
+    left = [[0, 0], [150, 0], [150, 220], [0, 220]]
+    stroke = {"kind": "polygon", "effect": "cut", "radius": 1, "points": left}
+    finish(room, marked_document(strokes={"0.png": [stroke], "3.png": [stroke]}))
+    cut, whole = (read_image(room / "masks" / name)[:, :, 0] == 1 for name in NAMES[:2])
+    assert not cut[:, :150].any() and cut[:, 150:].any() and whole[:, :150].any()
+    assert (room / "masks" / "3.png").exists(), "a photograph with nothing but a cut is marked, too"
+
+
+def test_writing_again_replaces_what_was_written_and_nothing_else(room: Path) -> None:
+    finish(room, marked_document((0, 1, 2)))
+    finish(room, marked_document((1, 2)))
+    assert sorted(path.name for path in (room / "masks").glob("*.png")) == ["1.png", "2.png"]
+    Image.new("L", (300, 220), 1).save(room / "masks" / "4.png")
+    with pytest.raises(InputError, match=r"not made by `glassplat annotate` \(4\.png\)"):
+        opened_session(room)
+    assert (room / "masks" / "4.png").exists()
+
+
+def test_a_record_that_names_other_files_removes_none(room: Path) -> None:
+    finish(room, marked_document())
+    (room / "masks" / "annotated.json").write_text(json.dumps(["../transforms.json", *NAMES[:3]]))
+    finish(room, marked_document((1, 2)))
+    assert (room / "transforms.json").exists()
+
+
+def test_without_a_pane_nothing_is_written(room: Path) -> None:
+    with pytest.raises(InputError, match="no pane is known yet"):
+        finish(room, marked_document((0,)))
+    assert not (room / "masks").exists() and not (room / "planes.json").exists()
+
+
+def test_the_nearer_pane_hides_the_farther_one(room: Path) -> None:
+    behind = Pane(FRONT.center + np.array([0.3, 0.0, 0.5]), FRONT.normal, FRONT.tangent, (0.8, 0.5))
+    eyes = [Eye.of(camera_from(place, FRONT.center)) for place in PLACES]
+    panes = []
+    for label, pane in enumerate((behind, FRONT), start=1):
+        corners = pane.at(np.array([-1.0, 1, 1, -1]), np.array([-1.0, -1, 1, 1]))
+        places = [{name: eye.project(c).tolist() for name, eye in zip(NAMES, eyes, strict=True)} for c in corners]
+        (marked,) = parsed_document(marked_document(label=label, corners=places), "here")
+        numbers = {name: number for number, name in enumerate(NAMES)}
+        panes.append((marked, fitted_pane(marked.marks(numbers), eyes, "rectangle")))
+    for order in (panes, panes[::-1]):
+        labels = pane_labels(NAMES[1], eyes[1], order)
+        truth = label_image(camera_from(PLACES[1], FRONT.center), [behind, FRONT]).numpy()
+        assert (labels != truth).mean() < 0.002
+
+
+def test_an_outline_that_passes_the_camera_is_cut_off() -> None:
+    eye = Eye.of(camera_from((0.0, 0.0, 0.0), np.array([0.0, 0.0, 1.0])))
+    floor = np.array([[-5.0, 1, -5], [5, 1, -5], [5, 1, 5], [-5, 1, 5]])
+    mask = filled(seen_outline(eye, floor), (300, 220))
+    horizon = 110 + 240 * 1 / 5
+    rows = np.flatnonzero(mask.any(axis=1))
+    assert rows.min() == pytest.approx(horizon, abs=2) and rows.max() == 219
+    behind = floor - [0, 0, 10]
+    assert not filled(seen_outline(eye, behind), (300, 220)).any()
+
+
+def test_put_back_restores_no_more_than_there_was() -> None:
+    mask = np.zeros((40, 40), dtype=bool)
+    mask[10:30, 10:30] = True
+    (pane,) = parsed_document(
+        marked_document(
+            strokes={
+                "0.png": [
+                    {"kind": "brush", "effect": "cut", "radius": 8, "points": [[20, 20]]},
+                    {"kind": "brush", "effect": "keep", "radius": 4, "points": [[20, 20], [60, 20]]},
+                ]
+            }
+        ),
+        "here",
+    )
+    found = with_strokes(mask, pane.strokes["0.png"])
+    assert found[20, 20] and not found[14, 20] and not found[20, 33] and not (found & ~mask).any()
+
+
+def test_masks_of_bent_photographs_are_bent_too(room: Path) -> None:
+    transforms = json.loads((room / "transforms.json").read_text()) | {"k1": -0.2, "k2": 0.02, "p1": 0.0, "p2": 0.0}
+    (room / "transforms.json").write_text(json.dumps(transforms))
+    view = load_dataset(room).train[0]
+    reader = view.read_photo
+    assert isinstance(reader, PhotoFile) and reader.pixel_map.lens is not None
+    labels = np.zeros((view.camera.height, view.camera.width), dtype=np.uint8)
+    labels[60:160, 80:220] = 1
+    bent = in_photograph(view, labels)
+    assert bent.shape == (220, 300)
+    back = reader.pixel_map.labels(bent)
+    assert (back != labels).mean() < 0.02
+
+
+def test_the_command_needs_a_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "photographs").mkdir()
+    assert main(["annotate", str(tmp_path / "photographs")]) == 2
+    assert "is no capture that can be read" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_damaged_document_is_named(room: Path) -> None:
+    (room / "annotations.json").write_text('{"version": 1}')
+    with pytest.raises(InputError, match=r"annotations\.json has no panes"):
+        opened_session(room)
+
+
+def test_the_wrong_order_of_corners_is_called_into_question(room: Path) -> None:
+    session = opened_session(room)
+    document = marked_document()
+    corners = document["panes"][0]["corners"]
+    corners[1], corners[2] = corners[2], corners[1]
+    answer = session.update(document)["panes"][0]
+    assert "do not form a rectangle" in answer["message"] or "pixels off" in answer["message"]
+
+
+def test_the_suggested_photograph_lowers_the_doubt(room: Path) -> None:
+    session = opened_session(room)
+    two = session.update(marked_document((0, 2)))["panes"][0]
+    best = two["next"][0]
+    assert best["doubt"] < two["doubt"]
+    three = session.update(marked_document((0, 2, best["view"])))["panes"][0]
+    assert three["doubt"] == pytest.approx(best["doubt"], rel=0.3)

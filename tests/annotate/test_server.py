@@ -1,0 +1,166 @@
+"""The server answers the browser that was given its key, on this computer, and nobody else."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from glassplat.annotate.document import MOST_CORNERS
+from glassplat.annotate.server import COOKIE, LARGEST_BODY, AnnotationServer
+from glassplat.annotate.session import opened_session
+from glassplat.data.errors import InputError
+from tests.annotate.conftest import NAMES, marked_document, serving
+
+
+@pytest.fixture
+def server(room: Path) -> Iterator[AnnotationServer]:
+    with serving(room) as running:
+        yield running
+
+
+def ask(
+    server: AnnotationServer, path: str, body: Any = None, *, key: str | None = None, **headers: str
+) -> tuple[int, bytes]:
+    """Status and body of one request; as the page sends it, unless headers say otherwise."""
+    port = server.server_address[1]
+    known = {
+        "Host": f"127.0.0.1:{port}",
+        "Origin": f"http://127.0.0.1:{port}",
+        "Cookie": f"{COOKIE}={server.key if key is None else key}",
+    }
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    data = None if body is None else body if isinstance(body, bytes) else json.dumps(body).encode()
+    try:
+        connection.putrequest("GET" if body is None else "POST", path, skip_host=True)
+        for name, value in (known | headers).items():
+            if value:
+                connection.putheader(name, value)
+        if data is not None and "Content-Length" not in headers:
+            connection.putheader("Content-Length", str(len(data)))
+        connection.endheaders(data)
+        response = connection.getresponse()
+        return response.status, response.read()
+    finally:
+        connection.close()
+
+
+def test_it_listens_on_this_computer_only(server: AnnotationServer) -> None:
+    assert server.server_address[0] == "127.0.0.1"
+
+
+def test_the_key_becomes_a_cookie_and_leaves_the_address(server: AnnotationServer) -> None:
+    status, _ = ask(server, f"/?key={server.key}", key="")
+    assert status == 303
+    assert ask(server, "/")[0] == 200
+    assert ask(server, "/?key=guessed")[0] == 403
+
+
+@pytest.mark.parametrize("path", ["/", "/page.js", "/capture", "/photo/0", "/thumbnail/0", "/nothing"])
+def test_without_the_key_there_is_nothing(path: str, server: AnnotationServer) -> None:
+    for key in ("", "guessed"):
+        assert ask(server, path, key=key)[0] == 403
+    assert ask(server, "/document", {}, key="guessed")[0] == 403
+
+
+def test_another_name_for_this_computer_is_refused(server: AnnotationServer) -> None:
+    """As of a site whose name server points to 127.0.0.1."""
+    assert ask(server, "/capture", Host="evil.example:80")[0] == 403
+    assert ask(server, "/capture", Host="")[0] in (400, 403)
+    for name in ("localhost:9999", "[::1]:9999", "127.0.0.1"):  # Another port, as through SSH.
+        assert ask(server, "/capture", Host=name)[0] == 200
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "", "http://127.0.0.1:1"])
+def test_what_other_sites_send_is_refused(origin: str, server: AnnotationServer) -> None:
+    for path in ("/document", "/results", "/close"):
+        assert ask(server, path, marked_document(), Origin=origin)[0] == 403
+    assert not server.is_finished
+
+
+@pytest.mark.parametrize(
+    "path", ["/photo/99", "/photo/-1", "/photo/..%2f..%2fetc%2fpasswd", "/photo/../annotations.json", "/etc/passwd"]
+)
+def test_no_path_leads_to_a_file(path: str, server: AnnotationServer) -> None:
+    assert ask(server, path)[0] == 404
+
+
+def test_photographs_are_jpegs(server: AnnotationServer) -> None:
+    for path in ("/photo/0", "/thumbnail/4"):
+        status, body = ask(server, path)
+        assert status == 200 and body.startswith(b"\xff\xd8")
+
+
+def test_a_document_is_saved_and_answered(server: AnnotationServer) -> None:
+    status, body = ask(server, "/document", marked_document())
+    answer = json.loads(body)["panes"][0]
+    assert status == 200 and answer["solved"] and answer["error"] < 0.1
+    assert len(answer["outlines"]) == len(answer["corners"]) == len(NAMES)
+    assert json.loads((server.session.root / "annotations.json").read_text()) == marked_document()
+    assert json.loads(ask(server, "/capture")[1])["document"] == marked_document()
+
+
+def test_one_view_gives_sight_lines_and_the_next_photograph(server: AnnotationServer) -> None:
+    answer = json.loads(ask(server, "/document", marked_document((0,)))[1])["panes"][0]
+    assert not answer["solved"] and "second photograph" in answer["message"]
+    assert answer["next"] and all(one["view"] != 0 for one in answer["next"])
+    assert all(line is not None for line in answer["lines"][0][1:]) and answer["lines"][0][0] is None
+
+
+def too_many_corners() -> dict:
+    return marked_document(corners=[{}] * (MOST_CORNERS + 1))
+
+
+@pytest.mark.parametrize(
+    ("body", "status"),
+    [
+        (b"{", 400),
+        (b"[1]", 400),
+        (b"\xff\xfe", 400),
+        (b"[" * 5000, 400),
+        ({"version": 2, "panes": []}, 400),
+        (marked_document(label=0), 400),
+        (marked_document(material="wood"), 400),
+        (marked_document(corners=[{"0.png": [1, None]}]), 400),
+        (marked_document(strokes={"0.png": [{"kind": "polygon", "effect": "burn", "points": []}]}), 400),
+        (too_many_corners(), 400),
+        ({"version": 1, "panes": marked_document()["panes"] * 2}, 400),
+    ],
+)
+def test_nonsense_changes_nothing(body: Any, status: int, server: AnnotationServer) -> None:
+    ask(server, "/document", marked_document())
+    found, message = ask(server, "/document", body)
+    assert found == status and json.loads(message)["error"]
+    assert server.session.document == marked_document()
+
+
+def test_a_body_that_is_too_long_is_not_read(server: AnnotationServer) -> None:
+    for length in (str(LARGEST_BODY + 1), "-1", "many"):
+        assert ask(server, "/document", b"{}", **{"Content-Length": length})[0] == 413
+
+
+def test_nothing_comes_from_elsewhere(server: AnnotationServer) -> None:
+    """No part of the page names an address, and the browser is told to load none."""
+    for path in ("/", "/page.js", "/drawing.js", "/marking.js", "/style.css"):
+        status, body = ask(server, path)
+        assert status == 200 and b"http:" not in body and b"https:" not in body
+
+
+def test_done_ends_it(room: Path) -> None:
+    with serving(room) as server:
+        assert ask(server, "/close", {})[0] == 200
+        assert server.is_finished
+
+
+def test_a_port_in_use_says_what_to_do(room: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError, match=rf"port {port} is in use; choose another with --port"):
+            AnnotationServer(opened_session(room), port)

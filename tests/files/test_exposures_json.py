@@ -1,0 +1,25 @@
+from pathlib import Path
+
+import pytest
+import torch
+
+from glassplat.files.exposures_json import read_exposures, write_exposures
+from glassplat.scene.exposure import Exposures
+
+
+def test_what_was_written_is_read(tmp_path: Path) -> None:
+    affine = torch.randn(3, 3, 4, generator=torch.Generator().manual_seed(0))
+    write_exposures(tmp_path / "exposures.json", Exposures(affine, ("a.png", "b/c.png", "ü.png")))
+    found = read_exposures(tmp_path / "exposures.json")
+    assert found.names == ("a.png", "b/c.png", "ü.png")
+    assert torch.equal(found.affine, affine)
+
+
+@pytest.mark.parametrize(
+    "text", ["[]", '{"a": 3}', '{"a": [[1, 2, 3, 4]]}', '{"a": [[1,2,3,NaN],[1,2,3,4],[1,2,3,4]]}']
+)
+def test_a_foreign_file_is_an_error_that_names_it(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "exposures.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"exposures\.json"):
+        read_exposures(path)

@@ -1,0 +1,151 @@
+"""The page shows what the renderer shows, asks for nothing, and does what its buttons say."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from glassplat.evaluate.metrics import psnr
+from glassplat.publish.web_page import SCRIPTS, SHADERS, asset, filled, page_text, write_page
+from glassplat.render.planar import Planar
+from glassplat.render.splat import Splat
+from glassplat.scene.camera import Camera
+from glassplat.scene.plane_edits import as_mirrors, without_glass
+from glassplat.scene.scene import Scene
+from tests.publish.browser import Browser, find_chromium
+from tests.render.tiny_scene import in_single_precision, joined, pane, showcase
+from tests.train.tiny_capture import tiny_capture, true_scene
+
+needs_chromium = pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
+FLIP = torch.tensor([1.0, -1.0, -1.0])
+CAMERAS = [(view.name, view.camera) for view in tiny_capture().train]
+LARGEST_SCRIPT = 64_000
+
+
+def wanted(camera: Camera, layer: str) -> str:
+    """A call for the picture of a camera."""
+    rotation, position = camera.cam_from_world[:3, :3] * FLIP, camera.center * FLIP
+    values: dict[str, Any] = {"rotation": rotation.flatten().tolist(), "position": position.tolist()}
+    values |= {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+    values |= {"layers": [layer, layer]}
+    return f"glassplat.then(page => page.picture({json.dumps(values)}))"
+
+
+def picture(browser: Browser, camera: Camera, layer: str = "rgb") -> torch.Tensor:
+    """What the page shows of a layer, [H, W, 3] uint8."""
+    pixels = np.frombuffer(base64.b64decode(browser.evaluate(wanted(camera, layer))), dtype=np.uint8)
+    return torch.from_numpy(pixels.reshape(camera.height, camera.width, 4)[::-1, :, :3].copy())
+
+
+def likeness(browser: Browser, scene: Scene, renderer: Planar | Splat, camera: Camera, layer: str = "rgb") -> float:
+    """Of the page's picture and the renderer's, in dB."""
+    with torch.no_grad():
+        frame = renderer(scene, camera)
+    truth = frame.rgb if layer == "rgb" else frame.layers[layer]
+    truth = truth if truth.dim() == 3 else truth[..., None].expand(-1, -1, 3)
+    return psnr(picture(browser, camera, layer), truth.clamp(0, 1))
+
+
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    path = tmp_path_factory.mktemp("page") / "index.html"
+    write_page(path, true_scene(), Planar(), CAMERAS, "A <tiny> scene & more")
+    with Browser(path, 320, 240) as browser:
+        yield browser
+
+
+@needs_chromium
+@pytest.mark.parametrize("layer", ["rgb", "without_panes", "reflection", "strength"])
+def test_every_layer_is_what_the_renderer_shows(opened: Browser, layer: str) -> None:
+    for _, camera in CAMERAS[:2]:
+        assert likeness(opened, true_scene(), Planar(), camera, layer) > 36
+
+
+@needs_chromium
+def test_the_buttons_do_what_they_say(opened: Browser) -> None:
+    camera = CAMERAS[1][1]
+    plain = picture(opened, camera)
+    opened.press("m")
+    assert likeness(opened, as_mirrors(true_scene(), [1]), Planar(), camera) > 36
+    opened.press("m")
+    opened.press("g")
+    assert likeness(opened, without_glass(true_scene()), Planar(), camera) > 36
+    opened.press("g")
+    assert torch.equal(picture(opened, camera), plain)
+    opened.evaluate("document.querySelector('[data-set=\"layer=strength\"]').click()")
+    assert opened.evaluate("glassplat.then(page => page.panel.state.layer)") == "strength"
+    opened.press("1")
+
+
+@needs_chromium
+def test_people_stay_near_the_photographs(opened: Browser) -> None:
+    farthest = """glassplat.then(({ navigation, scene }) => {
+      let most = 0;
+      for (let k = 0; k < 200; k++) {
+        navigation.orbit(Math.sin(k), Math.cos(3 * k));
+        navigation.pan(Math.sin(7 * k), 0.3);
+        navigation.walk(k % 3, 1, -1);
+        navigation.dolly(k % 2 ? 3 : 0.2);
+        const { rotation, offset } = navigation.pose();
+        const at = [0, 1, 2].map((c) => -[0, 1, 2].reduce((sum, r) => sum + rotation[3 * r + c] * offset[r], 0));
+        const distances = scene.views.map(({ position }) => Math.hypot(...position.map((x, c) => x - at[c])));
+        most = Math.max(most, Math.min(...distances) / scene.reach);
+      }
+      return most;
+    })"""
+    assert 0.5 < opened.evaluate(farthest) < 1.001
+
+
+@needs_chromium
+def test_nothing_is_asked_for_and_nothing_complained_of(opened: Browser) -> None:
+    opened.drag((100, 100), (160, 120))
+    opened.press("ArrowRight")
+    assert {address.split(":")[0] for address in opened.requests()} <= {"file", "data", "blob"}
+    assert opened.complaints() == []
+    assert opened.evaluate("document.title") == "A <tiny> scene & more"
+
+
+@needs_chromium
+def test_panes_behind_panes_and_scenes_without_any(tmp_path: Path) -> None:
+    two = in_single_precision(showcase(joined(pane(2.0, half=0.8), pane(3.0, half=0.9, label=2))))
+    for name, scene, renderer in (("two", two, Planar()), ("none", Scene(two.primary, two.extent), Splat())):
+        write_page(tmp_path / f"{name}.html", scene, renderer, CAMERAS, name)
+        with Browser(tmp_path / f"{name}.html", 320, 240) as browser:
+            for _, camera in CAMERAS[:2]:
+                assert likeness(browser, scene, renderer, camera) > 36
+            assert browser.complaints() == []
+
+
+def test_the_page_is_one_file_of_little_script() -> None:
+    page = page_text(true_scene(), Planar(), CAMERAS, "title")
+    outside = re.findall(r"(?:src|href|url)\s*[=(]\s*[\"']?(?!data:)[a-z]+:", page)
+    assert not outside and "http://" not in page and "https://" not in page
+    assert sum(len(asset(name)) for name in (*SCRIPTS, *SHADERS, "page.html", "style.css")) <= LARGEST_SCRIPT + 4000
+
+
+def test_names_cannot_end_the_script() -> None:
+    page = page_text(true_scene(), Planar(), [("</script><b>{{title}}", CAMERAS[0][1])], "</title><script>")
+    assert "</script><b>" not in page and "</title><script>" not in page
+    assert "\\u003c/script>\\u003cb>{{title}}" in page
+    assert filled("a{{x}}b", {"x": "{{x}}"}) == "a{{x}}b"
+
+
+@pytest.mark.parametrize("broken", ["cameras", "values"])
+def test_what_cannot_be_shown_is_refused(broken: str, tmp_path: Path) -> None:
+    scene = true_scene()
+    cameras = [] if broken == "cameras" else CAMERAS
+    if broken == "values":
+        means = torch.full_like(scene.primary.means, torch.inf)
+        scene = replace(scene, primary=scene.primary.with_tensors({"means": means}))
+    with pytest.raises(ValueError, match=broken if broken == "cameras" else "means"):
+        write_page(tmp_path / "a.html", scene, Planar(), cameras, "title")
+    assert not (tmp_path / "a.html").exists()

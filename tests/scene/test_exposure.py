@@ -1,0 +1,70 @@
+"""Exposures change the colours of the photographs that they belong to, and no others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from glassplat.losses.exposure import exposure_departure
+from glassplat.losses.photometric import PhotometricLoss
+from glassplat.render.frame import Frame
+from glassplat.scene.exposure import Exposures
+from tests.train.tiny_capture import tiny_capture, true_scene
+
+
+def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def test_a_neutral_exposure_changes_nothing() -> None:
+    image = drawn(4, 5, 3)
+    torch.testing.assert_close(Exposures.neutral(("a",)).applied(image.float(), "a"), image.float())
+    assert Exposures.neutral().applied(image, "a") is image
+
+
+def test_a_transform_is_applied_to_its_photograph_only() -> None:
+    affine = torch.zeros(2, 3, 4, dtype=torch.float64)
+    affine[1, 0, 1], affine[1, 2, 3] = 0.5, -0.1
+    exposures, image = Exposures(affine, ("a", "b")), drawn(4, 5, 3)
+    torch.testing.assert_close(exposures.applied(image, "a"), image)
+    expected = image.clone()
+    expected[..., 0] += 0.5 * image[..., 1]
+    expected[..., 2] -= 0.1
+    torch.testing.assert_close(exposures.applied(image, "b"), expected)
+
+
+def test_gradients_reach_image_and_transform() -> None:
+    image, affine = drawn(3, 2, 3).requires_grad_(), (0.1 * drawn(2, 3, 4, seed=1)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda i, a: Exposures(a, ("a", "b")).applied(i, "b"), (image, affine))
+
+
+def test_as_many_transforms_as_names_are_expected() -> None:
+    with pytest.raises(ValueError, match=r"expected \[1, 3, 4\]"):
+        Exposures(torch.zeros(2, 3, 4), ("a",))
+
+
+def test_the_loss_compares_in_the_colours_of_the_photograph() -> None:
+    view, scene = tiny_capture().train[0], true_scene()
+    photo = view.photo.float() / 255
+    affine = torch.zeros(1, 3, 4)
+    affine[0, :, :3] = -0.5 * torch.eye(3)
+    exposed = replace(scene, exposures=Exposures(affine, (view.name,)))
+    assert float(PhotometricLoss(0.2)(Frame(2 * photo), view, exposed)) < 1e-5
+    assert float(PhotometricLoss(0.2)(Frame(2 * photo), view, scene)) > 0.05
+
+
+def test_the_departure_holds_the_mean_and_each() -> None:
+    view, scene = tiny_capture().train[0], true_scene()
+    affine = torch.zeros(2, 3, 4)
+    affine[0, 0, 0], affine[1, 0, 0] = 0.2, -0.2
+    found = exposure_departure(
+        Frame(torch.zeros(1, 1, 3)), view, replace(scene, exposures=Exposures(affine, (view.name, "b")))
+    )
+    assert float(found) == pytest.approx(0.04 / 2)
+    both = exposure_departure(
+        Frame(torch.zeros(1, 1, 3)), view, replace(scene, exposures=Exposures(affine.abs(), (view.name, "b")))
+    )
+    assert float(both) == pytest.approx(0.04 / 2 + 0.04)
+    assert exposure_departure(Frame(torch.zeros(1, 1, 3)), view, scene) is None

@@ -1,0 +1,77 @@
+"""Exposures are learned beside the scene, stored with it, and taken up again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from glassplat.data.dataset import Dataset
+from glassplat.data.view import View
+from glassplat.files.scene_folder import read_scene, write_scene
+from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
+from glassplat.train.photo_exposure import PhotoExposure
+from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.splat_recipe import SplatRecipe
+from glassplat.train.state import TrainState
+from glassplat.train.trainer import train
+from tests.train.tiny_capture import tiny_capture, true_scene
+
+LEARNED, OFF = PhotoExposure(rate=0.003), PhotoExposure(rate=0)
+CAPTURE = replace(tiny_capture(), measured_points=False)
+"""With random points no plane is fitted before training."""
+
+
+def darkened(dataset: Dataset) -> Dataset:
+    """The capture with every other photograph half as bright."""
+    views = [
+        View.in_memory(v.name, v.camera, photo=v.photo // (1 + index % 2)) for index, v in enumerate(dataset.train)
+    ]
+    return replace(dataset, train=tuple(views))
+
+
+def trained(recipe: SplatRecipe, steps: int = 240) -> TrainState:
+    dataset = darkened(tiny_capture())
+    scene = recipe.exposure.begun(replace(true_scene(), planes=type(true_scene().planes).empty()), dataset)
+    state = TrainState(scene, 0)
+    frozen = tuple(
+        replace(
+            stage, rates={n: r for n, r in stage.rates.items() if n.startswith("exposures")}, actions=(), motions=()
+        )
+        for stage in recipe.stages(0)
+    )
+    for _ in train(frozen, dataset, state, steps):
+        pass
+    return state
+
+
+def test_dark_photographs_are_told_from_bright_ones() -> None:
+    affine = trained(SplatRecipe(exposure=LEARNED)).scene.exposures.affine
+    brightness = affine[:, :, :3].sum(dim=(1, 2)) / 3
+    assert bool((brightness[1::2] < brightness[::2] - 0.2).all())
+    assert float(affine.mean(dim=0).abs().max()) < 0.3
+
+
+@pytest.mark.parametrize("recipe", [SplatRecipe(exposure=LEARNED), PlanarRecipe(exposure=LEARNED)])
+def test_every_stage_learns_them(recipe: SplatRecipe | PlanarRecipe) -> None:
+    assert all("exposures.affine" in stage.rates for stage in recipe.stages(0))
+    assert all("exposure" in {term.name for term in stage.losses} for stage in recipe.stages(0))
+    assert recipe.initialise(CAPTURE).exposures.names == tuple(v.name for v in CAPTURE.train)
+
+
+@pytest.mark.parametrize("recipe", [SplatRecipe(exposure=OFF), PlanarRecipe(exposure=OFF)])
+def test_switched_off_nothing_knows_of_them(recipe: SplatRecipe | PlanarRecipe) -> None:
+    assert not any("exposures.affine" in stage.rates for stage in recipe.stages(0))
+    assert len(recipe.initialise(CAPTURE).exposures) == 0
+
+
+def test_they_are_stored_with_the_scene_and_in_checkpoints(tmp_path: Path) -> None:
+    state = trained(SplatRecipe(exposure=LEARNED), steps=12)
+    write_scene(tmp_path / "scene", state.scene)
+    assert torch.equal(read_scene(tmp_path / "scene").exposures.affine, state.scene.exposures.affine)
+    save_checkpoint(tmp_path / "checkpoint.safetensors", state)
+    restored = load_checkpoint(tmp_path / "checkpoint.safetensors").scene.exposures
+    assert restored.names == state.scene.exposures.names
+    assert torch.equal(restored.affine, state.scene.exposures.affine)

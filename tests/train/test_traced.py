@@ -1,0 +1,211 @@
+"""The `traced` recipe: its stages, how surroundings begin, grow and are pruned, a short run, and resuming."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from glassplat.densify.default import DefaultDensify, ScreenStatistics
+from glassplat.render.deferred import Deferred
+from glassplat.render.splat import Splat
+from glassplat.render.traced import Traced, mirrored_contributions
+from glassplat.scene.gaussians import Gaussians
+from glassplat.train.actions import Densify, PruneIdle, ResetOpacity
+from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
+from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
+from glassplat.train.propagation import Propagate, PropagationSchedule, RefineEnvironment
+from glassplat.train.recipe import recipe_from_json, recipe_to_json
+from glassplat.train.stage import Clock, Every
+from glassplat.train.state import TrainState
+from glassplat.train.strategy import Rhythm
+from glassplat.train.surroundings_entry import AddSurroundings, SurroundingsStart
+from glassplat.train.traced_recipe import SurroundingsOptions, TracedRecipe
+from glassplat.train.trainer import differentiate, train
+from tests.train.progress_of import finished
+from tests.train.tiny_capture import tiny_capture
+
+RECIPE = TracedRecipe(
+    sh_degree=1,
+    least_strength=0.0,
+    first_strength=0.3,
+    bootstrap=0.2,
+    surroundings=SurroundingsOptions(
+        begin=0.3,
+        start=SurroundingsStart(cells=2, copied_strength=0.9, copied_spread=1.0),
+        densify=DefaultDensify(split_by="gradient", interval=5, whole_passes=False, stop=0.6, gradient_threshold=1e-7),
+    ),
+    texels=4,
+    first_texels=2,
+    region=(0.0, 0.0, 3.5, 1.0),
+    rhythm=Rhythm(beat=0.1, least=2, sh=0.1),
+    schedule=PropagationSchedule(end="fixed", stop=0.7, pause=2),
+)
+PAPER = replace(RECIPE, mirrors="surroundings")
+
+
+def fresh_state(recipe: TracedRecipe = RECIPE) -> TrainState:
+    return TrainState(recipe.initialise(tiny_capture()), seed=0)
+
+
+def surrounded_state(start: SurroundingsStart | None = None) -> TrainState:
+    """With surroundings, as their stage begins, but for what was learned before."""
+    state = fresh_state()
+    AddSurroundings(start or RECIPE.surroundings.start, 1, Splat())(state, tiny_capture())
+    return state
+
+
+def run(recipe: TracedRecipe, state: TrainState, iterations: int = 40) -> list[Message]:
+    return list(train(recipe.stages(seed=0), tiny_capture(), state, iterations))
+
+
+def losses(messages: Sequence[Message]) -> list[float]:
+    return [m.losses["photometric"] for m in messages if isinstance(m, StepDone)]
+
+
+@pytest.mark.parametrize("recipe", [RECIPE, PAPER, replace(RECIPE, mirrors="environment")], ids=lambda r: r.mirrors)
+def test_a_short_run_learns(recipe: TracedRecipe) -> None:
+    state = fresh_state(recipe)
+    found = losses(run(recipe, state))
+    assert len(found) == 40 and sum(found[6:8]) < sum(found[:2])
+    assert all(torch.isfinite(tensor).all() for tensor in state.scene.parameters().values())
+    assert bool(len(state.scene.surroundings)) == (recipe.mirrors != "environment")
+    assert state.scene.environment.is_empty == (recipe.mirrors == "surroundings")
+    recipe.renderer().check(state.scene)
+
+
+def test_the_environment_is_mirrored_first_and_near_things_later() -> None:
+    messages = run(RECIPE, fresh_state())
+    entered = {m.stage: m.counts.get("surroundings", 0) for m in messages if isinstance(m, StageEntered)}
+    assert list(entered) == ["1 bootstrap", "2 distant reflections", "3 near reflections", "4 refinement"]
+    assert entered["2 distant reflections"] == 0 < entered["3 near reflections"]
+    renderers = [stage.renderer for stage in RECIPE.stages(0)]
+    assert isinstance(renderers[1], Deferred) and all(isinstance(r, Traced) for r in renderers[2:])
+    assert sum(stage.share for stage in RECIPE.stages(0)) == pytest.approx(1)
+
+
+def test_with_surroundings_alone_there_is_no_environment_to_refine() -> None:
+    actions = [action for stage in PAPER.stages(0) for action in stage.actions]
+    assert not any(isinstance(action, RefineEnvironment) for action in actions)
+    (propagate,) = [action for action in PAPER.stages(0)[1].actions if isinstance(action, Propagate)]
+    assert isinstance(propagate.renderer, Traced)
+
+
+def test_surroundings_learn_grow_and_are_pruned() -> None:
+    state = fresh_state()
+    messages = run(RECIPE, state)
+    done = [m.action for m in messages if isinstance(m, ActionDone)]
+    assert {"densify surroundings", "propagate normals", "prune idle surroundings"} <= set(done)
+    steps = [m for m in messages if isinstance(m, StepDone)]
+    counts = [m.counts["surroundings"] for m in steps if "surroundings" in m.counts]
+    assert max(counts) > counts[0] and min(counts) < max(counts)
+    assert bool(state.scene.surroundings.sh[:, 0].any())
+
+
+def test_a_resumed_run_ends_in_the_same_scene(tmp_path: Path) -> None:
+    whole = fresh_state()
+    run(RECIPE, whole)
+    first = fresh_state()
+    for message in train(RECIPE.stages(seed=0), tiny_capture(), first, 40):
+        if isinstance(message, StepDone) and message.step == 17:
+            break
+    save_checkpoint(tmp_path / "checkpoint", first)
+    second = load_checkpoint(tmp_path / "checkpoint")
+    assert len(second.scene.surroundings) and "surroundings" in second.statistics
+    run(RECIPE, second)
+    for name, tensor in whole.scene.parameters().items():
+        assert torch.equal(second.scene.parameters()[name], tensor), name
+
+
+def test_recipes_survive_as_json() -> None:
+    for recipe in (RECIPE, TracedRecipe.paper()):
+        assert recipe_from_json(recipe_to_json(recipe)) == recipe
+
+
+@pytest.mark.parametrize("begin", [0.2, 0.1, 0.7])
+def test_surroundings_have_to_begin_between_bootstrap_and_the_end_of_propagation(begin: float) -> None:
+    recipe = replace(RECIPE, surroundings=replace(RECIPE.surroundings, begin=begin))
+    assert f"--surroundings.begin is {begin}; expected a share" in (recipe.contradiction() or "")
+    assert replace(recipe, mirrors="surroundings").contradiction() is None
+    assert RECIPE.contradiction() is None
+
+
+def test_surroundings_are_copied_spread_or_both() -> None:
+    copied, spread, both = (
+        surrounded_state(SurroundingsStart(source, cells=2, copied_strength=0.9, copied_spread=1.0)).scene.surroundings
+        for source in ("scene", "box", "both")
+    )
+    assert len(spread) == 40 and len(copied) > 10 and len(both) == 40 + len(copied)
+    assert set(copied.means[:, 0].tolist()) <= set(fresh_state().scene.primary.means[:, 0].tolist())
+
+
+def test_where_everything_reflects_there_is_nothing_to_copy() -> None:
+    state = fresh_state()
+    channels = {"logit_strength": torch.full((len(state.scene.primary),), 3.0)}
+    state.scene = replace(state.scene, primary=replace(state.scene.primary, channels=channels))
+    AddSurroundings(SurroundingsStart("scene", cells=2), 1, Splat())(state, tiny_capture())
+    assert len(state.scene.surroundings) == 40
+
+
+def test_gradients_in_space_count_by_half_the_distance() -> None:
+    statistics = ScreenStatistics.zeros(3)
+    gradient = torch.tensor([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    for _ in range(2):
+        statistics.add_in_space(gradient, torch.tensor([2.0, 5.0, 4.0]))
+    assert statistics.mean_gradient.tolist() == [5.0, 0.0, 2.0]
+    assert statistics.view_count.tolist() == [[2.0, 0.0, 2.0]] * 2
+
+
+def test_a_step_gathers_gradients_of_what_rays_met() -> None:
+    state = surrounded_state()
+    strong = {"logit_strength": torch.full((len(state.scene.primary),), 1.0)}
+    state.scene = replace(state.scene, primary=replace(state.scene.primary, channels=strong))
+    stage = RECIPE.stages(0)[2]
+    result = differentiate(stage, state.scene, tiny_capture().train[0], probed=True)
+    (record,) = result.space
+    assert record.part == "surroundings" and bool(result.gradients["surroundings.means"].any())
+    assert not differentiate(stage, state.scene, tiny_capture().train[0], probed=False).space
+
+
+def test_what_reflections_never_show_is_pruned() -> None:
+    state = surrounded_state()
+    strong = {"logit_strength": torch.full((len(state.scene.primary),), 1.0)}
+    state.scene = replace(state.scene, primary=replace(state.scene.primary, channels=strong))
+    hidden = state.scene.surroundings.means.clone()
+    hidden[:7] += 1e3
+    state.scene = state.scene.with_parameters({"surroundings.means": hidden})
+    before = len(state.scene.surroundings)
+    densifier = DefaultDensify(least_contribution=1e-9, contribution_moments=(0.5,))
+    action = PruneIdle(densifier, "surroundings", mirrored_contributions)
+    assert action.due(Clock(20, 40, 6)) and finished(action.apply(state, tiny_capture(), Clock(20, 40, 6)))
+    assert 0 < len(state.scene.surroundings) <= before - 7
+    assert float(state.scene.surroundings.means.abs().max()) < 100
+    dull = {"logit_strength": torch.full((len(state.scene.primary),), -20.0)}
+    state.scene = replace(state.scene, primary=replace(state.scene.primary, channels=dull))
+    assert not finished(action.apply(state, tiny_capture(), Clock(20, 40, 6)))
+
+
+def test_opacities_of_surroundings_alone_are_reset() -> None:
+    state = surrounded_state()
+    before = state.scene.primary
+    ResetOpacity(Every(0.1), part="surroundings").apply(state, tiny_capture(), Clock(4, 40, 6))
+    assert torch.equal(state.scene.primary.logit_opacities, before.logit_opacities)
+    assert float(torch.sigmoid(state.scene.surroundings.logit_opacities).max()) <= 0.0101
+
+
+def test_the_preset_resets_surroundings_where_it_resets_the_scene() -> None:
+    def parts(recipe: TracedRecipe) -> set[str]:
+        return {a.part for s in recipe.stages(0) for a in s.actions if isinstance(a, ResetOpacity | Densify)}
+
+    assert parts(TracedRecipe.paper()) == {"primary", "surroundings"}
+    resets = [a for s in RECIPE.stages(0) for a in s.actions if isinstance(a, ResetOpacity)]
+    assert {a.part for a in resets} == {"primary"}
+
+
+def test_a_scene_without_surroundings_is_refused() -> None:
+    scene = replace(surrounded_state().scene, surroundings=Gaussians.empty())
+    with pytest.raises(ValueError, match="has no surroundings; expected one trained with `traced`"):
+        RECIPE.renderer().check(scene)

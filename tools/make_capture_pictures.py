@@ -1,0 +1,78 @@
+"""Makes the pictures of docs/capture.md: the page of `glassplat annotate` on one of our own scenes.
+
+    python -m tools.make_capture_pictures SCENE --output docs/images
+
+The scene ships the truth about its panes (`gt/planes.json`), which is where the corners are clicked.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from glassplat.annotate.eye import Eye
+from tools.marking_page import MarkingPage, marking_page
+
+SIZE = (1180, 700)
+COLORS = 128
+APART = 4
+"""Of the photographs that show the whole pane, every how manyth is marked."""
+
+
+def true_corners(scene: Path) -> NDArray[np.float64]:
+    """[4, 3] of the scene's first pane, round it."""
+    plane = json.loads((scene / "gt" / "planes.json").read_text())[0]
+    center, u, v = (np.array(plane[key]) for key in ("center", "half_u", "half_v"))
+    return np.stack([center - u + v, center + u + v, center + u - v, center - u - v])
+
+
+def whole_views(eyes: Sequence[Eye], corners: NDArray[np.float64]) -> list[int]:
+    """Views that show the whole pane, with a little room beside the photograph."""
+    return [number for number, eye in enumerate(eyes) if eye.holds(corners, 0.2).all()]
+
+
+def save(page: MarkingPage, path: Path) -> None:
+    """Saves what the window shows, with few colours, which keeps the repository small."""
+    picture = Image.fromarray(page.window.picture())
+    picture.quantize(COLORS, dither=Image.Dither.NONE).save(path, optimize=True)
+    print(path)
+
+
+def draw(scene: Path, output: Path) -> None:
+    """Marks the scene's pane in a copy of it, and saves two pictures on the way."""
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / scene.name
+        shutil.copytree(scene, copy, ignore=shutil.ignore_patterns("masks", "planes.json", "annot*", "gt"))
+        with marking_page(copy, width=SIZE[0], height=SIZE[1]) as page:
+            eyes, corners = page.server.session.eyes, true_corners(scene)
+            first, second, third = whole_views(eyes, corners)[:: APART + 1][:3]
+            page.mark(first, eyes[first].project(corners))
+            page.show(second)
+            save(page, output / "annotate-second.png")
+            page.mark(second, eyes[second].project(corners))
+            page.mark(third, eyes[third].project(corners))
+            left = eyes[third].project(corners)
+            post = 0.62 * left[[0, 1, 2, 3]] + 0.38 * left[[1, 0, 3, 2]]
+            page.cut(third, np.stack([post[0], post[1], post[2], post[3]]))
+            save(page, output / "annotate-cut.png")
+
+
+def main() -> None:
+    """Reads the arguments and draws."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--output", type=Path, default=Path("docs/images"))
+    options = parser.parse_args()
+    draw(options.scene, options.output)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,142 @@
+"""Marks panes of a capture on the page of `glassplat annotate`, in a headless browser, as somebody would with a mouse.
+
+    python -m tools.marking_page CAPTURE MARKS.json --pictures FOLDER
+
+MARKS.json maps names of photographs to what is clicked in them, in pixels of the photograph without distortion:
+
+    {"frame_0003.jpg": {"corners": [[120, 80], [900, 60], [910, 500], [110, 520]], "cut": [[[300, 400], ...]]}, ...}
+
+Masks and planes are written at the end, and with `--pictures` what the page shows on the way.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from glassplat.annotate.server import AnnotationServer
+from glassplat.annotate.session import opened_session
+from tools.browser import Browser, browser
+
+Places = Sequence[Sequence[float]] | np.ndarray
+WHOLE = 1.5
+"""What the canvas shows of a photograph at first, in its sizes: there is room for corners beside it."""
+
+
+class MarkingPage:
+    """The page, and the browser that it is open in."""
+
+    def __init__(self, window: Browser, server: AnnotationServer) -> None:
+        self.window, self.server = window, server
+        self._view = 0
+
+    def open(self) -> None:
+        """Opens the page, or opens it again."""
+        self.window.open(self.server.address)
+        self.window.wait("document.body.dataset.ready === 'yes'", "the page")
+        self.saved()
+
+    def saved(self) -> None:
+        """Waits until the server knows everything."""
+        self.window.wait("['saved', undefined].includes(document.body.dataset.state)", "the document to be saved")
+
+    def show(self, view: int) -> None:
+        """Goes to a photograph, by its number."""
+        self.window.run("document.querySelectorAll('#views button')[arguments[0]].click()", view)
+        self.window.wait(f"document.body.dataset.view === '{view}'", f"photograph {view}")
+        self._view = view
+
+    def on_screen(self, places: Places) -> list[tuple[float, float]]:
+        """Places of the photograph that is shown whole, in the window."""
+        left, top, width, height = self.window.run(
+            "const box = document.getElementById('canvas').getBoundingClientRect();"
+            "return [box.left, box.top, box.width, box.height]"
+        )
+        camera = self.server.session.views[self._view].camera
+        scale = min(width / (camera.width * WHOLE), height / (camera.height * WHOLE))
+        x, y = left + (width - camera.width * scale) / 2, top + (height - camera.height * scale) / 2
+        return [(x + scale * float(place[0]), y + scale * float(place[1])) for place in places]
+
+    def mark(self, view: int, corners: Places) -> None:
+        """Clicks corners, one after the other."""
+        self.show(view)
+        for x, y in self.on_screen(corners):
+            self.window.click(x, y)
+        self.saved()
+
+    def cut(self, view: int, outline: Places) -> None:
+        """Cuts a polygon out."""
+        self.show(view)
+        self.window.keys("3")
+        for x, y in self.on_screen(outline):
+            self.window.click(x, y)
+        self.window.keys("Enter")
+        self.window.keys("1")
+        self.saved()
+
+    def write(self) -> str:
+        """Writes masks and planes; what the page says."""
+        self.window.press("#write")
+        self.window.wait("document.body.dataset.written", "masks and planes")
+        return str(self.window.run("return document.getElementById('status').textContent"))
+
+    def said(self) -> str:
+        """What stands beside the panes."""
+        return str(self.window.run("return document.getElementById('panes').innerText"))
+
+
+@contextmanager
+def marking_page(capture: Path, *, width: int = 1400, height: int = 900) -> Iterator[MarkingPage]:
+    """The page of a capture, open in a browser."""
+    with AnnotationServer(opened_session(capture), 0) as server:
+        thread = Thread(target=server.serve_forever, args=(0.02,))
+        thread.start()
+        try:
+            with browser(width, height) as window:
+                page = MarkingPage(window, server)
+                page.open()
+                yield page
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def mark_all(page: MarkingPage, marks: Mapping[str, Any], pictures: Path | None) -> None:
+    """Does what a file of marks says, photograph by photograph."""
+    numbers = {view.name: number for number, view in enumerate(page.server.session.views)}
+    for done, (name, what) in enumerate(marks.items(), start=1):
+        page.mark(numbers[name], what.get("corners", []))
+        for outline in what.get("cut", []):
+            page.cut(numbers[name], outline)
+        _save(page, pictures, f"{done}-{Path(name).stem}")
+        print(f"{name}: {page.said()}")
+
+
+def _save(page: MarkingPage, pictures: Path | None, name: str) -> None:
+    if pictures is not None:
+        pictures.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(page.window.picture()).save(pictures / f"{name}.png")
+
+
+def main() -> None:
+    """Marks, writes, and says what was written."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("marks", type=Path)
+    parser.add_argument("--pictures", type=Path)
+    options = parser.parse_args()
+    with marking_page(options.capture) as page:
+        mark_all(page, json.loads(options.marks.read_text(encoding="utf-8")), options.pictures)
+        print(page.write())
+
+
+if __name__ == "__main__":
+    main()
