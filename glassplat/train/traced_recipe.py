@@ -33,6 +33,7 @@ from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, GrowSh, PruneIdle, ResetOpacity
 from glassplat.train.background import BLACK
 from glassplat.train.deferred_recipe import DeferredRecipe, ReflectionRates, Texels
+from glassplat.train.optimizer import PUBLISHED_ITERATIONS
 from glassplat.train.propagation import Propagate, PropagationSchedule, RefineEnvironment
 from glassplat.train.splat_recipe import GaussianRates, Primitive
 from glassplat.train.stage import Action, Every, Stage
@@ -208,7 +209,7 @@ class TracedRecipe:
             return self._distant().renderer()
         return Traced(self.background or BLACK, self.least_strength)
 
-    def stages(self, seed: int) -> tuple[Stage, ...]:
+    def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
         """Bootstrap, distant reflections, near reflections, and everything without propagation."""
         bootstrap, distant, refinement = self._distant().stages(seed)
         if self.primitive == "disc":
