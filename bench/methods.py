@@ -19,7 +19,7 @@ from glassplat.render.deferred import INVISIBLE, Deferred
 from glassplat.render.frame import Renderer
 from glassplat.render.planar import Planar, half_spaces_of
 from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, project_gaussians
-from glassplat.render.seen_panes import nearest_hits
+from glassplat.render.seen_panes import nearest_hits, panes_in_camera
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
 from glassplat.scene.pose import mirror_matrices
@@ -48,7 +48,7 @@ def frame_work(scene: Scene, renderer: Renderer, camera: Camera) -> Work:
 def bare_work(scene: Scene, camera: Camera) -> Work:
     """What no `planar` frame can save: the `splat` frame, and the mirrored one in the tiles of the panes."""
     splat, planes = Splat(depth=False), scene.planes
-    hits = nearest_hits(planes, camera)
+    hits = nearest_hits(panes_in_camera(planes, camera), camera)
     poses = camera.cam_from_world @ mirror_matrices(planes.centers, planes.normals)
     half_spaces = half_spaces_of(planes, camera)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from glassplat.data.view import View
 from glassplat.evaluate.truth import TrueView
 from glassplat.render.frame import Frame
-from glassplat.render.seen_panes import nearest_hits
+from glassplat.render.seen_panes import nearest_hits, panes_in_camera
 from glassplat.scene.plane import Planes
 
 NO_TRUTH = "the data set has no ground truth"
@@ -56,7 +56,7 @@ class MarkedRegions:
         """As in `PaneRegions`."""
         if view.pane_labels is not None:
             return view.pane_labels > 0
-        return nearest_hits(self.planes, view.camera).pane >= 0
+        return nearest_hits(panes_in_camera(self.planes, view.camera), view.camera).pane >= 0
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from glassplat.render.seen_panes import nearest_hits
+from glassplat.render.seen_panes import nearest_hits, panes_in_camera
 from glassplat.scene.camera import Camera
 from glassplat.scene.plane import Planes
 
@@ -74,7 +74,7 @@ def best_view(planes: Planes, cameras: Sequence[Camera]) -> int:
 def _composition(planes: Planes, camera: Camera) -> float:
     """How far a picture is from one that shows panes well: by their share of it, and by how far off its middle."""
     small = camera.resized(64, max(1, round(64 * camera.height / camera.width)))
-    rows, columns = (nearest_hits(planes, small).pane >= 0).nonzero(as_tuple=True)
+    rows, columns = (nearest_hits(panes_in_camera(planes, small), small).pane >= 0).nonzero(as_tuple=True)
     if not len(rows):
         return math.inf
     aside = math.hypot(*(float(at.double().mean()) / size - 0.5 for at, size in ((rows, small.height), (columns, 64))))

@@ -13,7 +13,7 @@ from glassplat.kernels.splats import Projected
 from glassplat.render.discs import blended_discs, projected_discs
 from glassplat.render.planar import detached, project_mirrored
 from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, project_gaussians
-from glassplat.render.seen_panes import nearest_hits, seen_panes
+from glassplat.render.seen_panes import nearest_hits, panes_in_camera, seen_panes
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
@@ -36,7 +36,7 @@ def contributions(scene: Scene, camera: Camera) -> Tensor:
     if primary.are_discs:
         return _disc_weight_sums(primary, camera, near)
     most = _weight_sums(project_gaussians(primary, camera, near=near), camera)
-    seen = seen_panes(scene.planes, camera, nearest_hits(scene.planes, camera))
+    seen = seen_panes(scene.planes, camera, nearest_hits(panes_in_camera(scene.planes, camera), camera))
     if seen is None:
         return most
     mirrored = project_mirrored(primary, camera, seen, near=near)

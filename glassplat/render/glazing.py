@@ -15,13 +15,9 @@ from glassplat.kernels.composite import composite
 from glassplat.kernels.panes import BlendedPanes, Fresnel
 from glassplat.kernels.splats import Splats
 from glassplat.render.seen_panes import SeenPanes
-from glassplat.scene import transfer
 from glassplat.scene.camera import Camera
 
 Blend = Literal["srgb", "linear"]
-GREY = 0.5
-"""Any strength and light at which the derivatives are finite, in place of what is left out."""
-
 FAINT = 0.5
 """A pane that is less visible in a pixel, as at its rim, leaves the layers to the pane behind it."""
 
@@ -101,35 +97,6 @@ def _joined_layers(
         reflection.index_put(pixels, encode(light / both[:, None])),
         strength.index_put(pixels, both),
     )
-
-
-def layer_slopes(result: Glazed, where: Tensor, blend: Blend) -> tuple[Tensor, Tensor]:
-    """[H, W] how much the image changes with its transmission, and with its reflection: the derivatives of Eq. 1.
-
-    Where `where` [H, W] is False, 1 and 0. In linear radiance they are not 1 - R and R: a weak reflection stands out
-    from a dark transmission, and takes contrast from it. Of grey that is as bright as the mean of the channels.
-    """
-    layers = (result.strength, result.transmission, result.reflection)
-    if transfer.waits(where.device):
-        # How many pixels there are, only the GPU knows: they are not gathered but all others left out.
-        strength, *colors = (torch.where(where if x.dim() == 2 else where[..., None], x, GREY) for x in layers)
-        through, mirrored = _slopes(strength, *colors, blend=blend)
-        return torch.where(where, through, 1), torch.where(where, mirrored, 0)
-    through, mirrored = _slopes(*(layer[where] for layer in layers), blend=blend)
-    clear, nothing = torch.ones_like(result.strength), torch.zeros_like(result.strength)
-    return clear.masked_scatter(where, through), nothing.masked_scatter(where, mirrored)
-
-
-def _slopes(strength: Tensor, behind: Tensor, mirror_image: Tensor, *, blend: Blend) -> tuple[Tensor, Tensor]:
-    """The derivatives of Eq. 1 in pixels [...] of these strengths, transmissions and reflections [..., 3]."""
-    decode, encode = curves(blend)
-    strength = strength.detach()
-    layers = [layer.detach().mean(dim=-1) for layer in (behind, mirror_image)]
-    with torch.enable_grad():
-        transmission, reflection = (layer.requires_grad_() for layer in layers)
-        image = encode((1 - strength) * decode(transmission) + strength * decode(reflection))
-        through, mirrored = torch.autograd.grad(image.sum(), (transmission, reflection))
-    return through, mirrored
 
 
 def curves(blend: Blend) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
-from glassplat.kernels.panes import Fresnel, PaneHits
+from glassplat.kernels.layer_slopes import layer_slopes
+from glassplat.kernels.panes import Fresnel, PaneHits, Panes
 from glassplat.kernels.splats import Deviation, Projected, Splats
 from glassplat.render.frame import Frame, ScreenPass
-from glassplat.render.glazing import Blend, Glazed, glazed, layer_slopes, own_masks, visibilities
+from glassplat.render.glazing import Blend, Glazed, glazed, own_masks, visibilities
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
     check_colored,
@@ -26,8 +27,14 @@ from glassplat.render.rasterize import (
     screen_pass,
     shown,
 )
-from glassplat.render.seen_panes import SeenPanes, amid_one_pane, glass_owners, nearest_hits, seen_panes
-from glassplat.scene import transfer
+from glassplat.render.seen_panes import (
+    SeenPanes,
+    amid_one_pane,
+    glass_owners,
+    nearest_hits,
+    panes_in_camera,
+    seen_panes,
+)
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
@@ -106,9 +113,10 @@ class Planar:
     def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are."""
         camera = camera.to(scene.primary.means.device)
-        first = self._first_pass(scene, camera, probed)
+        rectangles = panes_in_camera(scene.planes, camera)
+        first = self._first_pass(scene, camera, rectangles, probed)
         layers = {"without_panes": first.image, "depth": first.depth, "alpha": first.alpha, "mask": first.mask}
-        hits = nearest_hits(scene.planes, camera, first.mask)
+        hits = nearest_hits(rectangles, camera, first.mask)
         hit = (hits.pane >= 0).to(first.mask.dtype)
         layers["hit"] = hit
         if first.deviation is not None:
@@ -148,7 +156,7 @@ class Planar:
         if "logit_mark" not in scene.glass.channels:
             raise ValueError(f"the glass has the channels {sorted(scene.glass.channels)}; expected logit_mark")
 
-    def _first_pass(self, scene: Scene, camera: Camera, probed: bool) -> FirstPass:
+    def _first_pass(self, scene: Scene, camera: Camera, rectangles: Panes, probed: bool) -> FirstPass:
         near = NEAR_PER_EXTENT * scene.extent
         primary = project_gaussians(scene.primary, camera, near=near)
         glass = project_gaussians(scene.glass, camera, near=near)
@@ -159,7 +167,7 @@ class Planar:
         marks = torch.sigmoid(scene.glass.channels["logit_mark"])[None]
         deviation = None
         if self.deviation:
-            hit = nearest_hits(scene.planes, camera).pane >= 0
+            hit = nearest_hits(rectangles, camera).pane >= 0
             deviation = Deviation(3, hit.to(colors.dtype)[None], self.deviation_depth_gradient)
         screen = (screen_pass("primary", primary), screen_pass("glass", glass)) if probed else ()
         result = composite(
@@ -171,13 +179,14 @@ class Planar:
             deviation=deviation,
             probe=joined_probe(screen),
         )
-        alpha = result.alpha[0]
+        alpha = result.alpha.squeeze(0)
+        color, depth = result.image.squeeze(0).split((3, 1), dim=-1)
         return FirstPass(
-            image=over_background(result.image[0, ..., :3], alpha, self.background),
+            image=over_background(color, alpha, self.background),
             alpha=alpha,
-            depth=mean_depth(result.image[0, ..., 3], alpha),
-            mask=result.mask[0],
-            deviation=result.deviation[0] if deviation else None,
+            depth=mean_depth(depth.squeeze(-1), alpha),
+            mask=result.mask.squeeze(0),
+            deviation=result.deviation.squeeze(0) if deviation else None,
             splats=splats,
             marks=marks,
             direct=shown(primary),
@@ -222,15 +231,15 @@ def weighted_screen(
     that show a pane.
     """
     hit = hits.pane >= 0
-    through, mirrored = layer_slopes(result, hit, blend)
+    layers = result.strength, result.transmission, result.reflection
+    through, mirrored = layer_slopes(*layers, hit, linear=blend == "linear")
     primary, glass = first.screen
     height, width = hit.shape
     columns, rows = primary.means2d.nan_to_num().floor().long().unbind(-1)
     pixels = rows.clamp(0, height - 1), columns.clamp(0, width - 1)
     behind = first.splats.depths[:, : primary.means2d.shape[1]] > hits.depth[pixels]
     primary = replace(primary, weight=torch.where(behind, through[pixels], 1.0))
-    weight: float | Tensor
-    weight = mirrored.sum() / hit.sum().clamp(min=1) if transfer.waits(hit.device) else float(mirrored[hit].mean())
+    weight = mirrored.sum() / hit.sum().clamp(min=1)
     return (primary, glass, *(replace(record, weight=weight) for record in second.screen))
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.discs import ProjectedDiscs
 from glassplat.kernels.project import project
@@ -85,7 +87,23 @@ def over_background(image: Tensor, alpha: Tensor, background: tuple[float, ...])
     """Adds a constant background [D] behind an image [..., D] with coverage alpha [...]."""
     if not any(background):
         return image
-    return image + (1 - alpha)[..., None] * constant(tuple(background), image.dtype, image.device)
+    added: Tensor = _OverBackground.apply(image, alpha, constant(tuple(background), image.dtype, image.device))
+    return added
+
+
+class _OverBackground(torch.autograd.Function):
+    """One node: PyTorch's own four would go through an image for each."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
+        ctx.save_for_backward(background)
+        return torch.addcmul(image, (1 - alpha)[..., None], background)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_image: Tensor) -> tuple[Tensor, Tensor, None]:
+        (background,) = ctx.saved_tensors
+        return v_image, -(v_image @ background), None
 
 
 def mean_depth(depth_sum: Tensor, alpha: Tensor) -> Tensor:

@@ -46,12 +46,9 @@ def panes_in_camera(planes: Planes, camera: Camera) -> Panes:
         return Panes(centers @ rotation.T + translation, normals @ rotation.T, axes @ rotation.T, half_sizes)
 
 
-def nearest_hits(
-    planes: Planes, camera: Camera, mask: Tensor | None = None, beyond: PaneHits | None = None
-) -> PaneHits:
-    """The nearest pane of each pixel, or the next one; see `pane_hits`."""
-    rectangles = panes_in_camera(planes, camera)
-    return pane_hits(rectangles, camera.intrinsics, camera.width, camera.height, mask, beyond=beyond)
+def nearest_hits(panes: Panes, camera: Camera, mask: Tensor | None = None, beyond: PaneHits | None = None) -> PaneHits:
+    """The nearest of `panes_in_camera` on the ray of each pixel, or the next one; see `pane_hits`."""
+    return pane_hits(panes, camera.intrinsics, camera.width, camera.height, mask, beyond=beyond)
 
 
 def seen_panes(
@@ -70,7 +67,7 @@ def seen_panes(
     if not any(seen):
         return None
     while len(hits) < (len(planes) if most is None else most):
-        further = nearest_hits(planes, camera, mask, beyond=hits[-1])
+        further = nearest_hits(panes_in_camera(planes, camera), camera, mask, beyond=hits[-1])
         shown = _shown(further)
         if not any(shown):
             break
@@ -112,9 +109,15 @@ def amid_one_pane(pane: Tensor, strength: Tensor) -> Tensor:
         pane: [H, W] which pane is nearest, -1 for none.
         strength: [H, W] of the reflection; 0 where a pane is hit and no glass is there.
     """
-    shown = torch.where(strength > 0, pane, -1).to(strength.dtype)[None]
-    highest, negated_lowest = (torch.nn.functional.max_pool2d(image, 3, 1, 1)[0] for image in (shown, -shown))
-    return ((shown[0] >= 0) & (highest == -negated_lowest)).to(strength.dtype)
+    shown = torch.where(strength > 0, pane, -1)
+    above, along = shown[1:] == shown[:-1], shown[:, 1:] == shown[:, :-1]
+    # Three rows that are each the same throughout, and the same as their neighbours.
+    row = torch.nn.functional.pad(along, (0, 1), value=True) & torch.nn.functional.pad(along, (1, 0), value=True)
+    pair = row[1:] & row[:-1] & above
+    inner = torch.nn.functional.pad(pair, (0, 0, 0, 1), value=True) & torch.nn.functional.pad(
+        pair, (0, 0, 1, 0), value=True
+    )
+    return (inner & row & (shown >= 0)).to(strength.dtype)
 
 
 @torch.no_grad()

@@ -61,11 +61,13 @@ class Splat:
         screen = (screen_pass("primary", projected),) if probed else ()
         bins = bin_tiles(splats, camera.width, camera.height)
         result = composite(splats, channels, bins, probe=joined_probe(screen))
-        image, alpha = result.image[0], result.alpha[0]
+        # As a batch of one and split, because the gradient of an indexed image is a whole one of zeros first.
+        color, *depth = result.image.squeeze(0).split((3, 1) if self.depth else 3, dim=-1)
+        alpha = result.alpha.squeeze(0)
         layers = {"alpha": alpha}
         if self.depth:
-            layers["depth"] = mean_depth(image[..., 3], alpha)
-        rgb = over_background(image[..., :3], alpha, self.background)
+            layers["depth"] = mean_depth(depth[0].squeeze(-1), alpha)
+        rgb = over_background(color, alpha, self.background)
         return Frame(rgb, layers, direct=shown(projected), screen=screen)
 
     def _discs(self, scene: Scene, camera: Camera, probed: bool) -> Frame:

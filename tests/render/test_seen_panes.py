@@ -14,7 +14,7 @@ from glassplat.losses.reflection import gradient_conflict
 from glassplat.render.contribution import contributions
 from glassplat.render.glazing import FAINT, Blend, curves
 from glassplat.render.planar import Planar
-from glassplat.render.seen_panes import glass_owners, nearest_hits, seen_panes
+from glassplat.render.seen_panes import glass_owners, nearest_hits, panes_in_camera, seen_panes
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
@@ -59,7 +59,7 @@ def test_each_pane_lays_its_reflection_over_what_is_behind_it(half: float, shift
     expected = (1 - far) * light(back.layers["transmission"]) + far * light(back.layers["reflection"])
     expected = (1 - near) * expected + near * light(front.layers["reflection"])
     assert float((near * far).max()) > least
-    two = nearest_hits(front_pane, WIDE).pane >= 0
+    two = nearest_hits(panes_in_camera(front_pane, WIDE), WIDE).pane >= 0
     torch.testing.assert_close(light(both.rgb)[two], expected[two], rtol=1e-4, atol=2e-5)
 
 
@@ -150,13 +150,13 @@ def test_any_number_of_panes_may_stand_one_behind_another(count: int) -> None:
 def test_panes_beside_each_other_are_rendered_as_ever() -> None:
     left, right = (pane(2.0, half=0.4, label=label) for label in (1, 2))
     right = right.with_tensors({"centers": right.centers + torch.tensor([1.2, 0.0, 0.0])})
-    seen = seen_panes(planes := joined(left, right), CAMERA, nearest_hits(planes, CAMERA))
+    seen = seen_panes(planes := joined(left, right), CAMERA, nearest_hits(panes_in_camera(planes, CAMERA), CAMERA))
     assert len(seen.order) == 1
 
 
 def test_the_panes_on_a_ray_come_in_the_order_of_their_depths() -> None:
     planes = joined(*(pane(z, half=half, label=k + 1) for k, (z, half) in enumerate([(4, 3), (2, 0.6), (3, 1)])))
-    seen = seen_panes(planes, CAMERA, nearest_hits(planes, CAMERA))
+    seen = seen_panes(planes, CAMERA, nearest_hits(panes_in_camera(planes, CAMERA), CAMERA))
     nearness = torch.tensor([1.0, 3.0, 2.0, 0.0])
     assert len(seen.order) == 3 and bool((seen.order[2] >= 0).any())
     for before, after in pairwise(seen.order):
@@ -167,7 +167,7 @@ def test_the_panes_on_a_ray_come_in_the_order_of_their_depths() -> None:
 
 def test_panes_that_no_pixel_shows_are_left_out() -> None:
     planes = joined(pane(-3.0, label=1), pane(2.0, label=2), pane(4.0, label=3))
-    seen = seen_panes(planes, CAMERA, nearest_hits(planes, CAMERA))
+    seen = seen_panes(planes, CAMERA, nearest_hits(panes_in_camera(planes, CAMERA), CAMERA))
     assert seen.planes.labels == (2, 3) and seen.rows.tolist() == [1, 2]
     assert [int(pane.max()) for pane in seen.order] == [0, 1]
     assert seen.windows.tolist() == [[0.0, 0.0, 40.0, 28.0]] * 2

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from glassplat.render.seen_panes import nearest_hits
+from glassplat.render.seen_panes import nearest_hits, panes_in_camera
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
@@ -79,7 +79,7 @@ def in_single_precision(scene: Scene) -> Scene:
 
 def shown_panes(planes: Planes, camera: Camera) -> Tensor:
     """[K, H, W] bool: the pixels that show each pane, the nearest where panes overlap."""
-    index = nearest_hits(planes, camera).pane
+    index = nearest_hits(panes_in_camera(planes, camera), camera).pane
     return index == torch.arange(len(planes), dtype=torch.int32)[:, None, None]
 
 

@@ -32,16 +32,16 @@ def add_views(sums: Sums, views: Views) -> None:
     expected |= {name: (getattr(sums, name), (2, count)) for name in ("gradient_sum", "pull_sum", "view_count")}
     expected |= {name: (getattr(views, name), (cameras, count, 2)) for name in ("v_means2d", "v_probe", "radii")}
     if isinstance(views.weight, Tensor):
-        expected["weight"] = (views.weight, (cameras, count))
+        expected["weight"] = (views.weight, (cameras, count) if views.weight.dim() else ())
     check_tensors(expected)
     if sums.max_radius.device.type != "cpu":
         # On a GPU these few sums over Gaussians are no bottleneck, so that there they stay PyTorch's.
         reference.add_views(sums, views)
         return
     real = REAL_OF[sums.max_radius.dtype]
-    weight = views.weight.numpy() if isinstance(views.weight, Tensor) else np.full((1, 1), views.weight, real)
+    weight = np.ascontiguousarray(np.atleast_2d(views.weight), real)
     gradients = (tensor.detach().contiguous().numpy() for tensor in views[:3])
     add_views_kernel(real)(
-        *(tensor.numpy() for tensor in sums), *gradients, np.ascontiguousarray(weight),
+        *(tensor.numpy() for tensor in sums), *gradients, weight,
         views.width, views.height, 1 + views.direct,
     )  # fmt: skip

@@ -24,8 +24,8 @@ class Views(NamedTuple):
     """Views of one image size, and the gradients of a loss in them.
 
     v_means2d, v_probe, radii [C, N, 2]: gradients of centres and probe, and half extents, in pixels, 0 where a view
-    does not see the Gaussian. weight: what a view counts, all of it or [C, N] for each Gaussian. direct: whether the
-    views see the Gaussians themselves, and not their mirror images.
+    does not see the Gaussian. weight: what a view counts, a number or a scalar for all or [C, N] for each Gaussian.
+    direct: whether the views see the Gaussians themselves, and not their mirror images.
     """
 
     v_means2d: Tensor

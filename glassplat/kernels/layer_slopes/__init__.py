@@ -1,0 +1,5 @@
+"""How much an image behind a pane changes with its two layers."""
+
+from glassplat.kernels.layer_slopes.operation import layer_slopes
+
+__all__ = ["layer_slopes"]

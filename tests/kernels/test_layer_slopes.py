@@ -1,0 +1,97 @@
+"""How an image behind a pane changes with its layers: held against finite differences and the twin."""
+
+from __future__ import annotations
+
+import numba
+import pytest
+import torch
+from torch import Tensor
+
+from glassplat.kernels.color_space import linear_from_srgb, srgb_from_linear
+from glassplat.kernels.layer_slopes import layer_slopes
+from glassplat.kernels.layer_slopes.reference import layer_slopes as reference_layer_slopes
+
+
+def grey_layers(height: int = 5, width: int = 7) -> tuple[Tensor, Tensor, Tensor]:
+    layers = torch.rand(3, height, width, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    transmission, reflection = (layer[..., None].expand(-1, -1, 3) for layer in layers[:2])
+    return 0.5 * layers[2], transmission, reflection
+
+
+def some_pixels(height: int, width: int) -> Tensor:
+    return torch.rand(height, width, generator=torch.Generator().manual_seed(2)) > 0.5
+
+
+def test_slopes_are_finite_differences_of_the_image() -> None:
+    (strength, behind, reflected), step = grey_layers(), 1e-6
+
+    def image(transmission: Tensor, reflection: Tensor) -> Tensor:
+        share = strength[..., None]
+        return srgb_from_linear((1 - share) * linear_from_srgb(transmission) + share * linear_from_srgb(reflection))
+
+    everywhere = torch.ones(5, 7, dtype=torch.bool)
+    through, mirrored = layer_slopes(strength, behind, reflected, everywhere, linear=True)
+    by_behind = (image(behind + step, reflected) - image(behind - step, reflected)) / (2 * step)
+    by_reflected = (image(behind, reflected + step) - image(behind, reflected - step)) / (2 * step)
+    torch.testing.assert_close(through, by_behind[..., 0], rtol=1e-6, atol=0)
+    torch.testing.assert_close(mirrored, by_reflected[..., 0], rtol=1e-6, atol=0)
+    assert float(torch.stack([through, mirrored]).amax()) < 1
+
+
+def test_slopes_in_srgb_are_the_strength_and_its_rest() -> None:
+    (strength, *layers), where = grey_layers(), some_pixels(5, 7)
+    through, mirrored = layer_slopes(strength, *layers, where, linear=False)
+    torch.testing.assert_close(through, torch.where(where, 1 - strength, 1.0))
+    torch.testing.assert_close(mirrored, torch.where(where, strength, 0.0))
+
+
+def test_a_reflection_weighs_more_the_darker_it_is_behind_the_pane() -> None:
+    grey, where = torch.linspace(0.1, 0.9, 9, dtype=torch.float64)[None], torch.ones(1, 9, dtype=torch.bool)
+    behind = grey[..., None].expand(-1, -1, 3)
+    strength = torch.full_like(grey, 0.1)
+    through, mirrored = layer_slopes(strength, behind, torch.full_like(behind, 0.5), where, linear=True)
+    assert bool((mirrored.diff() < 0).all())
+    assert bool((through.diff() > 0).all())
+    assert mirrored[0, 4] == pytest.approx(0.1)  # As bright as each other.
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 3e-5), (torch.float64, 1e-11)])
+@pytest.mark.parametrize("linear", [False, True])
+@pytest.mark.parametrize("size", [(1, 1), (33, 70)])
+def test_agrees_with_its_twin(size: tuple[int, int], linear: bool, dtype: torch.dtype, tolerance: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    strength = torch.rand(size, generator=generator, dtype=torch.float64).to(dtype)
+    layers = [1.3 * torch.rand(*size, 3, generator=generator, dtype=torch.float64).to(dtype) - 0.1 for _ in range(2)]
+    where = some_pixels(*size)
+    found = layer_slopes(strength, *layers, where, linear=linear)
+    for own, wanted in zip(found, reference_layer_slopes(strength, *layers, where, linear=linear), strict=True):
+        torch.testing.assert_close(own, wanted, rtol=tolerance, atol=tolerance)
+
+
+def test_what_is_left_out_may_be_anything() -> None:
+    broken = torch.full((4, 6), torch.nan)
+    layers = broken[..., None].expand(-1, -1, 3)
+    through, mirrored = layer_slopes(broken, layers, layers, torch.zeros(4, 6, dtype=torch.bool), linear=True)
+    assert bool((through == 1).all()) and bool((mirrored == 0).all())
+
+
+def test_the_number_of_threads_changes_no_bit() -> None:
+    layers, where, found = [layer.float() for layer in grey_layers(90, 70)], some_pixels(90, 70), []
+    for threads in (1, numba.config.NUMBA_NUM_THREADS):
+        numba.set_num_threads(threads)
+        found.append(torch.stack(layer_slopes(*layers, where, linear=True)))
+    assert torch.equal(*found)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"reflection": torch.zeros(4, 5, 3)}, ValueError, r"reflection has shape \(4, 5, 3\); expected \(4, 6, 3\)"),
+        ({"where": torch.zeros(4, 6)}, TypeError, r"where is torch.float32 of shape \(4, 6\); expected bool"),
+    ],
+)
+def test_bad_input_is_refused(change: dict[str, Tensor], error: type[Exception], message: str) -> None:
+    arguments = {"strength": torch.zeros(4, 6), "where": torch.zeros(4, 6, dtype=torch.bool)}
+    arguments |= {name: torch.zeros(4, 6, 3) for name in ("transmission", "reflection")}
+    with pytest.raises(error, match=message):
+        layer_slopes(**(arguments | change), linear=True)
