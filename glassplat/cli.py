@@ -45,6 +45,14 @@ COMMANDS = {
         "Dereflect",
         "Take the reflections out of a planar run's photographs; one PNG per photograph, under its name.",
     ),
+    "view": Listed(
+        "view", "View", "Look at a scene in the browser, layer by layer, with its panes as they are or edited."
+    ),
+    "import": Listed(
+        "import_splats",
+        "Import",
+        "Read a splat file (PLY, compressed PLY, SPZ, .splat) of any program as a scene to look at, film and export.",
+    ),
     "export": Listed(
         "export",
         "Export",

@@ -18,6 +18,7 @@ from glassplat.commands.scene_edits import SceneEdits
 from glassplat.data.errors import InputError, input_checked
 from glassplat.evaluate.metrics import psnr
 from glassplat.files.atomic import atomic_write
+from glassplat.files.cameras_json import write_cameras
 from glassplat.files.environment_image import write_equirect
 from glassplat.files.planes_json import write_planes
 from glassplat.files.ply import write_gaussians
@@ -69,7 +70,10 @@ class Export:
             raise InputError("nothing to write without --formats; expected ply, spz or html")
         opened = open_scene(self.run_directory, self.device)
         opened = opened._replace(scene=self._chosen(self.edits.applied(opened.scene)))
-        targets = [self.output / name for name in ("index.html", "scene.ply", "scene.spz", "glass.ply", "planes.json")]
+        targets = [
+            self.output / name
+            for name in ("index.html", "scene.ply", "scene.spz", "glass.ply", "planes.json", "cameras.json")
+        ]
         check_targets(self.output, targets, [])
         if claim_folder(self.output, "export", self.run_directory):
             say(console, f"replacing the files of an earlier run of this command in {self.output}")
@@ -78,6 +82,7 @@ class Export:
             gaussians = self._baked(opened, console)
         else:
             self._write_beside(opened.scene, console)
+        write_cameras(self.output / "cameras.json", opened.cameras)
         self._write_gaussians(gaussians, console)
         if "html" in self.formats:
             self._write_page(opened, console)

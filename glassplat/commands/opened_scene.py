@@ -5,18 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from glassplat.commands.imported_scene import NamedCameras, imported_scene
 from glassplat.commands.stored_run import Split
+from glassplat.data.dataset import TEST_EVERY
 from glassplat.data.errors import InputError, input_checked
 from glassplat.files.cameras_json import read_cameras
 from glassplat.kernels.devices import DeviceName, chosen_device
 from glassplat.render.frame import Renderer
-from glassplat.scene.camera import Camera
+from glassplat.render.planar import Planar
 from glassplat.scene.scene import Scene
 from glassplat.train.background import BLACK, with_background
 from glassplat.train.run_directory import RunDirectory
-
-NamedCameras = tuple[tuple[str, Camera], ...]
-TEST_EVERY = 8
 
 
 class OpenedScene(NamedTuple):
@@ -40,12 +39,14 @@ class OpenedScene(NamedTuple):
 
 
 def open_scene(path: Path, device: DeviceName = "auto") -> OpenedScene:
-    """Opens the scene of a run.
+    """Opens the scene of a run, or of a splat file as it is.
 
     Raises:
         CudaUnavailableError: the GPU was asked for and cannot be used.
         InputError: nothing that can be looked at is there, or it cannot be read.
     """
+    if path.is_file():
+        return _opened_file(path, device)
     directory = RunDirectory(path)
     recipe: Any = with_background_of(directory.recipe())
     scene, _ = directory.latest_scene()
@@ -56,6 +57,13 @@ def open_scene(path: Path, device: DeviceName = "auto") -> OpenedScene:
     if not cameras:
         raise InputError(f"{path / 'cameras.json'} lists no camera; expected those of the photographs")
     return OpenedScene(path, path.resolve().name, recipe.method, scene.to(chosen_device(device)), renderer, cameras)
+
+
+def _opened_file(path: Path, device: DeviceName) -> OpenedScene:
+    """A scene that was not trained here, over black."""
+    with input_checked():
+        scene, cameras, _ = imported_scene(path)
+    return OpenedScene(path, path.stem, "planar", scene.to(chosen_device(device)), Planar(), cameras)
 
 
 def with_background_of(recipe: Any) -> Any:

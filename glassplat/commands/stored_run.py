@@ -5,8 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from glassplat.data.dataset import Dataset, View, load_dataset
+import torch
+from torch import Tensor
+
+from glassplat.data.dataset import TEST_EVERY, Dataset, PointCloud, View, load_dataset
 from glassplat.data.errors import InputError, first_names, input_checked
+from glassplat.files.cameras_json import read_cameras
 from glassplat.files.picture_paths import picture_paths
 from glassplat.kernels.devices import DeviceName, chosen_device
 from glassplat.render.frame import Renderer
@@ -53,7 +57,9 @@ def open_run(path: Path, device: DeviceName = "auto", data: Path | None = None) 
 
 
 def _capture(directory: RunDirectory, recipe: Any, moved: Path | None) -> Dataset:
-    """The capture of a run, where it was or where it is said to be now."""
+    """The capture of a run, where it was or where it is said to be now; of an imported scene its cameras alone."""
+    if directory.imported.is_file() and moved is None:
+        return _without_photographs(directory)
     settings = directory.settings()
     data = Path(settings.data) if moved is None else moved
     if moved is None and not data.is_dir():
@@ -69,6 +75,21 @@ def _capture(directory: RunDirectory, recipe: Any, moved: Path | None) -> Datase
     if moved is not None:
         _check_same(directory, dataset)
     return dataset
+
+
+def _without_photographs(directory: RunDirectory) -> Dataset:
+    """The cameras of a scene that was imported, as views that have no photographs."""
+    with input_checked():
+        cameras = sorted(read_cameras(directory.path / "cameras.json"), key=lambda named: named[0])
+
+    def no_photograph() -> Tensor:
+        raise InputError(f"{directory.path} was imported and has no photographs; this command needs those it shows")
+
+    views = tuple(View(name, camera, directory.path / name, no_photograph) for name, camera in cameras)
+    points = PointCloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
+    test = views[::TEST_EVERY]
+    train = tuple(view for view in views if view not in test)
+    return Dataset(directory.path, train, test, points, extent=1.0)
 
 
 def _check_same(directory: RunDirectory, dataset: Dataset) -> None:

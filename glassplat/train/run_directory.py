@@ -97,6 +97,11 @@ class RunDirectory:
         return self.path / "results.json"
 
     @property
+    def imported(self) -> Path:
+        """Where the source of a scene is recorded that was imported, and not trained."""
+        return self.path / "imported.json"
+
+    @property
     def is_saved(self) -> bool:
         """Whether there is something in it that took training to make."""
         return any((self.path / name).exists() for name in (self.checkpoint.name, self.results.name, "point_cloud"))

@@ -42,7 +42,7 @@ def test_the_photographs_need_not_be_there(tmp_path: Path) -> None:
 
 def test_another_program_reads_the_ply(tmp_path: Path) -> None:
     output, scene = exported(tmp_path, "--layer", "transmission", "--formats", "ply"), true_scene()
-    assert sorted(path.name for path in output.iterdir()) == ["glassplat.json", "scene.ply"]
+    assert sorted(path.name for path in output.iterdir()) == ["cameras.json", "glassplat.json", "scene.ply"]
     theirs = gsply.plyread(str(output / "scene.ply"))
     np.testing.assert_array_equal(theirs.means, scene.primary.means)
     np.testing.assert_array_equal(theirs.sh0, scene.primary.sh[:, 0])

@@ -197,6 +197,30 @@ def test_a_disc_across_the_near_plane_may_cover_the_whole_image() -> None:
     assert found.radii[0, 0].tolist() == [WIDTH, HEIGHT]
 
 
+def test_a_disc_across_the_near_plane_is_culled_where_all_behind_the_plane_lies_beside_the_image() -> None:
+    """Nothing that is culled would have been seen: a camera with a much wider image draws nothing within the window."""
+    generator = torch.Generator().manual_seed(4)
+    means = torch.randn(400, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.4, 0.4, 0.2]) + 0.3
+    raw = RawGaussians(
+        means, torch.randn(400, 4, generator=generator, dtype=torch.float64),
+        torch.full((400, 2), -2.0, dtype=torch.float64), torch.full((400,), 3.0, dtype=torch.float64),
+        torch.zeros(400, 1, 3, dtype=torch.float64),
+    )  # fmt: skip
+    camera, margin = front_camera(), 400
+    shift = torch.tensor([0.0, 0.0, margin, margin], dtype=torch.float64)
+    wide = camera._replace(intrinsics=camera.intrinsics + shift, width=WIDTH + 2 * margin, height=HEIGHT + 2 * margin)
+    found, everything = (project_discs(raw, c, sh_degree=0, near=0.05) for c in (camera, wide))
+    crossing = (everything.outline_conics[0] == 0).all(-1) & (everything.radii[0, :, 0] > 0)
+    lost = crossing & (found.radii[0, :, 0] == 0)
+    assert int(lost.sum()) > 20 and int((crossing & ~lost).sum()) > 20
+    x, y = torch.meshgrid(torch.arange(WIDTH) + 0.5 + margin, torch.arange(HEIGHT) + 0.5 + margin, indexing="xy")
+    offset = torch.stack([x, y], -1)[:, :, None] - everything.means2d[0, lost]
+    u, v, e = ((offset * everything.maps[0, lost, i : i + 2]).sum(-1) for i in (0, 2, 4))
+    e = 1 + e
+    shown = (e > 0) & (everything.depths[0, lost] > 0.05 * e) & (u * u + v * v <= 9 * e * e)
+    assert not shown.any()
+
+
 def test_threads_do_not_change_a_bit() -> None:
     discs, cameras = random_discs(2000, dtype=torch.float32), random_cameras(2, dtype=torch.float32)
 

@@ -29,8 +29,8 @@ def find_chromium() -> str | None:
 class Browser:
     """One tab of one browser; use it in a `with` statement."""
 
-    def __init__(self, page: Path, width: int = 640, height: int = 480, *, query: str = "#still") -> None:
-        """Opens a page from its file."""
+    def __init__(self, page: Path | str, width: int = 640, height: int = 480, *, query: str = "#still") -> None:
+        """Opens a page from its file, or from its address."""
         self._profile = tempfile.TemporaryDirectory()
         (to_read, self._to_write), (self._from_read, from_write) = os.pipe(), os.pipe()
         # The browser reads its third descriptor and writes its fourth; a shell moves them there.
@@ -57,7 +57,7 @@ class Browser:
         for domain in ("Page", "Runtime", "Network", "Log"):
             self._ask(f"{domain}.enable")
         self._ask("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
-        self._ask("Page.navigate", url=page.resolve().as_uri() + query)
+        self._ask("Page.navigate", url=page if isinstance(page, str) else page.resolve().as_uri() + query)
         while not any(event.get("method") == "Page.loadEventFired" for event in self.events):
             self.events.append(self._next())
 

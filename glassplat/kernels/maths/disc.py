@@ -126,10 +126,12 @@ class OutlineMaths(NamedTuple):
         outline: (dx, dy, xx, xy, yy, half width, half height): an ellipse that encloses what the disc covers, its
             centre as an offset from the disc's and its conic such that opacity exp(-q / 2) falls to 1/255 on it. A
             conic of zeros is the whole image: the disc crosses the near plane.
+        box: (left, right, top, bottom), pixels from the principal point, of what such a disc covers behind that plane.
     """
 
     reach: Scalar
     outline: Scalar
+    box: Scalar
 
 
 def outline_maths() -> OutlineMaths:
@@ -165,7 +167,46 @@ def outline_maths() -> OutlineMaths:
         scale = 2.0 * math.log(np.float64(opacity) / ALPHA_MIN) / (s_xx * s_yy - s_xy * s_xy)
         return dx, dy, s_yy * scale, -s_xy * scale, s_xx * scale, math.sqrt(s_xx), math.sqrt(s_yy)
 
-    return OutlineMaths(reach, outline)
+    return OutlineMaths(reach, outline, _box())
+
+
+def _box() -> Scalar:
+    low_pass = LOW_PASS
+
+    @inlined
+    def box(m, p, q, deviations, squared, near, fx, fy):  # type: ignore[no-untyped-def]
+        """The corners of a rectangle in the disc's plane, one side of it along the depth, cut off at the near plane."""
+        a, b = np.float64(p[2] * deviations[0]), np.float64(q[2] * deviations[1])
+        steepness, depth, reach = math.sqrt(a * a + b * b), np.float64(m[2]), math.sqrt(squared)
+        # However near the plane, what lies on it does not project.
+        first, last = -reach, reach
+        if steepness > 0.0:
+            first = max(-reach, (max(near, 1e-6 * depth) - depth) / steepness)
+            a, b = a / steepness, b / steepness
+        u_x, u_y = np.float64(p[0] * deviations[0]), np.float64(p[1] * deviations[0])
+        v_x, v_y = np.float64(q[0] * deviations[1]), np.float64(q[1] * deviations[1])
+        along_x, along_y, across_x, across_y = (
+            a * u_x + b * v_x,
+            a * u_y + b * v_y,
+            a * v_x - b * u_x,
+            a * v_y - b * u_y,
+        )
+        x, y, spot = fx * m[0] / depth, fy * m[1] / depth, low_pass * reach
+        left, right, top, bottom = x - spot, x + spot, y - spot, y + spot
+        for end in range(2):
+            way = first if end == 0 else last
+            behind = depth + way * steepness
+            x, y = fx * (m[0] + way * along_x) / behind, fy * (m[1] + way * along_y) / behind
+            wide, high = abs(fx * reach * across_x / behind), abs(fy * reach * across_y / behind)
+            left, right, top, bottom = (
+                min(left, x - wide),
+                max(right, x + wide),
+                min(top, y - high),
+                max(bottom, y + high),
+            )
+        return left, right, top, bottom
+
+    return box
 
 
 def _clamped_ellipse() -> Scalar:

@@ -28,8 +28,8 @@ def project_discs(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: i
     the camera's clip plane, it is seen from its edge (the cosine between its normal and the ray to its centre is at
     most 1e-3), its outline lies beside the camera's window, its opacity is at most 1/255, it has no size (a log scale
     beyond -40 or 40), or a parameter or its map is not finite. Then its radii and all its other values are zero and it
-    gets no gradient from that camera. A disc that reaches through the near plane is kept: its outline is the whole
-    image, and `composite_discs` leaves out what lies before the plane.
+    gets no gradient from that camera. A disc that reaches through the near plane is kept where what lies behind
+    that plane may be seen: then its outline is the whole image, and `composite_discs` leaves out what lies before it.
 
     Colours are those of `project`: along the direction from the camera centre, -A^T t, to the mean. A mirrored,
     left-handed A is as good as any.

@@ -132,8 +132,38 @@ def _visible(projected: ProjectedDiscs, gaussians: RawGaussians, cameras: Camera
         windows = torch.tensor([[0, 0, cameras.width, cameras.height]], dtype=projected.means2d.dtype)
     first, last = windows[:, None, :2], windows[:, None, 2:]
     low, high = projected.outline_centers - projected.radii, projected.outline_centers + projected.radii
-    everywhere = (projected.outline_conics == 0).all(dim=-1)
-    return visible & (everywhere | ((high > first) & (low < last)).all(dim=-1))
+    crossing = (projected.outline_conics == 0).all(dim=-1, keepdim=True)
+    lowest, highest = _crossing_boxes(gaussians, cameras, projected.opacities, near)
+    low, high = torch.where(crossing, lowest, low), torch.where(crossing, highest, high)
+    return visible & ((high > first) & (low < last)).all(dim=-1)
+
+
+def _crossing_boxes(
+    gaussians: RawGaussians, cameras: CameraBatch, opacities: Tensor, near: float
+) -> tuple[Tensor, Tensor]:
+    """Lowest and highest pixel coordinates [C, N, 2] of what discs cover behind the near plane.
+
+    Those of a rectangle around each disc, with one side along the depth, cut off at the plane, and of the low-pass.
+    """
+    poses, lenses = cameras.cam_from_world.double(), cameras.intrinsics.double()
+    linear, offset = poses[:, :3, :3], poses[:, :3, 3]
+    focal, middle = lenses[:, None, :2], lenses[:, None, 2:]
+    centers = gaussians.means.double() @ linear.mT + offset[:, None]
+    axes = rotations(gaussians.quats.double())[..., :2] * torch.exp(gaussians.log_scales.double())[:, None]
+    sides = torch.einsum("cij,njk->cnki", linear, axes)
+    slopes, depths = sides[..., 2], centers[..., 2:]
+    steepness = slopes.norm(dim=-1, keepdim=True)
+    reach = _squared_reach(opacities.double()).sqrt()[..., None]
+    turn = slopes / steepness
+    along = (turn[..., None] * sides).sum(-2)
+    across = turn[..., :1] * sides[..., 1, :] - turn[..., 1:] * sides[..., 0, :]
+    nearest = torch.maximum(torch.tensor(near, dtype=torch.float64), 1e-6 * depths)
+    first = torch.maximum((nearest - depths) / steepness, -reach)
+    points = [centers + way * along + side * reach * across for way in (first, reach) for side in (-1, 1)]
+    corners = torch.stack([point[..., :2] / point[..., 2:] * focal for point in points])
+    spot, place = LOW_PASS * reach, centers[..., :2] / depths * focal
+    lowest = torch.minimum(corners.amin(0), place - spot) + middle
+    return lowest.to(opacities.dtype), (torch.maximum(corners.amax(0), place + spot) + middle).to(opacities.dtype)
 
 
 def _faces(gaussians: RawGaussians, cameras: CameraBatch) -> Tensor:

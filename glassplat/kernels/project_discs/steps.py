@@ -101,8 +101,7 @@ def _towards(real: type) -> Scalar:
 def _place(real: type) -> Scalar:
     tangents, towards, pose = _tangents(real), _towards(real), view_steps(real).pose
     crossed, faces, map_of, _ = disc_maths(real)
-    is_finite, outline = shape_maths(real).is_finite, outline_maths().outline
-    reach = outline_maths().reach
+    is_finite, (reach, outline, box) = shape_maths(real).is_finite, outline_maths()
     one, alpha_min = real(1.0), real(ALPHA_MIN)
 
     @inlined
@@ -123,10 +122,15 @@ def _place(real: type) -> Scalar:
         dx, dy, xx, xy, yy, wide, high = outline(found, opacity, nearest, np.float64(near), size[0], size[1])
         u, v = fx * m[0] / m[2] + intrinsics[c, 2], fy * m[1] / m[2] + intrinsics[c, 3]
         x, y = u + real(dx), v + real(dy)
-        across_window = x + real(wide) > windows[c, 0] and x - real(wide) < windows[c, 2]
-        down_window = y + real(high) > windows[c, 1] and y - real(high) < windows[c, 3]
+        left, right, top, bottom = x - real(wide), x + real(wide), y - real(high), y + real(high)
+        if xx == 0.0:
+            reached = box(m, p, q, deviations, reach(opacity), np.float64(near), fx, fy)
+            left, right = real(reached[0]) + intrinsics[c, 2], real(reached[1]) + intrinsics[c, 2]
+            top, bottom = real(reached[2]) + intrinsics[c, 3], real(reached[3]) + intrinsics[c, 3]
         # Written so that NaN fails every comparison and the disc stays culled.
-        if not ((across_window and down_window) or (xx == 0.0 and is_finite(u) and is_finite(v))):
+        across_window = right > windows[c, 0] and left < windows[c, 2]
+        down_window = bottom > windows[c, 1] and top < windows[c, 3]
+        if not (across_window and down_window and is_finite(u) and is_finite(v)):
             return
         side = towards(axes[2], mean, lens, c)
         means2d[c, n, 0], means2d[c, n, 1], depths[c, n], opacities[c, n] = u, v, m[2], opacity

@@ -1,0 +1,1 @@
+"""Looking at a scene in the browser while this program renders it."""

@@ -1,0 +1,108 @@
+"""The render loop: coarse before sharp, nothing stale, everybody in turn, one picture at a time."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from glassplat.viewer.render_loop import LEAST_WIDTH, Picture, RenderLoop
+
+SIZE = (1280, 720)
+
+
+class Recorder:
+    """Draws grey pictures that say what they are of, when it is let; remembers what was shown."""
+
+    def __init__(self, *, held: bool = False) -> None:
+        self.drawn: list[tuple[int, int]] = []
+        self.shown: list[tuple[int, int, bool]] = []
+        self.let = threading.Event()
+        self.most_at_once, self._at_once = 0, 0
+        if not held:
+            self.let.set()
+        self.loop: RenderLoop[int] = RenderLoop(self.draw, self.show)
+
+    def draw(self, wish: int, rows: int) -> Picture:
+        self._at_once += 1
+        self.most_at_once = max(self.most_at_once, self._at_once)
+        self.drawn.append((wish, rows))
+        self.let.wait()
+        if wish < 0:
+            self._at_once -= 1
+            raise ValueError("cannot be drawn")
+        time.sleep(0.01 * rows / SIZE[1])
+        self._at_once -= 1
+        return np.full((rows, round(rows * SIZE[0] / SIZE[1]), 3), wish, dtype=np.uint8)
+
+    def show(self, client: int, picture: Picture, is_sharp: bool) -> None:
+        self.shown.append((client, int(picture[0, 0, 0]), is_sharp))
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    while not condition():
+        time.sleep(0.002)
+
+
+def slow(recorder: Recorder) -> None:
+    """As if a sharp picture took ten times what a coarse one may."""
+    recorder.loop._seconds_per_pixel = 1e-6
+
+
+def test_a_coarse_picture_comes_first_and_a_sharp_one_follows() -> None:
+    recorder = Recorder(held=True)
+    slow(recorder)
+    recorder.loop.ask(1, 7, SIZE)
+    recorder.let.set()
+    wait_until(lambda: len(recorder.shown) == 2)
+    recorder.loop.stop()
+    assert recorder.shown == [(1, 7, False), (1, 7, True)]
+    (_, coarse), (_, sharp) = recorder.drawn
+    assert sharp == SIZE[1] and coarse < sharp and coarse * SIZE[0] / SIZE[1] >= LEAST_WIDTH - 1
+
+
+def test_what_is_drawn_quickly_is_sharp_at_once() -> None:
+    recorder = Recorder()
+    recorder.loop.ask(1, 7, (640, 360))
+    wait_until(lambda: bool(recorder.shown))
+    recorder.loop.stop()
+    assert recorder.shown == [(1, 7, True)]
+
+
+def test_pictures_of_the_past_are_not_shown() -> None:
+    recorder = Recorder(held=True)
+    recorder.loop.ask(1, 1, SIZE)
+    wait_until(lambda: len(recorder.drawn) == 1)
+    for wish in (2, 3, 4):
+        recorder.loop.ask(1, wish, SIZE)
+    recorder.let.set()
+    wait_until(lambda: (1, 4, True) in recorder.shown)
+    recorder.loop.stop()
+    assert {wish for _, wish, _ in recorder.shown} == {4}
+
+
+def test_clients_take_turns_and_one_picture_is_drawn_at_a_time() -> None:
+    recorder = Recorder(held=True)
+    slow(recorder)
+    for client in range(5):
+        recorder.loop.ask(client, 10 + client, SIZE)
+    recorder.let.set()
+    wait_until(lambda: sum(sharp for *_, sharp in recorder.shown) == 5)
+    recorder.loop.stop()
+    assert {client for client, *_ in recorder.shown[:5]} == set(range(5))
+    assert recorder.most_at_once == 1
+
+
+def test_who_has_gone_is_forgotten_and_errors_end_nothing() -> None:
+    recorder = Recorder(held=True)
+    recorder.loop.ask(1, 1, SIZE)
+    wait_until(lambda: len(recorder.drawn) == 1)
+    recorder.loop.forget(1)
+    recorder.loop.ask(2, -1, SIZE)
+    recorder.loop.ask(3, 3, SIZE)
+    recorder.let.set()
+    wait_until(lambda: (3, 3, True) in recorder.shown)
+    recorder.loop.stop()
+    assert {client for client, *_ in recorder.shown} == {3}

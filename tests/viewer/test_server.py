@@ -1,0 +1,58 @@
+"""The viewer serves a browser."""
+
+from __future__ import annotations
+
+import socket
+import time
+from pathlib import Path
+
+import pytest
+
+from glassplat.cli import main
+from glassplat.render.planar import Planar
+from glassplat.viewer.server import Shown, Viewer
+from tests.commands.tiny_run import write_run
+from tests.publish.browser import Browser, find_chromium
+from tests.train.tiny_capture import tiny_capture, true_scene
+
+VIEWS = tiny_capture().train
+SHOWN = Shown(
+    "tiny",
+    true_scene(),
+    Planar(),
+    ("rgb", "strength"),
+    [(view.name, view.camera) for view in VIEWS],
+    {view.name: lambda: VIEWS[0].photo for view in VIEWS},
+)
+
+
+@pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
+def test_a_browser_is_shown_sharp_pictures_and_may_leave() -> None:
+    viewer = Viewer(SHOWN, "127.0.0.1", 8790)
+    shown: list[bool] = []
+    show = viewer._show
+    viewer._loop._show = lambda client, picture, is_sharp: (shown.append(is_sharp), show(client, picture, is_sharp))
+    try:
+        with Browser(f"http://127.0.0.1:{viewer.port}/", 400, 300) as browser:
+            while not any(shown):
+                time.sleep(0.05)
+            (client,) = viewer._clients.values()
+            shown.clear()
+            client.stand_at(2)
+            client._glass.value = "mirror"
+            while not any(shown):
+                time.sleep(0.05)
+            assert "Layer" in browser.evaluate("document.body.innerText")
+        while viewer._clients:
+            time.sleep(0.05)
+    finally:
+        viewer.stop()
+
+
+def test_a_port_in_use_gets_a_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = write_run(tmp_path / "run")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        assert main(["view", str(run), "--port", str(taken.getsockname()[1])]) == 2
+    assert "choose another --port" in " ".join(capsys.readouterr().err.split())
