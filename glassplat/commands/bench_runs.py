@@ -184,7 +184,7 @@ def execute(
     """
     for run in runs:
         run.check()
-        check_length(run.train.recipe.stages(run.train.seed), run.train.iterations)
+        check_length(run.train.recipe.stages(run.train.seed, run.train.iterations), run.train.iterations)
     finished = _finished(runs)
     after_each(finished)
     if finished:

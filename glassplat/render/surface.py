@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -11,12 +12,21 @@ from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
 from glassplat.kernels.pane_hits.reference import ray_grid
 from glassplat.kernels.shade_environment.shaded import NORMAL_AT, NORMAL_MIN, STRENGTH_AT, SURFACE_CHANNELS
-from glassplat.kernels.splats import Projected
 from glassplat.kernels.surface_channels import surface_channels
+from glassplat.render.discs import blended_discs, disc_layers, projected_discs
 from glassplat.render.frame import ScreenPass
-from glassplat.render.rasterize import joined_probe, joined_splats, mean_depth, over_background
+from glassplat.render.rasterize import (
+    NEAR_PER_EXTENT,
+    joined_probe,
+    joined_splats,
+    mean_depth,
+    over_background,
+    project_gaussians,
+    screen_pass,
+    shown,
+)
 from glassplat.scene.camera import Camera
-from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -29,6 +39,9 @@ class Surface:
         strength: [H, W] share of the reflection.
         depth: [H, W] mean camera z, 0 where nothing is.
         alpha: [H, W] coverage.
+        direct: [N] bool, which Gaussians reach a pixel.
+        screen: the record of the pass, if it was probed.
+        extra: further layers, of discs those that say how thin the surface is.
     """
 
     base: Tensor
@@ -36,10 +49,14 @@ class Surface:
     strength: Tensor
     depth: Tensor
     alpha: Tensor
+    direct: Tensor
+    screen: tuple[ScreenPass, ...] = ()
+    extra: Mapping[str, Tensor] = field(default_factory=dict)
 
     def layers(self) -> dict[str, Tensor]:
         """The layers of a frame."""
         return {
+            **self.extra,
             "base": self.base,
             "normal": self.normal,
             "strength": self.strength,
@@ -49,14 +66,21 @@ class Surface:
 
 
 def seen_surface(
-    gaussians: Gaussians,
-    camera: Camera,
-    projected: Projected,
-    *,
-    background: tuple[float, float, float],
-    screen: tuple[ScreenPass, ...] = (),
+    scene: Scene, camera: Camera, *, background: tuple[float, float, float], probed: bool = False
 ) -> Surface:
-    """Blends the surfaces of Gaussians with a `logit_strength`, as `projected` into the camera."""
+    """Blends the surfaces of the primary Gaussians, which have a `logit_strength`: ellipsoids or discs."""
+    near = NEAR_PER_EXTENT * scene.extent
+    seen = _seen_discs if scene.primary.are_discs else _seen_ellipsoids
+    return seen(scene, camera, near, background, probed)
+
+
+def _seen_ellipsoids(
+    scene: Scene, camera: Camera, near: float, background: tuple[float, float, float], probed: bool
+) -> Surface:
+    """Depths are those of the centres."""
+    gaussians = scene.primary
+    projected = project_gaussians(gaussians, camera, near=near)
+    screen = (screen_pass("primary", projected),) if probed else ()
     channels = surface_channels(
         projected.colors[0],
         projected.radii[0],
@@ -77,6 +101,31 @@ def seen_surface(
         strength=image[..., STRENGTH_AT],
         depth=mean_depth(image[..., SURFACE_CHANNELS], alpha),
         alpha=alpha,
+        direct=shown(projected),
+        screen=screen,
+    )
+
+
+def _seen_discs(
+    scene: Scene, camera: Camera, near: float, background: tuple[float, float, float], probed: bool
+) -> Surface:
+    """Depths are those of the places where rays meet the discs."""
+    projected = projected_discs(scene.primary, camera, near=near)
+    screen = (screen_pass("primary", projected),) if probed else ()
+    strengths = torch.sigmoid(scene.primary.channels["logit_strength"])[None, :, None]
+    channels = torch.cat([projected.colors, projected.normals, strengths], dim=-1)
+    blended = blended_discs(projected, channels, camera, near=near, screen=screen)
+    image, extra = blended.image[0], disc_layers(blended, scene.extent)
+    alpha, depth = extra.pop("alpha"), extra.pop("depth")
+    return Surface(
+        base=over_background(image[..., :NORMAL_AT], alpha, background),
+        normal=image[..., NORMAL_AT:STRENGTH_AT],
+        strength=image[..., STRENGTH_AT],
+        depth=depth,
+        alpha=alpha,
+        direct=shown(projected),
+        screen=screen,
+        extra=extra,
     )
 
 

@@ -19,9 +19,6 @@ from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
     check_colored,
     over_background,
-    project_gaussians,
-    screen_pass,
-    shown,
 )
 from glassplat.render.surface import Surface, reflected_rays, seen_surface, view_directions
 from glassplat.scene.camera import Camera
@@ -41,23 +38,28 @@ class Traced:
         d_ref = d - 2 (d . n) n,    n = N / |N|                                 (Eq. 4)
         c = (1 - beta) c_base + beta c_ref                                      (Eq. 5)
 
-    c_ref is what the ray from x along d_ref meets of the scene's `surroundings`, a set of Gaussians of their own, and
-    behind these the `environment` where the scene has one (not in the paper), else the background. n_i is the shortest
-    axis of a Gaussian, turned to the camera. Colours are sRGB, as in the paper.
+    The scene's Gaussians are discs, as in the paper, or ellipsoids, whose n_i is the shortest axis, turned to the
+    camera. c_ref is what the ray from x along d_ref meets of the scene's `surroundings`, a set of Gaussians of their
+    own, and behind these the `environment` where the scene has one (not in the paper), else the background. Without
+    surroundings it is the environment alone. Colours are sRGB, as in the paper.
 
     Layers: `base`, `reflection` [H, W, 3]; `normal` [H, W, 3] in world axes, blended and not normalised; `strength`,
-    `depth`, `alpha` [H, W]; `surroundings` [H, W, 3], with the environment those behind each pixel, if asked for.
+    `depth`, `alpha` [H, W], of discs also `median_depth` and `distortion`; `surroundings` [H, W, 3], with the
+    environment those behind each pixel, if asked for.
 
     Attributes:
         background: colour behind everything, also behind surroundings without an environment, sRGB.
         least_strength: rays are traced where the strength is larger (Table 6). Elsewhere the environment alone is
             mirrored, and nothing where there is none.
+        faintest: what reflects less mirrors nothing. 0 for training, where a strength learns from what it would
+            reflect.
         joint: False keeps the reflection's gradient from the surfaces (Table 4, ablation).
         surroundings: also render the layer `surroundings`.
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     least_strength: float = 0.0
+    faintest: float = INVISIBLE
     joint: bool = True
     surroundings: bool = False
 
@@ -65,21 +67,22 @@ class Traced:
         """Renders `scene` from `camera`, where the scene's tensors are.
 
         Raises:
-            ValueError: the scene has no surroundings, or its Gaussians no reflection strength.
+            ValueError: the scene has neither surroundings nor an environment, or its Gaussians no reflection strength.
         """
-        check_surrounded(scene)
+        check_mirrored(scene)
         camera = camera.to(scene.primary.means.device)
-        projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
-        screen = (screen_pass("primary", projected),) if probed else ()
-        surface = seen_surface(scene.primary, camera, projected, background=self.background, screen=screen)
+        surface = seen_surface(scene, camera, background=self.background, probed=probed)
         chosen = (surface.strength > self.least_strength) & (surface.depth > 0)
+        if not len(scene.surroundings):
+            chosen = torch.zeros_like(chosen)
         places, directions = reflected_rays(surface, camera, chosen)
         if not self.joint:
             places, directions = places.detach(), directions.detach()
-        near = START_PER_EXTENT * scene.extent
-        colors = traced_colors(scene, places, directions, near, self.background)
         reflection, mirrors = self._elsewhere(scene, camera, surface, chosen)
-        reflection = reflection.index_put(torch.where(chosen), colors)
+        if len(scene.surroundings):
+            near = START_PER_EXTENT * scene.extent
+            colors = traced_colors(scene, places, directions, near, self.background)
+            reflection = reflection.index_put(torch.where(chosen), colors)
         share = torch.where(mirrors, surface.strength, torch.zeros_like(surface.strength))[..., None]
         layers = surface.layers() | {"reflection": reflection}
         if self.surroundings:
@@ -87,22 +90,22 @@ class Traced:
         return Frame(
             rgb=(1 - share) * surface.base + share * reflection,
             layers=layers,
-            direct=shown(projected),
-            screen=screen,
-            space=(space_pass(scene, places),) if probed else (),
+            direct=surface.direct,
+            screen=surface.screen,
+            space=(space_pass(scene, places),) if probed and len(scene.surroundings) else (),
         )
 
     def check(self, scene: Scene) -> None:
         """Raises ValueError where a scene lacks colours, or what reflection needs."""
         check_colored(scene.primary)
-        check_surrounded(scene)
+        check_mirrored(scene)
 
     def _elsewhere(self, scene: Scene, camera: Camera, surface: Surface, chosen: Tensor) -> tuple[Tensor, Tensor]:
         """[H, W, 3] what pixels mirror where no ray is traced, and [H, W] which ones mirror anything."""
         black = torch.zeros_like(surface.base)
         if scene.environment.is_empty:
             return black, chosen
-        others = ~chosen & (surface.strength > INVISIBLE) & (surface.depth > 0)
+        others = ~chosen & (surface.strength > self.faintest) & (surface.depth > 0)
         _, directions = reflected_rays(surface, camera, others)
         distant = torch.sigmoid(cube_lookup(scene.environment.raw, directions if self.joint else directions.detach()))
         return black.index_put(torch.where(others), distant), chosen | others
@@ -152,8 +155,7 @@ def mirrored_contributions(scene: Scene, camera: Camera) -> Tensor:
     camera = camera.to(scene.primary.means.device)
     part = scene.surroundings
     with torch.no_grad():
-        projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
-        surface = seen_surface(scene.primary, camera, projected, background=(0.0, 0.0, 0.0))
+        surface = seen_surface(scene, camera, background=(0.0, 0.0, 0.0))
         chosen = (surface.strength > INVISIBLE) & (surface.depth > 0)
         places, directions = reflected_rays(surface, camera, chosen)
     with torch.enable_grad():
@@ -165,9 +167,12 @@ def mirrored_contributions(scene: Scene, camera: Camera) -> Tensor:
     return sums[:, 0, 0] / SH_ZERO
 
 
-def check_surrounded(scene: Scene) -> None:
-    """Raises ValueError where a scene lacks what traced reflections need."""
-    if not len(scene.surroundings):
+def check_mirrored(scene: Scene) -> None:
+    """Raises ValueError where there is nothing to mirror, or nothing mirrors.
+
+    An environment alone will do, as before the surroundings have begun.
+    """
+    if not len(scene.surroundings) and scene.environment.is_empty:
         raise ValueError("the scene has no surroundings; expected one trained with `traced`")
     if "logit_strength" not in scene.primary.channels:
         raise ValueError(

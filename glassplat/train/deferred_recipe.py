@@ -37,8 +37,8 @@ from glassplat.scene.gaussians import SH_ZERO
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, ResetOpacity
 from glassplat.train.background import BLACK
-from glassplat.train.environment_entry import AddEnvironment
-from glassplat.train.optimizer import Rate
+from glassplat.train.environment_entry import AddEnvironment, StayMatte
+from glassplat.train.optimizer import PUBLISHED_ITERATIONS, Rate
 from glassplat.train.propagation import (
     DensifyWhilePropagating,
     GrowShAfterPropagation,
@@ -47,7 +47,7 @@ from glassplat.train.propagation import (
     RefineEnvironment,
     ResetRaised,
 )
-from glassplat.train.splat_recipe import GaussianRates, image_terms
+from glassplat.train.splat_recipe import GaussianRates, SplatRecipe, image_terms
 from glassplat.train.stage import Action, Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
 
@@ -99,8 +99,10 @@ class DeferredRecipe:
         consistency_weight: weight of the difference between normals and the slope of the depths, while normals spread.
         propagation: how normals spread and colours are sabotaged.
         schedule: when they do.
+        least_iterations: of the shortest run in which anything reflects. A shorter one would be over before the colours
+            have learnt what the reflections leave to them; it trains like one of `splat`.
         hurry_matte: raise the learning rates to those of `splat` for the rest of a run in which nothing was found that
-            reflects.
+            reflects, and for all of one that is too short to look for it.
         propagation_interval: steps between densifications while normals spread; None keeps `densify.interval`.
         rates: learning rates of the Gaussians; they do not rise in short runs, which costs a mirror ball its normals
             (docs/experiments.md).
@@ -130,6 +132,7 @@ class DeferredRecipe:
     consistency_weight: NotNegative = 0.3
     propagation: NormalPropagation = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
+    least_iterations: Several = 6000
     hurry_matte: bool = True
     propagation_interval: Several | None = None
     rates: GaussianRates = field(default_factory=partial(GaussianRates, short_run_power=0.0))
@@ -152,6 +155,7 @@ class DeferredRecipe:
             consistency_weight=0.0,
             propagation=NormalPropagation(sabotage=0.4 * SH_ZERO),
             schedule=PropagationSchedule(end="fixed", stop=24_000 / CODE_ITERATIONS, pause=200, last_reset=False),
+            least_iterations=1,
             hurry_matte=False,
             propagation_interval=500,
             rates=GaussianRates(decay=30_000 / CODE_ITERATIONS, short_run_power=0.0),
@@ -183,8 +187,10 @@ class DeferredRecipe:
         """The renderer of the finished scene, with all its layers."""
         return Deferred(self.background or BLACK, self.shading, least_strength=INVISIBLE)
 
-    def stages(self, seed: int) -> tuple[Stage, ...]:
-        """Bootstrap, then everything; what changes in between is up to `Propagate`."""
+    def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
+        """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has one stage."""
+        if iterations < self.least_iterations:
+            return self._matte_stages(seed, iterations)
         population = self._population()
         image = image_terms(self.ssim_weight, self.view_dependence_weight)
         bootstrap = Stage(
@@ -219,7 +225,7 @@ class DeferredRecipe:
                 RefineEnvironment(self._doublings(), self.texels),
             ),
             motions=population.motions,
-            entry=AddEnvironment(min(self.first_texels, self.texels), self.region, self.find_region),
+            entry=self._entry(),
             densify_until=population.densify_until,
         )
         refinement = replace(
@@ -231,6 +237,28 @@ class DeferredRecipe:
             losses=tuple(term for term in reflection.losses if term.name != "consistency"),
         )
         return bootstrap, reflection, refinement
+
+    def _matte_stages(self, seed: int, iterations: int) -> tuple[Stage, ...]:
+        """The one stage of a run that is too short for normals to spread: that of `splat`."""
+        usual, power = Rhythm(), GaussianRates().short_run_power
+        plain = SplatRecipe(
+            sh_degree=self.sh_degree,
+            ssim_weight=self.ssim_weight,
+            view_dependence_weight=self.view_dependence_weight,
+            background=self.background,
+            rates=replace(self.rates, short_run_power=power) if self.hurry_matte else self.rates,
+            rhythm=replace(self.rhythm, beat=usual.beat, least=usual.least),
+            strategy=self.strategy,
+            densify=self.densify,
+            mcmc=self.mcmc,
+        )
+        (stage,) = plain.stages(seed)
+        entry = StayMatte(iterations, self.least_iterations, self._entry())
+        return (replace(stage, name="as splat", entry=entry),)
+
+    def _entry(self) -> AddEnvironment:
+        """How things begin to reflect."""
+        return AddEnvironment(min(self.first_texels, self.texels), self.region, self.find_region)
 
     def contradiction(self) -> str | None:
         """What is wrong with the options together, if anything."""

@@ -31,7 +31,7 @@ from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, GrowSh, PerturbOpacity, ResetOpacity
 from glassplat.train.background import BLACK
-from glassplat.train.optimizer import Rate
+from glassplat.train.optimizer import PUBLISHED_ITERATIONS, Rate
 from glassplat.train.photo_exposure import PhotoExposure
 from glassplat.train.plane_entry import PlaneEntry, fitted_planes
 from glassplat.train.splat_recipe import GaussianRates, image_terms
@@ -242,7 +242,7 @@ class PlanarRecipe:
             nearest_only=self.panes == "nearest",
         )
 
-    def stages(self, seed: int) -> tuple[Stage, ...]:
+    def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
         """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
         first, second, third = self.stage_shares
         population = self._population()

@@ -14,6 +14,7 @@ from glassplat.files.json_text import parse_json
 from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
 from glassplat.train.deferred_recipe import DeferredRecipe
+from glassplat.train.optimizer import PUBLISHED_ITERATIONS
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Stage
@@ -37,8 +38,8 @@ class Recipe(Protocol):
         """The first scene."""
         ...
 
-    def stages(self, seed: int) -> tuple[Stage, ...]:
-        """The training stages."""
+    def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
+        """The training stages of a run of this length; only where a method needs one does it matter."""
         ...
 
     def renderer(self) -> Renderer:

@@ -128,7 +128,7 @@ def run_training(
         OSError: the disk is full or fails; the last checkpoint stays.
     """
     recipe = settled(recipe, dataset)
-    stages = recipe.stages(settings.seed)
+    stages = recipe.stages(settings.seed, settings.iterations)
     check_length(stages, settings.iterations)
     check_output(directory, resume=resume)
     first = None if resume else first_state(recipe, settings, dataset, listen)

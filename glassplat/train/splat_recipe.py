@@ -18,7 +18,7 @@ from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import GrowSh
 from glassplat.train.background import BLACK
-from glassplat.train.optimizer import Rate
+from glassplat.train.optimizer import PUBLISHED_ITERATIONS, Rate
 from glassplat.train.photo_exposure import PhotoExposure
 from glassplat.train.stage import Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
@@ -152,7 +152,7 @@ class SplatRecipe:
         """The renderer of the finished scene, with all its layers."""
         return Splat(self.background or BLACK)
 
-    def stages(self, seed: int) -> tuple[Stage, ...]:
+    def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
         """One stage; of discs a new one whenever one of their terms begins to count."""
         population = self._population()
         first = Stage(

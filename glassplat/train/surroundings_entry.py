@@ -10,6 +10,7 @@ from glassplat.data.ranges import ESSENTIAL, InnerShare, Range, Share
 from glassplat.densify.edit import apply_edit
 from glassplat.densify.order import in_morton_order
 from glassplat.densify.reflectors import Search
+from glassplat.init.points import as_discs
 from glassplat.init.surroundings import (
     copied_surroundings,
     joined,
@@ -19,6 +20,7 @@ from glassplat.init.surroundings import (
 )
 from glassplat.render.frame import Renderer
 from glassplat.scene.gaussians import Gaussians
+from glassplat.train.propagation import search_anew
 from glassplat.train.state import TrainState
 
 
@@ -38,7 +40,7 @@ class SurroundingsStart:
             it mirrors, and has what it mirrors painted on, which rays would meet first.
     """
 
-    source: Annotated[Literal["box", "scene", "both"], ESSENTIAL] = "both"
+    source: Annotated[Literal["box", "scene", "both"], ESSENTIAL] = "scene"
     cells: Annotated[int, Range(1, 256)] | None = None
     per_cell: Annotated[int, Range(1, 1000)] = 5
     outside: Annotated[float, Range(0, 0.45)] = 0.005
@@ -68,6 +70,7 @@ class AddSurroundings:
         found = joined(*(parts or [self._in_box(state, dataset)]))
         ordered, _ = apply_edit(found, {}, in_morton_order(found.means), part="surroundings")
         state.scene = replace(state.scene, surroundings=ordered)
+        search_anew(state)
 
     def _parts(self, state: TrainState, dataset: Dataset) -> list[Gaussians]:
         parts = []
@@ -82,7 +85,7 @@ class AddSurroundings:
     def _in_box(self, state: TrainState, dataset: Dataset) -> Gaussians:
         camera = dataset.train[0].camera
         cells = self.start.cells or suitable_cells(camera.width * camera.height, self.start.per_cell)
-        return surroundings_in_box(
+        found = surroundings_in_box(
             percentile_box(dataset.points, self.start.outside),
             cells=cells,
             per_cell=self.start.per_cell,
@@ -90,3 +93,4 @@ class AddSurroundings:
             opacity=self.start.opacity,
             generator=state.generator("surroundings"),
         )
+        return as_discs(found, seed=state.seed) if state.scene.primary.are_discs else found

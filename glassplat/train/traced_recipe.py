@@ -22,9 +22,10 @@ from glassplat.data.ranges import (
 from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
 from glassplat.densify.propagate import NormalPropagation
+from glassplat.init.points import as_discs
 from glassplat.losses.monocular import MonocularNormals
 from glassplat.losses.term import LossTerm, weighted
-from glassplat.render.deferred import INVISIBLE, Deferred
+from glassplat.render.deferred import Deferred
 from glassplat.render.splat import Splat
 from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene.gaussians import SH_ZERO
@@ -32,8 +33,9 @@ from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, GrowSh, PruneIdle, ResetOpacity
 from glassplat.train.background import BLACK
 from glassplat.train.deferred_recipe import DeferredRecipe, ReflectionRates, Texels
+from glassplat.train.optimizer import PUBLISHED_ITERATIONS
 from glassplat.train.propagation import Propagate, PropagationSchedule, RefineEnvironment
-from glassplat.train.splat_recipe import GaussianRates
+from glassplat.train.splat_recipe import GaussianRates, Primitive
 from glassplat.train.stage import Action, Every, Stage
 from glassplat.train.strategy import Rhythm, Strategy
 from glassplat.train.surroundings_entry import AddSurroundings, SurroundingsStart
@@ -74,6 +76,7 @@ class TracedRecipe:
     """EnvGS: a strength and a normal for every Gaussian, and a second set of Gaussians that reflections show.
 
     Attributes:
+        primitive: what scene and surroundings are made of: ellipsoids, or discs (paper).
         sh_degree: highest degree of the view-dependent colour, which grows once propagation has ended.
         ssim_weight: lambda, share of D-SSIM in the photometric loss.
         view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
@@ -113,6 +116,7 @@ class TracedRecipe:
 
     method: ClassVar[str] = "traced"
 
+    primitive: Annotated[Primitive, ESSENTIAL] = "ellipsoid"
     sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
     ssim_weight: Share = 0.2
     view_dependence_weight: NotNegative = 0.0
@@ -196,17 +200,20 @@ class TracedRecipe:
 
     def initialise(self, dataset: Dataset) -> Scene:
         """The first scene: one Gaussian per point that hardly reflects, and nothing to mirror yet."""
-        return self._distant().initialise(dataset)
+        scene = self._distant().initialise(dataset)
+        return replace(scene, primary=as_discs(scene.primary)) if self.primitive == "disc" else scene
 
     def renderer(self) -> Traced | Deferred:
         """The renderer of the finished scene, with all its layers."""
-        if self.mirrors == "environment":
+        if self.mirrors == "environment" and self.primitive == "ellipsoid":
             return self._distant().renderer()
-        return Traced(self.background or BLACK, max(self.least_strength, INVISIBLE))
+        return Traced(self.background or BLACK, self.least_strength)
 
-    def stages(self, seed: int) -> tuple[Stage, ...]:
+    def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
         """Bootstrap, distant reflections, near reflections, and everything without propagation."""
         bootstrap, distant, refinement = self._distant().stages(seed)
+        if self.primitive == "disc":
+            distant, refinement = self._rendered(distant), self._rendered(refinement)
         if self.consistency_to_end:
             refinement = replace(refinement, losses=distant.losses, renderer=distant.renderer)
         guided = weighted(LossTerm("monocular normals", self.monocular_weight, MonocularNormals()))
@@ -237,19 +244,20 @@ class TracedRecipe:
 
     def _tracing(self, stage: Stage) -> Stage:
         """A stage of `deferred` in which rays find what is mirrored."""
-        renderer = Traced(self.background or BLACK, self.least_strength, joint=self.joint)
+        stage = self._rendered(stage)
         return replace(
             stage,
-            renderer=renderer,
             rates={**stage.rates, **self.surroundings.rates.of("surroundings")},
-            actions=(*self._scene_actions(stage, renderer), *self._surroundings_actions(stage)),
+            actions=(*stage.actions, *self._surroundings_actions(stage)),
             densify_until=max(stage.densify_until, self.surroundings.densify.stop),
         )
 
-    def _scene_actions(self, stage: Stage, renderer: Traced) -> list[Action]:
-        """Those of the stage of `deferred`, of which propagation looks at what is traced."""
-        kept = [a for a in stage.actions if self.mirrors == "both" or not isinstance(a, RefineEnvironment)]
-        return [replace(action, renderer=renderer) if isinstance(action, Propagate) else action for action in kept]
+    def _rendered(self, stage: Stage) -> Stage:
+        """A stage of `deferred` with this method's renderer, which propagation looks through as well."""
+        renderer = Traced(self.background or BLACK, self.least_strength, faintest=0.0, joint=self.joint)
+        kept = [a for a in stage.actions if self.mirrors != "surroundings" or not isinstance(a, RefineEnvironment)]
+        actions = [replace(action, renderer=renderer) if isinstance(action, Propagate) else action for action in kept]
+        return replace(stage, renderer=renderer, actions=tuple(actions))
 
     def _surroundings_actions(self, stage: Stage) -> list[Action]:
         """What changes the surroundings, but for learning."""

@@ -29,7 +29,16 @@ def run(tmp_path: Path) -> Path:
     """A run of a few steps, whose capture knows its environment."""
     capture = write_object_capture(tmp_path / "ball")
     write_equirect(capture / "environment.exr", 0.2 + 0.6 * torch.rand(8, 16, 3))
-    options = ["--data", str(capture), "--output", str(tmp_path / "run"), "--iterations", "12"]
+    options = [
+        "--data",
+        str(capture),
+        "--output",
+        str(tmp_path / "run"),
+        "--iterations",
+        "12",
+        "--least-iterations",
+        "1",
+    ]
     assert main(["train", "deferred", *options, "--sh-degree", "1", "--texels", "8", "--first-texels", "4"]) == 0
     return tmp_path / "run"
 
@@ -40,6 +49,22 @@ def test_it_is_measured_against_true_normals_strength_and_environment(run: Path)
     assert results["method"] == "deferred"
     for name in ("normal_error_deg", "reflective_normal_error_deg", "strength_error", "environment_psnr"):
         assert results[name] is not None and results[name] > 0, name
+
+
+def test_a_run_too_short_to_reflect_tells_its_user_and_can_be_measured_and_rendered(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    capture, run = write_object_capture(tmp_path / "ball"), tmp_path / "run"
+    options = ["--data", str(capture), "--iterations", "12", "--sh-degree", "1"]
+    assert main(["train", "deferred", *options, "--output", str(run)]) == 0
+    assert "12 iterations are too few for normals to spread" in caplog.text
+    assert main(["train", "splat", *options, "--output", str(tmp_path / "splat")]) == 0
+    psnr = []
+    for trained in (run, tmp_path / "splat"):
+        assert main(["eval", str(trained)]) == 0
+        psnr.append(json.loads((trained / "results.json").read_text())["psnr"])
+    assert psnr[0] == pytest.approx(psnr[1], abs=1e-3)
+    assert main(["render", str(run), "--layers", *LAYERS, "--output", str(tmp_path / "layers")]) == 0
 
 
 def test_every_layer_can_be_rendered(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

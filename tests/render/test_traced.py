@@ -62,6 +62,39 @@ def test_a_flat_mirror_shows_what_the_mirrored_camera_sees() -> None:
     assert float(expected.max()) > 0.3
 
 
+def flattened(gaussians: Gaussians) -> Gaussians:
+    return replace(gaussians, log_scales=gaussians.log_scales[:, :2].contiguous())
+
+
+def test_a_mirror_of_discs_shows_what_the_mirrored_camera_sees() -> None:
+    """Their depth is right wherever the camera looks, also where it does not look straight at the mirror."""
+    around = flattened(surroundings())
+    scene = Scene(flattened(mirror_wall()), extent=0.01, surroundings=around)
+    for camera in (camera_at(0.1, -0.2, 0.0), turned(camera_at(0.1, -0.2, 0.0))):
+        frame = Traced()(scene, camera)
+        expected = Traced(surroundings=True)(scene, mirrored(camera)).layers["surroundings"]
+        torch.testing.assert_close(frame.layers["reflection"], expected, atol=1e-5, rtol=0)
+        assert float(expected.max()) > 0.3
+
+
+def turned(camera: Camera, angle_rad: float = 0.3) -> Camera:
+    """The camera turned to the right about its own centre."""
+    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[0, 0], turn[0, 2], turn[2, 0], turn[2, 2] = cosine, -sine, sine, cosine
+    return replace(camera, cam_from_world=turn @ camera.cam_from_world)
+
+
+def test_discs_have_gradients_too() -> None:
+    scene, camera = glossy(), camera_at(0.0, 0.0, 0.0)
+    scene = replace(scene, primary=flattened(scene.primary), surroundings=flattened(scene.surroundings))
+    leaves = leaves_of(scene)
+    frame = Traced()(scene.with_parameters(leaves), camera)
+    gradients = torch.autograd.grad(frame.rgb.square().sum(), leaves.values())
+    assert all(bool(g.isfinite().all()) and float(g.abs().max()) > 0 for g in gradients)
+    assert {"distortion", "median_depth"} <= frame.layers.keys()
+
+
 def test_without_strength_it_is_the_base_bit_for_bit() -> None:
     scene = glossy()
     dull = replace(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 import torch
@@ -15,6 +15,7 @@ from glassplat.data.view import View
 from glassplat.densify.propagate import NormalPropagation
 from glassplat.densify.reflectors import Search
 from glassplat.render.deferred import Deferred
+from glassplat.scene.activations import logit
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import ResetOpacity
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
@@ -30,10 +31,12 @@ from glassplat.train.propagation import (
     ResetRaised,
 )
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
-from glassplat.train.splat_recipe import SplatRecipe
+from glassplat.train.run import run_training
+from glassplat.train.run_directory import RunDirectory, RunSettings
+from glassplat.train.splat_recipe import GaussianRates, SplatRecipe
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
-from glassplat.train.strategy import Rhythm
+from glassplat.train.strategy import Rhythm, Strategy
 from glassplat.train.trainer import train
 from tests.train.tiny_capture import tiny_capture
 
@@ -209,6 +212,7 @@ def propagated(search: Search, schedule: PropagationSchedule, beats: int = 10) -
         ("settled", [0.300, 0.305, 0.309, 0.5], 0.0, 50),
         ("settled", [0.0], 0.0, 30),
         ("settled", [0.02], 0.0, 30),
+        ("settled", [0.0], 0.15, 30),
         ("settled", [0.0], 0.5, 50),
         ("settled", [0.0, 0.2, 0.4, 0.6], 0.5, 80),
         ("fixed", [0.4], 0.0, 90),
@@ -220,6 +224,7 @@ def propagated(search: Search, schedule: PropagationSchedule, beats: int = 10) -
         "hardly grows",
         "nothing reflects",
         "hardly anything reflects",
+        "hardly anything looks like it",
         "nothing reflects, but looks like it",
         "found",
         "fixed",
@@ -237,7 +242,11 @@ def test_propagation_ends_when_no_more_reflectors_are_found(
 
 @pytest.mark.parametrize(
     ("share", "turns", "said"),
-    [(0.4, 0.0, None), (0.0, 0.0, "splat suits such a scene"), (0.004, 0.3, "30 % of what is seen .* --iterations")],
+    [
+        (0.4, 0.0, None),
+        (0.0, 0.12, "no more than 12 % of what is seen .* --region"),
+        (0.004, 0.3, "30 % of what is seen .* --iterations"),
+    ],
 )
 def test_where_nothing_reflects_the_run_hurries_on_and_says_so(
     share: float, turns: float, said: str | None, caplog: pytest.LogCaptureFixture
@@ -262,6 +271,48 @@ def test_where_nothing_reflects_the_rates_are_those_of_splat() -> None:
             factor = action.matte_rates[name].at(0.4, 1.0, iterations) if name in action.matte_rates else 1.0
             expected = rate.at(0.4, 1.0, iterations)
             assert reflection.rates[name].at(0.4, 1.0, iterations) * factor == pytest.approx(expected)
+
+
+def scene_after(recipe: Any, iterations: int, directory: Path) -> Scene:
+    settings = RunSettings("tiny", iterations=iterations)
+    run_training(recipe, settings, RunDirectory(directory), tiny_capture(), resume=False, listen=lambda message: None)
+    return load_checkpoint(directory / "checkpoint.safetensors").scene
+
+
+@pytest.mark.parametrize(("strategy", "iterations"), [("default", 760), ("mcmc", 120)])
+def test_a_run_too_short_for_normals_is_one_of_splat_and_says_so(
+    strategy: Strategy, iterations: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    # Of the opacity resets, the first falls into the longer run.
+    choices: dict[str, Any] = {"sh_degree": 1, "strategy": strategy, "rhythm": Rhythm(reset_stop=1.0)}
+    matte = DeferredRecipe(**choices, least_iterations=iterations + 1, region=(0.0, 0.0, 3.5, 1.0))
+    plain = scene_after(SplatRecipe(**choices), iterations, tmp_path / "splat")
+    assert not caplog.records
+    found = scene_after(matte, iterations, tmp_path / "deferred")
+    (warning,) = [record.getMessage() for record in caplog.records]
+    assert f"{iterations} iterations are too few" in warning
+    assert f"need {iterations + 1} --iterations" in warning and "--least-iterations 1" in warning
+    for name in ("means", "sh", "log_scales", "quats", "logit_opacities"):
+        assert torch.equal(getattr(found.primary, name), getattr(plain.primary, name)), name
+    camera = tiny_capture().test[0].camera
+    seen = matte.renderer()(found, camera).rgb, SplatRecipe(**choices).renderer()(plain, camera).rgb
+    torch.testing.assert_close(*seen, rtol=0, atol=1e-6)
+    assert found.environment.region == matte.region
+
+
+def test_a_run_long_enough_for_normals_has_all_stages(tmp_path: Path) -> None:
+    recipe = replace(RECIPE, least_iterations=20)
+    assert len(recipe.stages(0, 19)) == 1 and len(recipe.stages(0, 20)) == len(recipe.stages(0)) == 3
+    strengths = scene_after(recipe, 20, tmp_path).primary.channels["logit_strength"]
+    assert bool((strengths != logit(recipe.first_strength)).any())
+
+
+def test_the_rates_of_a_short_run_are_splats_unless_published_ones_are_asked_for() -> None:
+    def rates(recipe: Any) -> Any:
+        return recipe.stages(0, 3000)[0].rates
+
+    assert rates(DeferredRecipe()) == rates(SplatRecipe())
+    assert rates(DeferredRecipe(hurry_matte=False)) == rates(SplatRecipe(rates=GaussianRates(short_run_power=0.0)))
 
 
 def test_a_hurried_parameter_moves_as_much_faster_also_when_resumed(tmp_path: Path) -> None:

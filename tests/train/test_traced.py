@@ -13,11 +13,20 @@ from glassplat.densify.default import DefaultDensify, ScreenStatistics
 from glassplat.render.deferred import Deferred
 from glassplat.render.splat import Splat
 from glassplat.render.traced import Traced, mirrored_contributions
+from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import Gaussians
 from glassplat.train.actions import Densify, PruneIdle, ResetOpacity
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
-from glassplat.train.propagation import Propagate, PropagationSchedule, RefineEnvironment
+from glassplat.train.propagation import (
+    ENDED,
+    GREW,
+    MOST,
+    Propagate,
+    PropagationSchedule,
+    RefineEnvironment,
+    has_ended,
+)
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
@@ -35,7 +44,7 @@ RECIPE = TracedRecipe(
     bootstrap=0.2,
     surroundings=SurroundingsOptions(
         begin=0.3,
-        start=SurroundingsStart(cells=2, copied_strength=0.9, copied_spread=1.0),
+        start=SurroundingsStart("both", cells=2, copied_strength=0.9, copied_spread=1.0),
         densify=DefaultDensify(split_by="gradient", interval=5, whole_passes=False, stop=0.6, gradient_threshold=1e-7),
     ),
     texels=4,
@@ -66,7 +75,11 @@ def losses(messages: Sequence[Message]) -> list[float]:
     return [m.losses["photometric"] for m in messages if isinstance(m, StepDone)]
 
 
-@pytest.mark.parametrize("recipe", [RECIPE, PAPER, replace(RECIPE, mirrors="environment")], ids=lambda r: r.mirrors)
+DISCS = replace(RECIPE, primitive="disc")
+EVERY = [RECIPE, PAPER, replace(RECIPE, mirrors="environment"), DISCS, replace(DISCS, mirrors="environment")]
+
+
+@pytest.mark.parametrize("recipe", EVERY, ids=lambda recipe: f"{recipe.mirrors} {recipe.primitive}")
 def test_a_short_run_learns(recipe: TracedRecipe) -> None:
     state = fresh_state(recipe)
     found = losses(run(recipe, state))
@@ -75,6 +88,10 @@ def test_a_short_run_learns(recipe: TracedRecipe) -> None:
     assert bool(len(state.scene.surroundings)) == (recipe.mirrors != "environment")
     assert state.scene.environment.is_empty == (recipe.mirrors == "surroundings")
     recipe.renderer().check(state.scene)
+    assert {len(part) and part.are_discs for part in (state.scene.primary, state.scene.surroundings)} <= {
+        0,
+        recipe.primitive == "disc",
+    }
 
 
 def test_the_environment_is_mirrored_first_and_near_things_later() -> None:
@@ -142,6 +159,15 @@ def test_surroundings_are_copied_spread_or_both() -> None:
     assert set(copied.means[:, 0].tolist()) <= set(fresh_state().scene.primary.means[:, 0].tolist())
 
 
+@pytest.mark.parametrize(("most", "goes_on"), [(0.2, True), (0.01, False)])
+def test_propagation_goes_on_where_something_reflective_was_found(most: float, goes_on: bool) -> None:
+    state = fresh_state()
+    state.step, state.records = 12, {ENDED: 9.0, MOST: most, GREW: 4.0}
+    AddSurroundings(SurroundingsStart("box", cells=2), 1, Splat())(state, tiny_capture())
+    assert has_ended(state) != goes_on
+    assert state.records[GREW] == (12 if goes_on else 4)
+
+
 def test_where_everything_reflects_there_is_nothing_to_copy() -> None:
     state = fresh_state()
     channels = {"logit_strength": torch.full((len(state.scene.primary),), 3.0)}
@@ -206,6 +232,6 @@ def test_the_preset_resets_surroundings_where_it_resets_the_scene() -> None:
 
 
 def test_a_scene_without_surroundings_is_refused() -> None:
-    scene = replace(surrounded_state().scene, surroundings=Gaussians.empty())
+    scene = replace(surrounded_state().scene, surroundings=Gaussians.empty(), environment=Environment.empty())
     with pytest.raises(ValueError, match="has no surroundings; expected one trained with `traced`"):
         RECIPE.renderer().check(scene)
