@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import base64
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -21,29 +17,14 @@ from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
 from glassplat.scene.plane_edits import as_mirrors, without_glass
 from glassplat.scene.scene import Scene
-from tests.publish.browser import Browser, find_chromium
 from tests.render.tiny_scene import in_single_precision, joined, pane, showcase
 from tests.train.tiny_capture import tiny_capture, true_scene
+from tools.headless import Browser, find_chromium
+from tools.page_likeness import picture
 
 needs_chromium = pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
-FLIP = torch.tensor([1.0, -1.0, -1.0])
 CAMERAS = [(view.name, view.camera) for view in tiny_capture().train]
 LARGEST_SCRIPT = 64_000
-
-
-def wanted(camera: Camera, layer: str) -> str:
-    """A call for the picture of a camera."""
-    rotation, position = camera.cam_from_world[:3, :3] * FLIP, camera.center * FLIP
-    values: dict[str, Any] = {"rotation": rotation.flatten().tolist(), "position": position.tolist()}
-    values |= {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
-    values |= {"layers": [layer, layer]}
-    return f"glassplat.then(page => page.picture({json.dumps(values)}))"
-
-
-def picture(browser: Browser, camera: Camera, layer: str = "rgb") -> torch.Tensor:
-    """What the page shows of a layer, [H, W, 3] uint8."""
-    pixels = np.frombuffer(base64.b64decode(browser.evaluate(wanted(camera, layer))), dtype=np.uint8)
-    return torch.from_numpy(pixels.reshape(camera.height, camera.width, 4)[::-1, :, :3].copy())
 
 
 def likeness(browser: Browser, scene: Scene, renderer: Planar | Splat, camera: Camera, layer: str = "rgb") -> float:

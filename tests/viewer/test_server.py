@@ -12,8 +12,8 @@ from glassplat.cli import main
 from glassplat.render.planar import Planar
 from glassplat.viewer.server import Shown, Viewer
 from tests.commands.tiny_run import write_run
-from tests.publish.browser import Browser, find_chromium
 from tests.train.tiny_capture import tiny_capture, true_scene
+from tools.headless import Browser, find_chromium
 
 VIEWS = tiny_capture().train
 SHOWN = Shown(
