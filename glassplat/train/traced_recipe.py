@@ -65,7 +65,7 @@ class SurroundingsOptions:
     rates: GaussianRates = field(default_factory=GaussianRates)
     densify: DefaultDensify = field(
         default_factory=partial(
-            DefaultDensify, split_by="gradient", stop=0.7, least_contribution=0.02, contribution_moments=(0.5, 0.8)
+            DefaultDensify, split_by="gradient", stop=0.7, least_contribution=0.02, contribution_moments=(0.8,)
         )
     )
     reset: bool = False
@@ -154,6 +154,7 @@ class TracedRecipe:
         published = DefaultDensify.published()
         plain = GaussianRates(decay=30_000 / CODE_ITERATIONS, short_run_power=0.0)
         return cls(
+            primitive="disc",
             sh_degree=2,
             mirrors="surroundings",
             least_strength=0.0,
@@ -169,6 +170,7 @@ class TracedRecipe:
                     stop=21_000 / CODE_ITERATIONS,
                     gradient_threshold=1e-4,
                     cap=630_000,
+                    contribution_moments=(0.8,),
                 ),
                 reset=True,
             ),
