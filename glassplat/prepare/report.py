@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from glassplat.data.errors import first_names
-from glassplat.prepare.photographs import Photograph
-from glassplat.prepare.reconstruction import Solution
+from glassplat.prepare.photographs import FEWEST, Photograph
+from glassplat.prepare.reconstruction import Solution, image_numbers
 
 FEW_FEATURES = 500
 SHORT_TRACK = 3.0
@@ -27,7 +27,7 @@ class Report:
         photographs: how many there were.
         registered: how many were placed, all connected with each other.
         missing: names of the files that were not.
-        groups: sizes of the groups of photographs that were placed, each by itself.
+        groups: sizes of the groups of photographs that were placed, each by itself; each photograph counts once.
         points: measured places in the scene.
         reprojection_error: mean distance of a point from where photographs show it, in pixels.
         track_length: mean number of photographs that a point was measured in.
@@ -82,7 +82,7 @@ def report_of(solution: Solution) -> Report:
         photographs=len(photographs),
         registered=solution.registered,
         missing=tuple(one.path.name for one in missing),
-        groups=tuple(int(one.num_reg_images()) for one in solution.models),
+        groups=_groups(solution),
         points=int(model.num_points3D()) if model else 0,
         reprojection_error=float(model.compute_mean_reprojection_error()) if model else 0.0,
         track_length=float(model.compute_mean_track_length()) if model else 0.0,
@@ -93,6 +93,18 @@ def report_of(solution: Solution) -> Report:
         advice=(),
     )
     return Report(**{**figures.__dict__, "advice": tuple(_advice(figures, missing, solution))})
+
+
+def _groups(solution: Solution) -> tuple[int, ...]:
+    """How many photographs each model adds to the larger ones; a part of a group may be placed a second time."""
+    known: set[int] = set()
+    sizes = []
+    for model in solution.models:
+        added = set(image_numbers(model)) - known
+        known |= added
+        if len(added) >= FEWEST:
+            sizes.append(len(added))
+    return tuple(sizes)
 
 
 def _described(model: Any) -> list[str]:

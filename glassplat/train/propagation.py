@@ -35,7 +35,10 @@ FOUND = 0.03
 LOOKS_REFLECTIVE = 0.16
 """Share that turns with the view, below which propagation would cost more than it finds: two metal eggs with 0.07 lost
 1.3 dB by it at 7000 iterations, a mirror ball with 0.30 gained (docs/experiments.md)."""
-NOTHING_FOUND = "step %d: nothing reflective was found, so that the rest of the run trains like splat; %s"
+NOTHING_FOUND = (
+    "step %d: little or nothing reflective was found, so that normals are not propagated and the rest of the run "
+    "learns as fast as splat; %s"
+)
 MATTE = (
     "no more than %.0f %% of what is seen looks different from different sides. Should something reflect all the same, "
     "--region X Y Z RADIUS names its place"

@@ -84,10 +84,14 @@ def project_discs_forward(real: type) -> Kernel:
         for task in prange(num_chunks):
             chunk = task * stride % num_chunks
             for n in range(chunk * chunk_size, min(count, (chunk + 1) * chunk_size)):
-                mean = vec3(means, n)
-                usable, opacity, _, _, axes, deviations = shape(means, quats, log_scales, logit_opacities, n)
+                mean, wanted = vec3(means, n), False
                 for c in range(num_cameras):
                     cull(c, n, outputs)
+                    wanted |= in_front(c, mean, cam_from_world, near, clip_planes, clips)
+                if not wanted:
+                    continue
+                usable, opacity, _, _, axes, deviations = shape(means, quats, log_scales, logit_opacities, n)
+                for c in range(num_cameras):
                     if not (usable and in_front(c, mean, cam_from_world, near, clip_planes, clips)):
                         continue
                     place(

@@ -1,0 +1,116 @@
+"""`python -m bench.discs`: what discs cost beside ellipsoids of the same places and two of their three sizes.
+
+Processor time, the least of several rounds in which both take turns, so that other programs hardly matter.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from bench.kernels import HEIGHT, WIDTH
+from bench.scene import bench_camera, room
+from bench.timing import Work
+from glassplat.files.markdown_table import Table
+from glassplat.kernels.bin_tiles import bin_tiles
+from glassplat.kernels.composite import composite
+from glassplat.kernels.splats import Splats
+from glassplat.render.discs import blended_discs, projected_discs
+from glassplat.render.rasterize import joined_splats, project_gaussians
+from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
+
+COUNT, ROUNDS, NEAR = 100_000, 7, 0.03
+
+
+class Primitive(NamedTuple):
+    """The steps of one kind of Gaussians, and how many (tile, splat) pairs they have."""
+
+    works: dict[str, Work]
+    pairs: int
+
+
+def learning(gaussians: Gaussians) -> Gaussians:
+    """The same set as leaves of a graph."""
+    return gaussians.with_tensors({name: t.clone().requires_grad_() for name, t in gaussians.tensors().items()})
+
+
+def backward(outputs: Sequence[Tensor], gaussians: Gaussians) -> Work:
+    """A backward pass to all tensors that can be repeated."""
+    smooth = [output for output in outputs if output.requires_grad]
+    weights = [torch.rand_like(output) for output in smooth]
+    inputs = list(gaussians.tensors().values())
+    return lambda: torch.autograd.grad(smooth, inputs, weights, retain_graph=True, allow_unused=True)
+
+
+def ellipsoids(gaussians: Gaussians, camera: Camera) -> Primitive:
+    """Projection, tiles and blending of ellipsoids with colour and depth."""
+    own = learning(gaussians)
+    projected = project_gaussians(own, camera, near=NEAR)
+    splats = Splats(*(t.detach() for t in joined_splats(projected)))
+    bins = bin_tiles(splats, camera.width, camera.height)
+    channels = torch.cat([projected.colors, projected.depths[..., None]], dim=-1)
+    blended = composite(joined_splats(projected), channels, bins)
+    works: dict[str, Work] = {
+        "project forward": lambda: project_gaussians(gaussians, camera, near=NEAR),
+        "project backward": backward(projected, own),
+        "tiles and blending forward": lambda: composite(
+            splats, channels.detach(), bin_tiles(splats, camera.width, camera.height)
+        ),
+        "all backward": backward(blended[:2], own),
+    }
+    return Primitive(works, len(bins.pair_splats))
+
+
+def discs(gaussians: Gaussians, camera: Camera) -> Primitive:
+    """The same of discs, with colour and normals, depths and distortion."""
+    flat = replace(gaussians, log_scales=gaussians.log_scales[:, :2].contiguous())
+    own = learning(flat)
+    projected = projected_discs(own, camera, near=NEAR)
+    fixed = type(projected)(*(t.detach() for t in projected))
+    channels = torch.cat([projected.colors, projected.normals], dim=-1)
+    blended = blended_discs(projected, channels, camera, near=NEAR)
+    works: dict[str, Work] = {
+        "project forward": lambda: projected_discs(flat, camera, near=NEAR),
+        "project backward": backward(projected, own),
+        "tiles and blending forward": lambda: blended_discs(fixed, channels.detach(), camera, near=NEAR),
+        "all backward": backward(blended, own),
+    }
+    return Primitive(works, len(bin_tiles(projected.outlines, camera.width, camera.height).pair_splats))
+
+
+def least_milliseconds(works: Sequence[Work]) -> list[float]:
+    """Least processor time of each piece of work, in turns after one round of warming up."""
+    least = [float("inf")] * len(works)
+    for turn in range(ROUNDS + 1):
+        for i, work in enumerate(works):
+            start = time.process_time()
+            work()
+            least[i] = min(least[i], 1e3 * (time.process_time() - start)) if turn else least[i]
+    return least
+
+
+def disc_costs() -> Table:
+    """Milliseconds of both, and their ratio."""
+    camera, gaussians = bench_camera(WIDTH, HEIGHT), room(COUNT)
+    solid, flat = ellipsoids(gaussians, camera), discs(gaussians, camera)
+    table = Table(
+        f"Discs beside ellipsoids, {COUNT // 1000}k Gaussians, {WIDTH}x{HEIGHT}",
+        ("step", "ellipsoids, ms", "discs, ms", "ratio"),
+        f"{solid.pairs:,} (tile, splat) pairs of ellipsoids with 4 channels, {flat.pairs:,} of discs with 6 and depths "
+        "besides; processor time.",
+    )
+    for name, work in solid.works.items():
+        one, other = least_milliseconds([work, flat.works[name]])
+        table.add(name, one, other, other / one)
+    return table
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    print(disc_costs().markdown())

@@ -1,0 +1,104 @@
+"""The report counts what was placed, and advises where something could be better."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from glassplat.prepare.photographs import Photograph
+from glassplat.prepare.reconstruction import Solution
+from glassplat.prepare.report import report_of
+
+
+class FakeDatabase:
+    """What a report asks of a database."""
+
+    def __init__(self, count: int, features: int) -> None:
+        self.photographs = [Photograph(Path(f"{k}.jpg"), f"{k}.jpg", 640, 480, "", None) for k in range(count)]
+        self._features = features
+
+    def feature_counts(self) -> np.ndarray:
+        return np.full(len(self.photographs), self._features)
+
+
+class FakeImage:
+    """An image of a model."""
+
+    def __init__(self, number: int) -> None:
+        self.name, self.camera_id, self.has_pose = f"{number:06d}.png", 1, True
+
+
+class FakeCamera:
+    """A lens."""
+
+    width, height = 640, 480
+
+    def __init__(self, focal: float) -> None:
+        self._focal = focal
+
+    def mean_focal_length(self) -> float:
+        return self._focal
+
+
+class FakeModel:
+    """What a report asks of a reconstruction."""
+
+    def __init__(self, numbers: range, *, track: float = 5.0, error: float = 0.5, focal: float = 600.0) -> None:
+        self.images = {k: FakeImage(k) for k in numbers}
+        self.cameras = {1: FakeCamera(focal)}
+        self._track, self._error = track, error
+
+    def num_reg_images(self) -> int:
+        return len(self.images)
+
+    def num_points3D(self) -> int:  # noqa: N802 - As pycolmap calls it.
+        return 1000
+
+    def compute_mean_track_length(self) -> float:
+        return self._track
+
+    def compute_mean_reprojection_error(self) -> float:
+        return self._error
+
+
+def report(models: list[Any], *, count: int = 10, features: int = 3000) -> Any:
+    return report_of(Solution(FakeDatabase(count, features), models, "the usual settings", 1))  # type: ignore[arg-type]
+
+
+def test_a_good_preparation_needs_no_advice() -> None:
+    found = report([FakeModel(range(10))])
+    assert found.share == 1 and found.groups == (10,) and found.advice == () and found.missing == ()
+    assert found.lines()[0].startswith("10 of 10 photographs placed, with")
+
+
+def test_photographs_that_were_placed_twice_are_no_second_group() -> None:
+    assert report([FakeModel(range(10)), FakeModel(range(3, 7)), FakeModel(range(2))]).groups == (10,)
+
+
+def test_two_places_are_two_groups() -> None:
+    found = report([FakeModel(range(6)), FakeModel(range(5, 10))])
+    assert found.groups == (6, 4) and found.missing == ("6.jpg", "7.jpg", "8.jpg", "9.jpg")
+    assert any("2 groups that share nothing (6, 4 photographs)" in line for line in found.advice)
+    assert any("photograph once more around 6.jpg" in line for line in found.advice)
+
+
+@pytest.mark.parametrize(
+    ("model", "features", "expected"),
+    [
+        ({"track": 2.2}, 3000, "with smaller steps"),
+        ({"error": 2.0}, 3000, "nothing large moves"),
+        ({"focal": 5000.0}, 3000, "focal length is unusual"),
+        ({}, 200, "200 features only"),
+    ],
+)
+def test_what_is_poor_is_said(model: dict[str, float], features: int, expected: str) -> None:
+    (line,) = report([FakeModel(range(10), **model)], features=features).advice
+    assert expected in line
+
+
+def test_nothing_placed_is_reported_too() -> None:
+    found = report([])
+    assert found.registered == 0 and found.points == 0 and len(found.missing) == 10
