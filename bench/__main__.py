@@ -12,6 +12,7 @@ import torch
 
 from bench.kernels import kernel_times, twin_ratios
 from bench.methods import deferred_costs, method_costs, scaling
+from bench.steps import step_costs
 
 PAGE = Path(__file__).parent.parent / "docs" / "performance.md"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
@@ -37,7 +38,7 @@ def main() -> None:
     arguments = parser.parse_args()
     parts = [f"Machine: {machine()}.\n"]
     print(parts[0])
-    for measure in (kernel_times, twin_ratios, method_costs, deferred_costs, scaling):
+    for measure in (kernel_times, twin_ratios, step_costs, method_costs, deferred_costs, scaling):
         parts.append(measure().markdown())
         print(parts[-1], flush=True)
     if arguments.write:

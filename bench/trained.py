@@ -4,25 +4,17 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import numba
 
 from bench.methods import doublings, frame_work, thread_count
-from bench.timing import Work
+from bench.timing import clocks_of
 from glassplat.commands.stored_run import StoredRun, open_run
 from glassplat.files.markdown_table import Table
 from glassplat.render.deferred import Deferred
 from glassplat.render.splat import Splat
-
-
-def clocks_of(work: Work) -> tuple[float, float]:
-    """Milliseconds on the clock and of processor time, all threads together."""
-    start, processor = time.perf_counter(), time.process_time()
-    work()
-    return 1e3 * (time.perf_counter() - start), 1e3 * (time.process_time() - processor)
 
 
 def frame_costs(stored: StoredRun, renderer: Deferred, rounds: int) -> Table:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from glassplat.kernels.cpu import vector
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
+from glassplat.kernels.cpu.pixel_rows import ROW, interleaved, sorted_apart, with_fourths, without_fourths
 from glassplat.kernels.cpu.vector import constant, item, store, vector_kind
 
 REALS = [np.float32, np.float64]
@@ -109,8 +110,8 @@ def reorders(real: type, lanes: int) -> Kernel:
     @kernel("vector_reorders", real, parallel=False)
     def compute(a, out):
         four = (load(a, 0), load(a, lanes), load(a, 2 * lanes), load(a, 3 * lanes))
-        mixed = vector.interleaved(four)
-        again = vector.sorted_apart(mixed)
+        mixed = interleaved(four)
+        again = sorted_apart(mixed)
         for i in range(4):
             store(out, i * lanes, mixed[i])
             store(out, (4 + i) * lanes, again[i])
@@ -124,6 +125,28 @@ def test_four_vectors_interleave_and_come_apart_again(real: type, lanes: int) ->
     reorders(real, lanes)(a, out)
     np.testing.assert_array_equal(out[: 4 * lanes], a.reshape(4, lanes).T.ravel())
     np.testing.assert_array_equal(out[4 * lanes :], a)
+
+
+def three_channels(real: type) -> Kernel:
+    load = vector_kind(real, ROW).load
+
+    @kernel("vector_three_channels", real, parallel=False)
+    def compute(row, three, four):
+        eight, rest = without_fourths(load(row, 0))
+        store(three, 0, eight)
+        store(three, 8, rest)
+        store(four, 0, with_fourths(eight, rest))
+
+    return compute
+
+
+@pytest.mark.parametrize("real", REALS)
+def test_the_fourth_channel_of_a_row_is_left_out_and_comes_back_as_zero(real: type) -> None:
+    row, three, four = numbers(real, ROW), np.empty(12, real), np.empty(ROW, real)
+    three_channels(real)(row, three, four)
+    pixels = row.reshape(4, 4)
+    np.testing.assert_array_equal(three, pixels[:, :3].ravel())
+    np.testing.assert_array_equal(four.reshape(4, 4), np.c_[pixels[:, :3], np.zeros(4)])
 
 
 def four_sums(real: type) -> Kernel:

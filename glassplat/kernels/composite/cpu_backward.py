@@ -18,6 +18,7 @@ from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.composite.cpu_pair_rows import PAIR_VALUES
 from glassplat.kernels.composite.cpu_tile import exponent, lane_of
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
+from glassplat.kernels.cpu.pixel_rows import sorted_apart, with_fourths
 from glassplat.kernels.cpu.schedule import even_stride
 from glassplat.kernels.cpu.vector import (
     absolute,
@@ -25,7 +26,6 @@ from glassplat.kernels.cpu.vector import (
     lowest_bit,
     minimum,
     select,
-    sorted_apart,
     store,
     sums_of,
     vector_kind,
@@ -201,15 +201,22 @@ def _unblend_glass(real: type, probed: bool) -> Scalar:
 
 
 def _load_gradients(real: type) -> Scalar:
-    load, load_row = vector_kind(real, tile.LANES).load, vector_kind(real, tile.BLOCK).load
+    load, load_eight, load_row = (vector_kind(real, lanes).load for lanes in (tile.LANES, 2 * tile.BLOCK, tile.BLOCK))
     BLOCK, ACROSS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.LANES, tile.PIXELS
 
     @inlined
-    def load_whole_block(planes, i, v_image, v_alpha, first, width):
-        """A block of four channels that lies within the image; `first` is its first pixel."""
-        rows = load(v_image, first * 4), load(v_image, (first + width) * 4)
-        more = load(v_image, (first + 2 * width) * 4), load(v_image, (first + 3 * width) * 4)
-        v0, v1, v2, v3 = sorted_apart(rows + more)
+    def load_row_of_four(v_image, pixel, channels):
+        if channels == 4:
+            return load(v_image, pixel * 4)
+        return with_fourths(load_eight(v_image, pixel * 3), load_row(v_image, pixel * 3 + 8))
+
+    @inlined
+    def load_whole_block(planes, i, v_image, v_alpha, first, width, channels):
+        """A block of three or four channels that lies within the image; `first` is its first pixel."""
+        r0, r1 = load_row_of_four(v_image, first, channels), load_row_of_four(v_image, first + width, channels)
+        r2 = load_row_of_four(v_image, first + 2 * width, channels)
+        r3 = load_row_of_four(v_image, first + 3 * width, channels)
+        v0, v1, v2, v3 = sorted_apart((r0, r1, r2, r3))
         store(planes, V_IMAGE + i, v0)
         store(planes, V_IMAGE + PIXELS + i, v1)
         store(planes, V_IMAGE + 2 * PIXELS + i, v2)
@@ -223,8 +230,8 @@ def _load_gradients(real: type) -> Scalar:
         for b in range(tile.BLOCKS):
             x0, y0 = b % ACROSS * BLOCK, b // ACROSS * BLOCK
             corner = first + y0 * width + x0
-            if channels == 4 and x0 + BLOCK <= columns and y0 + BLOCK <= rows:
-                load_whole_block(planes, b * LANES, v_image, v_alpha, corner, width)
+            if 3 <= channels <= 4 and x0 + BLOCK <= columns and y0 + BLOCK <= rows:
+                load_whole_block(planes, b * LANES, v_image, v_alpha, corner, width, channels)
                 continue
             for y in range(min(BLOCK, rows - y0)):
                 for x in range(min(BLOCK, columns - x0)):

@@ -13,8 +13,9 @@ from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.composite.cpu_pair_rows import CHUNK as SPLATS
 from glassplat.kernels.composite.cpu_tile import exponent, lane_of, list_block
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
+from glassplat.kernels.cpu.pixel_rows import interleaved, without_fourths
 from glassplat.kernels.cpu.schedule import even_stride
-from glassplat.kernels.cpu.vector import absolute, bits_of, interleaved, item, minimum, select, store, vector_kind
+from glassplat.kernels.cpu.vector import absolute, bits_of, item, minimum, select, store, vector_kind
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
 from glassplat.kernels.splats import LEAST_ALPHA
 
@@ -196,14 +197,19 @@ def _write_tile(real: type) -> Scalar:
     BLOCK, ACROSS, LANES, PIXELS, T = tile.BLOCK, tile.ACROSS, tile.LANES, tile.PIXELS, tile.T
 
     @inlined
-    def write_whole_block(state, at, planes, i, image, alpha, first, width):
-        """A block of four channels that lies within the image; `first` is its first pixel."""
+    def write_whole_block(state, at, planes, i, image, alpha, first, width, channels):
+        """A block of three or four channels that lies within the image; `first` is its first pixel."""
         s0, s1 = load(planes, SUMS + i), load(planes, SUMS + PIXELS + i)
         s2, s3 = load(planes, SUMS + 2 * PIXELS + i), load(planes, SUMS + 3 * PIXELS + i)
         rows = interleaved((s0, s1, s2, s3))
         for y in range(BLOCK):
             store(alpha, first + y * width, one - load_row(state, at + T + i + y * BLOCK))
-            store(image, (first + y * width) * 4, rows[y])
+            if channels == 4:
+                store(image, (first + y * width) * 4, rows[y])
+            else:
+                eight, four = without_fourths(rows[y])
+                store(image, (first + y * width) * 3, eight)
+                store(image, (first + y * width) * 3 + 8, four)
 
     @inlined
     def write_block(state, at, planes, i, image, alpha, first, width, columns, rows, channels):
@@ -219,8 +225,8 @@ def _write_tile(real: type) -> Scalar:
         for b in range(tile.BLOCKS):
             x, y = b % ACROSS * BLOCK, b // ACROSS * BLOCK
             corner = first + y * width + x
-            if channels == 4 and x + BLOCK <= columns and y + BLOCK <= rows:
-                write_whole_block(state, at, planes, b * LANES, image, alpha, corner, width)
+            if 3 <= channels <= 4 and x + BLOCK <= columns and y + BLOCK <= rows:
+                write_whole_block(state, at, planes, b * LANES, image, alpha, corner, width, channels)
             elif x < columns and y < rows:
                 write_block(state, at, planes, b * LANES, image, alpha, corner, width, columns - x, rows - y, channels)
 

@@ -11,10 +11,12 @@ import numpy as np
 from numba.extending import register_jitable
 
 from glassplat.kernels.cpu.cache import KernelCache
+from glassplat.kernels.cpu.memory import keep_freed_memory
 from glassplat.kernels.cpu.threads import entrance, prefer_openmp
 
 # Before anything else in the process can start Numba's threads.
 prefer_openmp()
+keep_freed_memory()
 
 HOW = "".join(Path(__file__).with_name(name).read_text() for name in ("jit.py", "vector.py"))
 """This file and what operators on vectors mean, which no kernel names: with its own code, they decide whether the cache

@@ -90,7 +90,7 @@ def vector_kind(real: type, lanes: int) -> VectorKind:
     @intrinsic
     def full(typing, value):
         if value == kind.element:
-            return _plain(kind, (value,), lambda builder, x: _spread(builder, x, kind))
+            return plain(kind, (value,), lambda builder, x: _spread(builder, x, kind))
 
     @intrinsic
     def load(typing, array, at):
@@ -111,7 +111,7 @@ def constant(real: type, values: tuple[float, ...]) -> Intrinsic:
 
     @intrinsic
     def fixed(typing):
-        return _plain(kind, (), lambda builder: ir.Constant(llvm_type(kind), [float(real(v)) for v in values]))
+        return plain(kind, (), lambda builder: ir.Constant(llvm_type(kind), [float(real(v)) for v in values]))
 
     return fixed
 
@@ -148,14 +148,14 @@ def store(typing, array, at, value):
 def select(typing, mask, chosen, other):
     """`chosen` where the mask holds, `other` elsewhere."""
     if isinstance(mask, MaskType) and isinstance(chosen, VectorType) and chosen == other:
-        return _plain(chosen, (mask, chosen, other), lambda builder, *arguments: builder.select(*arguments))
+        return plain(chosen, (mask, chosen, other), lambda builder, *arguments: builder.select(*arguments))
 
 
 def _extreme(order: str) -> Intrinsic:
     @intrinsic
     def extreme(typing, a, b):
         if isinstance(a, VectorType) and a == b:
-            return _plain(a, (a, b), lambda builder, x, y: builder.select(builder.fcmp_ordered(order, x, y), x, y))
+            return plain(a, (a, b), lambda builder, x, y: builder.select(builder.fcmp_ordered(order, x, y), x, y))
 
     return extreme
 
@@ -170,7 +170,7 @@ def _called(name: str) -> Intrinsic:
     @intrinsic
     def called(typing, value):
         if isinstance(value, VectorType):
-            return _plain(value, (value,), lambda builder, x: _call(builder, name, value, x))
+            return plain(value, (value,), lambda builder, x: _call(builder, name, value, x))
 
     return called
 
@@ -190,14 +190,14 @@ def fraction(typing, value):
         return builder.fsub(x, builder.sitofp(whole, x.type), flags=FLAGS)
 
     if isinstance(value, VectorType):
-        return _plain(value, (value,), build)
+        return plain(value, (value,), build)
 
 
 @intrinsic
 def times_power_of_2(typing, value, exponent):
     """`value` times 2^n, where n is the exponent cut towards 0; undefined where the result is not a normal number."""
     if isinstance(value, VectorType) and value == exponent:
-        return _plain(value, (value, exponent), lambda builder, x, y: _times_power_of_2(builder, x, y, value))
+        return plain(value, (value, exponent), lambda builder, x, y: _times_power_of_2(builder, x, y, value))
 
 
 @intrinsic
@@ -209,14 +209,14 @@ def bits_of(typing, mask):
         return bits if mask.lanes == MASK_BITS else builder.zext(bits, ir.IntType(MASK_BITS))
 
     if isinstance(mask, MaskType):
-        return _plain(types.int64, (mask,), build)
+        return plain(types.int64, (mask,), build)
 
 
 @intrinsic
 def lowest_bit(typing, bits):
     """Which is the lowest bit that is set in an int64; undefined for 0."""
     if bits == types.int64:
-        return _plain(types.intp, (bits,), lambda builder, x: builder.cttz(x, ir.Constant(ir.IntType(1), 1)))
+        return plain(types.intp, (bits,), lambda builder, x: builder.cttz(x, ir.Constant(ir.IntType(1), 1)))
 
 
 @intrinsic
@@ -232,54 +232,11 @@ def sums_of(typing, vectors):
         return parts[0]
 
     if isinstance(vectors, types.UniTuple) and vectors.count == getattr(vectors.dtype, "lanes", 0):
-        return _plain(vectors.dtype, (vectors,), build)
+        return plain(vectors.dtype, (vectors,), build)
 
 
-@intrinsic
-def interleaved(typing, vectors):
-    """Four vectors taken apart lane by lane: the first lanes of all four, then their second lanes, and so on.
-
-    The result is four vectors again; `sorted_apart` undoes it.
-    """
-
-    def build(builder, packed):
-        a, b, c, d = (builder.extract_value(packed, i) for i in range(4))
-        pairs = [_zipped(builder, *pair) for pair in ((a, c), (b, d))]
-        rows = [row for even, odd in zip(*pairs, strict=True) for row in _zipped(builder, even, odd)]
-        return cgutils.pack_array(builder, rows, a.type)
-
-    if isinstance(vectors, types.UniTuple) and vectors.count == 4 and isinstance(vectors.dtype, VectorType):
-        return _plain(vectors, (vectors,), build)
-
-
-@intrinsic
-def sorted_apart(typing, vectors):
-    """Four vectors of which every fourth lane belongs together; undoes `interleaved`."""
-
-    def build(builder, packed):
-        rows = [builder.extract_value(packed, i) for i in range(4)]
-        halves = [_unzipped(builder, *pair) for pair in zip(rows[::2], rows[1::2], strict=True)]
-        evens, odds = (_unzipped(builder, *pair) for pair in zip(*halves, strict=True))
-        return cgutils.pack_array(builder, [evens[0], odds[0], evens[1], odds[1]], rows[0].type)
-
-    if isinstance(vectors, types.UniTuple) and vectors.count == 4 and isinstance(vectors.dtype, VectorType):
-        return _plain(vectors, (vectors,), build)
-
-
-def _zipped(builder: Any, a: Any, b: Any) -> tuple[Any, Any]:
-    """a0 b0 a1 b1 ..., in two vectors."""
-    lanes = a.type.count
-    order = [i // 2 + i % 2 * lanes for i in range(2 * lanes)]
-    return _shuffled(builder, a, b, order[:lanes]), _shuffled(builder, a, b, order[lanes:])
-
-
-def _unzipped(builder: Any, a: Any, b: Any) -> tuple[Any, Any]:
-    """The even lanes of two vectors in a row, and the odd ones."""
-    lanes = a.type.count
-    return _shuffled(builder, a, b, range(0, 2 * lanes, 2)), _shuffled(builder, a, b, range(1, 2 * lanes, 2))
-
-
-def _shuffled(builder: Any, a: Any, b: Any, order: Any) -> Any:
+def shuffled(builder: Any, a: Any, b: Any, order: Any) -> Any:
+    """Lanes of two vectors in a row, in some order, as one vector."""
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(order)), list(order)))
 
 
@@ -289,7 +246,7 @@ def _halved(builder: Any, a: Any, b: Any, groups: int) -> Any:
     width = lanes // groups
     near = [g * width + i for g in range(2 * groups) for i in range(width // 2)]
     far = [i + width // 2 for i in near]
-    return builder.fadd(_shuffled(builder, a, b, near), _shuffled(builder, a, b, far), flags=FLAGS)
+    return builder.fadd(shuffled(builder, a, b, near), shuffled(builder, a, b, far), flags=FLAGS)
 
 
 def _times_power_of_2(builder: Any, x: Any, exponent: Any, kind: VectorType) -> Any:
@@ -301,7 +258,7 @@ def _times_power_of_2(builder: Any, x: Any, exponent: Any, kind: VectorType) -> 
     return builder.bitcast(builder.add(builder.bitcast(x, bits), raised), x.type)
 
 
-def _plain(result: Any, arguments: tuple[Any, ...], build: Callable[..., Any]) -> tuple[Any, Callable[..., Any]]:
+def plain(result: Any, arguments: tuple[Any, ...], build: Callable[..., Any]) -> tuple[Any, Callable[..., Any]]:
     """What an intrinsic returns that needs nothing but the values of its arguments."""
     return result(*arguments), lambda context, builder, sig, values: build(builder, *values)
 

@@ -1,0 +1,104 @@
+"""Whole steps of training: python -m bench.steps [--data CAPTURE] [--run RUN].
+
+That is everything between two photographs: the frame, its losses and gradients, Adam, and what densification collects.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numba
+
+from bench.methods import doublings, thread_count
+from bench.timing import clocks_of
+from glassplat.commands.demo import SCENE
+from glassplat.commands.stored_run import open_run
+from glassplat.data.dataset import Dataset, load_dataset
+from glassplat.files.markdown_table import Table
+from glassplat.train.background import photo_background, settled
+from glassplat.train.checkpoint import load_checkpoint
+from glassplat.train.messages import Message, StepDone
+from glassplat.train.splat_recipe import SplatRecipe
+from glassplat.train.stage import stage_starts
+from glassplat.train.state import TrainState
+from glassplat.train.trainer import train
+
+ITERATIONS = 7000
+"""Length of the run of which the first steps are timed."""
+
+Begin = Callable[[], tuple[Any, Dataset, TrainState, int]]
+"""Gives recipe, capture, state and length of a run."""
+
+
+def first_steps(capture: Path) -> Begin:
+    """A run of `splat` at its beginning, with a Gaussian for each point of a capture."""
+
+    def begin() -> tuple[Any, Dataset, TrainState, int]:
+        dataset = load_dataset(capture, background=photo_background(SplatRecipe()))
+        recipe = settled(SplatRecipe(), dataset)
+        return recipe, dataset, TrainState(recipe.initialise(dataset), seed=0), ITERATIONS
+
+    return begin
+
+
+def last_stage(run: Path) -> Begin:
+    """The last stage of a finished run, with the Gaussians that it ended with, as if it had just begun."""
+
+    def begin() -> tuple[Any, Dataset, TrainState, int]:
+        stored = open_run(run, "cpu")
+        state = load_checkpoint(stored.directory.checkpoint)
+        state.step = stage_starts(stored.recipe.stages(state.seed), stored.iterations)[-2] + 1
+        return stored.recipe, stored.dataset, state, stored.iterations
+
+    return begin
+
+
+def step_costs(begins: tuple[Begin, ...] = (first_steps(SCENE),), rounds: int = 40) -> Table:
+    """Milliseconds of a step for 1, 2, 4, ... threads."""
+    table = Table(
+        "A step of training",
+        ("run", "method", "pixels", "Gaussians", "threads", "ms", "CPU ms"),
+        f"Medians over {rounds} steps for each number of threads, in turn; CPU ms are those of all threads together.",
+    )
+    for begin in begins:
+        recipe, dataset, state, iterations = begin()
+        for view in dataset.train:
+            _ = view.photo  # Reads it, as training does in its first pass.
+        camera, count = dataset.train[0].camera, len(state.scene.primary)
+        messages = train(recipe.stages(state.seed), dataset, state, iterations)
+        for threads, times in step_clocks(messages, rounds).items():
+            clock, processor = (statistics.median(column) for column in zip(*times, strict=True))
+            pixels = f"{camera.width}x{camera.height}"
+            table.add(dataset.root.name, recipe.method, pixels, f"{count:,}", threads, clock, processor)
+    return table
+
+
+def step_clocks(messages: Iterator[Message], rounds: int) -> dict[int, list[tuple[float, float]]]:
+    """Milliseconds on the clock and of processor time of steps of a run, by the number of threads."""
+    times: dict[int, list[tuple[float, float]]] = {n: [] for n in doublings(numba.config.NUMBA_NUM_THREADS)}
+    for _ in range(rounds + 1):
+        for threads, known in times.items():
+            with thread_count(threads):
+                known.append(clocks_of(lambda: next(message for message in messages if isinstance(message, StepDone))))
+    return {threads: known[1:] for threads, known in times.items()}
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(prog="python -m bench.steps", description=__doc__)
+    parser.add_argument(
+        "--data", type=Path, action="append", default=[], help="capture whose points `splat` begins with"
+    )
+    parser.add_argument("--run", type=Path, action="append", default=[], help="finished run whose last stage is timed")
+    parser.add_argument("--rounds", type=int, default=40, help="steps for each number of threads")
+    arguments = parser.parse_args()
+    begins = (*map(first_steps, arguments.data), *map(last_stage, arguments.run))
+    print(step_costs(begins or (first_steps(SCENE),), arguments.rounds).markdown())
+
+
+if __name__ == "__main__":
+    main()
