@@ -1,30 +1,28 @@
-"""The table of whole steps, on a capture of a few pixels."""
+"""Timing of whole steps: each number of threads takes its turn in one and the same run."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
 
 import numba
 
 from bench.methods import doublings
-from bench.steps import step_costs
-from glassplat.data.dataset import Dataset
-from glassplat.train.splat_recipe import SplatRecipe
-from glassplat.train.state import TrainState
-from tests.train.tiny_capture import tiny_capture
+from bench.steps import step_clocks
+from glassplat.train.messages import ActionDone, Message, StepDone
 
 
-def test_every_number_of_threads_takes_steps_of_the_same_run() -> None:
-    recipe, dataset = SplatRecipe(sh_degree=1), tiny_capture()
-    state = TrainState(recipe.initialise(dataset), seed=0)
+def test_every_number_of_threads_takes_its_turn() -> None:
+    threads: list[int] = []
 
-    def begin() -> tuple[Any, Dataset, TrainState, int]:
-        return recipe, dataset, state, 100
+    def run() -> Iterator[Message]:
+        for step in range(100):
+            threads.append(numba.get_num_threads())
+            yield StepDone(step, "view", 0.0, {}, {})
+            yield ActionDone(step, "densify", {})
 
     counts = doublings(numba.config.NUMBA_NUM_THREADS)
-    lines = step_costs((begin,), rounds=2).markdown().splitlines()
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if "| splat |" in line]
-    assert [int(row[4]) for row in rows] == counts
-    assert all(float(cell) > 0 for row in rows for cell in row[5:])
-    assert state.step == 3 * len(counts)
+    times = step_clocks(run(), rounds=2)
+    # Two rounds are told, after one that only warms up.
+    assert {count: len(known) for count, known in times.items()} == dict.fromkeys(counts, 2)
+    assert threads == counts * 3
     assert numba.get_num_threads() == numba.config.NUMBA_NUM_THREADS
