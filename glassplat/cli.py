@@ -48,6 +48,9 @@ COMMANDS = {
     "view": Listed(
         "view", "View", "Look at a scene in the browser, layer by layer, with its panes as they are or edited."
     ),
+    "video": Listed(
+        "video", "Video", "Film a scene along a path: one layer, several side by side, or one wiped over another."
+    ),
     "import": Listed(
         "import_splats",
         "Import",

@@ -4,7 +4,11 @@
 
 MARKS.json maps names of photographs to what is clicked in them, in pixels of the photograph without distortion:
 
-    {"frame_0003.jpg": {"corners": [[120, 80], [900, 60], [910, 500], [110, 520]], "cut": [[[300, 400], ...]]}, ...}
+    {"frame_0003.jpg": {"corners": [[120, 80], [900, 60], null, [110, 520]],
+                        "edges": [null, [[905, 300], [908, 500]], null, null],
+                        "cut": [[[300, 400], ...]]}, ...}
+
+What is null is not to be seen in that photograph, and is skipped.
 
 Masks and planes are written at the end, and with `--pictures` what the page shows on the way.
 """
@@ -26,7 +30,7 @@ from glassplat.annotate.server import AnnotationServer
 from glassplat.annotate.session import opened_session
 from tools.browser import Browser, browser
 
-Places = Sequence[Sequence[float]] | np.ndarray
+Places = Sequence[Any] | np.ndarray
 WHOLE = 1.5
 """What the canvas shows of a photograph at first, in its sizes: there is room for corners beside it."""
 
@@ -66,10 +70,26 @@ class MarkingPage:
         return [(x + scale * float(place[0]), y + scale * float(place[1])) for place in places]
 
     def mark(self, view: int, corners: Places) -> None:
-        """Clicks corners, one after the other."""
+        """Clicks corners, one after the other; None skips one."""
         self.show(view)
-        for x, y in self.on_screen(corners):
-            self.window.click(x, y)
+        self.window.keys("1")
+        for corner in corners:
+            if corner is None:
+                self.window.keys("n")
+            else:
+                self.window.click(*self.on_screen([corner])[0])
+        self.saved()
+
+    def mark_edges(self, view: int, edges: Sequence[Places | None]) -> None:
+        """Draws along edges, one after the other; None skips one."""
+        self.show(view)
+        self.window.keys("2")
+        for ends in edges:
+            if ends is None:
+                self.window.keys("n")
+            else:
+                self.window.drag(self.on_screen(ends))
+        self.window.keys("1")
         self.saved()
 
     def cut(self, view: int, outline: Places) -> None:
@@ -114,6 +134,7 @@ def mark_all(page: MarkingPage, marks: Mapping[str, Any], pictures: Path | None)
     numbers = {view.name: number for number, view in enumerate(page.server.session.views)}
     for done, (name, what) in enumerate(marks.items(), start=1):
         page.mark(numbers[name], what.get("corners", []))
+        page.mark_edges(numbers[name], what.get("edges", []))
         for outline in what.get("cut", []):
             page.cut(numbers[name], outline)
         _save(page, pictures, f"{done}-{Path(name).stem}")

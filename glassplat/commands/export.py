@@ -24,7 +24,7 @@ from glassplat.files.planes_json import write_planes
 from glassplat.files.ply import write_gaussians
 from glassplat.files.spz import write_spz
 from glassplat.kernels.devices import DeviceName
-from glassplat.publish.web_page import write_page
+from glassplat.publish.web_page import can_show, write_page
 from glassplat.render.baked import baked
 from glassplat.render.environment import equirect_from_environment
 from glassplat.render.splat import Splat
@@ -84,8 +84,13 @@ class Export:
             self._write_beside(opened.scene, console)
         write_cameras(self.output / "cameras.json", opened.cameras)
         self._write_gaussians(gaussians, console)
-        if "html" in self.formats:
+        if "html" in self.formats and can_show(opened.renderer):
             self._write_page(opened, console)
+        elif "html" in self.formats:
+            warn(
+                console,
+                f"no page was written: it shows planar and splat runs, not {opened.recipe.method} ones of this kind",
+            )
 
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""

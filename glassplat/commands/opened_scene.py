@@ -12,9 +12,9 @@ from glassplat.data.errors import InputError, input_checked
 from glassplat.files.cameras_json import read_cameras
 from glassplat.kernels.devices import DeviceName, chosen_device
 from glassplat.render.frame import Renderer
-from glassplat.render.planar import Planar
 from glassplat.scene.scene import Scene
 from glassplat.train.background import BLACK, with_background
+from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.run_directory import RunDirectory
 
 
@@ -24,7 +24,7 @@ class OpenedScene(NamedTuple):
     Attributes:
         path: what was opened.
         name: what to call it.
-        method: of the run; `planar` for an imported scene.
+        recipe: of the run; of an imported scene one that renders it as it is.
         scene: on the device that was asked for.
         renderer: as the run renders it.
         cameras: of the photographs, by name; for an imported scene some that look at it.
@@ -32,7 +32,7 @@ class OpenedScene(NamedTuple):
 
     path: Path
     name: str
-    method: str
+    recipe: Any
     scene: Scene
     renderer: Renderer
     cameras: NamedCameras
@@ -56,14 +56,15 @@ def open_scene(path: Path, device: DeviceName = "auto") -> OpenedScene:
         cameras = tuple(read_cameras(path / "cameras.json"))
     if not cameras:
         raise InputError(f"{path / 'cameras.json'} lists no camera; expected those of the photographs")
-    return OpenedScene(path, path.resolve().name, recipe.method, scene.to(chosen_device(device)), renderer, cameras)
+    return OpenedScene(path, path.resolve().name, recipe, scene.to(chosen_device(device)), renderer, cameras)
 
 
 def _opened_file(path: Path, device: DeviceName) -> OpenedScene:
     """A scene that was not trained here, over black."""
     with input_checked():
         scene, cameras, _ = imported_scene(path)
-    return OpenedScene(path, path.stem, "planar", scene.to(chosen_device(device)), Planar(), cameras)
+    recipe = PlanarRecipe(background=BLACK)
+    return OpenedScene(path, path.stem, recipe, scene.to(chosen_device(device)), recipe.renderer(), cameras)
 
 
 def with_background_of(recipe: Any) -> Any:

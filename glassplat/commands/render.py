@@ -106,14 +106,18 @@ class Render:
         return f"images already written to {self.output} are whole: repeat the command for all of them"
 
 
+def layers_of(recipe: Any) -> tuple[Layer, ...]:
+    """What a run renders that is worth looking at."""
+    return DISC_LAYERS if getattr(recipe, "primitive", None) == "disc" else LAYERS[recipe.method]
+
+
 def check_layers(layers: Sequence[str], recipe: Any) -> None:
     """Refuses layers that a method does not render, before anything is rendered.
 
     Raises:
         InputError: there are such, or none is asked for.
     """
-    discs = getattr(recipe, "primitive", None) == "disc"
-    known, method = DISC_LAYERS if discs else LAYERS[recipe.method], recipe.method
+    known, method = layers_of(recipe), recipe.method
     foreign = [layer for layer in layers if layer not in known]
     if foreign or not layers:
         asked = f"renders no layer {', '.join(foreign)}" if foreign else "renders nothing without --layers"

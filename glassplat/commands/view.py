@@ -16,7 +16,7 @@ from torch import Tensor
 
 from glassplat.commands.messages import say
 from glassplat.commands.opened_scene import OpenedScene, open_scene
-from glassplat.commands.render import LAYERS
+from glassplat.commands.render import layers_of
 from glassplat.commands.scene_edits import SceneEdits
 from glassplat.commands.stored_run import open_run
 from glassplat.data.errors import InputError
@@ -70,7 +70,7 @@ class View:
 
     def _viewer(self, opened: OpenedScene) -> Viewer:
         try:
-            layers = [layer for layer in LAYERS[opened.method] if layer not in HIDDEN_LAYERS]
+            layers = [layer for layer in layers_of(opened.recipe) if layer not in HIDDEN_LAYERS]
             photographs = photographs_beside(opened)
             shown = Shown(opened.name, opened.scene, opened.renderer, layers, opened.cameras, photographs)
             return Viewer(shown, self.host, self.port)

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import torch
@@ -68,7 +68,7 @@ def write_page(
 @torch.no_grad()
 def page_text(scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Camera]], title: str) -> str:
     """What `write_page` writes."""
-    if not isinstance(renderer, (Planar, Splat)):
+    if not can_show(renderer):
         raise ValueError(f"a page cannot show what {type(renderer).__name__} renders; expected a planar or a splat run")
     if not cameras or len(scene.planes) > MOST_PANES:
         raise ValueError(
@@ -99,6 +99,11 @@ def page_text(scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Cam
             "script": "\n".join(asset(name) for name in SCRIPTS),
         },
     )
+
+
+def can_show(renderer: Renderer) -> TypeGuard[Planar | Splat]:
+    """Whether a page can draw what a renderer draws."""
+    return isinstance(renderer, (Planar, Splat))
 
 
 def asset(name: str) -> str:

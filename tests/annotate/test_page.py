@@ -140,17 +140,25 @@ def test_keys_choose_photographs_panes_and_brushes(page: Page) -> None:
 
 
 def test_edges_do_where_no_corner_shows(page: Page) -> None:
-    page.window.keys("2")
     for view in (0, 1, 2):
-        page.show(view)
         corners = true_corners(view)
-        for number in range(4):
-            one, other = corners[number], corners[(number + 1) % 4]
-            ends = np.stack([one + 0.3 * (other - one), one + 0.7 * (other - one)])
-            page.window.drag(page.on_screen(ends))
-        page.saved()
+        ends = [(corners[k], corners[(k + 1) % 4]) for k in range(4)]
+        page.mark_edges(view, [np.stack([a + 0.3 * (b - a), a + 0.7 * (b - a)]) for a, b in ends])
     page.show(3)
     assert is_blue(page.color_at(tuple(true_corners(3).mean(axis=0))))
+
+
+def test_what_is_not_to_be_seen_is_skipped(page: Page) -> None:
+    for view, hidden in ((0, 1), (1, 3), (2, 0)):
+        corners: list = list(true_corners(view))
+        corners[hidden] = None
+        page.mark(view, corners)
+    marked = [sorted(places) for places in page.document()["corners"]]
+    assert marked == [["0.png", "1.png"], ["1.png", "2.png"], ["0.png", "1.png", "2.png"], ["0.png", "2.png"]]
+    page.show(3)
+    assert is_blue(page.color_at(tuple(true_corners(3).mean(axis=0))))
+    page.mark_edges(4, [None, None, true_corners(4)[[2, 3]]])
+    assert [sorted(places) for places in page.document()["edges"]] == [[], [], ["4.png"], []]
 
 
 def test_the_page_asks_for_nothing_from_elsewhere(page: Page) -> None:

@@ -63,11 +63,12 @@ export class Marking {
     this.change((document) => { document.panes.find((pane) => pane.label === label)[key] = value; });
   }
 
-  // The corner that the next click in a view marks: the first that has no mark there; a polygon may grow.
-  nextCorner(view) {
+  // The corner that the next click in a view marks: the first that has no mark there and is not skipped; a polygon
+  // may grow.
+  nextCorner(view, skipped = new Set()) {
     const pane = this.pane;
     if (!pane) return null;
-    const free = pane.corners.findIndex((places) => !(view in places));
+    const free = pane.corners.findIndex((places, number) => !(view in places) && !skipped.has(number));
     if (free >= 0) return free;
     return pane.shape === "polygon" && pane.corners.every((places) => Object.keys(places).length <= 1) ? pane.corners.length : null;
   }
@@ -84,8 +85,9 @@ export class Marking {
     this.change(() => { this.pane.edges[number][view] = ends.map(rounded); });
   }
 
-  nextEdge(view) {
-    const free = this.pane.edges.findIndex((places) => !(view in places));
+  nextEdge(view, skipped = new Set()) {
+    if (!this.pane) return null;
+    const free = this.pane.edges.findIndex((places, number) => !(view in places) && !skipped.has(number));
     return free >= 0 ? free : null;
   }
 

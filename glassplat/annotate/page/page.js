@@ -15,6 +15,7 @@ const HINTS = {
 
 let capture, marking, drawing;
 let current = 0, tool = "corner", radius = 20, pending = null, drag = null, gestures = 0;
+let skipped = { corner: new Set(), edge: new Set() }; // In this photograph: what is not to be seen in it.
 let answers = {}, sending = false, waiting = false, saveTimer = null, spaceHeld = false;
 const images = new Map();
 
@@ -68,10 +69,27 @@ function refresh() {
 
 function hint() {
   if (!marking.pane) return "add a pane first";
-  const number = marking.nextCorner(view().name);
-  if (tool === "corner" && number === null) return "all corners are marked here; drag them, or go to another photograph";
-  return tool === "corner" ? `corner ${number + 1}: ${HINTS.corner}` : HINTS[tool];
+  if (tool !== "corner" && tool !== "edge") return HINTS[tool];
+  const number = upcoming();
+  if (number === null) return `all ${tool}s are marked or skipped here; drag corners, or go to another photograph`;
+  const which = tool === "corner" ? `corner ${number + 1}` : `edge from corner ${number + 1} to ${(number + 1) % marking.pane.corners.length + 1}`;
+  return `${which}: ${HINTS[tool]}; N skips it`;
 }
+
+// The corner or edge that comes next in this photograph.
+function upcoming() {
+  const name = view().name;
+  return tool === "edge" ? marking.nextEdge(name, skipped.edge) : marking.nextCorner(name, skipped.corner);
+}
+
+function skip() {
+  if (tool !== "corner" && tool !== "edge") return;
+  const number = upcoming();
+  if (number === null) skipped[tool].clear(); else skipped[tool].add(number);
+  refresh();
+}
+
+function unskip() { skipped = { corner: new Set(), edge: new Set() }; }
 
 const view = () => capture.views[current];
 
@@ -118,7 +136,7 @@ function drawPanes() {
     remove.addEventListener("click", (event) => { event.stopPropagation(); marking.removePane(pane.label); });
     const card = make("div", { className: `pane ${pane.label === marking.active ? "active" : ""}` },
       make("h2", {}, swatch, `pane ${pane.label}`, remove), choice(pane, "material", ["glass", "mirror", "screen"]), " ", choice(pane, "shape", ["rectangle", "polygon"]));
-    card.addEventListener("click", () => { if (marking.active !== pane.label) { marking.active = pane.label; refresh(); } });
+    card.addEventListener("click", () => { if (marking.active !== pane.label) { marking.active = pane.label; unskip(); refresh(); } });
     for (const [text, kind] of judgement(answer)) card.append(make("p", { textContent: text, className: kind }));
     return card;
   }));
@@ -137,6 +155,7 @@ function judgement(answer) {
 async function show(number) {
   current = (number + capture.views.length) % capture.views.length;
   pending = drag = null;
+  unskip();
   drawing.show({ ...view(), number: current }, images.get(current) || null);
   refresh();
   element("views").children[current].scrollIntoView({ block: "nearest" });
@@ -181,7 +200,7 @@ function pressed(event) {
 function pressCorner(place) {
   const reach = REACH / drawing.scale;
   let number = drawing.cornerAt(marking.pane, answers[marking.active], place, reach);
-  if (number < 0) number = marking.nextCorner(view().name);
+  if (number < 0) number = marking.nextCorner(view().name, skipped.corner);
   if (number === null) return;
   gestures += 1;
   drag = { kind: "corner", number, gesture: `drag ${gestures}` };
@@ -211,7 +230,7 @@ function moved(event) {
 
 function released() {
   if (drag && drag.kind === "edge" && distance(...pending.points) * drawing.scale > 10) {
-    const number = marking.nextEdge(view().name);
+    const number = marking.nextEdge(view().name, skipped.edge);
     if (number !== null) marking.setEdge(view().name, number, pending.points);
   }
   if (drag && drag.kind === "brush") marking.addStroke(view().name, pending);
@@ -234,6 +253,7 @@ function nextPane() {
   const labels = marking.document.panes.map((pane) => pane.label);
   if (!labels.length) return;
   marking.active = labels[(labels.indexOf(marking.active) + 1) % labels.length];
+  unskip();
   refresh();
 }
 
@@ -241,7 +261,8 @@ const KEYS = {
   ArrowLeft: () => show(current - 1),
   ArrowRight: () => show(current + 1),
   s: () => { const next = suggested()[0]; if (next) show(next.view); },
-  a: () => marking.addPane(),
+  a: () => { marking.addPane(); unskip(); refresh(); },
+  n: skip,
   0: () => { drawing.fit(); draw(); },
   1: () => choose("corner"),
   2: () => choose("edge"),
@@ -311,7 +332,7 @@ function listen() {
   window.addEventListener("beforeunload", (event) => { if (document.body.dataset.state === "changed") event.preventDefault(); });
   new ResizeObserver(() => { drawing.fit(); draw(); }).observe(canvas);
   document.querySelectorAll("[data-tool]").forEach((button) => button.addEventListener("click", () => choose(button.dataset.tool)));
-  for (const [id, act] of [["undo", () => marking.undo()], ["redo", () => marking.redo()], ["add", () => marking.addPane()], ["write", write], ["close", close]]) {
+  for (const [id, act] of [["undo", () => marking.undo()], ["redo", () => marking.redo()], ["add", KEYS.a], ["write", write], ["close", close]]) {
     element(id).addEventListener("click", (event) => { act(); event.currentTarget.blur(); });
   }
 }

@@ -1,0 +1,110 @@
+"""Paths of a camera through a scene: around what the photographs show, or along where they were taken."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+from torch import Tensor
+
+from glassplat.publish.surveyed import surveyed
+from glassplat.scene.camera import Camera
+
+MOST_KEYFRAMES = 12
+"""Photographs that a path goes through; more of them make it shake as the hand did that took them."""
+ALL_AROUND = 0.4
+"""Length of the mean direction from which photographs were taken, below which they were taken from all sides."""
+SHARE_OF_SPREAD = 1.2
+LEAST_LOOP = 0.08
+"""Of the distance: a loop in front of the scene is no smaller."""
+
+
+def orbit(cameras: Sequence[Camera], extent: float, frames: int) -> list[Camera]:
+    """Once around what the cameras look at, or, where they all stand on one side, in a loop before it; closed.
+
+    Args:
+        cameras: of the photographs; the first one gives the lens.
+        extent: of the scene.
+        frames: how many cameras to return.
+    """
+    survey = surveyed(cameras, extent)
+    centers = torch.stack([camera.center.double().cpu() for camera in cameras])
+    arms = centers - survey.focus
+    heights = arms @ survey.up
+    flat = arms - heights[:, None] * survey.up
+    facing = torch.nn.functional.normalize(flat, dim=1).mean(0)
+    angles = [2 * math.pi * index / frames for index in range(frames)]
+    if float(facing.norm()) < ALL_AROUND:
+        aside = torch.nn.functional.normalize(flat[0], dim=0)
+        ahead = torch.linalg.cross(survey.up, aside)
+        radius, height = float(flat.norm(dim=1).median()), float(heights.median())
+        places = [radius * (math.cos(a) * aside + math.sin(a) * ahead) + height * survey.up for a in angles]
+    else:
+        arm = arms.median(dim=0).values
+        right = torch.nn.functional.normalize(torch.linalg.cross(survey.up, arm), dim=0)
+        wide, tall = (_loop(arms @ axis, survey.distance) for axis in (right, survey.up))
+        places = [arm + wide * math.sin(a) * right + tall * math.cos(a) * survey.up for a in angles]
+    return [_towards(survey.focus + place, survey.focus, survey.up, cameras[0]) for place in places]
+
+
+def interpolated(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """A smooth way through the cameras, at an even pace from one to the next; the first and the last one are on it.
+
+    Args:
+        cameras: at least two; lenses change on the way as poses do, the size is that of the first one.
+        frames: how many cameras to return.
+
+    Raises:
+        ValueError: fewer than two cameras.
+    """
+    if len(cameras) < 2:
+        raise ValueError(f"{len(cameras)} cameras make no path; expected at least two")
+    knots = np.arange(len(cameras), dtype=np.float64)
+    times = np.linspace(0, knots[-1], frames)
+    poses = [camera.cam_from_world.double().cpu().numpy() for camera in cameras]
+    rotations = Rotation.from_matrix(np.stack([pose[:3, :3] for pose in poses]))
+    turned = RotationSpline(knots, rotations)(times).as_matrix()
+    places = CubicSpline(knots, np.stack([camera.center.double().cpu().numpy() for camera in cameras]))(times)
+    first = cameras[0]
+    alike = [camera.resized(first.width, first.height) for camera in cameras]
+    lenses = np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in alike])
+    lens = np.stack([np.interp(times, knots, column) for column in lenses.T], axis=1)
+    path = []
+    for rotation, place, (fx, fy, cx, cy) in zip(turned, places, lens.tolist(), strict=True):
+        path.append(Camera(_pose(rotation, place), fx, fy, cx, cy, first.width, first.height))
+    return path
+
+
+def keyframes_of(cameras: Sequence[Camera]) -> list[Camera]:
+    """A few of the cameras, evenly, the first and the last one among them."""
+    count = min(len(cameras), MOST_KEYFRAMES)
+    return [cameras[round(index * (len(cameras) - 1) / max(count - 1, 1))] for index in range(count)]
+
+
+def widened(camera: Camera, width: int) -> Camera:
+    """The camera with pictures of a width, both sides even, as encoders want them."""
+    height = max(2, 2 * round(width * camera.height / camera.width / 2))
+    return camera.resized(width, height)
+
+
+def _loop(spread: Tensor, distance: float) -> float:
+    return max(SHARE_OF_SPREAD * float(spread.std(correction=0)), LEAST_LOOP * distance)
+
+
+def _towards(place: Tensor, target: Tensor, up: Tensor, lens: Camera) -> Camera:
+    forward = torch.nn.functional.normalize(target - place, dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward]).numpy()
+    return replace(lens, cam_from_world=_pose(rotation, place.numpy()))
+
+
+def _pose(rotation: NDArray[np.float64], place: NDArray[np.float64]) -> Tensor:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ place
+    return torch.from_numpy(pose).float()

@@ -1,0 +1,75 @@
+"""Camera paths: smooth, upright, and where the scene is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from glassplat.publish.camera_paths import interpolated, keyframes_of, orbit, widened
+from glassplat.publish.look_around import cameras_around
+from glassplat.publish.surveyed import best_view, surveyed
+from glassplat.scene.camera import Camera
+from tests.files.test_spz import typical
+from tests.render.tiny_scene import camera_at
+from tests.train.tiny_capture import true_scene
+
+UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+AROUND = [camera for _, camera in cameras_around(typical(), UP)]
+IN_FRONT = [
+    replace(c, cam_from_world=c.cam_from_world.float())
+    for c in (camera_at(0.2 * k, 0.05 * (-1) ** k, -0.3) for k in range(-4, 5))
+]
+
+
+def forward(camera: Camera) -> torch.Tensor:
+    return camera.cam_from_world[2, :3].double()
+
+
+def test_a_survey_finds_what_all_look_at() -> None:
+    survey = surveyed(AROUND, 1.0)
+    middle = torch.stack([camera.center for camera in AROUND]).mean(0).double()
+    down = (survey.focus - middle) @ survey.up
+    assert float(down) < 0 and float((survey.focus - middle + survey.up * -down).norm()) < 1e-3 * survey.distance
+    torch.testing.assert_close(survey.up, UP, atol=1e-3, rtol=0)
+
+
+def test_an_orbit_goes_all_around_what_was_seen_from_all_sides() -> None:
+    survey, path = surveyed(AROUND, 1.0), orbit(AROUND, 1.0, 40)
+    arms = torch.stack([camera.center.double() - survey.focus for camera in path])
+    assert float(torch.nn.functional.normalize(arms, dim=1).mean(0).norm()) < 0.4
+    for camera, arm in zip(path, arms, strict=True):
+        assert float(forward(camera) @ torch.nn.functional.normalize(-arm, dim=0)) > 0.999
+        assert abs(float(arm.norm()) / survey.distance - 1) < 0.05
+
+
+def test_an_orbit_stays_in_front_of_what_was_seen_from_one_side() -> None:
+    path = orbit(IN_FRONT, 2.0, 24)
+    for camera in path:
+        assert float(forward(camera)[2]) > 0.8
+        assert min(float((camera.center - other.center).norm()) for other in IN_FRONT) < 0.5
+
+
+@pytest.mark.parametrize("frames", [2, 25])
+def test_an_interpolated_path_begins_and_ends_at_its_cameras(frames: int) -> None:
+    keys = keyframes_of(AROUND)[:5]
+    path = interpolated(keys, frames)
+    assert len(path) == frames
+    for mine, given in ((path[0], keys[0]), (path[-1], keys[-1])):
+        torch.testing.assert_close(mine.cam_from_world, given.cam_from_world, atol=1e-5, rtol=1e-5)
+    for camera in path:
+        rotation = camera.cam_from_world[:3, :3]
+        torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)
+    assert widened(path[0], 321 + 1).width % 2 == 0 and widened(path[0], 322).height % 2 == 0
+
+
+def test_one_camera_is_no_path() -> None:
+    with pytest.raises(ValueError, match="at least two"):
+        interpolated(AROUND[:1], 10)
+    assert keyframes_of(AROUND[:1]) == AROUND[:1]
+
+
+def test_the_first_view_shows_the_pane_in_its_middle() -> None:
+    away = replace(IN_FRONT[0], cam_from_world=torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ IN_FRONT[0].cam_from_world)
+    assert best_view(true_scene().planes, [away, *IN_FRONT]) in range(3, 8)

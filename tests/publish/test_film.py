@@ -1,0 +1,58 @@
+"""Films hold the pictures that were given, and nothing that only looks like one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from glassplat.publish.film import check_encoder, side_by_side, wiped, write_film
+
+PICTURES = [np.full((48, 64, 3), (40 + 20 * k, 100, 200 - 15 * k), dtype=np.uint8) for k in range(6)]
+
+
+def mean_colors(path: Path) -> list[np.ndarray]:
+    """Of every picture of a film."""
+    if path.suffix == ".mp4":
+        film, found = cv2.VideoCapture(str(path)), []
+        while (read := film.read())[0]:
+            found.append(read[1][..., ::-1].mean(axis=(0, 1)))
+        return found
+    with Image.open(path) as film:
+        count = film.n_frames
+        return [np.asarray(seek(film, k)).mean(axis=(0, 1)) for k in range(count)]
+
+
+def seek(film: Image.Image, index: int) -> Image.Image:
+    film.seek(index)
+    return film.convert("RGB")
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".webp", ".gif"])
+def test_every_picture_is_in_the_film(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"film{suffix}"
+    assert write_film(path, iter(PICTURES), fps=10) == len(PICTURES)
+    colors = mean_colors(path)
+    assert len(colors) == len(PICTURES)
+    for color, picture in zip(colors, PICTURES, strict=True):
+        np.testing.assert_allclose(color, picture[0, 0], atol=8)
+
+
+def test_what_is_no_film_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="avi is no name of a film"):
+        check_encoder(tmp_path / "film.avi")
+    with pytest.raises(ValueError, match="needs a picture"):
+        write_film(tmp_path / "film.webp", iter([]), fps=10)
+    with pytest.raises(OSError, match="VP9"):
+        write_film(tmp_path / "none" / "film.mp4", iter(PICTURES), fps=10)
+
+
+def test_a_wipe_shows_both() -> None:
+    left, right = PICTURES[0], PICTURES[5]
+    picture = wiped(left, right, 0.25)
+    assert (picture[:, :15] == left[:, :15]).all() and (picture[:, 17:] == right[:, 17:]).all()
+    assert (picture[:, 15:17] == 255).all()
+    assert side_by_side([left, right]).shape == (48, 128, 3)
