@@ -65,7 +65,7 @@ class SurroundingsOptions:
     rates: GaussianRates = field(default_factory=GaussianRates)
     densify: DefaultDensify = field(
         default_factory=partial(
-            DefaultDensify, split_by="gradient", stop=0.7, least_contribution=0.02, contribution_moments=(0.5, 0.8)
+            DefaultDensify, split_by="gradient", stop=0.7, least_contribution=0.02, contribution_moments=(0.8,)
         )
     )
     reset: bool = False
@@ -85,6 +85,7 @@ class TracedRecipe:
             the environment alone at first and later behind the surroundings.
         joint: reflections also move the surfaces; without, they only teach the surroundings (ablation).
         least_strength: rays are traced where the strength is larger; elsewhere the environment alone is mirrored.
+        least_iterations: of the shortest run in which anything reflects; a shorter one trains like `splat`.
         bootstrap: share of the run without reflection.
         surroundings: how the Gaussians learn that reflections show.
         texels: edge length of the environment's cube faces in the end.
@@ -124,6 +125,7 @@ class TracedRecipe:
     mirrors: Annotated[Mirrors, ESSENTIAL] = "both"
     joint: bool = True
     least_strength: Annotated[Share, ESSENTIAL] = 0.02
+    least_iterations: Several = 6000
     bootstrap: Share = 0.043
     surroundings: SurroundingsOptions = field(default_factory=SurroundingsOptions)
     texels: Annotated[Texels, ESSENTIAL] = 64
@@ -154,9 +156,11 @@ class TracedRecipe:
         published = DefaultDensify.published()
         plain = GaussianRates(decay=30_000 / CODE_ITERATIONS, short_run_power=0.0)
         return cls(
+            primitive="disc",
             sh_degree=2,
             mirrors="surroundings",
             least_strength=0.0,
+            least_iterations=1,
             bootstrap=3000 / CODE_ITERATIONS,
             surroundings=SurroundingsOptions(
                 start=SurroundingsStart(source="box", cells=32),
@@ -169,6 +173,7 @@ class TracedRecipe:
                     stop=21_000 / CODE_ITERATIONS,
                     gradient_threshold=1e-4,
                     cap=630_000,
+                    contribution_moments=(0.8,),
                 ),
                 reset=True,
             ),
@@ -210,8 +215,11 @@ class TracedRecipe:
         return Traced(self.background or BLACK, self.least_strength)
 
     def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
-        """Bootstrap, distant reflections, near reflections, and everything without propagation."""
-        bootstrap, distant, refinement = self._distant().stages(seed)
+        """Bootstrap, distant and near reflections, everything without propagation; a short run has one stage."""
+        known = self._distant().stages(seed, iterations)
+        if len(known) == 1:
+            return known
+        bootstrap, distant, refinement = known
         if self.primitive == "disc":
             distant, refinement = self._rendered(distant), self._rendered(refinement)
         if self.consistency_to_end:

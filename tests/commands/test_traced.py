@@ -22,7 +22,16 @@ LAYERS = render.LAYERS["traced"]
 def run(tmp_path: Path) -> Path:
     """A run of a few steps."""
     capture = write_object_capture(tmp_path / "ball")
-    options = ["--data", str(capture), "--output", str(tmp_path / "run"), "--iterations", "12"]
+    options = [
+        "--data",
+        str(capture),
+        "--output",
+        str(tmp_path / "run"),
+        "--iterations",
+        "12",
+        "--least-iterations",
+        "1",
+    ]
     options += ["--surroundings.start.cells", "3", "--sh-degree", "1", "--texels", "8", "--first-texels", "4"]
     assert main(["train", "traced", *options]) == 0
     return tmp_path / "run"
@@ -59,6 +68,15 @@ def test_broken_normals_beside_the_photographs_are_named(run: Path, capsys: pyte
     capture = run.parent / "ball"
     (capture / "train" / "normals").mkdir()
     shutil.copy(capture / "transforms_train.json", capture / "train" / "normals" / "r_0.npy")
-    options = ["--data", str(capture), "--output", str(run.parent / "other"), "--iterations", "12"]
+    options = [
+        "--data",
+        str(capture),
+        "--output",
+        str(run.parent / "other"),
+        "--iterations",
+        "12",
+        "--least-iterations",
+        "1",
+    ]
     assert main(["train", "traced", *options, "--surroundings.start.cells", "3"]) == 2
     assert "r_0.npy is no array that NumPy can read" in " ".join(capsys.readouterr().err.split())

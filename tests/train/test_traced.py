@@ -40,6 +40,7 @@ from tests.train.tiny_capture import tiny_capture
 RECIPE = TracedRecipe(
     sh_degree=1,
     least_strength=0.0,
+    least_iterations=1,
     first_strength=0.3,
     bootstrap=0.2,
     surroundings=SurroundingsOptions(
@@ -135,6 +136,15 @@ def test_a_resumed_run_ends_in_the_same_scene(tmp_path: Path) -> None:
     run(RECIPE, second)
     for name, tensor in whole.scene.parameters().items():
         assert torch.equal(second.scene.parameters()[name], tensor), name
+
+
+def test_a_short_run_is_one_of_splat() -> None:
+    recipe = replace(RECIPE, least_iterations=41)
+    state = fresh_state(recipe)
+    messages = list(train(recipe.stages(0, 40), tiny_capture(), state, 40))
+    assert [m.stage for m in messages if isinstance(m, StageEntered)] == ["as splat"]
+    assert not len(state.scene.surroundings)
+    recipe.renderer().check(state.scene)
 
 
 def test_recipes_survive_as_json() -> None:

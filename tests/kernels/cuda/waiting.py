@@ -13,9 +13,13 @@ import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from glassplat.densify import default as densify
 from glassplat.kernels import devices
-from glassplat.kernels.gradient_conflict import reference
+from glassplat.kernels.gradient_conflict import reference as conflict_twin
+from glassplat.kernels.layer_slopes import reference as slopes_twin
+from glassplat.kernels.screen_statistics import reference as statistics_twin
 from glassplat.losses import reflection
+from glassplat.render import planar
 from glassplat.scene import transfer
 
 ATEN = torch.ops.aten
@@ -110,6 +114,8 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch, waits: Waits) -> None:
         return SimpleNamespace(**{name: run(name) for name, value in vars(module).items() if callable(value)})
 
     monkeypatch.setattr(devices, "_module", counted)
-    # The only operation that is PyTorch's own on a GPU.
-    monkeypatch.setattr(reflection, "shared_edges", reference.gradient_conflict)
+    # The operations that are PyTorch's own on a GPU.
+    monkeypatch.setattr(reflection, "shared_edges", conflict_twin.gradient_conflict)
+    monkeypatch.setattr(planar, "layer_slopes", slopes_twin.layer_slopes)
+    monkeypatch.setattr(densify, "add_views", statistics_twin.add_views)
     monkeypatch.setattr(transfer, "waits", lambda device: True)

@@ -1,0 +1,28 @@
+"""Timing of whole steps: each number of threads takes its turn in one and the same run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numba
+
+from bench.methods import doublings
+from bench.steps import step_clocks
+from glassplat.train.messages import ActionDone, Message, StepDone
+
+
+def test_every_number_of_threads_takes_its_turn() -> None:
+    threads: list[int] = []
+
+    def run() -> Iterator[Message]:
+        for step in range(100):
+            threads.append(numba.get_num_threads())
+            yield StepDone(step, "view", 0.0, {}, {})
+            yield ActionDone(step, "densify", {})
+
+    counts = doublings(numba.config.NUMBA_NUM_THREADS)
+    times = step_clocks(run(), rounds=2)
+    # Two rounds are told, after one that only warms up.
+    assert {count: len(known) for count, known in times.items()} == dict.fromkeys(counts, 2)
+    assert threads == counts * 3
+    assert numba.get_num_threads() == numba.config.NUMBA_NUM_THREADS
