@@ -9,9 +9,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.devices import kernels_for
-from glassplat.kernels.maths.harmonics import check_sh_degree
+from glassplat.kernels.discs import SOLID
+from glassplat.kernels.projection_inputs import projection_inputs
 from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians
-from glassplat.kernels.tensor_checks import check_tensors
 
 
 def project(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, near: float) -> Projected:
@@ -39,43 +39,8 @@ def project(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, ne
         ValueError: a shape, the degree or `near` is out of range.
         TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
-    _check(gaussians, cameras, sh_degree, near)
-    clip_planes = cameras.clip_planes
-    if clip_planes is None:
-        clip_planes = gaussians.means.new_empty(0, 4)
-    windows = cameras.windows
-    if windows is None:
-        # Filled in on the device: numbers that came from here would make it wait.
-        windows = gaussians.means.new_zeros(cameras.cam_from_world.shape[0], 4)
-        windows[:, 2].fill_(cameras.width)
-        windows[:, 3].fill_(cameras.height)
-    outputs = _Project.apply(
-        *gaussians, cameras.cam_from_world, cameras.intrinsics, clip_planes, windows,
-        cameras.width, cameras.height, sh_degree, near,
-    )  # fmt: skip
-    return Projected(*outputs)
-
-
-def _check(gaussians: RawGaussians, cameras: CameraBatch, sh_degree: int, near: float) -> None:
-    count, num_cameras = gaussians.means.shape[0], cameras.cam_from_world.shape[0]
-    coefficients = gaussians.sh.shape[1] if gaussians.sh.dim() == 3 else 0
-    expected = {
-        "means": (gaussians.means, (count, 3)),
-        "quats": (gaussians.quats, (count, 4)),
-        "log_scales": (gaussians.log_scales, (count, 3)),
-        "logit_opacities": (gaussians.logit_opacities, (count,)),
-        "sh": (gaussians.sh, (count, coefficients, 3)),
-        "cam_from_world": (cameras.cam_from_world, (num_cameras, 4, 4)),
-        "intrinsics": (cameras.intrinsics, (num_cameras, 4)),
-    }
-    if cameras.clip_planes is not None:
-        expected["clip_planes"] = (cameras.clip_planes, (num_cameras, 4))
-    if cameras.windows is not None:
-        expected["windows"] = (cameras.windows, (num_cameras, 4))
-    check_tensors(expected)
-    check_sh_degree(sh_degree, coefficients)
-    if not near >= 0:
-        raise ValueError(f"near is {near}; expected a depth of at least 0")
+    inputs = projection_inputs(gaussians, cameras, scales=SOLID, sh_degree=sh_degree, near=near)
+    return Projected(*_Project.apply(*inputs, cameras.width, cameras.height, sh_degree, near))
 
 
 class _Project(torch.autograd.Function):

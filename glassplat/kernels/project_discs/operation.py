@@ -10,9 +10,8 @@ from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.devices import kernels_for
 from glassplat.kernels.discs import FLAT, ProjectedDiscs
-from glassplat.kernels.maths.harmonics import check_sh_degree
+from glassplat.kernels.projection_inputs import projection_inputs
 from glassplat.kernels.splats import CameraBatch, RawGaussians
-from glassplat.kernels.tensor_checks import check_tensors
 
 SMOOTH = 6
 """Outputs with a gradient; they come first."""
@@ -47,42 +46,8 @@ def project_discs(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: i
         ValueError: a shape, the degree or `near` is out of range.
         TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
-    _check(gaussians, cameras, sh_degree, near)
-    means = gaussians.means
-    clip_planes = means.new_empty(0, 4) if cameras.clip_planes is None else cameras.clip_planes
-    windows = cameras.windows
-    if windows is None:
-        # Filled in on the device: numbers that came from here would make it wait.
-        windows = means.new_zeros(cameras.cam_from_world.shape[0], 4)
-        windows[:, 2].fill_(cameras.width)
-        windows[:, 3].fill_(cameras.height)
-    outputs = _ProjectDiscs.apply(
-        *gaussians, cameras.cam_from_world, cameras.intrinsics, clip_planes, windows,
-        cameras.width, cameras.height, sh_degree, near,
-    )  # fmt: skip
-    return ProjectedDiscs(*outputs)
-
-
-def _check(gaussians: RawGaussians, cameras: CameraBatch, sh_degree: int, near: float) -> None:
-    count, num_cameras = gaussians.means.shape[0], cameras.cam_from_world.shape[0]
-    coefficients = gaussians.sh.shape[1] if gaussians.sh.dim() == 3 else 0
-    expected = {
-        "means": (gaussians.means, (count, 3)),
-        "quats": (gaussians.quats, (count, 4)),
-        "log_scales": (gaussians.log_scales, (count, FLAT)),
-        "logit_opacities": (gaussians.logit_opacities, (count,)),
-        "sh": (gaussians.sh, (count, coefficients, 3)),
-        "cam_from_world": (cameras.cam_from_world, (num_cameras, 4, 4)),
-        "intrinsics": (cameras.intrinsics, (num_cameras, 4)),
-    }
-    if cameras.clip_planes is not None:
-        expected["clip_planes"] = (cameras.clip_planes, (num_cameras, 4))
-    if cameras.windows is not None:
-        expected["windows"] = (cameras.windows, (num_cameras, 4))
-    check_tensors(expected)
-    check_sh_degree(sh_degree, coefficients)
-    if not near >= 0:
-        raise ValueError(f"near is {near}; expected a depth of at least 0")
+    inputs = projection_inputs(gaussians, cameras, scales=FLAT, sh_degree=sh_degree, near=near)
+    return ProjectedDiscs(*_ProjectDiscs.apply(*inputs, cameras.width, cameras.height, sh_degree, near))
 
 
 class _ProjectDiscs(torch.autograd.Function):
