@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 
@@ -11,15 +9,17 @@ from glassplat.data.view import View, _opaque
 from glassplat.losses.photometric import PhotometricLoss
 from glassplat.render.frame import Frame
 from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Scene
 
-UNUSED: Any = None
+SCENE = Scene(Gaussians.empty(), extent=1.0)
 CAMERA = Camera(torch.eye(4), 20.0, 20.0, 12.0, 8.0, 24, 16)
 
 
 def test_the_weight_blends_l1_and_dssim() -> None:
     photo = (torch.rand(16, 24, 3) * 255).to(torch.uint8)
     view, frame = View.in_memory("a.png", CAMERA, photo=photo), Frame(torch.rand(16, 24, 3))
-    l1, dssim, both = (PhotometricLoss(weight)(frame, view, UNUSED).item() for weight in (0.0, 1.0, 0.2))
+    l1, dssim, both = (PhotometricLoss(weight)(frame, view, SCENE).item() for weight in (0.0, 1.0, 0.2))
     assert l1 == pytest.approx((frame.rgb - photo / 255).abs().mean().item())
     assert both == pytest.approx(0.8 * l1 + 0.2 * dssim)
 
@@ -30,7 +30,7 @@ def test_a_render_over_the_background_of_a_transparent_photograph_is_without_los
     view = View.in_memory("a.png", CAMERA, photo=torch.from_numpy(_opaque(rgba.numpy(), (1.0, 1.0, 1.0))))
     alpha = rgba[..., 3:] / 255
     rgb = (rgba[..., :3] / 255 * alpha + 1 - alpha).requires_grad_()
-    loss = PhotometricLoss(0.0)(Frame(rgb), view, UNUSED)
+    loss = PhotometricLoss(0.0)(Frame(rgb), view, SCENE)
     (gradient,) = torch.autograd.grad(loss, rgb)
     assert loss.item() < 0.5 / 255
     assert gradient[:, :12].abs().max() == 0

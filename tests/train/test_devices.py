@@ -22,7 +22,16 @@ FACTORIES = {
     torch.rand, torch.randn, torch.from_numpy,
 }  # fmt: skip
 # The kernels of the CPU belong to it; what a run starts from is moved as a whole; data stays in memory.
-ON_THE_CPU = ("/cpu.py", "/cpu_", "/init/", "/data/", "/scene/gaussians.py", "/scene/plane.py", "/scene/environment.py")
+ON_THE_CPU = (
+    "/cpu.py",
+    "/cpu_",
+    "/init/",
+    "/data/",
+    "/scene/gaussians.py",
+    "/scene/plane.py",
+    "/scene/environment.py",
+    "/scene/exposure.py",
+)
 
 
 class WithoutDevice(TorchFunctionMode):
