@@ -31,7 +31,7 @@ class Browser:
 
     def __init__(self, page: Path | str, width: int = 640, height: int = 480, *, query: str = "#still") -> None:
         """Opens a page from its file, or from its address."""
-        self._profile = tempfile.TemporaryDirectory()
+        self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         (to_read, self._to_write), (self._from_read, from_write) = os.pipe(), os.pipe()
         # The browser reads its third descriptor and writes its fourth; a shell moves them there.
         command = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -26,6 +27,14 @@ SHOWN = Shown(
 )
 
 
+def eventually(happens: Callable[[], bool], seconds: float = 120) -> None:
+    """Waits for what a browser does in its own time."""
+    deadline = time.monotonic() + seconds
+    while not happens():
+        assert time.monotonic() < deadline, "it did not happen"
+        time.sleep(0.05)
+
+
 @pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
 def test_a_browser_is_shown_sharp_pictures_and_may_leave() -> None:
     viewer = Viewer(SHOWN, "127.0.0.1", 8790)
@@ -34,17 +43,14 @@ def test_a_browser_is_shown_sharp_pictures_and_may_leave() -> None:
     viewer._loop._show = lambda client, picture, is_sharp: (shown.append(is_sharp), show(client, picture, is_sharp))
     try:
         with Browser(f"http://127.0.0.1:{viewer.port}/", 400, 300) as browser:
-            while not any(shown):
-                time.sleep(0.05)
+            eventually(lambda: any(shown))
             (client,) = viewer._clients.values()
             shown.clear()
             client.stand_at(2)
             client._glass.value = "mirror"
-            while not any(shown):
-                time.sleep(0.05)
-            assert "Layer" in browser.evaluate("document.body.innerText")
-        while viewer._clients:
-            time.sleep(0.05)
+            eventually(lambda: any(shown))
+            eventually(lambda: "Layer" in browser.evaluate("document.body.innerText"))
+        eventually(lambda: not viewer._clients)
     finally:
         viewer.stop()
 
