@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
@@ -59,6 +58,8 @@ def _pane_discs(planes: Planes, index: int, *, count: int, seed: int) -> tuple[T
     means = planes.centers[index].detach().cpu() + in_plane @ torch.stack([tangent, bitangent])
 
     frame = torch.stack([tangent, bitangent, planes.normals[index].detach().cpu()], dim=1)
+    from scipy.spatial.transform import Rotation
+
     x, y, z, w = Rotation.from_matrix(frame.double().numpy()).as_quat()
     quat = torch.tensor([w, x, y, z], dtype=torch.float32)
     along = OVERLAP * math.sqrt(float(4 * half.prod()) / count)

@@ -9,8 +9,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
 from glassplat.publish.surveyed import surveyed
@@ -63,6 +61,9 @@ def interpolated(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     Raises:
         ValueError: fewer than two cameras.
     """
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
     if len(cameras) < 2:
         raise ValueError(f"{len(cameras)} cameras make no path; expected at least two")
     knots = np.arange(len(cameras), dtype=np.float64)
