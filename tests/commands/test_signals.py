@@ -74,7 +74,10 @@ def test_loading_pycolmap_leaves_termination_as_it_was() -> None:
 
 
 def test_pycolmap_can_be_loaded_in_another_thread() -> None:
-    script = "import threading\n\ndef load():\n    from glassplat.data.colmap_library import pycolmap\n    print('loaded')\n\n"
+    script = (
+        "import threading\n\ndef load():\n    from glassplat.data import colmap_library\n    colmap_library.pycolmap\n"
+    )
+    script += "    print('loaded')\n\n"
     assert ended(script + "worker = threading.Thread(target=load)\nworker.start()\nworker.join()")[1] == "loaded\n"
 
 
