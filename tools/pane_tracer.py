@@ -159,11 +159,25 @@ class Seen(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Lamp:
+    """Makes what is near it shine more: `power` times its texture at the centre, half of that at a distance `reach`."""
+
+    center: tuple[float, float, float]
+    reach: float
+    power: float = 2.0
+
+    def gains(self, points: Array) -> Array:
+        """Radiance [N, 1] of points [N, 3] for that of their textures; photographs cut at 1 what is brighter."""
+        return self.power / (1 + ((points - self.center) ** 2).sum(axis=1, keepdims=True) / self.reach**2)
+
+
+@dataclass(frozen=True)
 class Place:
-    """Things and panes; some thing must be a room, so that every ray ends."""
+    """Things and panes; some thing must be a room, so that every ray ends. Without a lamp all shine alike."""
 
     things: Sequence[Thing]
     panes: Sequence[Pane]
+    lamp: Lamp | None = None
 
     def without_panes(self, origins: Array, directions: Array) -> tuple[Array, Array]:
         """Radiance [N, 3] along rays of a place without panes, and how far [N] they go."""
@@ -174,7 +188,7 @@ class Place:
         for number, thing in enumerate(self.things):
             of_it = nearest == number
             radiance[of_it] = painted(points[of_it], thing.seed)
-        return radiance, distance
+        return radiance if self.lamp is None else radiance * self.lamp.gains(points), distance
 
     def radiance(self, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> Array:
         """Radiance [N, 3] along rays; panes that light meets after so many reflections are not there for it."""
