@@ -32,6 +32,11 @@ class Thing(Protocol):
         """Chooses its texture."""
         ...
 
+    @property
+    def shade(self) -> float:
+        """Factor on the radiance of its texture."""
+        ...
+
     def distances(self, origins: Array, directions: Array) -> Array:
         """How far [N] rays with unit directions go until they meet it; infinite where they do not."""
         ...
@@ -48,6 +53,7 @@ class Ball:
     center: tuple[float, float, float]
     radius: float
     seed: int
+    shade: float = 1.0
 
     def distances(self, origins: Array, directions: Array) -> Array:
         """See `Thing`."""
@@ -70,6 +76,7 @@ class Box:
     high: tuple[float, float, float]
     seed: int
     room: bool = False
+    shade: float = 1.0
 
     def distances(self, origins: Array, directions: Array) -> Array:
         """See `Thing`."""
@@ -101,6 +108,11 @@ class Carried:
     def seed(self) -> int:
         """See `Thing`."""
         return self.thing.seed
+
+    @property
+    def shade(self) -> float:
+        """See `Thing`."""
+        return self.thing.shade
 
     def distances(self, origins: Array, directions: Array) -> Array:
         """See `Thing`."""
@@ -218,7 +230,7 @@ class Place:
         radiance = np.empty_like(points)
         for number, thing in enumerate(self.things):
             of_it = nearest == number
-            radiance[of_it] = painted(thing.on_texture(points[of_it]), thing.seed)
+            radiance[of_it] = thing.shade * painted(thing.on_texture(points[of_it]), thing.seed)
         return radiance, distance
 
     def radiance(self, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> Array:

@@ -22,7 +22,8 @@ from glassplat.evaluate.evaluate import timed_render
 from glassplat.files.images import write_image
 from glassplat.kernels.devices import DeviceName
 from glassplat.render.deferred import Deferred
-from glassplat.render.frame import Frame
+from glassplat.render.frame import Frame, Renderer
+from glassplat.render.planar import with_photographer
 from glassplat.render.traced import Traced
 
 Layer = Literal[
@@ -39,11 +40,22 @@ Layer = Literal[
     "environment",
     "surroundings",
     "median_depth",
+    "photographed",
 ]
 
 LAYERS: dict[str, tuple[Layer, ...]] = {
     "splat": ("rgb", "depth", "alpha"),
-    "planar": ("rgb", "transmission", "without_panes", "reflection", "strength", "mask", "depth", "alpha"),
+    "planar": (
+        "rgb",
+        "transmission",
+        "without_panes",
+        "reflection",
+        "strength",
+        "mask",
+        "depth",
+        "alpha",
+        "photographed",
+    ),
     "deferred": ("rgb", "base", "reflection", "strength", "normal", "environment", "depth", "alpha"),
     "traced": ("rgb", "base", "reflection", "strength", "normal", "surroundings", "depth", "alpha"),
 }
@@ -51,6 +63,9 @@ LAYERS: dict[str, tuple[Layer, ...]] = {
 
 DISC_LAYERS: tuple[Layer, ...] = ("rgb", "normal", "depth", "median_depth", "alpha")
 """What `splat` renders of discs."""
+
+PHOTOGRAPHED: Layer = "photographed"
+"""The image with whom the panes of a photograph show, of runs that looked for somebody."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +95,7 @@ class Render:
         stored = open_run(self.run_directory, self.device, self.data)
         check_layers(self.layers, stored.recipe)
         scene = self.edits.applied(stored.scene)
-        renderer = stored.renderer
-        if "environment" in self.layers and isinstance(renderer, Deferred):
-            renderer = replace(renderer, environment=True)
-        if "surroundings" in self.layers and isinstance(renderer, Traced):
-            renderer = replace(renderer, surroundings=True)
+        renderer = with_layers(stored.renderer, self.layers)
         views = chosen_views(stored.dataset, self.split)
         paths = pictures_of(stored.dataset)
         targets = [self.output / layer / paths[view.name] for layer in self.layers for view in views]
@@ -106,6 +117,15 @@ class Render:
         return f"images already written to {self.output} are whole: repeat the command for all of them"
 
 
+def with_layers(renderer: Renderer, layers: Sequence[str]) -> Renderer:
+    """The renderer, which also renders those layers that cost more than an image."""
+    if "environment" in layers and isinstance(renderer, Deferred):
+        return replace(renderer, environment=True)
+    if "surroundings" in layers and isinstance(renderer, Traced):
+        return replace(renderer, surroundings=True)
+    return with_photographer(renderer, "beside") if PHOTOGRAPHED in layers else renderer
+
+
 def layers_of(recipe: Any) -> tuple[Layer, ...]:
     """What a run renders that is worth looking at."""
     return DISC_LAYERS if getattr(recipe, "primitive", None) == "disc" else LAYERS[recipe.method]
@@ -118,6 +138,8 @@ def check_layers(layers: Sequence[str], recipe: Any) -> None:
         InputError: there are such, or none is asked for.
     """
     known, method = layers_of(recipe), recipe.method
+    if method == "planar" and recipe.photographer.learn:
+        known = (*known, PHOTOGRAPHED)
     foreign = [layer for layer in layers if layer not in known]
     if foreign or not layers:
         asked = f"renders no layer {', '.join(foreign)}" if foreign else "renders nothing without --layers"
@@ -126,8 +148,8 @@ def check_layers(layers: Sequence[str], recipe: Any) -> None:
 
 def layer_image(frame: Frame, layer: str) -> Tensor:
     """A layer of a frame as an image in [0, 1]; depth is colour-mapped, near bright, normals are (n + 1) / 2."""
-    if layer == "rgb":
-        return frame.rgb.clamp(0, 1)
+    if layer in ("rgb", PHOTOGRAPHED):
+        return getattr(frame, layer).clamp(0, 1)
     image = frame.layers[layer]
     if layer == "normal":
         return normal_colors(image)

@@ -17,7 +17,7 @@ from rich.progress import track
 
 from glassplat.commands.messages import say
 from glassplat.commands.opened_scene import OpenedScene, open_scene
-from glassplat.commands.render import Layer, check_layers, layer_image
+from glassplat.commands.render import Layer, check_layers, layer_image, with_layers
 from glassplat.commands.scene_edits import SceneEdits
 from glassplat.data.errors import InputError, input_checked
 from glassplat.data.ranges import Range
@@ -114,9 +114,10 @@ class Video:
     def _pictures(self, opened: OpenedScene, cameras: Iterable[Camera]) -> Iterator[NDArray[np.uint8]]:
         """One picture per camera; rendered when the encoder asks for it."""
         frames = max(2, round(self.seconds * self.fps))
+        renderer = with_layers(opened.renderer, self.layers)
         for index, camera in enumerate(cameras):
             with torch.no_grad():
-                frame = opened.renderer(opened.scene, camera)
+                frame = renderer(opened.scene, camera)
                 shown = [self._picture(layer_image(frame, layer)) for layer in self.layers]
             if self.layout == "wipe":
                 share = 0.5 + WIPE_SPAN / 2 * math.sin(2 * math.pi * index / frames)

@@ -21,7 +21,9 @@ SPREAD = 0.2
 OPACITY = 0.05
 
 
-def first_photographer(planes: Planes, cameras: Sequence[Camera], *, count: int, sh_degree: int, seed: int) -> Gaussians:
+def first_photographer(
+    planes: Planes, cameras: Sequence[Camera], *, count: int, sh_degree: int, seed: int
+) -> Gaussians:
     """A faint grey cloud behind the camera, as dense in the logarithm of the distance from it everywhere.
 
     Args:

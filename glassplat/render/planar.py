@@ -14,7 +14,7 @@ from glassplat.kernels.composite import composite
 from glassplat.kernels.layer_slopes import layer_slopes
 from glassplat.kernels.panes import Fresnel, PaneHits, Panes
 from glassplat.kernels.splats import Deviation, Projected, Splats
-from glassplat.render.frame import Frame, ScreenPass
+from glassplat.render.frame import Frame, Renderer, ScreenPass
 from glassplat.render.glazing import Blend, Glazed, glazed, own_masks, visibilities
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
@@ -42,6 +42,9 @@ from glassplat.scene.photographer import world_from_photographer
 from glassplat.scene.plane import Planes
 from glassplat.scene.pose import mirror_matrices
 from glassplat.scene.scene import Scene
+
+Shown = Literal["absent", "present", "beside"]
+"""Whether panes show who took a photograph."""
 
 
 class FirstPass(NamedTuple):
@@ -116,7 +119,7 @@ class Planar:
     deviation_depth_gradient: bool = False
     blend: Blend = "linear"
     nearest_only: bool = False
-    photographer: Literal["absent", "present", "beside"] = "absent"
+    photographer: Shown = "absent"
     tells_mirrored: bool = True
 
     def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
@@ -202,7 +205,7 @@ class Planar:
         intensity = torch.exp(primary.channels["log_intensity"]).expand(len(seen.planes), -1)
         channels = torch.cat([projected.colors, intensity[..., None]], dim=-1)
         mirrored = [projected]
-        screen = (screen_pass("primary", projected, direct=False),) if probed else ()
+        screen: tuple[ScreenPass, ...] = (screen_pass("primary", projected, direct=False),) if probed else ()
         if self.photographer == "present" and len(scene.photographer):
             body = project_photographer(scene, camera, seen, near=NEAR_PER_EXTENT * scene.extent)
             # A body is as bright as it is: an intensity of its own would be a second factor on its colours.
@@ -291,6 +294,11 @@ def project_mirrored(gaussians: Gaussians, camera: Camera, seen: SeenPanes, *, n
         clip_planes=half_spaces_of(seen.planes, camera),
         windows=seen.windows,
     )
+
+
+def with_photographer(renderer: Renderer, photographer: Shown) -> Renderer:
+    """A renderer whose frames tell what photographs show, as far as it knows of anybody; see `Planar.photographer`."""
+    return replace(renderer, photographer=photographer) if isinstance(renderer, Planar) else renderer
 
 
 def project_photographer(scene: Scene, camera: Camera, seen: SeenPanes, *, near: float) -> Projected:
