@@ -1,9 +1,11 @@
 """Makes a capture of a room with free-standing panes, photographed all the way round, with exact layers.
 
     python -m tools.make_pane_scene --output scenes/screens
+    python -m tools.make_pane_scene --output scenes/room-1 --drawn 1
 
-Two panes of glass, one upright, one leaning, through which the other is seen, stand between things; a mirror hangs on
-a wall. docs/scenes.md describes the files. Needs nothing but glassplat's own dependencies.
+`screens`: two panes of glass, one upright, one leaning, through which the other is seen, stand between things; a mirror
+hangs on a wall. With `--drawn` everything is drawn by chance (`tools/pane_draws.py`). docs/scenes.md describes the
+files. Needs nothing but glassplat's own dependencies.
 """
 
 from __future__ import annotations
@@ -22,11 +24,12 @@ from scipy.spatial.transform import Rotation
 
 from tools.make_demo_scene import TEST_EVERY, srgb_from_linear
 from tools.make_scenes import GOLDEN_ANGLE_RAD, as_bytes, world_from_opengl
-from tools.pane_tracer import Array, Ball, Box, Pane, Place, Seen
+from tools.pane_draws import OPENGL_FROM_CAM, DrawnPlace, draw_place, standing_pane
+from tools.pane_tracer import Array, Ball, Box, Place, Seen
 from tools.photographer_body import photographer
+from tools.window_place import window_place, window_poses
 
 LOOKED_AT = np.array([0.0, 0.1, 0.8])
-OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
 ORBIT = (1.45, 1.75)
 """Least and largest distance of cameras from the vertical through `LOOKED_AT`, world units."""
 HEIGHTS = (0.7, 1.7)
@@ -56,9 +59,13 @@ class Arguments:
     points: int = 6000
     """Sparse points."""
     seed: int = 0
-    """Of cameras and points."""
+    """Of cameras and points of `screens` and `window`."""
+    drawn: int | None = None
+    """Seed of a place drawn by chance, to make in place of `screens`."""
+    window: bool = False
+    """Make a large window before a dark case, photographed from the front, in place of `screens`."""
     photographer: bool = False
-    """Somebody stands behind the camera with a phone before the face, and is seen in panes and the mirror."""
+    """Somebody stands behind the camera with a phone before the face, and is seen in panes and mirrors."""
 
 
 def make_place() -> Place:
@@ -79,20 +86,6 @@ def make_place() -> Place:
             standing_pane(3, (2.19, 0.0, 1.1), turn_deg=90, lean_deg=0, half_sizes=(0.7, 0.5), refraction=None),
         ),
     )
-
-
-def standing_pane(
-    label: int,
-    center: tuple[float, float, float],
-    *,
-    turn_deg: float,
-    lean_deg: float,
-    half_sizes: tuple[float, float],
-    refraction: float | None = 1.5,
-) -> Pane:
-    """A pane whose lower side is level: turned about the vertical from facing -y, then leaning back."""
-    axes = Rotation.from_euler("xz", [-lean_deg, turn_deg], degrees=True).as_matrix()
-    return Pane(label, np.array(center), -axes[:, 1], axes[:, 0], half_sizes, refraction)
 
 
 def camera_poses(count: int, seed: int) -> list[Array]:
@@ -191,7 +184,8 @@ def write_model(folder: Path, arguments: Arguments, poses: list[Array], place: P
         values = " ".join(f"{value:.9f}" for value in (w, x, y, z, *inverse[:3, 3]))
         lines.append(f"{number + 1} {values} 1 {view_name(number)}\n\n")
     (folder / "images.txt").write_text("".join(lines))
-    positions, colors = sparse_points(place, poses, arguments.points, arguments.seed)
+    seed = arguments.seed if arguments.drawn is None else arguments.drawn
+    positions, colors = sparse_points(place, poses, arguments.points, seed)
     rows = [
         f"{number + 1} {x:.6f} {y:.6f} {z:.6f} {r} {g} {b} 0.5\n"
         for number, ((x, y, z), (r, g, b)) in enumerate(zip(positions, colors, strict=True))
@@ -246,6 +240,15 @@ def write_view(arguments: Arguments, place: Place, number: int, pose: Array, *, 
         write_layers(folder / "gt/with_photographer", name, seen)
 
 
+def chosen_place(arguments: Arguments) -> DrawnPlace:
+    """The place to photograph, and from where."""
+    if arguments.drawn is not None:
+        return draw_place(arguments.drawn, arguments.views)
+    if arguments.window:
+        return DrawnPlace(window_place(), window_poses(arguments.views, arguments.seed))
+    return DrawnPlace(make_place(), camera_poses(arguments.views, arguments.seed))
+
+
 def main(arguments: Arguments) -> None:
     """Makes the scene."""
     folder = arguments.output
@@ -253,7 +256,8 @@ def main(arguments: Arguments) -> None:
         raise FileExistsError(f"{folder} exists; expected a new folder, so remove it first")
     for part in ("images", "masks", "sparse/0", "gt/strength"):
         (folder / part).mkdir(parents=True)
-    place, poses = make_place(), camera_poses(arguments.views, arguments.seed)
+    drawn = chosen_place(arguments)
+    place, poses = drawn.place, drawn.poses
     write_model(folder / "sparse/0", arguments, poses, place)
     write_planes(folder / "gt/planes.json", place)
     annotated, started = annotated_views(place, poses, arguments.masks), time.monotonic()

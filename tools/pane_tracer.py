@@ -209,17 +209,32 @@ class Seen(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Lamp:
+    """Makes what is near it shine more: `power` times its texture at the centre, half of that at a distance `reach`."""
+
+    center: tuple[float, float, float]
+    reach: float
+    power: float = 2.0
+
+    def gains(self, points: Array) -> Array:
+        """Radiance [N, 1] of points [N, 3] for that of their textures; photographs cut at 1 what is brighter."""
+        return self.power / (1 + ((points - self.center) ** 2).sum(axis=1, keepdims=True) / self.reach**2)
+
+
+@dataclass(frozen=True)
 class Place:
     """Things and panes.
 
     Attributes:
         things: what there is; one must be a room, so that every ray ends.
         panes: glass and mirrors.
+        lamp: without one all shine alike.
         photographer: things that stand where the rays come from: light meets them after a reflection only.
     """
 
     things: Sequence[Thing]
     panes: Sequence[Pane]
+    lamp: Lamp | None = None
     photographer: Sequence[Thing] = ()
 
     def without_panes(self, origins: Array, directions: Array) -> tuple[Array, Array]:
@@ -231,7 +246,7 @@ class Place:
         for number, thing in enumerate(self.things):
             of_it = nearest == number
             radiance[of_it] = thing.shade * painted(thing.on_texture(points[of_it]), thing.seed)
-        return radiance, distance
+        return radiance if self.lamp is None else radiance * self.lamp.gains(points), distance
 
     def radiance(self, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> Array:
         """Radiance [N, 3] along rays; panes that light meets after so many reflections are not there for it."""

@@ -6,9 +6,10 @@ import numpy as np
 
 from tools.pane_tracer import Array, Ball, Box, Carried, Thing
 
-PHONE = Box((-0.08, -0.04, -0.02), (0.08, 0.04, -0.01), seed=70)
+PHONE = Box((-0.08, -0.04, -0.02), (0.08, 0.04, -0.01), seed=70, shade=0.1)
+# In dark clothes, as most people are; face and hands are bright.
 HEAD = Ball((0.0, 0.03, -0.2), 0.11, seed=80)
-TORSO = Box((-0.23, 0.18, -0.32), (0.23, 0.8, -0.1), seed=90)
+TORSO = Box((-0.23, 0.18, -0.32), (0.23, 0.8, -0.1), seed=90, shade=0.2)
 HANDS = (Ball((-0.09, 0.05, -0.05), 0.045, seed=80), Ball((0.09, 0.05, -0.05), 0.045, seed=80))
 LEG_TOP, LEG_WIDTH = 0.8, 0.18
 UP = np.array([0.0, 0.0, 1.0])
@@ -27,7 +28,7 @@ def photographer(world_from_cam: Array) -> tuple[Thing, ...]:
     if height > LEG_TOP:
         for side in (-1, 1):
             low, high = sorted((side * 0.04, side * (0.04 + LEG_WIDTH)))
-            parts.append(Box((low, LEG_TOP, -0.3), (high, height, -0.12), seed=100))
+            parts.append(Box((low, LEG_TOP, -0.3), (high, height, -0.12), seed=100, shade=0.12))
     return tuple(Carried(part, frame) for part in parts)
 
 

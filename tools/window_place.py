@@ -6,12 +6,13 @@ import math
 
 import numpy as np
 
+from tools.make_scenes import world_from_opengl
+from tools.pane_draws import OPENGL_FROM_CAM
 from tools.pane_tracer import Array, Ball, Box, Pane, Place
-from tools.scene_surfaces import look
 
 WINDOW_HEIGHT = 1.25
 """Of the middle of the pane."""
-DARK, PLAIN = 0.25, 0.6
+DARK, PLAIN = 0.12, 0.6
 
 
 def window_place() -> Place:
@@ -42,8 +43,8 @@ def window_poses(count: int, seed: int) -> list[Array]:
         position = generator.uniform((-1.2, -2.2, 1.1), (1.2, -0.9, 1.7))
         if number % 3 == 2:
             angle = math.radians(generator.uniform(180, 360))
-            target = position + [math.cos(angle), math.sin(angle), generator.uniform(-0.3, 0.2)]
+            target = position + np.array([math.cos(angle), math.sin(angle), generator.uniform(-0.3, 0.2)])
         else:
             target = np.array([generator.uniform(-0.6, 0.6), 0.0, generator.uniform(0.85, 1.4)])
-        poses.append(look(position, target))
+        poses.append(world_from_opengl(position, target) @ OPENGL_FROM_CAM)
     return poses
