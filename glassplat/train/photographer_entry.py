@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 from glassplat.data.dataset import Dataset
-from glassplat.data.ranges import ESSENTIAL, Range, ShDegree
+from glassplat.data.ranges import Range, ShDegree
 from glassplat.densify.default import DefaultDensify
 from glassplat.init.photographer import first_photographer
 from glassplat.render.planar import Planar
@@ -31,7 +31,7 @@ class Photographer:
         rates: learning rates.
     """
 
-    learn: Annotated[bool, ESSENTIAL] = False
+    learn: bool = False
     upright: bool = True
     count: Annotated[int, Range(1, 1_000_000)] = 500
     sh_degree: ShDegree = 0
