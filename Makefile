@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check --no-input
 
-.PHONY: help setup browser demo test lint format bench clean
+.PHONY: help setup browser demo test lint format docs bench clean
 .DEFAULT_GOAL := help
 
 help:
@@ -15,6 +15,7 @@ help:
 	@echo "make test    style, types and tests, as the continuous integration runs them"
 	@echo "make lint    style and types only"
 	@echo "make format  rewrite the sources in the project's format"
+	@echo "make docs    the documentation of the Python interface, in build/docs"
 	@echo "make bench   measure the kernels and the methods"
 	@echo "make setup   only create .venv"
 	@echo "make browser install Chromium for the tests of pages, from Debian's packages (asks for sudo where needed)"
@@ -51,6 +52,9 @@ test: lint
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+docs: $(STAMP)
+	$(BIN)/python -m tools.make_docs build/docs
 
 bench: $(STAMP)
 	$(BIN)/python -m bench

@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from glassplat.commands.opened_scene import OpenedScene, cameras_of, open_scene
+from glassplat.commands.export import cameras_of
 from glassplat.evaluate.metrics import psnr
 from glassplat.files.spz_sections import FLIP
+from glassplat.interface.loading import load
+from glassplat.interface.model import Model
 from glassplat.scene.camera import Camera
 from tools.headless import Browser
 
@@ -41,13 +43,13 @@ def picture(browser: Browser, camera: Camera, layer: str = "rgb") -> torch.Tenso
     return torch.from_numpy(pixels.reshape(camera.height, camera.width, 4)[::-1, :, :3].copy())
 
 
-def likenesses(browser: Browser, opened: OpenedScene) -> list[float]:
+def likenesses(browser: Browser, model: Model) -> list[float]:
     """PSNR of the page's pictures against the renders of some test cameras."""
-    cameras = [camera for _, camera in cameras_of(opened, "test")]
+    cameras = cameras_of(model, "test")
     found = []
     for camera in cameras[:: max(1, len(cameras) // VIEWS)][:VIEWS]:
         with torch.no_grad():
-            truth = opened.renderer(opened.scene, camera).rgb
+            truth = model.renderer(model.scene, camera).rgb
         found.append(psnr(picture(browser, camera), truth.clamp(0, 1)))
     return found
 
@@ -55,9 +57,9 @@ def likenesses(browser: Browser, opened: OpenedScene) -> list[float]:
 def main() -> None:
     """Prints both."""
     run, page = map(Path, sys.argv[1:3])
-    opened = open_scene(run, "cpu")
+    model = load(run, device="cpu")
     with Browser(page, 640, 480) as browser:
-        found = likenesses(browser, opened)
+        found = likenesses(browser, model)
         print(
             f"{page.stat().st_size / 1e6:.2f} MB, PSNR of {len(found)} views: {', '.join(f'{x:.1f}' for x in found)} dB"
         )

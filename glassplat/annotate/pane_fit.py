@@ -8,7 +8,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from glassplat.annotate.eye import Eye
 from glassplat.annotate.pane_shape import PaneShape, polygon_pane, rectangle_pane
@@ -88,6 +87,8 @@ def fitted_pane(marks: Marks, eyes: Sequence[Eye], shape: Shape) -> PaneFit:
     Raises:
         TooFewMarksError: a corner of too few is known from two places; the message says what to mark.
     """
+    from scipy.optimize import least_squares
+
     start = polygon_pane(_first_corners(marks, eyes))
     begun: PaneShape = rectangle_pane(start) if shape == "rectangle" and len(marks.corners) == 4 else start
 

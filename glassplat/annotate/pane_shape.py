@@ -7,7 +7,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
@@ -132,4 +131,6 @@ def rectangle_pane(polygon: PolygonPane) -> RectanglePane:
 
 def _turned(axes: Array, angles: Array) -> Array:
     """Axes turned about themselves by small angles, radians."""
+    from scipy.spatial.transform import Rotation
+
     return np.asarray(Rotation.from_rotvec(angles).as_matrix().T @ axes)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,22 +11,22 @@ import tyro
 from rich.console import Console
 
 from glassplat.commands.messages import say, warn
-from glassplat.commands.opened_scene import OpenedScene, cameras_of, open_scene
 from glassplat.commands.output_folder import check_targets, claim_folder
 from glassplat.commands.scene_edits import SceneEdits
-from glassplat.data.errors import InputError, input_checked
+from glassplat.data.dataset import TEST_EVERY
+from glassplat.data.errors import InputError
 from glassplat.evaluate.metrics import psnr
-from glassplat.files.atomic import atomic_write
 from glassplat.files.cameras_json import write_cameras
-from glassplat.files.environment_image import write_equirect
-from glassplat.files.planes_json import write_planes
 from glassplat.files.ply import write_gaussians
 from glassplat.files.spz import write_spz
+from glassplat.interface.loading import load
+from glassplat.interface.model import Model
+from glassplat.interface.saving import ENVIRONMENT, GLASS, PLANES, save_page, write_beside
 from glassplat.kernels.devices import DeviceName
-from glassplat.publish.web_page import can_show, write_page
+from glassplat.publish.web_page import can_show
 from glassplat.render.baked import baked
-from glassplat.render.environment import equirect_from_environment
 from glassplat.render.splat import Splat
+from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane_edits import without_glass
 from glassplat.scene.scene import Scene
@@ -68,8 +67,8 @@ class Export:
         """Writes the files."""
         if not self.formats:
             raise InputError("nothing to write without --formats; expected ply, spz or html")
-        opened = open_scene(self.run_directory, self.device)
-        opened = opened._replace(scene=self._chosen(self.edits.applied(opened.scene)))
+        model = load(self.run_directory, device=self.device)
+        model = model.with_scene(self._chosen(self.edits.applied(model.scene)))
         targets = [
             self.output / name
             for name in ("index.html", "scene.ply", "scene.spz", "glass.ply", "planes.json", "cameras.json")
@@ -77,20 +76,15 @@ class Export:
         check_targets(self.output, targets, [])
         if claim_folder(self.output, "export", self.run_directory):
             say(console, f"replacing the files of an earlier run of this command in {self.output}")
-        gaussians = opened.scene.primary
+        gaussians = model.scene.primary
         if self.bake_reflections:
-            gaussians = self._baked(opened, console)
+            gaussians = self._baked(model, console)
         else:
-            self._write_beside(opened.scene, console)
-        write_cameras(self.output / "cameras.json", opened.cameras)
+            self._write_beside(model.scene, console)
+        write_cameras(self.output / "cameras.json", model.cameras.items())
         self._write_gaussians(gaussians, console)
-        if "html" in self.formats and can_show(opened.renderer):
-            self._write_page(opened, console)
-        elif "html" in self.formats:
-            warn(
-                console,
-                f"no page was written: it shows planar and splat runs, not {opened.recipe.method} ones of this kind",
-            )
+        if "html" in self.formats:
+            self._write_page(model, console)
 
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""
@@ -104,15 +98,15 @@ class Export:
         bare = without_glass(scene)
         return replace(bare, primary=replace(bare.primary, channels={}))
 
-    def _baked(self, opened: OpenedScene, console: Console) -> Gaussians:
-        if not len(opened.scene.planes):
-            raise InputError(f"{opened.path} has no panes whose reflections could be baked")
+    def _baked(self, model: Model, console: Console) -> Gaussians:
+        if not len(model.scene.planes):
+            raise InputError(f"{model.path} has no panes whose reflections could be baked")
         say(console, "rendering the panes to bake what they reflect")
-        gaussians = baked(opened.scene, opened.renderer, [camera for _, camera in cameras_of(opened, "train")])
-        before, after = baking_errors(opened, gaussians)
+        gaussians = baked(model.scene, model.renderer, cameras_of(model, "train"))
+        before, after = baking_errors(model, gaussians)
         say(
             console,
-            f"{len(gaussians) - len(opened.scene.primary)} Gaussians added behind the panes; of the true render's "
+            f"{len(gaussians) - len(model.scene.primary)} Gaussians added behind the panes; of the true render's "
             f"panes they show {after:.1f} dB over the test views, the scene without them {before:.1f} dB",
         )
         return replace(gaussians, channels={})
@@ -126,53 +120,45 @@ class Export:
             write_spz(path, gaussians, self.spz_version)
             say(console, f"{path.stat().st_size / 1e6:.2f} MB, version {self.spz_version} -> {path}")
 
-    def _write_page(self, opened: OpenedScene, console: Console) -> None:
+    def _write_page(self, model: Model, console: Console) -> None:
         """The page shows the panes themselves, so that it needs nothing baked."""
         path = self.output / "index.html"
-        with input_checked():
-            write_page(path, opened.scene, opened.renderer, cameras_of(opened, "all"), self.title or opened.name)
+        if not can_show(model.renderer):
+            warn(console, f"no page was written: it does not show {model.recipe.method} runs of this kind")
+            return
+        save_page(model, path, self.title or model.name)
         say(console, f"{path.stat().st_size / 1e6:.2f} MB, open it in a browser -> {path}")
 
     def _write_beside(self, scene: Scene, console: Console) -> None:
         """Planes, glass and environment, where there are any."""
+        write_beside(self.output, scene)
         if len(scene.planes):
-            write_planes(self.output / "planes.json", scene.planes)
-            write_gaussians(self.output / "glass.ply", scene.glass)
-            say(console, f"{len(scene.planes)} panes -> {self.output / 'planes.json'}, their shape -> glass.ply")
+            say(console, f"{len(scene.planes)} panes -> {self.output / PLANES}, their shape -> {GLASS}")
         if not scene.environment.is_empty:
-            write_environment_files(self.output, scene)
-            warn(console, "other viewers show this scene without what it mirrors; that is in environment.json")
+            warn(console, f"other viewers show this scene without what it mirrors; that is in {ENVIRONMENT}")
 
 
 @torch.no_grad()
-def baking_errors(opened: OpenedScene, gaussians: Gaussians) -> tuple[float, float]:
+def baking_errors(model: Model, gaussians: Gaussians) -> tuple[float, float]:
     """PSNR over the pixels of panes, against the true render, without baked reflections and with them."""
-    chosen = cameras_of(opened, "test")
-    bare, full = Scene(opened.scene.primary, opened.scene.extent), Scene(gaussians, opened.scene.extent)
+    chosen = cameras_of(model, "test")
+    bare, full = Scene(model.scene.primary, model.scene.extent), Scene(gaussians, model.scene.extent)
     images: dict[str, list[torch.Tensor]] = {"truth": [], "bare": [], "full": []}
-    for _, camera in chosen[:: max(1, len(chosen) // COMPARED_VIEWS)]:
-        frame = opened.renderer(opened.scene, camera)
+    for camera in chosen[:: max(1, len(chosen) // COMPARED_VIEWS)]:
+        frame = model.renderer(model.scene, camera)
         hit = frame.layers["strength"] > 0
         images["truth"].append(frame.rgb[hit])
         images["bare"].append(Splat()(bare, camera).rgb[hit])
         images["full"].append(Splat()(full, camera).rgb[hit])
     truth, without, with_images = (torch.cat(images[name]) for name in ("truth", "bare", "full"))
     if not len(truth):
-        raise InputError(f"no view of {opened.path} shows a pane; there is nothing to bake")
+        raise InputError(f"no view of {model.path} shows a pane; there is nothing to bake")
     return psnr(without, truth), psnr(with_images, truth)
 
 
-def write_environment_files(folder: Path, scene: Scene) -> None:
-    """The surroundings as a panorama, and a description that says how to read it."""
-    environment = scene.environment
-    write_equirect(folder / "environment.png", equirect_from_environment(environment, 2 * environment.size))
-    description = {
-        "image": "environment.png",
-        "projection": "equirectangular",
-        "color": "sRGB",
-        "up": "+z in the top row",
-        "forward": "+x in the middle column, +y left of it",
-        "region": environment.region,
-    }
-    with atomic_write(folder / "environment.json") as temporary:
-        temporary.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
+def cameras_of(model: Model, split: Literal["train", "test"]) -> list[Camera]:
+    """The cameras of a split, by name: every eighth is of the test views; all of them, where there are few."""
+    cameras = [model.cameras[name] for name in sorted(model.cameras)]
+    if len(cameras) < TEST_EVERY:
+        return cameras
+    return [camera for index, camera in enumerate(cameras) if (index % TEST_EVERY == 0) == (split == "test")]

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 from rich.console import Console
 
-from glassplat.commands.imported_scene import NamedCameras, Up, imported_scene
 from glassplat.commands.messages import say, warn
 from glassplat.data.errors import InputError, input_checked
-from glassplat.files.cameras_json import write_cameras
-from glassplat.files.folders import check_folder, make_folder
-from glassplat.scene.scene import Scene
+from glassplat.files.folders import check_folder
+from glassplat.interface.imported_scene import Up, imported_scene
+from glassplat.interface.model import Model, by_name
+from glassplat.interface.saving import write_as_run
+from glassplat.train.background import BLACK
 from glassplat.train.planar_recipe import PlanarRecipe
-from glassplat.train.recipe import recipe_to_json
-from glassplat.train.run_directory import RunDirectory, write_text
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,8 @@ class Import:
             scene, cameras, lost = imported_scene(self.file, self.planes, self.up)
         if lost:
             warn(console, f"{lost} Gaussians were left out: values that are no numbers or too large to draw")
-        write_imported(self.output, scene, cameras, self.file)
+        model = Model(scene, PlanarRecipe(background=BLACK), by_name(cameras))
+        write_as_run(self.output, model, self.file)
         panes = f", {len(scene.planes)} panes" if len(scene.planes) else ""
         say(console, f"{len(scene.primary)} Gaussians of degree {scene.primary.max_sh_degree}{panes} -> {self.output}")
         say(console, f"next: glassplat view {self.output}")
@@ -54,13 +53,3 @@ class Import:
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""
         return f"{self.output} may hold a part of the scene: delete it and repeat the command"
-
-
-def write_imported(folder: Path, scene: Scene, cameras: NamedCameras, source: Path) -> None:
-    """Writes a scene without photographs as a run; the record comes last, so that a part of one is none."""
-    make_folder(folder)
-    directory = RunDirectory(folder)
-    directory.export(scene, step=0)
-    write_cameras(folder / "cameras.json", cameras)
-    write_text(directory.imported, json.dumps({"file": str(source.resolve())}))
-    write_text(folder / "recipe.json", recipe_to_json(PlanarRecipe(background=(0.0, 0.0, 0.0))))

@@ -14,10 +14,11 @@ from glassplat.commands.training_progress import TrainingProgress
 from glassplat.data.dataset import Dataset, load_dataset
 from glassplat.data.masks import Polarity
 from glassplat.data.ranges import Downscale, Positive, Seed, Several
+from glassplat.interface.training import Training
 from glassplat.kernels.devices import DeviceName, chosen_device
 from glassplat.train.background import photo_background
 from glassplat.train.recipe import Preset, Recipe
-from glassplat.train.run import CHECKPOINT_SECONDS, check_output, run_training
+from glassplat.train.run import CHECKPOINT_SECONDS, check_output
 from glassplat.train.run_directory import RunDirectory, RunSettings
 
 RecipeKind = TypeVar("RecipeKind", bound=Recipe)
@@ -63,20 +64,22 @@ class Train(Generic[RecipeKind]):
             self.data, downscale=self.downscale, background=background, mask_polarity=self.mask_polarity
         )
         describe(dataset, console)
+        training = Training(
+            dataset,
+            self.recipe,
+            iterations=self.iterations,
+            output=self.output,
+            seed=self.seed,
+            device=self.device,
+            resume=self.resume,
+            checkpoint_every=self.checkpoint_every,
+        )
         with TrainingProgress(console, self.iterations) as progress:
-            state = run_training(
-                self.recipe,
-                self.settings(),
-                RunDirectory(self.output),
-                dataset,
-                resume=self.resume,
-                listen=progress.show,
-                checkpoint_every=self.checkpoint_every,
-            )
+            scene = training.run(progress.show).scene
         say(
             console,
-            f"trained {self.recipe.method} for {state.step} iterations in {state.seconds:.0f} s: "
-            f"{len(state.scene.primary)} Gaussians, {len(state.scene.planes)} panes -> {self.output}",
+            f"trained {self.recipe.method} for {training.step} iterations in {training.seconds:.0f} s: "
+            f"{len(scene.primary)} Gaussians, {len(scene.planes)} panes -> {self.output}",
         )
         say(console, f"next: glassplat eval {self.output}")
 

@@ -16,16 +16,18 @@ from rich.console import Console
 from rich.progress import track
 
 from glassplat.commands.messages import say
-from glassplat.commands.opened_scene import OpenedScene, open_scene
-from glassplat.commands.render import Layer, check_layers, layer_image, with_layers
 from glassplat.commands.scene_edits import SceneEdits
 from glassplat.data.errors import InputError, input_checked
 from glassplat.data.ranges import Range
+from glassplat.evaluate.layer_image import layer_image
 from glassplat.evaluate.metrics import quantized
 from glassplat.files.atomic import atomic_write
 from glassplat.files.cameras_json import read_cameras
+from glassplat.interface.layers import Layer, check_layers, renderer_with
+from glassplat.interface.loading import load
+from glassplat.interface.model import Model
 from glassplat.kernels.devices import DeviceName
-from glassplat.publish.camera_paths import interpolated, keyframes_of, orbit, widened
+from glassplat.publish.camera_paths import interpolated, keyframes_of, widened
 from glassplat.publish.film import check_encoder, side_by_side, wiped, write_film
 from glassplat.scene.camera import Camera
 
@@ -69,11 +71,11 @@ class Video:
     def run(self, console: Console) -> None:
         """Renders and encodes."""
         self._check()
-        opened = open_scene(self.scene, self.device)
-        check_layers(self.layers, opened.recipe)
-        opened = opened._replace(scene=self.edits.applied(opened.scene))
-        cameras = self._cameras(opened)
-        pictures = self._pictures(opened, track(cameras, "filming", console=console))
+        model = load(self.scene, device=self.device)
+        check_layers(self.layers, model.recipe)
+        model = model.with_scene(self.edits.applied(model.scene))
+        cameras = self._cameras(model)
+        pictures = self._pictures(model, track(cameras, "filming", console=console))
         with atomic_write(self.output) as temporary:
             count = write_film(temporary, pictures, self.fps)
         say(console, f"{count} pictures, {self.output.stat().st_size / 1e6:.1f} MB -> {self.output}")
@@ -98,26 +100,24 @@ class Video:
         if (self.path == "keyframes") != (self.keyframes is not None):
             raise InputError("--path keyframes and --keyframes FILE belong together; give both or neither")
 
-    def _cameras(self, opened: OpenedScene) -> list[Camera]:
+    def _cameras(self, model: Model) -> list[Camera]:
         frames = max(2, round(self.seconds * self.fps))
-        given = [camera for _, camera in opened.cameras]
         with input_checked():
             if self.keyframes is not None:
                 cameras = interpolated([camera for _, camera in read_cameras(self.keyframes)], frames)
             elif self.path == "interpolate":
-                by_name = sorted(opened.cameras, key=lambda named: named[0])
-                cameras = interpolated(keyframes_of([camera for _, camera in by_name]), frames)
+                cameras = interpolated(keyframes_of([model.cameras[name] for name in sorted(model.cameras)]), frames)
             else:
-                cameras = orbit(given, opened.scene.extent, frames)
+                cameras = model.orbit(frames)
         return [widened(camera, self.width + self.width % 2) for camera in cameras]
 
-    def _pictures(self, opened: OpenedScene, cameras: Iterable[Camera]) -> Iterator[NDArray[np.uint8]]:
+    def _pictures(self, model: Model, cameras: Iterable[Camera]) -> Iterator[NDArray[np.uint8]]:
         """One picture per camera; rendered when the encoder asks for it."""
         frames = max(2, round(self.seconds * self.fps))
-        renderer = with_layers(opened.renderer, self.layers)
+        renderer = renderer_with(model.renderer, self.layers)
         for index, camera in enumerate(cameras):
             with torch.no_grad():
-                frame = renderer(opened.scene, camera)
+                frame = renderer(model.scene, camera)
                 shown = [self._picture(layer_image(frame, layer)) for layer in self.layers]
             if self.layout == "wipe":
                 share = 0.5 + WIPE_SPAN / 2 * math.sin(2 * math.pi * index / frames)

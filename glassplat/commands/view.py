@@ -15,12 +15,12 @@ from rich.console import Console
 from torch import Tensor
 
 from glassplat.commands.messages import say
-from glassplat.commands.opened_scene import OpenedScene, open_scene
-from glassplat.commands.render import layers_of
 from glassplat.commands.scene_edits import SceneEdits
 from glassplat.commands.stored_run import open_run
 from glassplat.data.errors import InputError
 from glassplat.data.ranges import Range
+from glassplat.interface.loading import load
+from glassplat.interface.model import Model
 from glassplat.kernels.devices import DeviceName
 from glassplat.viewer.server import Shown, Viewer
 
@@ -48,9 +48,9 @@ class View:
 
     def run(self, console: Console) -> None:
         """Serves until it is interrupted."""
-        opened = open_scene(self.scene, self.device)
+        model = load(self.scene, device=self.device)
         check_port(self.host, self.port)
-        viewer = self._viewer(opened._replace(scene=self.edits.applied(opened.scene)))
+        viewer = self._viewer(model.with_scene(self.edits.applied(model.scene)))
         try:
             say(console, f"look at http://{'localhost' if self.host == LOCAL else self.host}:{viewer.port}")
             if self.host == LOCAL:
@@ -68,11 +68,11 @@ class View:
         """What an interrupt leaves, and how to go on."""
         return "nothing was changed"
 
-    def _viewer(self, opened: OpenedScene) -> Viewer:
+    def _viewer(self, model: Model) -> Viewer:
         try:
-            layers = [layer for layer in layers_of(opened.recipe) if layer not in HIDDEN_LAYERS]
-            photographs = photographs_beside(opened)
-            shown = Shown(opened.name, opened.scene, opened.renderer, layers, opened.cameras, photographs)
+            layers = [layer for layer in model.layers if layer not in HIDDEN_LAYERS]
+            cameras = tuple(model.cameras.items())
+            shown = Shown(model.name, model.scene, model.renderer, layers, cameras, photographs_of(self.scene))
             return Viewer(shown, self.host, self.port)
         except ImportError as error:
             raise InputError(
@@ -81,12 +81,12 @@ class View:
             ) from error
 
 
-def photographs_beside(opened: OpenedScene) -> dict[str, Callable[[], Tensor]]:
+def photographs_of(run: Path) -> dict[str, Callable[[], Tensor]]:
     """The photographs of a run by name, where they still are."""
-    if not opened.path.is_dir():
+    if not run.is_dir():
         return {}
     try:
-        dataset = open_run(opened.path, "cpu").dataset
+        dataset = open_run(run, "cpu").dataset
     except (InputError, FileNotFoundError):
         return {}
     views = [view for view in (*dataset.train, *dataset.test) if view.image_path.is_file()]

@@ -1,4 +1,4 @@
-"""pycolmap, without what importing it does to the process.
+"""pycolmap, when it is first asked for, and without what importing it does to the process.
 
 It installs a handler that answers SIGTERM, with which job schedulers and shut-downs end a process, like a crash: with a
 stack of its C++ functions. Whatever answered before does so again.
@@ -8,13 +8,18 @@ from __future__ import annotations
 
 import signal
 import threading
+from typing import Any
 
-_before = signal.getsignal(signal.SIGTERM)
 
-import pycolmap  # noqa: E402
+def __getattr__(name: str) -> Any:
+    """`pycolmap`, which takes a tenth of a second to import."""
+    if name != "pycolmap":
+        raise AttributeError(f"module {__name__} has no attribute {name}")
+    before = signal.getsignal(signal.SIGTERM)
+    import pycolmap
 
-# Only the main thread may say how signals are answered; None stands for what Python does not know and cannot restore.
-if _before is not None and threading.current_thread() is threading.main_thread():
-    signal.signal(signal.SIGTERM, _before)
-
-__all__ = ["pycolmap"]
+    # Only the main thread may say how signals are answered; None stands for what Python cannot restore.
+    if before is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)
+    globals()[name] = pycolmap
+    return pycolmap

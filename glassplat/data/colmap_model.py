@@ -18,7 +18,6 @@ import torch
 from numpy.typing import NDArray
 
 from glassplat.data.capture import PointCloud
-from glassplat.data.colmap_library import pycolmap
 from glassplat.data.errors import InputError, input_checked
 from glassplat.data.lens import make_lens
 from glassplat.files.reading import reading
@@ -141,6 +140,8 @@ class _Bytes:
 
 
 def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, Any]]:
+    from glassplat.data.colmap_library import pycolmap
+
     (count,) = data.take("Q")
     for _ in range(count):
         camera_id, model_id, width, height = data.take("IiQQ")

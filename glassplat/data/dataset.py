@@ -57,6 +57,8 @@ class Dataset:
         measured_points: False if `points` are random ones, which carry no geometry.
         background: sRGB that is seen through transparent photographs; None where none is transparent.
         planes: panes that the capture gives as rectangles; their masks, if any, only refine them.
+        downscale: by how much the photographs were reduced.
+        mask_polarity: which value of black-and-white masks was taken for the pane.
     """
 
     root: Path
@@ -71,6 +73,8 @@ class Dataset:
     measured_points: bool = True
     background: Rgb | None = None
     planes: Planes | None = None
+    downscale: float = 1.0
+    mask_polarity: Polarity = "auto"
 
 
 def load_dataset(
@@ -124,6 +128,8 @@ def load_dataset(
         measured_points=measured,
         background=background if transparent else None,
         planes=given_planes(root, [view.camera for view in train]),
+        downscale=downscale,
+        mask_polarity=mask_polarity,
     )
 
 

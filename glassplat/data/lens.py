@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from glassplat.data.colmap_library import pycolmap
+from glassplat.data import colmap_library as library
 from glassplat.data.errors import InputError
 
 Interpolation = Literal["BILINEAR", "NEAREST_NEIGHBOR"]
@@ -100,12 +100,12 @@ def make_lens(model: str, parameters: list[float], size: tuple[int, int]) -> Any
     Raises:
         InputError: unknown model, wrong number of parameters, or a size or a parameter that no lens has.
     """
-    if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
-        known = ", ".join(name for name in pycolmap.CameraModelId.__members__ if name != "INVALID")
+    if model not in library.pycolmap.CameraModelId.__members__ or model == "INVALID":
+        known = ", ".join(name for name in library.pycolmap.CameraModelId.__members__ if name != "INVALID")
         raise InputError(f"unknown camera model {model!r}; expected one of {known}")
     if not all(1 <= side <= LARGEST_SIDE for side in size):
         raise InputError(f"the camera is {_size_text(size)} pixels large; expected sides from 1 to {LARGEST_SIDE}")
-    lens = pycolmap.Camera.create_from_model_id(0, getattr(pycolmap.CameraModelId, model), 1.0, *size)
+    lens = library.pycolmap.Camera.create_from_model_id(0, getattr(library.pycolmap.CameraModelId, model), 1.0, *size)
     if len(parameters) != len(lens.params):
         raise InputError(f"camera model {model} takes {len(lens.params)} parameters, got {len(parameters)}")
     _check_parameters(lens, parameters, size)
@@ -156,7 +156,7 @@ def lens_for_image(lens: Any, size: tuple[int, int], name: str) -> Any:
             f"{name} is {width}x{height} pixels large, but its camera {lens.width}x{lens.height}; expected the "
             "same size or a scaled copy; photographs rotated or cropped after calibration cannot be used"
         )
-    rescaled = pycolmap.Camera(lens.todict())
+    rescaled = library.pycolmap.Camera(lens.todict())
     rescaled.rescale(width, height)
     return rescaled
 
@@ -184,7 +184,7 @@ def _pinhole(model: str, parameters: tuple[float, ...], width: int, height: int)
         return _intrinsics(lens), False
     lens = make_lens(model, list(parameters), (width, height))
     try:
-        undistorted = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
+        undistorted = library.pycolmap.undistort_camera(library.pycolmap.UndistortCameraOptions(), lens)
     except (ValueError, RuntimeError) as error:
         raise InputError(
             f"camera model {model} with parameters {parameters} cannot be undistorted ({error})"
@@ -216,8 +216,10 @@ def _intrinsics(lens: Any) -> Pinhole:
 
 
 def _undistort(pixels: NDArray[np.uint8], lens: Any, interpolation: Interpolation) -> NDArray[np.uint8]:
-    options = pycolmap.UndistortCameraOptions()
+    options = library.pycolmap.UndistortCameraOptions()
     kinds = type(options.warp_options.interpolation)  # pycolmap gives this enumeration no public name.
     options.warp_options.interpolation = getattr(kinds, interpolation)
-    image, _ = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(np.ascontiguousarray(pixels)), lens)
+    image, _ = library.pycolmap.undistort_image(
+        options, library.pycolmap.Bitmap.from_array(np.ascontiguousarray(pixels)), lens
+    )
     return np.array(image.to_array())

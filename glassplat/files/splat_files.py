@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -90,10 +89,3 @@ def _read_rows(path: Path) -> Gaussians:
         logit_opacities=torch.logit(shares[:, 3].clamp(0.5 / 255, 1 - 0.5 / 255)),
         sh=((shares[:, None, :3] - 0.5) / SH_ZERO).contiguous(),
     )
-
-
-def with_intensity(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians with an intensity of 1 in what panes mirror, unless they have one."""
-    if "log_intensity" in gaussians.channels:
-        return gaussians
-    return replace(gaussians, channels={**gaussians.channels, "log_intensity": torch.zeros(len(gaussians))})

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 from torch import Tensor
 
 from glassplat.scene.camera import Camera
@@ -103,6 +102,8 @@ class PaneView:
     def edge_distance(self, pixels: Array) -> Array:
         """[P] signed distance to the mask's edge at pixel positions [P, 2], interpolated."""
         centred = pixels[:, ::-1].T - 0.5
+        from scipy import ndimage
+
         sampled: Array = ndimage.map_coordinates(self.distance, centred, order=1, mode="nearest")
         return sampled
 
@@ -155,6 +156,8 @@ def _without_slivers(mask: Mask) -> Mask:
 
     Label images that were resized or saved with blending carry a line of label 1 around label 2.
     """
+    from scipy import ndimage
+
     parts, count = ndimage.label(mask)
     if count == 0:
         return mask
@@ -169,6 +172,8 @@ def _signed_distance(mask: Mask) -> Array:
     if mask.all() or not mask.any():
         return np.full(mask.shape, np.hypot(*mask.shape) if mask.all() else -np.hypot(*mask.shape))
     # The edge runs half a pixel before the nearest centre on the other side.
+    from scipy import ndimage
+
     inside: Array = ndimage.distance_transform_edt(mask)
     outside: Array = ndimage.distance_transform_edt(~mask)
     return np.where(mask, inside - 0.5, 0.5 - outside)
@@ -184,6 +189,8 @@ def _edge_points(mask: Mask) -> Array:
 
 def _outward(mask: Mask, edge: Array) -> Array:
     """[E, 2] unit vectors down the slope of the smoothed mask at its edge points."""
+    from scipy import ndimage
+
     smooth = ndimage.gaussian_filter(mask.astype(np.float64), EDGE_SMOOTHING * np.hypot(*mask.shape), mode="nearest")
     slopes = [
         ndimage.map_coordinates(-np.gradient(smooth, axis=axis), edge[:, ::-1].T - 0.5, order=1) for axis in (1, 0)

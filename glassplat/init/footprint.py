@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from glassplat.init.annotation import PaneView
 from glassplat.init.consistency import meet
@@ -73,6 +72,8 @@ def _is_pane(points: Array, views: Sequence[PaneView], normal: Array) -> Mask:
 
 
 def _without_specks(inside: Mask) -> Mask:
+    from scipy import ndimage
+
     parts, count = ndimage.label(inside)
     sizes = np.bincount(parts.ravel(), minlength=count + 1)
     sizes[0] = 0

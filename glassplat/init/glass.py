@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
+from glassplat.scene.scene import Scene
 
 OVERLAP = 0.7
 """Standard deviation of a disc, in distances between neighbours; the discs blend into an even sheet."""
 THICKNESS = 0.05
 """Standard deviation across the pane, as a share of that along it."""
+OPAQUE_SHEET = 0.9
+"""Opacity of discs that cover a pane which nobody trains."""
 
 
 def glass_gaussians(
@@ -50,6 +53,35 @@ def glass_gaussians(
     ).to(planes.centers.device)
 
 
+def with_pane(scene: Scene, pane: Planes) -> Scene:
+    """The scene with one more pane, its rectangle evenly covered with glass.
+
+    Args:
+        scene: any; Gaussians that do not say how bright they are in a pane are as bright as they are.
+        pane: a single plane.
+
+    Raises:
+        ValueError: the scene has a pane of that label.
+    """
+    if set(pane.labels) & set(scene.planes.labels):
+        raise ValueError(f"the scene has a pane {pane.labels[0]} already; its panes are {list(scene.planes.labels)}")
+    pane = pane.to(scene.primary.means.device)
+    glass = glass_gaussians(pane, opacity=OPAQUE_SHEET)
+    return replace(
+        scene,
+        primary=with_intensity(scene.primary),
+        planes=scene.planes.joined(pane) if len(scene.planes) else pane,
+        glass=scene.glass.joined(glass) if len(scene.glass) else glass,
+    )
+
+
+def with_intensity(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians with an intensity of 1 in what panes mirror, unless they have one."""
+    if "log_intensity" in gaussians.channels:
+        return gaussians
+    return replace(gaussians, channels={**gaussians.channels, "log_intensity": torch.zeros_like(gaussians.means[:, 0])})
+
+
 def _pane_discs(planes: Planes, index: int, *, count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
     """Means [M, 3], quats [M, 4] and log scales [M, 3] of the discs on one pane."""
     half = planes.half_sizes[index].detach().cpu()
@@ -59,6 +91,8 @@ def _pane_discs(planes: Planes, index: int, *, count: int, seed: int) -> tuple[T
     means = planes.centers[index].detach().cpu() + in_plane @ torch.stack([tangent, bitangent])
 
     frame = torch.stack([tangent, bitangent, planes.normals[index].detach().cpu()], dim=1)
+    from scipy.spatial.transform import Rotation
+
     x, y, z, w = Rotation.from_matrix(frame.double().numpy()).as_quat()
     quat = torch.tensor([w, x, y, z], dtype=torch.float32)
     along = OVERLAP * math.sqrt(float(4 * half.prod()) / count)

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from glassplat.init.annotation import PaneView
 from glassplat.init.consistency import agreement_of_each
@@ -73,6 +72,8 @@ def meeting_of_each(plane: FramedPlanes, views: Sequence[PaneView]) -> Array:
 
 def _without_shared_edges(view: PaneView) -> PaneView:
     """The view without what other panes may hide: no edge between them counts, and no distance is known there."""
+    from scipy import ndimage
+
     beside: NDArray[np.bool_] = ndimage.binary_dilation(view.hidden, iterations=2)
     column, row = np.floor(view.edge).astype(np.int64).T
     kept = ~beside[np.minimum(row, beside.shape[0] - 1), np.minimum(column, beside.shape[1] - 1)]

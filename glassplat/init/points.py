@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from glassplat.data.capture import PointCloud
@@ -97,5 +96,7 @@ def _spacing(means: Tensor) -> Tensor:
     size = float(np.linalg.norm(positions.max(axis=0) - positions.min(axis=0))) or 1.0
     if neighbours == 0:
         return torch.full((1,), size, dtype=torch.float64)
+    from scipy.spatial import cKDTree
+
     distances, _ = cKDTree(positions).query(positions, k=neighbours + 1)
     return torch.from_numpy(np.maximum(distances[:, 1:].mean(axis=1), SMALLEST_SCALE * size))

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 Array = NDArray[np.float64]
 
@@ -35,6 +34,8 @@ def min_area_rectangle(points: Array) -> Rectangle:
     Raises:
         ValueError: the points do not span an area.
     """
+    from scipy.spatial import ConvexHull, QhullError
+
     try:
         hull = points[ConvexHull(points).vertices]
     except (QhullError, ValueError) as error:

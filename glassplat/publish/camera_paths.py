@@ -9,12 +9,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
 from glassplat.publish.surveyed import surveyed
 from glassplat.scene.camera import Camera
+from glassplat.scene.pose import look_at
 
 MOST_KEYFRAMES = 12
 """Photographs that a path goes through; more of them make it shake as the hand did that took them."""
@@ -50,7 +49,9 @@ def orbit(cameras: Sequence[Camera], extent: float, frames: int) -> list[Camera]
         right = torch.nn.functional.normalize(torch.linalg.cross(survey.up, arm), dim=0)
         wide, tall = (_loop(arms @ axis, survey.distance) for axis in (right, survey.up))
         places = [arm + wide * math.sin(a) * right + tall * math.cos(a) * survey.up for a in angles]
-    return [_towards(survey.focus + place, survey.focus, survey.up, cameras[0]) for place in places]
+    return [
+        replace(cameras[0], cam_from_world=look_at(survey.focus + place, survey.focus, survey.up)) for place in places
+    ]
 
 
 def interpolated(cameras: Sequence[Camera], frames: int) -> list[Camera]:
@@ -63,6 +64,9 @@ def interpolated(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     Raises:
         ValueError: fewer than two cameras.
     """
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
     if len(cameras) < 2:
         raise ValueError(f"{len(cameras)} cameras make no path; expected at least two")
     knots = np.arange(len(cameras), dtype=np.float64)
@@ -95,13 +99,6 @@ def widened(camera: Camera, width: int) -> Camera:
 
 def _loop(spread: Tensor, distance: float) -> float:
     return max(SHARE_OF_SPREAD * float(spread.std(correction=0)), LEAST_LOOP * distance)
-
-
-def _towards(place: Tensor, target: Tensor, up: Tensor, lens: Camera) -> Camera:
-    forward = torch.nn.functional.normalize(target - place, dim=0)
-    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
-    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward]).numpy()
-    return replace(lens, cam_from_world=_pose(rotation, place.numpy()))
 
 
 def _pose(rotation: NDArray[np.float64], place: NDArray[np.float64]) -> Tensor:

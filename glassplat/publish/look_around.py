@@ -37,7 +37,9 @@ def cameras_around(gaussians: Gaussians, up: Tensor) -> list[tuple[str, Camera]]
     for index in range(COUNT):
         angle = 2 * math.pi * index / COUNT
         arm = math.cos(angle) * ahead + math.sin(angle) * aside + ELEVATION * up
-        cameras.append((f"{index:03d}.png", camera_towards(middle + distance * arm, middle, up)))
+        eye = middle + distance * arm
+        camera = Camera.look_at(eye, middle, up=up, fov_rad=FOV_RAD, width=WIDTH, height=HEIGHT)
+        cameras.append((f"{index:03d}.png", camera))
     return cameras
 
 
@@ -51,18 +53,6 @@ def bounding_ball(gaussians: Gaussians) -> tuple[Tensor, float]:
     middle = (means.quantile(rest, dim=0) + means.quantile(1 - rest, dim=0)) / 2
     distances = (means - middle).norm(dim=1)
     return middle, max(float(distances.quantile(INNER_SHARE)), 1e-6)
-
-
-def camera_towards(position: Tensor, target: Tensor, up: Tensor) -> Camera:
-    """A camera at a place that looks at another, upright."""
-    forward = torch.nn.functional.normalize(target - position, dim=0)
-    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
-    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = -rotation @ position
-    focal = HEIGHT / 2 / math.tan(FOV_RAD / 2)
-    return Camera(pose.float(), focal, focal, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
 
 
 def _least_along(up: Tensor) -> Tensor:

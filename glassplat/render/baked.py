@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -46,7 +47,7 @@ def baked(scene: Scene, renderer: Renderer, cameras: Sequence[Camera]) -> Gaussi
 
     def with_gain(gain: float) -> Gaussians:
         weaker = [_weakened(part, gain * strength) for part, strength in zip(images, strengths, strict=True)]
-        return _joined([scene.primary, *weaker])
+        return functools.reduce(Gaussians.joined, weaker, scene.primary)
 
     def error(gain: float) -> float:
         candidate = Scene(with_gain(gain), scene.extent)
@@ -112,8 +113,3 @@ def _mirror_images(scene: Scene, row: int, cameras: Sequence[Camera]) -> Gaussia
 def _weakened(gaussians: Gaussians, factor: float) -> Gaussians:
     opacities = (factor * torch.sigmoid(gaussians.logit_opacities)).clamp(max=OPAQUE)
     return gaussians.with_tensors({"logit_opacities": torch.logit(opacities, eps=1e-6)})
-
-
-def _joined(sets: Sequence[Gaussians]) -> Gaussians:
-    tensors = {name: torch.cat([part.tensors()[name] for part in sets]) for name in sets[0].tensors()}
-    return sets[0].with_tensors(tensors)

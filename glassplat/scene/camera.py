@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from glassplat.scene.pose import look_at
 from glassplat.scene.transfer import constant, moved
 
 
@@ -28,6 +31,33 @@ class Camera:
     cy: float
     width: int
     height: int
+
+    @staticmethod
+    def look_at(
+        eye: Tensor | Sequence[float],
+        target: Tensor | Sequence[float],
+        *,
+        up: Tensor | Sequence[float],
+        fov_rad: float = math.radians(50),
+        width: int = 960,
+        height: int = 640,
+    ) -> Camera:
+        """An upright camera at `eye` that looks at `target`, with square pixels and the principal point in the middle.
+
+        Args:
+            eye: [3] camera centre, world units.
+            target: [3] what is in the middle of the picture.
+            up: [3] away from the ground; (0, -1, 0) in most captures.
+            fov_rad: vertical field of view, radians.
+            width: of the image, pixels.
+            height: of the image, pixels.
+
+        Raises:
+            ValueError: the camera stands where it looks, or looks straight up or down.
+        """
+        pose = look_at(*(torch.as_tensor(vector, dtype=torch.float64) for vector in (eye, target, up)))
+        focal = height / 2 / math.tan(fov_rad / 2)
+        return Camera(pose, focal, focal, width / 2, height / 2, width, height)
 
     @property
     def intrinsics(self) -> Tensor:

@@ -86,6 +86,11 @@ class Gaussians:
         """The Gaussians at `index` (a boolean mask [N] or integer indices)."""
         return self.with_tensors({name: tensor[index] for name, tensor in self.tensors().items()})
 
+    def joined(self, other: Gaussians) -> Gaussians:
+        """These Gaussians, then others with the same tensors."""
+        theirs = other.tensors()
+        return self.with_tensors({name: torch.cat([tensor, theirs[name]]) for name, tensor in self.tensors().items()})
+
     def to(self, device: torch.device | str) -> Gaussians:
         """The same set on another device."""
         return self.with_tensors({name: tensor.to(device) for name, tensor in self.tensors().items()})

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from glassplat.scene.transfer import constant
 
+LEAST_SINE = 1e-6
+"""Of the angle between a pane's normal and its tangent."""
 TRAINABLE = ("centers", "raw_normals", "logit_reflectances")
 
 
@@ -103,6 +105,44 @@ class Planes:
     def to(self, device: torch.device | str) -> Planes:
         """The same planes on another device."""
         return self.with_tensors({name: tensor.to(device) for name, tensor in self.tensors().items()})
+
+    @staticmethod
+    def rectangle(
+        center: Sequence[float],
+        normal: Sequence[float],
+        half_sizes: Sequence[float],
+        *,
+        tangent: Sequence[float] | None = None,
+        label: int = 1,
+    ) -> Planes:
+        """A single plane, with a base reflectance of one half.
+
+        Args:
+            center: [3] its middle, world units.
+            normal: [3] of any length.
+            half_sizes: half its sides along tangent and bitangent, world units.
+            tangent: [3] direction of its first side; some direction in the plane if None.
+            label: what to call it.
+
+        Raises:
+            ValueError: a value is not finite, a size is not above 0, or a direction has no length in the plane.
+        """
+        middle, across, half = (
+            torch.tensor(list(values), dtype=torch.float32) for values in (center, normal, half_sizes)
+        )
+        if tangent is None:
+            axis = torch.eye(3)[int(across.abs().argmin())]
+        else:
+            axis = torch.tensor(list(tangent), dtype=torch.float32)
+        shapes = [tuple(vector.shape) for vector in (middle, across, axis, half)]
+        if shapes != [(3,), (3,), (3,), (2,)]:
+            raise ValueError(f"center, normal, tangent and half_sizes have the shapes {shapes}; expected 3, 3, 3 and 2")
+        numbers = torch.cat([middle, across, axis, half])
+        if not bool(numbers.isfinite().all()) or not bool((half > 0).all()):
+            raise ValueError(f"a pane of {center}, {normal}, {half_sizes}; expected finite numbers, sizes above 0")
+        if float(torch.linalg.cross(across, axis).norm()) <= LEAST_SINE * float(across.norm() * axis.norm()):
+            raise ValueError(f"a pane with the normal {normal} and the tangent {tangent}; expected two directions")
+        return Planes(middle[None], across[None], torch.zeros(1), axis[None], half[None], (label,))
 
     @staticmethod
     def empty() -> Planes:

@@ -25,6 +25,19 @@ def without_glass(scene: Scene) -> Scene:
     )
 
 
+def without_pane(scene: Scene, label: int) -> Scene:
+    """The scene without one of its panes: what is behind it is seen, and nothing reflects.
+
+    Raises:
+        ValueError: no pane has the label.
+    """
+    row = row_of(scene.planes, label)
+    if len(scene.planes) == 1:
+        return without_glass(scene)
+    glass = scene.glass.select(~glass_of_pane(scene, row))
+    return replace(scene, glass=glass, planes=scene.planes.select([k for k in range(len(scene.planes)) if k != row]))
+
+
 def as_mirrors(scene: Scene, labels: Sequence[int]) -> Scene:
     """The panes with these labels reflect everything, from every angle.
 

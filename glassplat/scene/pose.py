@@ -7,6 +7,9 @@ from torch import Tensor
 
 from glassplat.scene.transfer import constant
 
+LEAST_SINE = 1e-6
+"""Of the angle between two directions that still tell which way is up."""
+
 
 def rotation_from_quat(quats: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of quaternions [..., 4] in `wxyz` order, normalised here."""
@@ -26,6 +29,32 @@ def quat_product(left: Tensor, right: Tensor) -> Tensor:
     real = left_real * right_real - (left_vector * right_vector).sum(-1, keepdim=True)
     crossed = torch.linalg.cross(left_vector, right_vector)
     return torch.cat([real, left_real * right_vector + right_real * left_vector + crossed], dim=-1)
+
+
+def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
+    """`cam_from_world` [4, 4], float32, of an upright camera at `eye` that looks at `target`, OpenCV axes.
+
+    Args:
+        eye: [3] camera centre, world units.
+        target: [3] what is in the middle of the picture.
+        up: [3] away from the ground, of any length.
+
+    Raises:
+        ValueError: the camera stands where it looks, or looks straight up or down.
+    """
+    eye, target, up = (vector.detach().to("cpu", torch.float64) for vector in (eye, target, up))
+    forward = torch.nn.functional.normalize(target - eye, dim=0)
+    right = torch.linalg.cross(forward, torch.nn.functional.normalize(up, dim=0))
+    if not float(right.norm()) > LEAST_SINE:
+        raise ValueError(
+            f"a camera at {eye.tolist()} cannot look at {target.tolist()} with {up.tolist()} upwards; expected another "
+            "place, and a direction that is not that of the view"
+        )
+    right = torch.nn.functional.normalize(right, dim=0)
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
+    return pose.float()
 
 
 def mirror_matrices(centers: Tensor, normals: Tensor) -> Tensor:

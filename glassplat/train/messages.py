@@ -23,7 +23,7 @@ class RunBegun:
 
 @dataclass(frozen=True)
 class StageEntered:
-    """A stage begins."""
+    """A stage begins; `counts` says how many Gaussians and planes there are, by scene part."""
 
     step: int
     stage: str

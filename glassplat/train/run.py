@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from types import FrameType
@@ -108,49 +108,117 @@ def run_training(
 ) -> TrainState:
     """Trains to the end or to the user's interrupt, and leaves a run directory from which both can go on.
 
-    A recipe that names no background gets the one that transparent photographs are laid over; it is recorded.
-    Nothing is written before the first scene has been made.
-
     Args:
-        recipe: how to train.
+        recipe: as for `Run`, like the others.
         settings: what was asked for beside it.
         directory: where everything goes.
         dataset: photographs to fit.
         resume: go on from the checkpoint in `directory`.
         listen: gets every message.
-        checkpoint_every: seconds from one checkpoint to the next; there is one at the end in any case.
+        checkpoint_every: seconds from one checkpoint to the next.
 
     Raises:
-        InputError: the directory is not fit for it (`check_output`), the run was recorded with other settings, it is
-            too short for its stages, a photograph cannot be read, of the test views too, or as `settled` does.
-        KeyboardInterrupt: the user stopped the run; the checkpoint is written.
-        TrainingDivergedError: training cannot go on; the last checkpoint stays.
-        OSError: the disk is full or fails; the last checkpoint stays.
+        InputError, KeyboardInterrupt, TrainingDivergedError, OSError: as `Run` does.
     """
-    recipe = settled(recipe, dataset)
-    stages = recipe.stages(settings.seed, settings.iterations)
-    check_length(stages, settings.iterations)
-    check_output(directory, resume=resume)
-    first = None if resume else first_state(recipe, settings, dataset, listen)
-    make_folder(directory.path)
-    with run_lock(directory.path):
-        # Another training may have ended here meanwhile.
-        anew = directory.is_begun and not resume
-        state = resumed_state(recipe, settings, directory) if first is None else first
-        if not resume:
-            directory.check_vacant()
-            directory.begin(recipe, settings, dataset)
-        with open_log(directory.log, state.step) as log:
-            sitting = Sitting(directory, state, log=log, listen=listen, checkpoint_every=checkpoint_every)
-            sitting.tell(RunBegun(state.step, settings.iterations, anew))
-            sitting.train(stages, dataset, settings.iterations)
-        directory.export(state.scene, state.step)
-    return state
+    run = Run(recipe, settings, directory, dataset, resume=resume, checkpoint_every=checkpoint_every)
+    return run.to_the_end(listen)
 
 
-def first_state(recipe: Any, settings: RunSettings, dataset: Dataset, listen: Listener) -> TrainState:
+class Run:
+    """A training run in its directory, followed message by message.
+
+    A recipe that names no background gets the one that transparent photographs are laid over; it is recorded. Nothing
+    is written before the first scene has been made. Who stops following leaves a checkpoint behind, from which the run
+    can be resumed.
+    """
+
+    def __init__(
+        self,
+        recipe: Any,
+        settings: RunSettings,
+        directory: RunDirectory,
+        dataset: Dataset,
+        *,
+        resume: bool = False,
+        checkpoint_every: float = CHECKPOINT_SECONDS,
+    ) -> None:
+        """Checks what can be known beforehand.
+
+        Args:
+            recipe: how to train.
+            settings: what was asked for beside it.
+            directory: where everything goes.
+            dataset: photographs to fit.
+            resume: go on from the checkpoint in `directory`.
+            checkpoint_every: seconds from one checkpoint to the next; there is one at the end in any case.
+
+        Raises:
+            InputError: the directory is not fit for it (`check_output`), the run is too short for its stages, or as
+                `settled` does.
+        """
+        self.recipe = settled(recipe, dataset)
+        self._stages = self.recipe.stages(settings.seed, settings.iterations)
+        check_length(self._stages, settings.iterations)
+        check_output(directory, resume=resume)
+        self._settings, self._directory, self._dataset = settings, directory, dataset
+        self._resume, self._every = resume, checkpoint_every
+        self._sitting: Sitting | None = None
+        self.state: TrainState | None = None
+
+    def to_the_end(self, listen: Listener) -> TrainState:
+        """Trains to the end or to the user's interrupt; raises what `listen` raises, once all is saved."""
+        messages = self.messages()
+        for message in messages:
+            try:
+                listen(message)
+            except BaseException as error:  # noqa: BLE001 - The run saves itself, and raises it again.
+                messages.throw(error)
+        assert self.state is not None
+        return self.state
+
+    def messages(self) -> Generator[Message, None, None]:
+        """Trains from one message to the next.
+
+        Raises:
+            InputError: the run was recorded with other settings, or a photograph cannot be read, of the test views too.
+            KeyboardInterrupt: the user stopped the run; the checkpoint is written.
+            TrainingDivergedError: training cannot go on; the last checkpoint stays.
+            OSError: the disk is full or fails; the last checkpoint stays.
+        """
+        directory, settings = self._directory, self._settings
+        if not self._resume:
+            yield Working("preparing the first scene", 0, 1)
+            self.state = first_state(self.recipe, settings, self._dataset)
+        make_folder(directory.path)
+        with run_lock(directory.path):
+            # Another training may have ended here meanwhile.
+            anew = directory.is_begun and not self._resume
+            if self.state is None:
+                self.state = resumed_state(self.recipe, settings, directory)
+            else:
+                directory.check_vacant()
+                directory.begin(self.recipe, settings, self._dataset)
+            with open_log(directory.log, self.state.step) as log:
+                self._sitting = Sitting(directory, self.state, log=log, checkpoint_every=self._every)
+                yield from self._sitting.told(RunBegun(self.state.step, settings.iterations, anew))
+                yield from self._sitting.trained(self._stages, self._dataset, settings.iterations)
+            directory.export(self.state.scene, self.state.step)
+
+    def save(self) -> None:
+        """Writes a checkpoint and the scene, between two messages of which the last one is `StepDone` or later.
+
+        Raises:
+            RuntimeError: the run has not begun.
+            OSError: the disk is full or fails.
+        """
+        if self._sitting is None or self.state is None:
+            raise RuntimeError("nothing to save: the run has not begun")
+        self._sitting.save()
+        self._directory.export(self.state.scene, self.state.step)
+
+
+def first_state(recipe: Any, settings: RunSettings, dataset: Dataset) -> TrainState:
     """The state from which a fresh run starts."""
-    listen(Working("preparing the first scene", 0, 1))
     return TrainState(recipe.initialise(dataset), settings.seed, method=recipe.method).to(settings.device)
 
 
@@ -178,49 +246,42 @@ def resumed_state(recipe: Any, settings: RunSettings, directory: RunDirectory) -
 class Sitting:
     """One stretch of a run: from its beginning or a checkpoint to its end or an interrupt."""
 
-    def __init__(
-        self,
-        directory: RunDirectory,
-        state: TrainState,
-        *,
-        log: RunLog,
-        listen: Listener,
-        checkpoint_every: float,
-    ) -> None:
+    def __init__(self, directory: RunDirectory, state: TrainState, *, log: RunLog, checkpoint_every: float) -> None:
         self._directory, self._state = directory, state
-        self._log, self._listen, self._every = log, listen, checkpoint_every
+        self._log, self._every = log, checkpoint_every
         self._seconds_before, self._started = state.seconds, time.perf_counter()
         self._saved = self._started
         self._stop = StopRequest()
 
-    def train(self, stages: tuple[Stage, ...], dataset: Dataset, iterations: int) -> None:
+    def trained(self, stages: tuple[Stage, ...], dataset: Dataset, iterations: int) -> Generator[Message, None, None]:
         """Trains to the end, or raises KeyboardInterrupt after the step in which the user asks for it."""
         with stop_on_interrupt() as self._stop, photographs_read(dataset) as check_photographs:
             for message in train(stages, dataset, self._state, iterations):
                 check_photographs()
-                self.tell(message)
+                yield from self.told(message)
                 if not isinstance(message, StepDone):
                     continue
                 is_last = message.step == iterations
                 if self._stop.requested or is_last or time.perf_counter() - self._saved >= self._every:
-                    self._save()
-                    self.tell(CheckpointWritten(message.step))
+                    self.save()
+                    yield from self.told(CheckpointWritten(message.step))
                 if self._stop.requested and not is_last:
                     self._stop.end()
 
-    def tell(self, message: Message) -> None:
+    def told(self, message: Message) -> Generator[Message, None, None]:
         """Passes a message on; should nobody be there any more to hear it, what was trained is saved first."""
         try:
             self._log.write(message)
-            self._listen(message)
+            yield message
         except BaseException as error:
             if isinstance(message, StepDone | ActionDone):
-                self._save()
+                self.save()
             if self._stop.requested and isinstance(error, OSError):
                 self._stop.end()  # A terminal that was closed can show nothing, and that is no failure.
             raise
 
-    def _save(self) -> None:
+    def save(self) -> None:
+        """Writes a checkpoint; the state must not be in the middle of a change."""
         self._state.seconds = self._seconds_before + time.perf_counter() - self._started
         save_checkpoint(self._directory.checkpoint, self._state)
         self._saved = time.perf_counter()

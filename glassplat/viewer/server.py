@@ -6,6 +6,7 @@ viser's own splats know nothing of panes, so that what it shows is a picture beh
 from __future__ import annotations
 
 import logging
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -65,6 +66,8 @@ class Viewer:
         self._clients: dict[int, Client] = {}
         self._loop: RenderLoop[Wish] = RenderLoop(self._draw, self._show)
         logging.getLogger("websockets").setLevel(logging.CRITICAL)
+        # A browser may leave while its picture is drawn; viser drops what is sent to it, which is what is wanted.
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
         self._server = viser.ViserServer(host=host, port=port, label=shown.title, verbose=False)
         survey = surveyed([camera for _, camera in shown.cameras], shown.scene.extent)
         self._server.scene.set_up_direction(tuple(survey.up.tolist()))

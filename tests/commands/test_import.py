@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from glassplat.cli import main
-from glassplat.commands.opened_scene import open_scene
 from glassplat.files.images import read_image
 from glassplat.files.planes_json import write_planes
 from glassplat.files.ply import write_gaussians
 from glassplat.files.splat_files import SUFFIXES
+from glassplat.interface.loading import load
 from tests.commands.tiny_run import write_run
 from tests.files.test_spz import typical
 from tests.train.tiny_capture import true_scene
@@ -28,14 +28,14 @@ def test_what_was_exported_comes_back(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     assert main(["export", str(run), "--output", str(tmp_path / "out"), "--formats", "ply", "spz"]) == 0
     for kind, precision in (("ply", 0.0), ("spz", 2**-18)):
-        again = open_scene(imported(tmp_path / "out" / f"scene.{kind}", tmp_path / kind), "cpu")
-        before = open_scene(run, "cpu")
+        again = load(imported(tmp_path / "out" / f"scene.{kind}", tmp_path / kind), device="cpu")
+        before = load(run, device="cpu")
         torch.testing.assert_close(again.scene.primary.means, before.scene.primary.means, rtol=0, atol=precision)
         assert torch.equal(again.scene.planes.centers, before.scene.planes.centers)
         assert torch.equal(again.scene.glass.means, before.scene.glass.means)
-        assert [name for name, _ in again.cameras] == [name for name, _ in before.cameras]
+        assert list(again.cameras) == list(before.cameras)
         if kind == "ply":
-            camera = before.cameras[0][1]
+            camera = next(iter(before.cameras.values()))
             with torch.no_grad():
                 images = [opened.renderer(opened.scene, camera).rgb for opened in (before, again)]
             torch.testing.assert_close(*images)
@@ -58,11 +58,11 @@ def test_panes_can_be_given_by_hand(tmp_path: Path) -> None:
     for entry in entries:
         del entry["raw_normal"], entry["logit_reflectance"]
     (tmp_path / "mine.json").write_text(json.dumps(entries))
-    opened = open_scene(
-        imported(tmp_path / "a.ply", tmp_path / "scene", "--planes", str(tmp_path / "mine.json")), "cpu"
+    opened = load(
+        imported(tmp_path / "a.ply", tmp_path / "scene", "--planes", str(tmp_path / "mine.json")), device="cpu"
     )
     plane = opened.scene.planes
-    camera = opened.cameras[0][1]
+    camera = next(iter(opened.cameras.values()))
     pose = camera.cam_from_world.clone()
     pose[:3, :3], pose[:3, 3] = torch.eye(3), -plane.centers[0] + torch.tensor([0.0, 0.0, 2.0])
     with torch.no_grad():

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from glassplat.cli import main
-from glassplat.commands.render import DISC_LAYERS, LAYERS, PHOTOGRAPHED, Layer
 from glassplat.commands.scene_edits import SceneEdits
 from glassplat.data.errors import InputError
 from glassplat.files.images import read_image
+from glassplat.interface.layers import DISC_LAYERS, LAYERS, PHOTOGRAPHED, Layer
 from glassplat.scene.plane_edits import as_mirrors, shifted, tilted, with_reflectance, without_glass
 from glassplat.scene.scene import Scene
 from glassplat.train.recipe import RECIPES

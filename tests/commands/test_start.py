@@ -52,6 +52,18 @@ def test_the_list_of_commands_needs_none_of_the_libraries(arguments: list[str], 
     assert all(name in done.stdout + done.stderr for name in COMMANDS) or arguments == ["--version"]
 
 
+@pytest.mark.parametrize("name", ["train", "eval", "export", "view", "video", "import", "info"])
+def test_a_command_does_not_wait_for_what_it_may_never_need(name: str) -> None:
+    late = ["scipy.spatial", "scipy.ndimage", "scipy.interpolate", "pycolmap", "viser", "cv2"]
+    done = subprocess.run(
+        [sys.executable, "-c", IMPORTS.format(arguments=[name, "--help"], slow=late)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert json.loads(done.stdout.splitlines()[-1])[:2] == [0, []]
+
+
 def test_the_package_runs_as_a_module() -> None:
     done = subprocess.run([sys.executable, "-m", "glassplat", "--version"], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, f"glassplat {glassplat.__version__}\n")

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from glassplat.files.compressed_ply import BOUNDS
 from glassplat.files.ply import write_gaussians
-from glassplat.files.splat_files import SPLAT_ROW, drawable, read_splats, with_intensity
+from glassplat.files.splat_files import SPLAT_ROW, drawable, read_splats
 from glassplat.files.spz import write_spz
+from glassplat.init.glass import with_intensity
 from glassplat.kernels.project.reference import rotations
 from glassplat.scene.gaussians import SH_ZERO, Gaussians
 from tests.files.test_spz import shapes, typical

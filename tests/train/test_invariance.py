@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -72,6 +73,11 @@ def trained(recipe: SplatRecipe | PlanarRecipe, scale: float, turn: torch.Tensor
     return state.scene, losses
 
 
+def means_of_tens(losses: list[float]) -> np.ndarray:
+    """The mean loss of ten steps after the other."""
+    return np.array(losses).reshape(-1, 10).mean(axis=1)
+
+
 @pytest.mark.parametrize("recipe", [SplatRecipe(sh_degree=1), PlanarRecipe(sh_degree=1)], ids=["splat", "planar"])
 @pytest.mark.parametrize(("scale", "turn"), [(1000.0, torch.eye(3)), (0.001, torch.eye(3)), (1.0, TURN)])
 def test_units_and_orientation_do_not_matter(
@@ -80,7 +86,8 @@ def test_units_and_orientation_do_not_matter(
     scene, losses = trained(recipe, 1.0, torch.eye(3))
     other, other_losses = trained(recipe, scale, turn)
     assert losses[-1] < 0.8 * losses[0]
-    # Adam steps along the axes of the frame, so a turned run is alike and not the same.
-    assert other_losses == pytest.approx(losses, rel=0.06)
+    # Adam steps along the axes of the frame, so a turned run is alike and not the same, least of all in single steps.
+    assert np.array(other_losses) == pytest.approx(np.array(losses), rel=0.3)
+    assert means_of_tens(other_losses) == pytest.approx(means_of_tens(losses), rel=0.05)
     assert len(other.primary) == pytest.approx(len(scene.primary), rel=0.1)
     torch.testing.assert_close(other.extent, scale * scene.extent)

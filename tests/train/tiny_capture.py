@@ -35,7 +35,8 @@ def tiny_capture() -> Dataset:
         views.append(
             View.in_memory(f"{index}.png", camera, photo=photo, pane_labels=labels if index % 3 == 0 else None)
         )
-    points = PointCloud(scene.primary.means, (255 * torch.rand(len(scene.primary), 3)).to(torch.uint8))
+    colors = torch.rand(len(scene.primary), 3, generator=torch.Generator().manual_seed(0))
+    points = PointCloud(scene.primary.means, (255 * colors).to(torch.uint8))
     return Dataset(Path("tiny"), tuple(views), tuple(views[:1]), points, scene.extent, pane_labels=(1,))
 
 

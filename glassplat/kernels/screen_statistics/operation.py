@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.screen_statistics import reference as reference
-from glassplat.kernels.screen_statistics.cpu import add_views_kernel
 from glassplat.kernels.screen_statistics.views import Sums, Views
 from glassplat.kernels.tensor_checks import REAL_OF, check_tensors
 
@@ -38,6 +37,8 @@ def add_views(sums: Sums, views: Views) -> None:
         # On a GPU these few sums over Gaussians are no bottleneck, so that there they stay PyTorch's.
         reference.add_views(sums, views)
         return
+    from glassplat.kernels.screen_statistics.cpu import add_views_kernel
+
     real = REAL_OF[sums.max_radius.dtype]
     weight = np.ascontiguousarray(np.atleast_2d(views.weight), real)
     gradients = (tensor.detach().contiguous().numpy() for tensor in views[:3])

@@ -11,8 +11,8 @@ from glassplat.data.errors import InputError
 from glassplat.files.cameras_json import read_cameras
 from glassplat.files.planes_json import read_planes
 from glassplat.files.ply import read_gaussians
-from glassplat.files.splat_files import drawable, read_splats, with_intensity
-from glassplat.init.glass import glass_gaussians
+from glassplat.files.splat_files import drawable, read_splats
+from glassplat.init.glass import OPAQUE_SHEET, glass_gaussians, with_intensity
 from glassplat.publish.look_around import bounding_ball, cameras_around
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
@@ -25,7 +25,6 @@ AXES: dict[str, tuple[int, int, int]] = {
     "x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1),
 }  # fmt: skip
 EXTENT_MARGIN = 1.1
-OPACITY_OF_GLASS = 0.9
 
 
 class ImportedScene(NamedTuple):
@@ -75,7 +74,7 @@ def _glass(file: Path, planes: Planes, *, own: bool) -> Gaussians:
     """The glass that lies beside the file, or else an even sheet on each pane."""
     beside = file.with_name("glass.ply")
     if not len(planes) or not own or not beside.is_file():
-        return glass_gaussians(planes, opacity=OPACITY_OF_GLASS)
+        return glass_gaussians(planes, opacity=OPAQUE_SHEET)
     glass, _ = drawable(read_gaussians(beside), beside)
     if "logit_mark" not in glass.channels:
         raise InputError(f"{beside} has no property logit_mark; expected glass as `glassplat export` writes it")

@@ -1,0 +1,43 @@
+"""Edit the panes of a scene: take the glass away, make it a mirror, move it, add another one; save and publish it.
+
+python examples/3_panes.py runs/place --output edited
+"""
+
+from pathlib import Path
+
+import tyro
+
+import glassplat
+
+
+def main(run: tyro.conf.Positional[Path], output: Path = Path("edited")) -> None:
+    model = glassplat.load(run)
+    pane = model.panes[0]
+
+    # Models are values: what edits one returns another, and shares with it what it did not edit.
+    edits = {
+        "without_glass": model.without_glass(),
+        "mirror": model.with_mirrors(pane),
+        "faint": model.with_reflectance(pane, 0.02),
+        "moved": model.shifted(pane, 0.02 * model.scene.extent).tilted(pane, 5),
+    }
+    name = next(iter(model.cameras))
+    for edit, edited in edits.items():
+        print(
+            edit, f"changes the image by {float((edited.image(name) - model.image(name)).abs().mean()):.4f} on average"
+        )
+
+    # A mirror where there was none, also in a scene of another program: its middle, its normal, half its sides.
+    planes = model.scene.planes
+    size = 0.2 * model.scene.extent
+    beside = planes.centers[0] + 0.1 * model.scene.extent * planes.normals[0]
+    mirrored = model.with_pane(beside.tolist(), planes.normals[0].tolist(), (size, size), base_reflectance=1)
+    print(mirrored)
+
+    # For other programs, with the panes beside it; as a page for any browser; and as it is, to go on with.
+    for file in ("mirror.ply", "page.html", "run"):
+        print("->", edits["mirror"].save(output / file))
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

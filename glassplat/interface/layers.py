@@ -1,0 +1,73 @@
+"""Which layers each method renders."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+from glassplat.data.errors import InputError
+from glassplat.render.deferred import Deferred
+from glassplat.render.frame import Renderer
+from glassplat.render.planar import with_photographer
+from glassplat.render.traced import Traced
+
+Layer = Literal[
+    "rgb",
+    "transmission",
+    "without_panes",
+    "reflection",
+    "strength",
+    "mask",
+    "depth",
+    "alpha",
+    "base",
+    "normal",
+    "environment",
+    "surroundings",
+    "median_depth",
+    "photographed",
+]
+
+LAYERS: dict[str, tuple[Layer, ...]] = {
+    "splat": ("rgb", "depth", "alpha"),
+    "planar": ("rgb", "transmission", "without_panes", "reflection", "strength", "mask", "depth", "alpha"),
+    "deferred": ("rgb", "base", "reflection", "strength", "normal", "environment", "depth", "alpha"),
+    "traced": ("rgb", "base", "reflection", "strength", "normal", "surroundings", "depth", "alpha"),
+}
+"""What each method renders that is worth looking at; its frames hold more for the losses."""
+
+DISC_LAYERS: tuple[Layer, ...] = ("rgb", "normal", "depth", "median_depth", "alpha")
+"""What `splat` renders of discs."""
+
+PHOTOGRAPHED: Layer = "photographed"
+"""The image with whom the panes of a photograph show, of runs that looked for somebody."""
+
+
+def layers_of(recipe: Any) -> tuple[Layer, ...]:
+    """What a run of a recipe renders that is worth looking at."""
+    return DISC_LAYERS if getattr(recipe, "primitive", None) == "disc" else LAYERS[recipe.method]
+
+
+def check_layers(layers: Sequence[str], recipe: Any) -> None:
+    """Refuses layers that a method does not render, before anything is rendered.
+
+    Raises:
+        InputError: there are such, or none is asked for.
+    """
+    known, method = layers_of(recipe), recipe.method
+    if method == "planar" and recipe.photographer.learn:
+        known = (*known, PHOTOGRAPHED)
+    foreign = [layer for layer in layers if layer not in known]
+    if foreign or not layers:
+        asked = f"renders no layer {', '.join(foreign)}" if foreign else "renders nothing without --layers"
+        raise InputError(f"{method} {asked}; expected --layers out of {', '.join(known)}")
+
+
+def renderer_with(renderer: Renderer, layers: Sequence[str]) -> Renderer:
+    """The renderer, also of those of the layers that it renders only when asked."""
+    if isinstance(renderer, Deferred) and "environment" in layers:
+        return replace(renderer, environment=True)
+    if isinstance(renderer, Traced) and "surroundings" in layers:
+        return replace(renderer, surroundings=True)
+    return with_photographer(renderer, "beside") if PHOTOGRAPHED in layers else renderer

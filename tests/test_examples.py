@@ -1,0 +1,59 @@
+"""The examples do what they say, on the bundled scene, small and short."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def said_by(example: str, *options: str, folder: Path) -> str:
+    """What an example prints, run in a folder; in this process, which has its kernels at hand."""
+    path, said = EXAMPLES / example, io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said):
+        patch.chdir(folder)
+        patch.setattr(sys, "argv", [str(path), *options])
+        runpy.run_path(str(path), run_name="__main__")
+    return said.getvalue()
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which the first example was run."""
+    folder = tmp_path_factory.mktemp("place")
+    said = said_by("1_train.py", "--iterations", "60", "--downscale", "4", folder=folder)
+    assert "panes (1,)" in said and "stage" in said and re.search(r"PSNR \d\d\.\d\d dB .*\d dB over the panes", said)
+    return folder
+
+
+def test_the_examples_are_numbered_and_explained() -> None:
+    assert [path.name[:2] for path in sorted(EXAMPLES.glob("*.py"))] == ["1_", "2_", "3_", "4_"]
+    for path in EXAMPLES.glob("*.py"):
+        assert f"\npython examples/{path.name} " in path.read_text()
+
+
+def test_layers_are_written(place: Path) -> None:
+    said = said_by("2_layers.py", "runs/place", "--frames", "2", folder=place)
+    pictures = {path.stem for path in (place / "pictures").iterdir()}
+    assert {"rgb", "transmission", "reflection", "orbit_000", "orbit_001"} <= pictures
+    assert "'strength': (" in said
+
+
+def test_panes_are_edited(place: Path) -> None:
+    said = said_by("3_panes.py", "runs/place", folder=place)
+    changes = [float(number) for number in re.findall(r"by (0\.\d+)", said)]
+    assert len(changes) == 4 and min(changes) > 0
+    assert "2 panes" in said and (place / "edited" / "page.html").is_file() and (place / "edited" / "run").is_dir()
+
+
+def test_gradients_lead_back(place: Path) -> None:
+    said = said_by("4_gradients.py", "runs/place", "--downscale", "4", "--steps", "21", folder=place)
+    losses = [float(number) for number in re.findall(r"loss (0\.\d+)", said)]
+    assert losses[-1] < losses[0]
