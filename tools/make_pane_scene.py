@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,8 @@ from tools.make_demo_scene import TEST_EVERY, srgb_from_linear
 from tools.make_scenes import GOLDEN_ANGLE_RAD, as_bytes, world_from_opengl
 from tools.pane_draws import OPENGL_FROM_CAM, DrawnPlace, draw_place, standing_pane
 from tools.pane_tracer import Array, Ball, Box, Place, Seen
+from tools.photographer_body import photographer
+from tools.window_place import window_place, window_poses
 
 LOOKED_AT = np.array([0.0, 0.1, 0.8])
 ORBIT = (1.45, 1.75)
@@ -57,9 +59,13 @@ class Arguments:
     points: int = 6000
     """Sparse points."""
     seed: int = 0
-    """Of cameras and points of `screens`."""
+    """Of cameras and points of `screens` and `window`."""
     drawn: int | None = None
     """Seed of a place drawn by chance, to make in place of `screens`."""
+    window: bool = False
+    """Make a large window before a dark case, photographed from the front, in place of `screens`."""
+    photographer: bool = False
+    """Somebody stands behind the camera with a phone before the face, and is seen in panes and mirrors."""
 
 
 def make_place() -> Place:
@@ -121,19 +127,28 @@ def whole_labels(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.where(labels.min(axis=2) == labels.max(axis=2), labels[:, :, 0], 0).astype(np.uint8)
 
 
-def write_view(folder: Path, name: str, seen: Seen, *, annotated: bool, test: bool) -> None:
-    """Writes a photograph, with its mask if it is annotated and its layers if it is a test view."""
+def write_photograph(folder: Path, name: str, seen: Seen, *, annotated: bool) -> None:
+    """Writes a photograph, with its mask if it is annotated."""
     Image.fromarray(picture(seen.radiance)).save(folder / "images" / name)
     if annotated:
         Image.fromarray(seen.label[:, :, SUBPIXELS**2 // 2]).save(folder / "masks" / name)
-    if test:
-        Image.fromarray(picture(seen.transmission)).save(folder / "gt/trans" / name)
-        # Of rays that meet no pane, a pixel at the edge of one has nothing to show.
-        share = np.maximum((seen.label > 0).mean(axis=2), 1e-9)[..., None, None]
-        Image.fromarray(picture(seen.reflection / share)).save(folder / "gt/refl" / name)
-        strength = np.round(65535 * seen.strength.mean(axis=2)).astype(np.uint16)
-        Image.fromarray(strength).save(folder / "gt/strength" / name)
-        Image.fromarray(whole_labels(seen.label)).save(folder / "gt/strength" / name.replace(".png", "_pane.png"))
+
+
+def write_layers(folder: Path, name: str, seen: Seen) -> None:
+    """Writes what comes through the panes of a test view, and what they mirror."""
+    for part in ("trans", "refl"):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+    Image.fromarray(picture(seen.transmission)).save(folder / "trans" / name)
+    # Of rays that meet no pane, a pixel at the edge of one has nothing to show.
+    share = np.maximum((seen.label > 0).mean(axis=2), 1e-9)[..., None, None]
+    Image.fromarray(picture(seen.reflection / share)).save(folder / "refl" / name)
+
+
+def write_strength(folder: Path, name: str, seen: Seen) -> None:
+    """Writes how much the panes of a test view reflect, and where they are."""
+    strength = np.round(65535 * seen.strength.mean(axis=2)).astype(np.uint16)
+    Image.fromarray(strength).save(folder / name)
+    Image.fromarray(whole_labels(seen.label)).save(folder / name.replace(".png", "_pane.png"))
 
 
 def sparse_points(place: Place, poses: list[Array], count: int, seed: int) -> tuple[Array, NDArray[np.uint8]]:
@@ -211,10 +226,26 @@ def annotated_views(place: Place, poses: list[Array], masks: int) -> set[int]:
     return chosen
 
 
+def write_view(arguments: Arguments, place: Place, number: int, pose: Array, *, annotated: bool) -> None:
+    """Writes all that there is of a view; true layers are those without a photographer, and beside them with one."""
+    folder, name, size = arguments.output, view_name(number), (arguments.width, arguments.width * 3 // 4)
+    peopled = replace(place, photographer=photographer(pose)) if arguments.photographer else place
+    seen = see(peopled, pose, *size)
+    write_photograph(folder, name, seen, annotated=annotated)
+    if number % TEST_EVERY:
+        return
+    write_strength(folder / "gt/strength", name, seen)
+    write_layers(folder / "gt", name, see(place, pose, *size) if arguments.photographer else seen)
+    if arguments.photographer:
+        write_layers(folder / "gt/with_photographer", name, seen)
+
+
 def chosen_place(arguments: Arguments) -> DrawnPlace:
     """The place to photograph, and from where."""
     if arguments.drawn is not None:
         return draw_place(arguments.drawn, arguments.views)
+    if arguments.window:
+        return DrawnPlace(window_place(), window_poses(arguments.views, arguments.seed))
     return DrawnPlace(make_place(), camera_poses(arguments.views, arguments.seed))
 
 
@@ -223,7 +254,7 @@ def main(arguments: Arguments) -> None:
     folder = arguments.output
     if folder.exists():
         raise FileExistsError(f"{folder} exists; expected a new folder, so remove it first")
-    for part in ("images", "masks", "sparse/0", "gt/trans", "gt/refl", "gt/strength"):
+    for part in ("images", "masks", "sparse/0", "gt/strength"):
         (folder / part).mkdir(parents=True)
     drawn = chosen_place(arguments)
     place, poses = drawn.place, drawn.poses
@@ -231,9 +262,7 @@ def main(arguments: Arguments) -> None:
     write_planes(folder / "gt/planes.json", place)
     annotated, started = annotated_views(place, poses, arguments.masks), time.monotonic()
     for number, pose in enumerate(poses):
-        seen = see(place, pose, arguments.width, arguments.width * 3 // 4)
-        test = number % TEST_EVERY == 0
-        write_view(folder, view_name(number), seen, annotated=number in annotated, test=test)
+        write_view(arguments, place, number, pose, annotated=number in annotated)
         print(f"\r{folder.name} {number + 1}/{len(poses)}, {time.monotonic() - started:.0f} s", end="", flush=True)
     print()
 

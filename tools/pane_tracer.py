@@ -7,7 +7,7 @@ thin: light goes through without a bend, and what comes back is the sum over all
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -32,8 +32,17 @@ class Thing(Protocol):
         """Chooses its texture."""
         ...
 
+    @property
+    def shade(self) -> float:
+        """Factor on the radiance of its texture."""
+        ...
+
     def distances(self, origins: Array, directions: Array) -> Array:
         """How far [N] rays with unit directions go until they meet it; infinite where they do not."""
+        ...
+
+    def on_texture(self, points: Array) -> Array:
+        """Where [N, 3] in the texture the points of its surface lie."""
         ...
 
 
@@ -44,6 +53,7 @@ class Ball:
     center: tuple[float, float, float]
     radius: float
     seed: int
+    shade: float = 1.0
 
     def distances(self, origins: Array, directions: Array) -> Array:
         """See `Thing`."""
@@ -52,6 +62,10 @@ class Ball:
         discriminant = along**2 - (offset**2).sum(axis=1) + self.radius**2
         near = -along - np.sqrt(np.maximum(discriminant, 0))
         return np.where((discriminant > 0) & (near > 0), near, np.inf)
+
+    def on_texture(self, points: Array) -> Array:
+        """See `Thing`."""
+        return points
 
 
 @dataclass(frozen=True)
@@ -62,6 +76,7 @@ class Box:
     high: tuple[float, float, float]
     seed: int
     room: bool = False
+    shade: float = 1.0
 
     def distances(self, origins: Array, directions: Array) -> Array:
         """See `Thing`."""
@@ -71,6 +86,41 @@ class Box:
         if self.room:
             return leaves
         return np.where((enters < leaves) & (enters > 0), enters, np.inf)
+
+    def on_texture(self, points: Array) -> Array:
+        """See `Thing`."""
+        return points
+
+
+@dataclass(frozen=True)
+class Carried:
+    """A thing that is carried about, its texture with it.
+
+    Attributes:
+        thing: as it is in a frame of its own.
+        world_from_thing: [4, 4] rigid transform of that frame.
+    """
+
+    thing: Thing
+    world_from_thing: Array
+
+    @property
+    def seed(self) -> int:
+        """See `Thing`."""
+        return self.thing.seed
+
+    @property
+    def shade(self) -> float:
+        """See `Thing`."""
+        return self.thing.shade
+
+    def distances(self, origins: Array, directions: Array) -> Array:
+        """See `Thing`."""
+        return self.thing.distances(self.on_texture(origins), directions @ self.world_from_thing[:3, :3])
+
+    def on_texture(self, points: Array) -> Array:
+        """See `Thing`."""
+        return (points - self.world_from_thing[:3, 3]) @ self.world_from_thing[:3, :3]
 
 
 class Meeting(NamedTuple):
@@ -173,11 +223,19 @@ class Lamp:
 
 @dataclass(frozen=True)
 class Place:
-    """Things and panes; some thing must be a room, so that every ray ends. Without a lamp all shine alike."""
+    """Things and panes.
+
+    Attributes:
+        things: what there is; one must be a room, so that every ray ends.
+        panes: glass and mirrors.
+        lamp: without one all shine alike.
+        photographer: things that stand where the rays come from: light meets them after a reflection only.
+    """
 
     things: Sequence[Thing]
     panes: Sequence[Pane]
     lamp: Lamp | None = None
+    photographer: Sequence[Thing] = ()
 
     def without_panes(self, origins: Array, directions: Array) -> tuple[Array, Array]:
         """Radiance [N, 3] along rays of a place without panes, and how far [N] they go."""
@@ -187,7 +245,7 @@ class Place:
         radiance = np.empty_like(points)
         for number, thing in enumerate(self.things):
             of_it = nearest == number
-            radiance[of_it] = painted(points[of_it], thing.seed)
+            radiance[of_it] = thing.shade * painted(thing.on_texture(points[of_it]), thing.seed)
         return radiance if self.lamp is None else radiance * self.lamp.gains(points), distance
 
     def radiance(self, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> Array:
@@ -199,6 +257,7 @@ class Place:
     def seen(self, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> Seen:
         """The radiance along rays and its layers; there must be a pane."""
         radiance, end = self.without_panes(origins, directions)
+        mirrored = replace(self, things=(*self.things, *self.photographer), photographer=())
         distances = np.stack([pane.distances(origins, directions) for pane in self.panes])
         distances = np.where(distances < end, distances, np.inf)
         order = distances.argsort(axis=0)
@@ -209,7 +268,7 @@ class Place:
             for number, pane in enumerate(self.panes):
                 hit = (order[place] == number) & (distances[number] < np.inf)
                 met = pane.meeting(origins[hit], directions[hit], distances[number, hit])
-                reflection[hit] = self.radiance(met.points, met.mirrored, reflections - 1)
+                reflection[hit] = mirrored.radiance(met.points, met.mirrored, reflections - 1)
                 strength[hit], label[hit] = met.share, pane.label
             radiance = (1 - strength[:, None]) * transmission + strength[:, None] * reflection
         return Seen(radiance, transmission, reflection, strength, label)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -73,14 +73,14 @@ class Dereflect:
 
 
 def planar_renderer(stored: StoredRun) -> Planar:
-    """The renderer of a run that has reflections to take off.
+    """The renderer of a run that has reflections to take off, that of the photographer among them.
 
     Raises:
         InputError: it has none.
     """
     renderer = stored.renderer
     if isinstance(renderer, Planar) and len(stored.scene.planes):
-        return renderer
+        return replace(renderer, photographer="present")
     raise InputError(
         f"{stored.directory.path} is a {stored.recipe.method} run without panes, so it knows no reflection; train one "
         f"that does, with pane masks: glassplat train planar --data {stored.directory.settings().data} --output RUN"

@@ -17,7 +17,7 @@ from glassplat.evaluate.evaluate import Evaluation, evaluate
 from glassplat.evaluate.metric_names import PLANE_COLUMNS, missing_reasons, shown_metrics, written
 from glassplat.evaluate.report import Report
 from glassplat.kernels.devices import DeviceName
-from glassplat.render.planar import Planar
+from glassplat.render.planar import Planar, with_photographer
 from glassplat.train.checkpoint import recorded_seconds
 from glassplat.train.run_directory import write_text
 
@@ -63,7 +63,13 @@ def evaluate_run(stored: StoredRun, panes: PaneSource = "auto") -> dict:
     settings, path = stored.directory.settings(), stored.directory.path
     blend = stored.renderer.blend if isinstance(stored.renderer, Planar) else None
     report = Report(path, stored.dataset, blend)
-    evaluation: Evaluation = evaluate(stored.scene, stored.renderer, stored.dataset, regions=regions, listen=report.add)
+    evaluation: Evaluation = evaluate(
+        stored.scene,
+        with_photographer(stored.renderer, "beside"),
+        stored.dataset,
+        regions=regions,
+        listen=report.add,
+    )
     results = {
         "method": stored.recipe.method,
         "iterations": stored.iterations,

@@ -91,6 +91,8 @@ def _describe_scene(scene: Scene, finding: Finding) -> None:
             for label, reflectance in zip(planes.labels, planes.base_reflectances, strict=True)
         )
         finding.facts["panes"] = ", ".join(told)
+    if len(scene.photographer):
+        finding.facts["photographer"] = f"{len(scene.photographer)} Gaussians, which panes show in photographs only"
     if not scene.environment.is_empty:
         finding.facts["environment"] = f"a cube map of {scene.environment.size} texels a side"
 

@@ -205,13 +205,14 @@ def _measure(
     lpips: Lpips | str,
 ) -> _Measurement:
     """Every metric of one view except the reflection's, which needs all views."""
+    image = frame.photographed
     metrics: dict[str, Outcome] = {
-        "psnr": psnr(frame.rgb, photo),
-        "corrected_psnr": psnr(color_corrected(frame.rgb, photo), photo),
-        "right_half_psnr": _right_half_psnr(frame.rgb, photo),
-        "ssim": ssim(frame.rgb, photo),
-        "lpips": NO_WEIGHTS if isinstance(lpips, str) else lpips(quantized(frame.rgb), quantized(photo)),
-        "pane_psnr": pane if isinstance(pane, str) else _region_psnr(frame.rgb, photo, pane, TOO_FEW),
+        "psnr": psnr(image, photo),
+        "corrected_psnr": psnr(color_corrected(image, photo), photo),
+        "right_half_psnr": _right_half_psnr(image, photo),
+        "ssim": ssim(image, photo),
+        "lpips": NO_WEIGHTS if isinstance(lpips, str) else lpips(quantized(image), quantized(photo)),
+        "pane_psnr": pane if isinstance(pane, str) else _region_psnr(image, photo, pane, TOO_FEW),
         "transmission_psnr": _transmission_psnr(frame, *truth),
         **surface_metrics(frame, photo, surface),
     }

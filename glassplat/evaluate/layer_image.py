@@ -10,8 +10,9 @@ from glassplat.render.frame import Frame
 
 def layer_image(frame: Frame, layer: str) -> Tensor:
     """A layer as an image [H, W] or [H, W, 3] in [0, 1]; depth is colour-mapped (near bright), normals (n + 1) / 2."""
-    if layer == "rgb":
-        return frame.rgb.clamp(0, 1)
+    if layer in ("rgb", "photographed"):
+        image: Tensor = getattr(frame, layer)
+        return image.clamp(0, 1)
     image = frame.layers[layer]
     if layer == "normal":
         return normal_colors(image)

@@ -92,12 +92,14 @@ def composed(rows: Sequence[Row], title: str, subtitle: str) -> NDArray[np.uint8
 
 
 def _image_row(frame: Frame, photo: Tensor) -> list[Panel]:
-    error = (frame.rgb.clamp(0, 1) - photo.to(torch.float32) / 255).abs().mean(dim=-1)
+    error = (frame.photographed.clamp(0, 1) - photo.to(torch.float32) / 255).abs().mean(dim=-1)
     row = [
         Panel("photograph", photo),
-        Panel("render", frame.rgb),
+        Panel("render", frame.photographed),
         Panel(f"error (brightest: {ERROR_SCALE:g} and more)", heat_colors(error / ERROR_SCALE)),
     ]
+    if "photographed" in frame.layers:
+        row.append(Panel("without the photographer", frame.rgb))
     if "depth" in frame.layers:
         row.append(Panel("depth (near is bright)", depth_colors(frame.layers["depth"], frame.layers.get("alpha"))))
     return row

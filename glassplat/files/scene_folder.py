@@ -3,32 +3,40 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from glassplat.files.atomic import atomic_write
 from glassplat.files.environment_file import read_environment, write_environment
 from glassplat.files.exposures_json import read_exposures, write_exposures
-from glassplat.files.fields import LARGEST_COORDINATE, Choice, Field, Items, Number, Optional, Whole, checked
+from glassplat.files.fields import LARGEST_COORDINATE, Choice, Field, Items, Nullable, Number, Optional, Whole, checked
 from glassplat.files.json_text import read_json
 from glassplat.files.planes_json import read_planes, write_planes
 from glassplat.files.ply import read_gaussians, write_gaussians
 from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.photographer import Direction
 from glassplat.scene.scene import Scene
 
 PRIMARY, GLASS, PLANES, SCENE = "point_cloud.ply", "glass.ply", "planes.json", "scene.json"
 ENVIRONMENT, SURROUNDINGS, EXPOSURES = "environment.safetensors", "surroundings.ply", "exposures.json"
+PHOTOGRAPHER = "photographer.ply"
 LARGEST_COLOR = 1e6
 LARGEST_LOG = 40.0
 """Of a logarithm: its exponential, squared, fits float32."""
 EXTENT = Number(above=0, most=4 * LARGEST_COORDINATE)
 SH_DEGREE = Whole(0, 3)
+DIRECTION = Nullable(Items(Number(-1.001, 1.001), 3))
+UNIT_TOLERANCE = 1e-3
 HEADER: dict[str, Field] = {
     "extent": EXTENT,
     "active_sh_degree": SH_DEGREE,
     "surroundings_sh_degree": Optional(SH_DEGREE),
-    "files": Optional(Items(Choice((PRIMARY, GLASS, PLANES, ENVIRONMENT, SURROUNDINGS, EXPOSURES)))),
+    "photographer_sh_degree": Optional(SH_DEGREE),
+    "up": Optional(DIRECTION),
+    "files": Optional(Items(Choice((PRIMARY, GLASS, PLANES, ENVIRONMENT, SURROUNDINGS, EXPOSURES, PHOTOGRAPHER)))),
 }
 """`files` is what the scene consists of, so that one that is lost is missed; folders of earlier versions lack it."""
 
@@ -39,7 +47,8 @@ def write_scene(folder: Path, scene: Scene) -> None:
     `point_cloud.ply` holds the primary Gaussians, which any splat viewer shows without the reflections;
     `glass.ply` and `planes.json` hold what a viewer that knows panes needs on top, `environment.safetensors` the raw
     texels of the environment's cube map, `surroundings.ply` the Gaussians that reflections show, `exposures.json` how
-    the photographs were exposed. Each is there only where the scene has it.
+    the photographs were exposed, `photographer.ply` whom the panes show in them, in a frame that goes along with the
+    camera. Each is there only where the scene has it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = [PRIMARY]
@@ -56,6 +65,10 @@ def write_scene(folder: Path, scene: Scene) -> None:
         write_gaussians(folder / SURROUNDINGS, scene.surroundings)
         header["surroundings_sh_degree"] = scene.surroundings.active_sh_degree
         files += [SURROUNDINGS]
+    if len(scene.photographer):
+        write_gaussians(folder / PHOTOGRAPHER, scene.photographer)
+        header |= {"photographer_sh_degree": scene.photographer.active_sh_degree, "up": scene.up}
+        files += [PHOTOGRAPHER]
     if len(scene.exposures):
         write_exposures(folder / EXPOSURES, scene.exposures)
         files += [EXPOSURES]
@@ -80,9 +93,26 @@ def read_scene(folder: Path) -> Scene:
         scene = replace(scene, environment=read_environment(folder / ENVIRONMENT))
     if (folder / SURROUNDINGS).is_file():
         scene = replace(scene, surroundings=_colored(folder, SURROUNDINGS, header["surroundings_sh_degree"]))
+    if (folder / PHOTOGRAPHER).is_file():
+        photographer = _colored(folder, PHOTOGRAPHER, header["photographer_sh_degree"])
+        scene = replace(scene, photographer=photographer, up=direction(header["up"], str(folder / SCENE)))
     if (folder / EXPOSURES).is_file():
         scene = replace(scene, exposures=read_exposures(folder / EXPOSURES))
     return scene
+
+
+def direction(up: Sequence[float] | None, where: str) -> Direction | None:
+    """The direction that a header holds, if any.
+
+    Raises:
+        ValueError: its length is not one.
+    """
+    if up is None:
+        return None
+    x, y, z = up
+    if abs(math.hypot(x, y, z) - 1) > UNIT_TOLERANCE:
+        raise ValueError(f"up in {where} has length {math.hypot(x, y, z):g}; expected a unit direction")
+    return (x, y, z)
 
 
 def _colored(folder: Path, name: str, active_sh_degree: int | None) -> Gaussians:

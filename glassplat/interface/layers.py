@@ -9,6 +9,7 @@ from typing import Any, Literal
 from glassplat.data.errors import InputError
 from glassplat.render.deferred import Deferred
 from glassplat.render.frame import Renderer
+from glassplat.render.planar import with_photographer
 from glassplat.render.traced import Traced
 
 Layer = Literal[
@@ -25,6 +26,7 @@ Layer = Literal[
     "environment",
     "surroundings",
     "median_depth",
+    "photographed",
 ]
 
 LAYERS: dict[str, tuple[Layer, ...]] = {
@@ -37,6 +39,9 @@ LAYERS: dict[str, tuple[Layer, ...]] = {
 
 DISC_LAYERS: tuple[Layer, ...] = ("rgb", "normal", "depth", "median_depth", "alpha")
 """What `splat` renders of discs."""
+
+PHOTOGRAPHED: Layer = "photographed"
+"""The image with whom the panes of a photograph show, of runs that looked for somebody."""
 
 
 def layers_of(recipe: Any) -> tuple[Layer, ...]:
@@ -51,6 +56,8 @@ def check_layers(layers: Sequence[str], recipe: Any) -> None:
         InputError: there are such, or none is asked for.
     """
     known, method = layers_of(recipe), recipe.method
+    if method == "planar" and recipe.photographer.learn:
+        known = (*known, PHOTOGRAPHED)
     foreign = [layer for layer in layers if layer not in known]
     if foreign or not layers:
         asked = f"renders no layer {', '.join(foreign)}" if foreign else "renders nothing without --layers"
@@ -63,4 +70,4 @@ def renderer_with(renderer: Renderer, layers: Sequence[str]) -> Renderer:
         return replace(renderer, environment=True)
     if isinstance(renderer, Traced) and "surroundings" in layers:
         return replace(renderer, surroundings=True)
-    return renderer
+    return with_photographer(renderer, "beside") if PHOTOGRAPHED in layers else renderer

@@ -74,6 +74,11 @@ class Frame:
     space: tuple[SpacePass, ...] = ()
 
     @property
+    def photographed(self) -> Tensor:
+        """[H, W, 3] what a photograph shows: the image, with the photographer where panes show one and it was asked."""
+        return self.layers.get("photographed", self.rgb)
+
+    @property
     def visible(self) -> Tensor | None:
         """[N] bool, which primary Gaussians reach a pixel in either way; None where the renderer does not say."""
         return self.direct if self.direct is None or self.mirrored is None else self.direct | self.mirrored

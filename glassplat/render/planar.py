@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -13,7 +14,7 @@ from glassplat.kernels.composite import composite
 from glassplat.kernels.layer_slopes import layer_slopes
 from glassplat.kernels.panes import Fresnel, PaneHits, Panes
 from glassplat.kernels.splats import Deviation, Projected, Splats
-from glassplat.render.frame import Frame, ScreenPass
+from glassplat.render.frame import Frame, Renderer, ScreenPass
 from glassplat.render.glazing import Blend, Glazed, glazed, own_masks, visibilities
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
@@ -37,9 +38,13 @@ from glassplat.render.seen_panes import (
 )
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.photographer import world_from_photographer
 from glassplat.scene.plane import Planes
 from glassplat.scene.pose import mirror_matrices
 from glassplat.scene.scene import Scene
+
+Shown = Literal["absent", "present", "beside"]
+"""Whether panes show who took a photograph."""
 
 
 class FirstPass(NamedTuple):
@@ -86,6 +91,9 @@ class Planar:
     were there no panes, and `share` [H, W], how much of what is seen the panes add, all of them together;
     `deviation` [H, W] (Eq. 14) if asked for.
 
+    A photograph also shows who took it, in the panes: `Scene.photographer`, Gaussians in a frame that goes along with
+    the camera. They are drawn among those that a pane mirrors, through the camera mirrored about it, and nowhere else.
+
     Attributes:
         background: colour behind everything, sRGB.
         fresnel: how R_k rises from R0 at normal incidence: as that of a pane with its two surfaces, by Schlick's curve
@@ -96,6 +104,9 @@ class Planar:
         deviation_depth_gradient: let the deviation's gradient pass through the mean depth D_t.
         blend: space in which Eqs. 1 and 13 hold: linear radiance, where light adds up, or sRGB as in the paper.
         nearest_only: of panes that are seen through one another, show the nearest only, as the paper does.
+        photographer: whether panes show the scene's photographer: not, so that the image is what nobody disturbs; in
+            the image and its reflection, as photographs do, for training; or in a layer `photographed` [H, W, 3] beside
+            the image without.
         tells_mirrored: whether the records of a probed frame tell mirror images from what is seen directly, and how
             much is left of either; if not, all of them count alike.
     """
@@ -108,6 +119,7 @@ class Planar:
     deviation_depth_gradient: bool = False
     blend: Blend = "linear"
     nearest_only: bool = False
+    photographer: Shown = "absent"
     tells_mirrored: bool = True
 
     def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
@@ -129,16 +141,10 @@ class Planar:
             return Frame(first.image, layers, direct=first.direct, screen=first.screen)
         second = self._second_pass(scene, camera, seen, probed)
         masks = self._visibilities(scene, camera, seen, first)
-        result = glazed(
-            first.image,
-            seen,
-            masks,
-            second.reflections,
-            camera,
-            fresnel=self.fresnel,
-            intensity=self.intensity,
-            blend=self.blend,
-        )
+        result = self._glazed(first, seen, masks, second, camera)
+        if self.photographer == "beside" and len(scene.photographer):
+            with_body = replace(self, photographer="present")._second_pass(scene, camera, seen, False)
+            layers["photographed"] = self._glazed(first, seen, masks, with_body, camera).rgb
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
         layers["inner"] = amid_one_pane(hits.pane, result.strength)
         screen = self._screen(first, second, hits, result) if probed else ()
@@ -196,15 +202,38 @@ class Planar:
     def _second_pass(self, scene: Scene, camera: Camera, seen: SeenPanes, probed: bool) -> SecondPass:
         primary = scene.primary if self.reflection_gradient == "all" else detached(scene.primary)
         projected = project_mirrored(primary, camera, seen, near=NEAR_PER_EXTENT * scene.extent)
-        splats = joined_splats(projected)
-        bins = bin_tiles(splats, camera.width, camera.height, seen.tiles)
         intensity = torch.exp(primary.channels["log_intensity"]).expand(len(seen.planes), -1)
         channels = torch.cat([projected.colors, intensity[..., None]], dim=-1)
-        screen = (screen_pass("primary", projected, direct=False),) if probed else ()
+        mirrored = [projected]
+        screen: tuple[ScreenPass, ...] = (screen_pass("primary", projected, direct=False),) if probed else ()
+        if self.photographer == "present" and len(scene.photographer):
+            body = project_photographer(scene, camera, seen, near=NEAR_PER_EXTENT * scene.extent)
+            # A body is as bright as it is: an intensity of its own would be a second factor on its colours.
+            channels = torch.cat([channels, torch.nn.functional.pad(body.colors, (0, 1), value=1.0)], dim=1)
+            mirrored.append(body)
+            # No view shows it directly, so that mirror images are what it is densified by.
+            screen += (screen_pass("photographer", body),) if probed else ()
+        splats = joined_splats(*mirrored)
+        bins = bin_tiles(splats, camera.width, camera.height, seen.tiles)
         result = composite(splats, channels, bins, probe=joined_probe(screen))
         # The background, too, is as bright in a pane as it is: with no intensity of its own it would be black there.
         reflections = over_background(result.image, result.alpha, (*self.background, 1.0))
         return SecondPass(reflections, shown(projected), screen)
+
+    def _glazed(
+        self, first: FirstPass, seen: SeenPanes, masks: Sequence[Tensor], second: SecondPass, camera: Camera
+    ) -> Glazed:
+        """Lays the panes and what they mirror before the image."""
+        return glazed(
+            first.image,
+            seen,
+            masks,
+            second.reflections,
+            camera,
+            fresnel=self.fresnel,
+            intensity=self.intensity,
+            blend=self.blend,
+        )
 
     def _screen(self, first: FirstPass, second: SecondPass, hits: PaneHits, result: Glazed) -> tuple[ScreenPass, ...]:
         """The records of both passes."""
@@ -263,6 +292,36 @@ def project_mirrored(gaussians: Gaussians, camera: Camera, seen: SeenPanes, *, n
         near=near,
         poses=camera.cam_from_world @ mirror_matrices(seen.planes.centers, seen.planes.normals),
         clip_planes=half_spaces_of(seen.planes, camera),
+        windows=seen.windows,
+    )
+
+
+def with_photographer(renderer: Renderer, photographer: Shown) -> Renderer:
+    """A renderer whose frames tell what photographs show, as far as it knows of anybody; see `Planar.photographer`."""
+    return replace(renderer, photographer=photographer) if isinstance(renderer, Planar) else renderer
+
+
+def project_photographer(scene: Scene, camera: Camera, seen: SeenPanes, *, near: float) -> Projected:
+    """Projects the photographer's mirror images: what `project_mirrored` does, of Gaussians that the camera carries.
+
+    Mirrored about plane k, the camera sees them at `cam_from_world @ M_k @ world_from_photographer`; all else, also
+    the depths by which they are sorted into the room, follows from that pose.
+
+    Args:
+        scene: with a photographer.
+        camera: that the photographer holds.
+        seen: the planes that it sees, and where.
+        near: depth below which a Gaussian is culled, world units.
+    """
+    frame = world_from_photographer(camera, scene.up)
+    half_spaces = half_spaces_of(seen.planes, camera)
+    return project_gaussians(
+        scene.photographer,
+        camera,
+        near=near,
+        poses=camera.cam_from_world @ mirror_matrices(seen.planes.centers, seen.planes.normals) @ frame,
+        # A plane n . x + d = 0 is (n, d) as a row vector, so that frames change it from the right.
+        clip_planes=half_spaces @ frame.detach(),
         windows=seen.windows,
     )
 

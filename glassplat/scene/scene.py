@@ -12,9 +12,12 @@ from torch import Tensor
 from glassplat.scene.environment import Environment
 from glassplat.scene.exposure import Exposures
 from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.photographer import Direction
 from glassplat.scene.plane import TRAINABLE, Planes
 
-GAUSSIAN_SETS = ("primary", "glass", "surroundings")
+GAUSSIAN_SETS = ("primary", "glass", "surroundings", "photographer")
+OPTIONAL_SETS = GAUSSIAN_SETS[2:]
+"""Those that most scenes have not."""
 PARTS = (*GAUSSIAN_SETS, "planes", "environment", "exposures")
 """Fields of `Scene` that hold tensors."""
 
@@ -31,6 +34,9 @@ class Scene:
         environment: what shiny surfaces mirror from far away; empty for most methods.
         surroundings: Gaussians that shiny surfaces mirror from near by, and nothing else shows (EnvGS); empty for most
             methods.
+        photographer: Gaussians in the frame of whoever held the camera (`world_from_photographer`), which only panes
+            show; empty for most methods.
+        up: the direction in which the photographer stands, unit; None where the body leans with the camera.
         exposures: how the photographs were exposed that it was trained on; empty where all are taken as alike.
     """
 
@@ -40,12 +46,14 @@ class Scene:
     planes: Planes = field(default_factory=Planes.empty)
     environment: Environment = field(default_factory=Environment.empty)
     surroundings: Gaussians = field(default_factory=Gaussians.empty)
+    photographer: Gaussians = field(default_factory=Gaussians.empty)
+    up: Direction | None = None
     exposures: Exposures = field(default_factory=Exposures.neutral)
 
     def gaussian_sets(self) -> dict[str, Gaussians]:
-        """The sets of Gaussians by name; the surroundings are among them where there are any."""
+        """The sets of Gaussians by name; surroundings and photographer are among them where there are any."""
         sets = {"primary": self.primary, "glass": self.glass}
-        return sets | ({"surroundings": self.surroundings} if len(self.surroundings) else {})
+        return sets | {name: getattr(self, name) for name in OPTIONAL_SETS if len(getattr(self, name))}
 
     def parameters(self) -> dict[str, Tensor]:
         """Every trainable tensor by dotted name (`primary.means`, `planes.centers`, ...).

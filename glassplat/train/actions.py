@@ -89,8 +89,8 @@ class Densify:
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state`, if there is anything to edit."""
         statistics = state.statistics.pop(self.part, None)
-        gaussians = state.scene.gaussian_sets()[self.part]
-        if statistics is None or len(gaussians) == 0:
+        gaussians = state.scene.gaussian_sets().get(self.part)
+        if statistics is None or gaussians is None or len(gaussians) == 0:
             return False
         factor = threshold_factor(dataset) if self.densifier.adapt_to_size else 1.0
         densifier = replace(
@@ -157,8 +157,11 @@ class PruneIdle:
 def put_in_order(state: TrainState, gaussians: Gaussians, moments: Moments, part: str = "primary") -> None:
     """Replaces a part of the scene and its moments, sorted so that neighbours in space are neighbours in memory."""
     order = in_morton_order(gaussians.means)
-    ordered, state.optimizer.moments = apply_edit(gaussians, moments, order, part=part)
+    ordered, moments = apply_edit(gaussians, moments, order, part=part)
     state.scene = state.scene.with_gaussians(part, ordered)
+    # Of a set that has vanished, a scene has no parameters.
+    known = state.scene.parameters()
+    state.optimizer.moments = {name: pair for name, pair in moments.items() if name in known}
 
 
 def cap_of(densifier: McmcDensify, dataset: Dataset) -> int:

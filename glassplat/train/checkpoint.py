@@ -15,13 +15,13 @@ from glassplat.densify.default import ScreenStatistics
 from glassplat.files.environment_file import REGION
 from glassplat.files.fields import ByName, Field, Items, Nullable, Number, Optional, Text, Whole, checked
 from glassplat.files.planes_json import HIGHEST_LABEL
-from glassplat.files.scene_folder import EXTENT, SH_DEGREE
+from glassplat.files.scene_folder import DIRECTION, EXTENT, SH_DEGREE, direction
 from glassplat.files.tensors_file import TensorsFile, opened_tensors, write_tensors
 from glassplat.scene.environment import Environment
 from glassplat.scene.exposure import Exposures
 from glassplat.scene.gaussians import DISC_SCALES, PER_GAUSSIAN, Gaussians
 from glassplat.scene.plane import Planes
-from glassplat.scene.scene import Scene
+from glassplat.scene.scene import OPTIONAL_SETS, Scene
 from glassplat.train.optimizer import Optimizer
 from glassplat.train.state import TrainState
 
@@ -42,6 +42,7 @@ HEADER: dict[str, Field] = {
     "hurried": Optional(ByName(Number(0)), {}),
     "records": Optional(ByName(Number()), {}),
     "photographs": Optional(Items(Text()), ()),
+    "up": Optional(DIRECTION),
 }
 """What is `Optional` was added after the first checkpoints were written."""
 GAUSSIAN_SHAPES = {"means": (3,), "quats": (4,), "log_scales": None, "logit_opacities": ()}
@@ -92,6 +93,7 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
         "hurried": state.optimizer.hurried,
         "records": state.records,
         "photographs": list(scene.exposures.names),
+        "up": scene.up,
     }
     write_tensors(path, tensors, header)
 
@@ -196,10 +198,10 @@ def restored_state(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
 def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Scene:
     """The scene; ValueError where a tensor is missing or of another shape."""
     empty = Scene(Gaussians.empty(), extent=header["extent"])
-    if header["active_sh_degree"].keys() - {"surroundings"} != empty.gaussian_sets().keys():
+    if header["active_sh_degree"].keys() - set(OPTIONAL_SETS) != empty.gaussian_sets().keys():
         raise InputError(
             f"it holds the sets of Gaussians {sorted(header['active_sh_degree'])}; expected primary, glass, and "
-            "surroundings where there are any"
+            f"{' and '.join(OPTIONAL_SETS)} where there are any"
         )
     if "scene/glass/logit_mark" not in tensors:
         raise InputError("the glass has no logit_mark")
@@ -218,6 +220,7 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
         extent=header["extent"],
         planes=Planes(**planes, labels=header["labels"], mirrors=header["mirrors"]),
         environment=environment,
+        up=direction(header["up"], "the header"),
         exposures=Exposures(**exposed, names=tuple(header["photographs"])) if exposed else empty.exposures,
         **sets,
     )

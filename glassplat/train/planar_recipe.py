@@ -33,6 +33,7 @@ from glassplat.train.actions import Densify, GrowSh, PerturbOpacity, ResetOpacit
 from glassplat.train.background import BLACK
 from glassplat.train.optimizer import PUBLISHED_ITERATIONS, Rate
 from glassplat.train.photo_exposure import PhotoExposure
+from glassplat.train.photographer_entry import Photographer
 from glassplat.train.plane_entry import PlaneEntry, fitted_planes
 from glassplat.train.splat_recipe import GaussianRates, image_terms
 from glassplat.train.stage import Every, Stage
@@ -153,6 +154,7 @@ class PlanarRecipe:
         densify: when and how Gaussians are added and pruned under `default`.
         mcmc: when and how Gaussians are relocated and added under `mcmc`.
         exposure: whether the exposure of each photograph is learned.
+        photographer: whether panes show who took the photographs.
     """
 
     method: ClassVar[str] = "planar"
@@ -185,6 +187,7 @@ class PlanarRecipe:
     densify: DefaultDensify = field(default_factory=DefaultDensify)
     mcmc: McmcDensify = field(default_factory=McmcDensify)
     exposure: PhotoExposure = field(default_factory=PhotoExposure)
+    photographer: Photographer = field(default_factory=Photographer)
 
     @classmethod
     def paper(cls) -> PlanarRecipe:
@@ -268,7 +271,7 @@ class PlanarRecipe:
             stages: tuple[Stage, ...] = (initialisation, replace(self._joint(second + third), entry=entry))
         else:
             stages = (initialisation, self._adjustment(second, entry), self._joint(third))
-        return self.exposure.learnt_in(stages)
+        return self.exposure.learnt_in(self.photographer.learnt_in(stages, self.densify, seed))
 
     def _adjustment(self, share: float, entry: PlaneEntry) -> Stage:
         """Stage 2: the reflection's gradient reaches the planes, not the Gaussians."""

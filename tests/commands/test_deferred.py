@@ -10,18 +10,18 @@ import pytest
 import torch
 
 from glassplat.cli import main
-from glassplat.commands import render
 from glassplat.commands.scene_edits import SceneEdits
 from glassplat.commands.stored_run import open_run
 from glassplat.data.errors import InputError
 from glassplat.files.environment_image import read_equirect, write_equirect
 from glassplat.files.images import read_image
+from glassplat.interface import layers
 from glassplat.render.environment import equirect_from_environment
 from glassplat.scene.environment import Environment
 from glassplat.train.checkpoint import load_checkpoint
 from tests.train.object_capture import write_object_capture
 
-LAYERS = render.LAYERS["deferred"]
+LAYERS = layers.LAYERS["deferred"]
 
 
 @pytest.fixture

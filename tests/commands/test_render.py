@@ -12,7 +12,7 @@ from glassplat.cli import main
 from glassplat.commands.scene_edits import SceneEdits
 from glassplat.data.errors import InputError
 from glassplat.files.images import read_image
-from glassplat.interface.layers import DISC_LAYERS, LAYERS, Layer
+from glassplat.interface.layers import DISC_LAYERS, LAYERS, PHOTOGRAPHED, Layer
 from glassplat.scene.plane_edits import as_mirrors, shifted, tilted, with_reflectance, without_glass
 from glassplat.scene.scene import Scene
 from glassplat.train.recipe import RECIPES
@@ -82,7 +82,8 @@ def test_layers_that_a_method_lacks_are_refused_before_anything_is_rendered(
 
 def test_layers_that_are_listed_can_be_asked_for() -> None:
     assert set(LAYERS) == set(RECIPES)
-    assert {layer for layers in (*LAYERS.values(), DISC_LAYERS) for layer in layers} == set(get_args(Layer))
+    known = (*LAYERS.values(), DISC_LAYERS, [PHOTOGRAPHED])
+    assert {layer for layers in known for layer in layers} == set(get_args(Layer))
 
 
 def test_a_scene_without_panes_cannot_be_edited() -> None:

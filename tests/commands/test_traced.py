@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from glassplat.cli import main
-from glassplat.commands import render
 from glassplat.commands.stored_run import open_run
+from glassplat.interface import layers
 from glassplat.train.checkpoint import load_checkpoint
 from tests.train.object_capture import write_object_capture
 
-LAYERS = render.LAYERS["traced"]
+LAYERS = layers.LAYERS["traced"]
 
 
 @pytest.fixture

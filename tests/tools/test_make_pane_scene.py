@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from glassplat.data.dataset import load_dataset
 from glassplat.evaluate.truth import load_truth
@@ -15,7 +16,8 @@ from glassplat.kernels.blend_panes.reference import two_surfaces
 from glassplat.kernels.pane_hits.reference import pane_hits
 from glassplat.kernels.panes import Panes
 from tools.make_pane_scene import Arguments, main
-from tools.pane_tracer import Ball, Box, Pane, Place
+from tools.pane_tracer import Ball, Box, Carried, Pane, Place
+from tools.photographer_body import photographer, upright_frame
 
 ROOM = Box((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), seed=1, room=True)
 X, Y = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
@@ -126,6 +128,68 @@ def test_the_capture_fits_its_truth(tmp_path: Path) -> None:
     layers = truth.view(view.name, view.camera.width, view.camera.height)
     assert layers is not None
     assert (view.photo[layers.strength == 0] == layers.transmission[layers.strength == 0]).all()
+
+
+STANDING = np.array([[1.0, 0, 0, 0.1], [0, 0, 1, -1.0], [0, -1, 0, 1.2], [0, 0, 0, 1]])
+"""A camera before the window that looks along +y, 1.2 above the floor."""
+
+
+def test_the_body_stands_on_the_floor_behind_the_camera_however_that_is_tilted() -> None:
+    tilt = np.eye(4)
+    tilt[:3, :3] = Rotation.from_euler("x", -30, degrees=True).as_matrix()
+    for pose in (STANDING, STANDING @ tilt):
+        np.testing.assert_allclose(upright_frame(pose), STANDING, atol=1e-12)
+        # Downwards: onto the shoulders, from within the torso onto the legs, and past both.
+        above = np.array([[0.2, -1.2, 1.1], [0.2, -1.2, 0.45], [0.6, -1.2, 1.1]])
+        below = np.broadcast_to([0.0, 0.0, -1.0], above.shape)
+        distances = np.min([part.distances(above, below) for part in photographer(pose)], axis=0)
+        np.testing.assert_allclose(distances, [1.1 - (1.2 - 0.18), 0.45 - (1.2 - 0.8), np.inf])
+
+
+def test_only_mirrored_rays_meet_the_photographer() -> None:
+    room = Box((-2.0, -2.0, 0.0), (2.0, 2.0, 2.5), seed=1, room=True)
+    window = replace(WINDOW, center=np.array([0.0, 0.0, 1.2]))
+    somebody = photographer(STANDING)
+    origins, directions = towards_window()
+    origins = np.broadcast_to(STANDING[:3, 3], origins.shape)
+    alone, peopled = Place((room,), (window,)), Place((room,), (window,), photographer=somebody)
+    nobody, seen = alone.seen(origins, directions), peopled.seen(origins, directions)
+    hit = nobody.label == 1
+    np.testing.assert_array_equal(seen.transmission, nobody.transmission)
+    np.testing.assert_array_equal(seen.radiance[~hit], nobody.radiance[~hit])
+    differs = (np.abs(seen.reflection - nobody.reflection) > 1e-9).any(axis=1)
+    assert differs.mean() > 0.01
+    # What the window mirrors is what somebody sees who looks at the body from behind the window.
+    body_in_room = Place((room, *somebody), ())
+    image, _ = body_in_room.without_panes(origins[hit] * [1, -1, 1], directions[hit] * [1, -1, 1])
+    np.testing.assert_allclose(seen.reflection[hit], image, atol=1e-9)
+
+
+def test_what_is_carried_keeps_its_texture() -> None:
+    turn = np.eye(4)
+    turn[:3, :3], turn[:3, 3] = Rotation.from_euler("xyz", [20, 50, -10], degrees=True).as_matrix(), [0.3, -0.2, 0.1]
+    ball = Ball((0.0, 1.0, 0.0), 0.25, seed=2)
+    rays = towards_window()
+    before, _ = Place((ROOM, ball), ()).without_panes(*rays)
+    moved = Place((Carried(ROOM, turn), Carried(ball, turn)), ())
+    after, _ = moved.without_panes(rays[0] @ turn[:3, :3].T + turn[:3, 3], rays[1] @ turn[:3, :3].T)
+    np.testing.assert_allclose(after, before, atol=1e-9)
+
+
+def test_layers_are_those_without_a_photographer_and_beside_them_with_one(tmp_path: Path) -> None:
+    arguments = Arguments(tmp_path / "peopled", width=24, views=9, masks=1, points=10, window=True, photographer=True)
+    main(arguments)
+    main(replace(arguments, output=tmp_path / "empty", photographer=False))
+    peopled, empty = tmp_path / "peopled", tmp_path / "empty"
+    for part in ("gt/refl", "gt/trans", "gt/strength"):
+        for path in sorted((empty / part).iterdir()):
+            assert path.read_bytes() == (peopled / part / path.name).read_bytes()
+    names = [path.name for path in sorted((empty / "gt/refl").iterdir())]
+    assert any(
+        (peopled / "gt/with_photographer/refl" / name).read_bytes() != (peopled / "gt/refl" / name).read_bytes()
+        for name in names
+    )
+    assert (peopled / "images/0000.png").read_bytes() != (empty / "images/0000.png").read_bytes()
 
 
 def test_a_scene_is_not_overwritten(tmp_path: Path) -> None:

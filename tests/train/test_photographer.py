@@ -1,0 +1,131 @@
+"""The photographer is put behind the camera when panes are known, learns, is stored and taken up again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from glassplat.data.dataset import Dataset
+from glassplat.data.view import View
+from glassplat.densify.default import ScreenStatistics
+from glassplat.files.scene_folder import read_scene, write_scene
+from glassplat.init.photographer import distance_to_panes, first_photographer
+from glassplat.render.planar import Planar
+from glassplat.render.splat import Splat
+from glassplat.scene.scene import Scene
+from glassplat.train.actions import Densify
+from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
+from glassplat.train.photographer_entry import AddPhotographer, Photographer
+from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.stage import Clock, carried_out
+from glassplat.train.state import TrainState
+from glassplat.train.trainer import train
+from tests.render.test_photographer import body
+from tests.render.tiny_scene import in_single_precision, pane
+from tests.train.tiny_capture import tiny_capture, true_scene
+
+LEARNED = Photographer(learn=True, count=60)
+UP = (0.0, -1.0, 0.0)
+
+
+def peopled_capture() -> Dataset:
+    """The capture photographed by somebody."""
+    scene, views = peopled_scene(), []
+    for view in tiny_capture().train:
+        with torch.no_grad():
+            image = Planar(photographer="present")(scene, view.camera).rgb
+        photo = (255 * image.clamp(0, 1)).to(torch.uint8)
+        views.append(View.in_memory(view.name, view.camera, photo=photo, pane_labels=view.pane_labels))
+    return replace(tiny_capture(), train=tuple(views))
+
+
+def peopled_scene() -> Scene:
+    mirror = pane(2.0, half=2.5, base_reflectance=0.9)
+    return in_single_precision(replace(true_scene(), planes=mirror, photographer=body(), up=UP))
+
+
+def begun(options: Photographer = LEARNED, scene: Scene | None = None) -> TrainState:
+    state = TrainState(scene or true_scene(), 0)
+    for _ in carried_out(AddPhotographer(options, 0, None)(state, tiny_capture())):
+        pass
+    return state
+
+
+def test_the_first_cloud_is_behind_the_camera_within_reach_of_the_panes() -> None:
+    cameras = [view.camera for view in tiny_capture().train]
+    planes = true_scene().planes
+    distance = distance_to_panes(planes, cameras)
+    assert 2.3 < distance < 2.6
+    cloud = first_photographer(planes, cameras, count=300, sh_degree=0, seed=1)
+    assert bool((cloud.means[:, 2] < 0).all())
+    radii = cloud.means.norm(dim=1) / distance
+    assert 0.02 < float(radii.min()) < 0.05 and 0.5 < float(radii.max()) <= 0.601
+    again = first_photographer(planes, cameras, count=300, sh_degree=0, seed=1)
+    assert torch.equal(again.means, cloud.means)
+
+
+def test_stages_with_panes_show_and_teach_the_photographer() -> None:
+    stages = PlanarRecipe(photographer=LEARNED).stages(0)
+    assert isinstance(stages[0].renderer, Splat) and not any("photographer" in name for name in stages[0].rates)
+    for stage in stages[1:]:
+        assert isinstance(stage.renderer, Planar) and stage.renderer.photographer == "present"
+        assert "photographer.means" in stage.rates
+        assert any(isinstance(action, Densify) and action.part == "photographer" for action in stage.actions)
+    assert isinstance(stages[1].entry, AddPhotographer) and not isinstance(stages[2].entry, AddPhotographer)
+    assert PlanarRecipe(photographer=LEARNED).renderer().photographer == "absent"
+
+
+def test_switched_off_nothing_knows_of_anybody() -> None:
+    for stage in PlanarRecipe().stages(0):
+        assert not any("photographer" in name for name in stage.rates)
+        assert not isinstance(stage.entry, AddPhotographer)
+        assert not isinstance(stage.renderer, Planar) or stage.renderer.photographer == "absent"
+
+
+def test_somebody_is_found_in_the_photographs() -> None:
+    """With the true room and panes held, the cloud takes the form of who stands there."""
+    dataset, state = peopled_capture(), begun(scene=peopled_scene())
+    frozen = [
+        replace(
+            stage,
+            rates={name: rate for name, rate in stage.rates.items() if name.startswith("photographer")},
+            entry=None,
+            actions=(),
+            motions=(),
+            losses=stage.losses[:1],
+        )
+        for stage in PlanarRecipe(photographer=LEARNED).stages(0)[2:]
+    ]
+    before, after = [], []
+    for message in train(tuple(frozen), dataset, state, 180):
+        loss = getattr(message, "loss", None)
+        if loss is not None:
+            (before if state.step <= 6 else after).append(loss)
+    assert sum(after[-6:]) < 0.6 * sum(before)
+
+
+def test_somebody_is_stored_with_the_scene_and_in_checkpoints(tmp_path: Path) -> None:
+    state = TrainState(peopled_scene(), 0)
+    write_scene(tmp_path / "scene", state.scene)
+    save_checkpoint(tmp_path / "checkpoint.safetensors", state)
+    for scene in (read_scene(tmp_path / "scene"), load_checkpoint(tmp_path / "checkpoint.safetensors").scene):
+        assert scene.up == UP and scene.photographer.active_sh_degree == 0
+        for name, tensor in state.scene.parameters().items():
+            assert torch.equal(scene.parameters()[name], tensor), name
+
+
+def test_a_photographer_who_has_vanished_leaves_nothing_behind(tmp_path: Path) -> None:
+    state = begun()
+    faint = state.scene.photographer.with_tensors({"logit_opacities": torch.full((60,), -9.0)})
+    state.scene = replace(state.scene, photographer=faint)
+    moments = {name: (torch.zeros_like(t), torch.zeros_like(t)) for name, t in state.scene.parameters().items()}
+    state.optimizer.moments, state.optimizer.updates = moments, dict.fromkeys(moments, 1)
+    densify = Densify(PlanarRecipe().densify, part="photographer")
+    state.statistics["photographer"] = ScreenStatistics.zeros(60)
+    assert densify.apply(state, tiny_capture(), Clock(100, 1000, 6))
+    assert len(state.scene.photographer) == 0 and not any("photographer" in name for name in state.optimizer.moments)
+    assert not densify.apply(state, tiny_capture(), Clock(200, 1000, 6))
+    save_checkpoint(tmp_path / "checkpoint.safetensors", state)
+    assert len(load_checkpoint(tmp_path / "checkpoint.safetensors").scene.photographer) == 0
