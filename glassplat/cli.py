@@ -54,12 +54,12 @@ COMMANDS = {
     "import": Listed(
         "import_splats",
         "Import",
-        "Read a splat file (PLY, compressed PLY, SPZ, .splat) of any program as a scene to look at, film and export.",
+        "Read a splat file (PLY, SPZ, GLB, .splat) of any program as a scene to look at, film and export.",
     ),
     "export": Listed(
         "export",
         "Export",
-        "Write a scene as others read it: PLY, SPZ, a web page with live panes, and the panes beside them.",
+        "Write a scene as others read it: PLY, SPZ, GLB, a web page with live panes, and the panes beside them.",
     ),
     "info": Listed("info", "Info", "Say what a folder or file is, whether it is healthy, and what to do next."),
     "demo": Listed(

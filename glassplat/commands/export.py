@@ -14,9 +14,10 @@ from glassplat.commands.messages import say, warn
 from glassplat.commands.output_folder import check_targets, claim_folder
 from glassplat.commands.scene_edits import SceneEdits
 from glassplat.data.dataset import TEST_EVERY
-from glassplat.data.errors import InputError
+from glassplat.data.errors import InputError, input_checked
 from glassplat.evaluate.metrics import psnr
 from glassplat.files.cameras_json import write_cameras
+from glassplat.files.glb import write_glb
 from glassplat.files.ply import write_gaussians
 from glassplat.files.spz import write_spz
 from glassplat.interface.loading import load
@@ -31,18 +32,19 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane_edits import without_glass
 from glassplat.scene.scene import Scene
 
-Format = Literal["ply", "spz", "html"]
+Format = Literal["ply", "spz", "glb", "html"]
 COMPARED_VIEWS = 12
 
 
 @dataclass(frozen=True)
 class Export:
-    """Write a scene as others read it: PLY, SPZ, a web page with live panes, and the panes beside them.
+    """Write a scene as others read it: PLY, SPZ, GLB, a web page with live panes, and the panes beside them.
 
     Attributes:
         run_directory: the run's directory.
         output: where the files go; a new folder, or one that this command wrote.
-        formats: which files; html is a page that shows the scene in any browser, by itself and without a server.
+        formats: which files; glb is glTF with KHR_gaussian_splatting, html a page that shows the scene in any browser,
+            by itself and without a server.
         layer: all is the scene with its panes beside it, as planes.json and glass.ply; transmission is the place
             without its panes and what they reflect.
         bake_reflections: put what the panes reflect behind them, as Gaussians, for viewers that know nothing of
@@ -66,12 +68,20 @@ class Export:
     def run(self, console: Console) -> None:
         """Writes the files."""
         if not self.formats:
-            raise InputError("nothing to write without --formats; expected ply, spz or html")
+            raise InputError("nothing to write without --formats; expected ply, spz, glb or html")
         model = load(self.run_directory, device=self.device)
         model = model.with_scene(self._chosen(self.edits.applied(model.scene)))
         targets = [
             self.output / name
-            for name in ("index.html", "scene.ply", "scene.spz", "glass.ply", "planes.json", "cameras.json")
+            for name in (
+                "index.html",
+                "scene.ply",
+                "scene.spz",
+                "scene.glb",
+                "glass.ply",
+                "planes.json",
+                "cameras.json",
+            )
         ]
         check_targets(self.output, targets, [])
         if claim_folder(self.output, "export", self.run_directory):
@@ -119,6 +129,11 @@ class Export:
             path = self.output / "scene.spz"
             write_spz(path, gaussians, self.spz_version)
             say(console, f"{path.stat().st_size / 1e6:.2f} MB, version {self.spz_version} -> {path}")
+        if "glb" in self.formats:
+            path = self.output / "scene.glb"
+            with input_checked():
+                write_glb(path, gaussians)
+            say(console, f"{path.stat().st_size / 1e6:.2f} MB -> {path}")
 
     def _write_page(self, model: Model, console: Console) -> None:
         """The page shows the panes themselves, so that it needs nothing baked."""

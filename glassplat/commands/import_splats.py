@@ -20,10 +20,11 @@ from glassplat.train.planar_recipe import PlanarRecipe
 
 @dataclass(frozen=True)
 class Import:
-    """Read a splat file (PLY, compressed PLY, SPZ, .splat) of any program as a scene to look at, film and export.
+    """Read a splat file (PLY, SPZ, GLB, .splat) of any program as a scene to look at, film and export.
 
     Attributes:
-        file: a .ply as 3DGS and gsplat write it or as SuperSplat compresses it, a .spz of versions 1 to 4, or a .splat.
+        file: a .ply as 3DGS and gsplat write it or as SuperSplat compresses it, a .spz of versions
+            1 to 4, a .glb with KHR_gaussian_splatting, or a .splat.
         output: where the scene goes; a new folder. It can be used like a run, but for what needs photographs.
         planes: planes.json of the panes, written by hand or by `export`; the one beside the file if not given.
         up: which way is up, for the cameras that look at it; y points down in most files. A cameras.json beside the

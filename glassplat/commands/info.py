@@ -24,7 +24,7 @@ from glassplat.files.scene_folder import SCENE
 from glassplat.prepare.video import VIDEO_SUFFIXES
 from glassplat.train.run_directory import RunDirectory
 
-KINDS = "a capture, photographs, a video, a run, an exported scene, or a splat file (.ply, .spz)"
+KINDS = "a capture, photographs, a video, a run, an exported scene, or a splat file (.ply, .spz, .glb)"
 
 
 @dataclass(frozen=True)

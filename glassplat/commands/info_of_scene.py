@@ -10,6 +10,7 @@ import torch
 
 from glassplat.commands.finding import Finding
 from glassplat.data.errors import InputError
+from glassplat.files.glb import read_glb
 from glassplat.files.json_text import read_json
 from glassplat.files.ply import read_gaussians
 from glassplat.files.scene_folder import SCENE, read_scene
@@ -18,7 +19,11 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 from glassplat.train.run_directory import RunDirectory
 
-SPLAT_READERS: dict[str, Callable[[Path], Gaussians]] = {".ply": read_gaussians, ".spz": read_spz}
+SPLAT_READERS: dict[str, Callable[[Path], Gaussians]] = {
+    ".ply": read_gaussians,
+    ".spz": read_spz,
+    ".glb": read_glb,
+}
 MEASURES = {"psnr": "PSNR", "pane_psnr": "PSNR over panes", "ssim": "SSIM", "lpips": "LPIPS"}
 MANY_FAINT = 0.5
 FAINT = 0.01

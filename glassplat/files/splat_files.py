@@ -1,4 +1,4 @@
-"""Trained splats of other programs: PLY as everybody writes it, compressed PLY, SPZ, and .splat."""
+"""Trained splats of other programs: PLY as everybody writes it, compressed PLY, SPZ, GLB, and .splat."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import torch
 
 from glassplat.files.compressed_ply import is_compressed, read_compressed
 from glassplat.files.fields import LARGEST_COORDINATE
+from glassplat.files.glb import read_glb
+from glassplat.files.glb_container import MAGIC
 from glassplat.files.ply import read_gaussians
 from glassplat.files.ply_table import read_table
 from glassplat.files.reading import reading
@@ -17,7 +19,7 @@ from glassplat.files.scene_folder import LARGEST_COLOR, LARGEST_LOG
 from glassplat.files.spz import GZIP, read_spz
 from glassplat.scene.gaussians import SH_ZERO, Gaussians
 
-SUFFIXES = (".ply", ".spz", ".splat")
+SUFFIXES = (".ply", ".spz", ".glb", ".splat")
 SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
 LEAST_SCALE = 1e-12
 
@@ -39,6 +41,8 @@ def read_splats(path: Path | str) -> Gaussians:
         return read_compressed(path, table) if is_compressed(table) else read_gaussians(path)
     if head[:2] == GZIP or head == b"NGSP":
         return read_spz(path)
+    if head == MAGIC:
+        return read_glb(path)
     if path.suffix.lower() == ".splat":
         return _read_rows(path)
     raise ValueError(f"{path} is no splat file that can be read; expected one of {', '.join(SUFFIXES)}")

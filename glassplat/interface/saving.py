@@ -12,6 +12,7 @@ from glassplat.files.atomic import atomic_write
 from glassplat.files.cameras_json import write_cameras
 from glassplat.files.environment_image import write_equirect
 from glassplat.files.folders import make_folder
+from glassplat.files.glb import write_glb
 from glassplat.files.planes_json import write_planes
 from glassplat.files.ply import write_gaussians
 from glassplat.files.spz import write_spz
@@ -24,7 +25,7 @@ from glassplat.scene.scene import Scene
 from glassplat.train.recipe import recipe_to_json
 from glassplat.train.run_directory import RunDirectory, write_text
 
-WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {".ply": write_gaussians, ".spz": write_spz}
+WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {".ply": write_gaussians, ".spz": write_spz, ".glb": write_glb}
 PLANES, GLASS, CAMERAS = "planes.json", "glass.ply", "cameras.json"
 PANORAMA, ENVIRONMENT = "environment.png", "environment.json"
 

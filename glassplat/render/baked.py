@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from glassplat.kernels.project.reference import sh_basis
+from glassplat.kernels.turned_harmonics import turned_harmonics
 from glassplat.render.frame import Renderer
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
@@ -23,7 +23,6 @@ MOST_CAMERAS = 24
 COMPARED_CAMERAS = 5
 GAINS = (1.0, 1.5, 2.0, 3.0)
 """Candidates: blended in sRGB, as viewers do, a weak reflection has to weigh more than in linear radiance."""
-DIRECTIONS = 64
 OPAQUE = 1 - 1e-6
 
 
@@ -85,20 +84,11 @@ def mean_strengths(scene: Scene, renderer: Renderer, cameras: Sequence[Camera]) 
 def mirrored_harmonics(sh: Tensor, normal: Tensor) -> Tensor:
     """Coefficients [N, K, 3] of colours seen in a mirror: the same colour along the mirrored direction.
 
-    Mirroring keeps each degree to itself, so a few directions determine the map between the coefficients exactly.
-
     Args:
         sh: [N, K, 3], K in {0, 1, 4, 9, 16}.
         normal: [3] unit normal of the mirror.
     """
-    count = sh.shape[1]
-    generator = torch.Generator().manual_seed(0)
-    directions = torch.nn.functional.normalize(torch.randn(DIRECTIONS, 3, generator=generator, dtype=torch.float64))
-    axis = normal.to("cpu", torch.float64)
-    mirrored = directions - 2 * (directions @ axis)[:, None] * axis
-    before, after = (sh_basis(rays)[:, :count] for rays in (directions, mirrored))
-    turn = torch.linalg.lstsq(before, after).solution
-    return torch.einsum("jk,nkc->njc", turn.to(sh), sh)
+    return turned_harmonics(sh, torch.eye(3).to(normal) - 2 * normal[:, None] * normal)
 
 
 def _mirror_images(scene: Scene, row: int, cameras: Sequence[Camera]) -> Gaussians:

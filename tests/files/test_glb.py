@@ -1,0 +1,281 @@
+"""GLB: what comes back is what went in; another program reads the same; files that lie cost nothing."""
+
+from __future__ import annotations
+
+import json
+import struct
+import tracemalloc
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pygltflib
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from glassplat.files.glb import EXTENSION, read_glb, write_glb
+from glassplat.files.glb_container import CHUNK, HEADER
+from glassplat.kernels.project.reference import rotations, sh_basis
+from glassplat.scene.gaussians import SH_ZERO, Gaussians
+from glassplat.scene.pose import rotation_from_quat
+from tests.files.test_spz import shapes, typical
+
+FLIP = torch.tensor([-1.0, -1.0, 1.0])
+FOREIGN = Path(__file__).parent.parent / "data_files" / "splat_transform.glb"
+"""`typical()` in 3 Gaussians, written by splat-transform 3.7 from our PLY."""
+
+
+def written(folder: Path, gaussians: Gaussians | None = None) -> Path:
+    write_glb(folder / "a.glb", typical() if gaussians is None else gaussians)
+    return folder / "a.glb"
+
+
+def edited(path: Path, edit: Callable[[dict[str, Any]], None]) -> Path:
+    """The same file with another document."""
+    data = path.read_bytes()
+    size, kind = CHUNK.unpack_from(data, HEADER.size)
+    start = HEADER.size + CHUNK.size
+    document = json.loads(data[start : start + size])
+    edit(document)
+    text = json.dumps(document).encode()
+    rest = data[start + size :]
+    head = HEADER.pack(b"glTF", 2, start + len(text) + len(rest)) + CHUNK.pack(len(text), kind)
+    path.write_bytes(head + text + rest)
+    return path
+
+
+@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
+def test_what_is_written_comes_back(coefficients: int, tmp_path: Path) -> None:
+    before = typical(coefficients)
+    after = read_glb(written(tmp_path, before))
+    assert after.active_sh_degree == before.max_sh_degree and not after.channels
+    assert torch.equal(after.means, before.means) and torch.equal(after.sh, before.sh)
+    torch.testing.assert_close(after.log_scales, before.log_scales, rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        torch.sigmoid(after.logit_opacities), torch.sigmoid(before.logit_opacities), rtol=0, atol=1e-6
+    )
+    torch.testing.assert_close(after.quats, torch.nn.functional.normalize(before.quats, dim=1))
+
+
+def test_discs_come_back_as_discs(tmp_path: Path) -> None:
+    before = replace(typical(), log_scales=typical().log_scales[:, :2].contiguous())
+    after = read_glb(written(tmp_path, before))
+    assert after.are_discs
+    torch.testing.assert_close(after.log_scales, before.log_scales, rtol=0, atol=1e-6)
+
+
+def accessor(gltf: pygltflib.GLTF2, index: int) -> np.ndarray:
+    found, blob = gltf.accessors[index], gltf.binary_blob()
+    view, width = gltf.bufferViews[found.bufferView], {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[found.type]
+    start = (view.byteOffset or 0) + (found.byteOffset or 0)
+    return np.frombuffer(blob, "<f4", found.count * width, start).reshape(-1, width)
+
+
+def test_another_program_reads_what_the_extension_promises(tmp_path: Path) -> None:
+    gaussians = typical()
+    gltf = pygltflib.GLTF2().load_binary(str(written(tmp_path, gaussians)))
+    assert gltf.extensionsUsed == [EXTENSION] and gltf.asset.version == "2.0"
+    primitive = gltf.meshes[0].primitives[0]
+    assert primitive.mode == pygltflib.POINTS and primitive.extensions[EXTENSION]["kernel"] == "ellipse"
+    indices = vars(primitive.attributes)
+    means = accessor(gltf, indices["POSITION"])
+    np.testing.assert_array_equal(means, gaussians.means * FLIP)
+    np.testing.assert_allclose(gltf.accessors[indices["POSITION"]].max, means.max(axis=0))
+    rotation = torch.from_numpy(accessor(gltf, indices[f"{EXTENSION}:ROTATION"]).copy()).roll(1, dims=1)
+    scales = torch.from_numpy(accessor(gltf, indices[f"{EXTENSION}:SCALE"]).copy())
+    axes = rotations(rotation) * scales[:, None, :]
+    flipped = torch.diag(FLIP) @ shapes(gaussians) @ torch.diag(FLIP)
+    torch.testing.assert_close(axes @ axes.mT, flipped, atol=1e-5, rtol=1e-4)
+    opacities = accessor(gltf, indices[f"{EXTENSION}:OPACITY"])[:, 0]
+    np.testing.assert_allclose(opacities, torch.sigmoid(gaussians.logit_opacities), atol=1e-6)
+    colors = accessor(gltf, indices["COLOR_0"])
+    assert colors.min() >= 0 and colors.max() <= 1
+    np.testing.assert_array_equal(colors[:, 3], opacities)
+    names = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{n}" for d in range(4) for n in range(2 * d + 1)]
+    sh = torch.from_numpy(np.stack([accessor(gltf, indices[name]) for name in names], axis=1))
+    directions = torch.nn.functional.normalize(torch.randn(7, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    ours, theirs = (sh_basis(rays) for rays in (directions, directions * FLIP))
+    torch.testing.assert_close(
+        torch.einsum("dk,nkc->ndc", theirs, sh), torch.einsum("dk,nkc->ndc", ours, gaussians.sh), atol=1e-5, rtol=1e-4
+    )
+
+
+def test_what_another_program_wrote_is_read() -> None:
+    before, after = typical(count=3), read_glb(FOREIGN)
+    torch.testing.assert_close(after.means, before.means)
+    torch.testing.assert_close(after.sh, before.sh)
+    torch.testing.assert_close(shapes(after), shapes(before), atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(torch.sigmoid(after.logit_opacities), torch.sigmoid(before.logit_opacities))
+
+
+def test_nodes_place_splats(tmp_path: Path) -> None:
+    path, before = written(tmp_path), read_glb(written(tmp_path))
+    half = 0.5**0.5
+    turn = rotation_from_quat(torch.tensor([half, 0.0, half, 0.0]))
+
+    def place(document: dict[str, Any]) -> None:
+        matrix = torch.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = 2 * turn, torch.tensor([1.0, 2.0, 3.0])
+        document["nodes"] = [
+            {"mesh": 0, "rotation": [0, 0, 0, 1]},
+            {"children": [0], "matrix": matrix.T.flatten().tolist()},
+        ]
+        document["scenes"] = [{"nodes": [1]}]
+
+    after = read_glb(edited(path, place))
+    expected = 2 * (before.means * FLIP) @ turn.T + torch.tensor([1.0, 2.0, 3.0])
+    torch.testing.assert_close(after.means, expected * FLIP, atol=1e-5, rtol=1e-5)
+    whole = torch.diag(FLIP) @ (2 * turn) @ torch.diag(FLIP)
+    torch.testing.assert_close(shapes(after), whole @ shapes(before) @ whole.T, atol=1e-4, rtol=1e-3)
+    direction = torch.nn.functional.normalize(torch.tensor([[0.3, -0.5, 0.8]]), dim=1)
+    colors = [
+        torch.einsum("dk,nkc->ndc", sh_basis(ray), part.sh)
+        for ray, part in ((direction, after), (direction @ whole / 2, before))
+    ]
+    torch.testing.assert_close(*colors, atol=1e-4, rtol=1e-3)
+
+
+def test_quantised_attributes_are_read(tmp_path: Path) -> None:
+    path = written(tmp_path, typical(1))
+    count = len(typical())
+
+    def quantise(document: dict[str, Any]) -> None:
+        primitive = document["meshes"][0]["primitives"][0]["attributes"]
+        index = primitive[f"{EXTENSION}:OPACITY"]
+        document["accessors"][index] |= {"componentType": 5121, "normalized": True}
+        document["bufferViews"][document["accessors"][index]["bufferView"]]["byteStride"] = 4
+
+    shares = torch.sigmoid(read_glb(edited(path, quantise)).logit_opacities)
+    data = path.read_bytes()
+    gltf = pygltflib.GLTF2().load_binary(str(path))
+    index = vars(gltf.meshes[0].primitives[0].attributes)[f"{EXTENSION}:OPACITY"]
+    start = gltf.bufferViews[gltf.accessors[index].bufferView].byteOffset
+    expected = np.frombuffer(gltf.binary_blob(), np.uint8, 4 * count, start)[::4] / 255
+    np.testing.assert_allclose(shares, expected.clip(1e-7, 1 - 1e-7), atol=1e-6)
+    assert len(data) > 0
+
+
+def document_without(*keys: Any) -> Callable[[dict[str, Any]], None]:
+    def edit(document: dict[str, Any]) -> None:
+        inner: Any = document
+        for key in keys[:-1]:
+            inner = inner[key]
+        del inner[keys[-1]]
+
+    return edit
+
+
+def document_with(value: Any, *keys: Any) -> Callable[[dict[str, Any]], None]:
+    def edit(document: dict[str, Any]) -> None:
+        inner: Any = document
+        for key in keys[:-1]:
+            inner = inner[key]
+        inner[keys[-1]] = value
+
+    return edit
+
+
+PRIMITIVE = ("meshes", 0, "primitives", 0)
+LIES = {
+    "another version": (document_with("1.0", "asset", "version"), "glTF of version 1.0"),
+    "no asset": (document_without("asset"), "asset of"),
+    "no splats": (document_without(*PRIMITIVE, "extensions"), "shows no splats"),
+    "no scene": (document_with([], "scenes", 0, "nodes"), "shows no splats"),
+    "no rotation": (document_without(*PRIMITIVE, "attributes", f"{EXTENSION}:ROTATION"), "lacks .*ROTATION"),
+    "a gap": (document_without(*PRIMITIVE, "attributes", f"{EXTENSION}:SH_DEGREE_2_COEF_3"), "lacks .*DEGREE_2_COEF_3"),
+    "a high degree": (document_with(0, *PRIMITIVE, "attributes", f"{EXTENSION}:SH_DEGREE_4_COEF_0"), "degrees .*'4'"),
+    "triangles": (document_with(4, *PRIMITIVE, "mode"), "expected them as they are"),
+    "packed": (document_with({"X_spz": {}}, *PRIMITIVE, "extensions", EXTENSION, "extensions"), "packed by"),
+    "another kernel": (
+        document_with("cube", *PRIMITIVE, "extensions", EXTENSION, "kernel"),
+        "expected one of 'ellipse'",
+    ),
+    "linear": (document_with("lin_rec709_display", *PRIMITIVE, "extensions", EXTENSION, "colorSpace"), "colorSpace"),
+    "too many rows": (document_with(2**31, "accessors", 0, "count"), "no scene does"),
+    "a few rows more": (document_with(51, "accessors", 0, "count"), "one number"),
+    "a view beyond": (document_with(10**9, "bufferViews", 0, "byteOffset"), "cut off or damaged"),
+    "a view that is none": (document_with(999, "accessors", 0, "bufferView"), "entry 999 of bufferViews"),
+    "sparse": (document_with({}, "accessors", 0, "sparse"), "not sparse"),
+    "another type": (document_with("VEC4", "accessors", 0, "type"), "expected 3 numbers a row"),
+    "another file": (document_with(1, "bufferViews", 0, "buffer"), "buffer of entry 0"),
+    "a circle": (document_with([0], "nodes", 0, "children"), "expected a tree"),
+    "stretched": (document_with([1, 2, 1], "nodes", 0, "scale"), "skews, mirrors or stretches"),
+    "mirrored": (document_with([-1, -1, -1], "nodes", 0, "scale"), "skews, mirrors or stretches"),
+    "skewed": (document_with([1, 1, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], "nodes", 0, "matrix"), "skews"),
+    "no list": (document_with({}, "meshes"), "expected a list"),
+    "no primitives": (document_with(7, "meshes", 0, "primitives"), "no list of primitives"),
+}
+
+
+@pytest.mark.parametrize(("edit", "message"), LIES.values(), ids=LIES)
+def test_a_document_that_lies_is_refused(edit: Callable[[dict[str, Any]], None], message: str, tmp_path: Path) -> None:
+    path = edited(written(tmp_path), edit)
+    with pytest.raises(ValueError, match=message):
+        read_glb(path)
+
+
+def test_one_mesh_shown_over_and_over_is_refused(tmp_path: Path) -> None:
+    def repeat(document: dict[str, Any]) -> None:
+        document["nodes"] = [{"mesh": 0}] * 30_000
+        document["scenes"] = [{"nodes": list(range(30_000))}]
+
+    with pytest.raises(ValueError, match="no scene does"):
+        read_glb(edited(written(tmp_path), repeat))
+
+
+def test_logarithmic_scales_of_drafts_are_told(tmp_path: Path) -> None:
+    path = written(tmp_path)
+    data = bytearray(path.read_bytes())
+    gltf = pygltflib.GLTF2().load_binary(str(path))
+    index = vars(gltf.meshes[0].primitives[0].attributes)[f"{EXTENSION}:SCALE"]
+    at = len(data) - len(gltf.binary_blob()) + gltf.bufferViews[gltf.accessors[index].bufferView].byteOffset
+    struct.pack_into("<f", data, at, -3.0)
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"as drafts of .* stored logarithms"):
+        read_glb(path)
+
+
+@pytest.mark.parametrize("cut", [0, 3, 11, 19, 25, 500, -1])
+def test_a_file_that_is_cut_off_is_refused(cut: int, tmp_path: Path) -> None:
+    path = written(tmp_path)
+    path.write_bytes(path.read_bytes()[:cut])
+    with pytest.raises(ValueError, match=r"cut off|no GLB"):
+        read_glb(path)
+
+
+def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    broken = typical()
+    broken.means[3, 1] = torch.nan
+    for gaussians, message in ((Gaussians.empty(1), "no Gaussians"), (broken, "means are not all finite")):
+        with pytest.raises(ValueError, match=message):
+            write_glb(tmp_path / "a.glb", gaussians)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_colours_of_the_points_are_linear(tmp_path: Path) -> None:
+    grey = typical(1, count=1)
+    grey = grey.with_tensors({"sh": torch.zeros_like(grey.sh)})
+    gltf = pygltflib.GLTF2().load_binary(str(written(tmp_path, grey)))
+    assert SH_ZERO > 0
+    color = accessor(gltf, vars(gltf.meshes[0].primitives[0].attributes)["COLOR_0"])
+    np.testing.assert_allclose(color[0, :3], 0.2140, atol=1e-3)
+
+
+@given(st.data())
+def test_mutated_files_end_in_a_message_and_in_little_memory(tmp_path_factory: Any, data: st.DataObject) -> None:
+    path = written(tmp_path_factory.mktemp("glb"), typical(4, count=5))
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 8))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(bytes(content))
+    tracemalloc.start()
+    with suppress(ValueError):
+        read_glb(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**24
