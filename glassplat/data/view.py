@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -68,6 +69,12 @@ class View:
     def is_annotated(self) -> bool:
         """Whether there is a mask; does not read it."""
         return self.read_pane_labels is not None
+
+    def with_camera(self, camera: Camera) -> View:
+        """The same photograph from another camera; what was read of it stays read."""
+        other = copy(self)
+        object.__setattr__(other, "camera", camera)
+        return other
 
     @staticmethod
     def in_memory(name: str, camera: Camera, *, photo: Tensor, pane_labels: Tensor | None = None) -> View:

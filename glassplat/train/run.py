@@ -202,7 +202,7 @@ class Run:
                 self._sitting = Sitting(directory, self.state, log=log, checkpoint_every=self._every)
                 yield from self._sitting.told(RunBegun(self.state.step, settings.iterations, anew))
                 yield from self._sitting.trained(self._stages, self._dataset, settings.iterations)
-            directory.export(self.state.scene, self.state.step)
+            self._export()
 
     @property
     def is_stopping(self) -> bool:
@@ -219,7 +219,12 @@ class Run:
         if self._sitting is None or self.state is None:
             raise RuntimeError("nothing to save: the run has not begun")
         self._sitting.save()
+        self._export()
+
+    def _export(self) -> None:
+        assert self.state is not None
         self._directory.export(self.state.scene, self.state.step)
+        self._directory.write_refined(self._dataset, self.state.scene)
 
 
 def first_state(recipe: Any, settings: RunSettings, dataset: Dataset) -> TrainState:
