@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from glassplat.data.dataset import View
@@ -24,7 +25,10 @@ class PhotometricLoss:
     ssim_weight: float
 
     def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor:
-        """The loss of a view, in the colours of its photograph; scalar."""
+        """The loss of a view, in the colours of its photograph; scalar. Ignored pixels count as if they were right."""
         image = scene.exposures.applied(frame.rgb, view.name)
-        found = photometric(image, moved(view.photo, image.device))
+        photo = moved(view.photo, image.device)
+        if view.ignored is not None:
+            image = torch.where(moved(view.ignored, image.device)[..., None], photo.to(image.dtype) / 255, image)
+        found = photometric(image, photo)
         return found.l1.lerp(1 - found.ssim, self.ssim_weight)
