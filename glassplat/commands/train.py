@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Generic, TypeVar
@@ -13,12 +15,13 @@ from glassplat.commands.messages import say, warn
 from glassplat.commands.training_progress import TrainingProgress
 from glassplat.data.dataset import Dataset, load_dataset
 from glassplat.data.masks import Polarity
-from glassplat.data.ranges import Downscale, Positive, Seed, Several
+from glassplat.data.ranges import Downscale, Positive, Range, Seed, Several
 from glassplat.interface.training import Training
 from glassplat.kernels.devices import DeviceName, chosen_device
 from glassplat.train.background import photo_background
+from glassplat.train.messages import Message
 from glassplat.train.recipe import Preset, Recipe
-from glassplat.train.run import CHECKPOINT_SECONDS, check_output
+from glassplat.train.run import CHECKPOINT_SECONDS, Listener, check_output
 from glassplat.train.run_directory import RunDirectory, RunSettings
 
 RecipeKind = TypeVar("RecipeKind", bound=Recipe)
@@ -42,6 +45,9 @@ class Train(Generic[RecipeKind]):
         mask_polarity: which value of black-and-white masks is the pane.
         checkpoint_every: seconds of training from one checkpoint to the next; there is one at the end, and when the
             run is interrupted, in any case.
+        view: look at the scene in the browser while it is trained, on this machine; pause and save it there. Drawing
+            takes at most 15 % of the time while somebody looks, and none while nobody does. Needs glassplat[view].
+        port: where the browser finds it.
     """
 
     recipe: Annotated[RecipeKind, tyro.conf.arg(name="")]
@@ -55,6 +61,8 @@ class Train(Generic[RecipeKind]):
     mask_polarity: Polarity = "auto"
     checkpoint_every: Positive = CHECKPOINT_SECONDS
     preset: Preset = "glassplat"
+    view: bool = False
+    port: Annotated[int, Range(1, 65535)] = 8080
 
     def run(self, console: Console) -> None:
         """Trains, with a progress bar or lines."""
@@ -74,14 +82,37 @@ class Train(Generic[RecipeKind]):
             resume=self.resume,
             checkpoint_every=self.checkpoint_every,
         )
-        with TrainingProgress(console, self.iterations) as progress:
-            scene = training.run(progress.show).scene
+        with TrainingProgress(console, self.iterations) as progress, self._watched(training, dataset, console) as watch:
+
+            def listen(message: Message) -> None:
+                progress.show(message)
+                watch(message)
+
+            scene = training.run(listen).scene
         say(
             console,
             f"trained {self.recipe.method} for {training.step} iterations in {training.seconds:.0f} s: "
             f"{len(scene.primary)} Gaussians, {len(scene.planes)} panes -> {self.output}",
         )
         say(console, f"next: glassplat eval {self.output}")
+
+    @contextmanager
+    def _watched(self, training: Training, dataset: Dataset, console: Console) -> Iterator[Listener]:
+        """What else listens: the viewer, where it is asked for."""
+        if not self.view:
+            yield lambda message: None
+            return
+        from glassplat.commands.view import announce
+        from glassplat.interface.watching import WatchedTraining
+        from glassplat.viewer.server import LOCAL
+
+        watched = WatchedTraining(
+            training, dataset, host=LOCAL, port=self.port, announce=lambda viewer: announce(viewer, console)
+        )
+        try:
+            yield watched.hear
+        finally:
+            watched.stop()
 
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""

@@ -204,6 +204,11 @@ class Run:
                 yield from self._sitting.trained(self._stages, self._dataset, settings.iterations)
             self._export()
 
+    @property
+    def is_stopping(self) -> bool:
+        """Whether the user has asked the run to end; it does after the step."""
+        return self._sitting is not None and self._sitting.is_stopping
+
     def save(self) -> None:
         """Writes a checkpoint and the scene, between two messages of which the last one is `StepDone` or later.
 
@@ -284,6 +289,11 @@ class Sitting:
             if self._stop.requested and isinstance(error, OSError):
                 self._stop.end()  # A terminal that was closed can show nothing, and that is no failure.
             raise
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether a signal asked for the end."""
+        return self._stop.requested
 
     def save(self) -> None:
         """Writes a checkpoint; the state must not be in the middle of a change."""
