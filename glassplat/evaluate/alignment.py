@@ -9,8 +9,9 @@ import torch
 
 from glassplat.data.corrected_views import plain
 from glassplat.data.dataset import Dataset
+from glassplat.data.ignored import with_ignored_right
 from glassplat.data.view import View
-from glassplat.losses.photometric import PhotometricLoss
+from glassplat.kernels.photometric import photometric
 from glassplat.render.frame import Renderer
 from glassplat.scene.camera import Camera
 from glassplat.scene.pose_correction import moved_camera
@@ -19,7 +20,7 @@ from glassplat.scene.scene import Scene
 STEPS = 40
 FIRST_STEP, LAST_STEP = 1.5e-3, 5e-5
 """Radians, and extents; steps shrink from the one to the other."""
-LIKENESS = PhotometricLoss(ssim_weight=0.2)
+SSIM_SHARE = 0.2
 Listener = Callable[[int, int], None]
 
 
@@ -55,15 +56,16 @@ def aligned_camera(scene: Scene, renderer: Renderer, view: View, *, steps: int =
     """
     device = scene.primary.means.device
     still = scene.with_parameters({name: tensor.detach() for name, tensor in scene.parameters().items()})
-    camera = view.camera.to(device)
+    camera, photo = view.camera.to(device), view.photo.to(device)
     twist = torch.zeros(6, device=device, requires_grad=True)
     optimizer = torch.optim.Adam([twist], lr=FIRST_STEP, betas=(0.8, 0.95))
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST_STEP / FIRST_STEP) ** (1 / max(steps, 1)))
     best, lowest = torch.zeros_like(twist), torch.inf
     for _ in range(steps):
         optimizer.zero_grad()
-        moved_view = view.with_camera(moved_camera(camera, twist, scene.extent))
-        loss = LIKENESS(renderer(still, moved_view.camera), moved_view, still)
+        image = renderer(still, moved_camera(camera, twist, scene.extent)).rgb
+        found = photometric(with_ignored_right(image, view), photo)
+        loss = found.l1.lerp(1 - found.ssim, SSIM_SHARE)
         if (value := float(loss.detach())) < lowest:
             best, lowest = twist.detach().clone(), value
         if not loss.requires_grad:  # Nothing of the scene is in sight.

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from glassplat.data.dataset import Dataset, View
 from glassplat.data.errors import InputError
+from glassplat.data.ignored import with_ignored_right
 from glassplat.evaluate.environment_metrics import environment_metrics, learned_environment, true_environment
 from glassplat.evaluate.lpips import Lpips, load_lpips
 from glassplat.evaluate.metrics import color_corrected, psnr, quantized, reflection_gain, ssim
@@ -210,8 +211,7 @@ def _measure(
     """Every metric of one view except the reflection's, which needs all views."""
     image, photo, counted = frame.photographed, view.photo, None if view.ignored is None else ~view.ignored
     if counted is not None:
-        # What is measured by windows takes ignored pixels for right.
-        image = torch.where(counted[..., None], image, photo.to(image.dtype) / 255)
+        image = with_ignored_right(image, view)
         pane = pane if isinstance(pane, str) else pane & counted
     metrics: dict[str, Outcome] = {
         "psnr": _counted_psnr(image, photo, counted),

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from glassplat.data.dataset import View
+from glassplat.data.ignored import with_ignored_right
 from glassplat.kernels.photometric import photometric
 from glassplat.render.frame import Frame
 from glassplat.scene.scene import Scene
@@ -26,9 +26,6 @@ class PhotometricLoss:
 
     def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor:
         """The loss of a view, in the colours of its photograph; scalar. Ignored pixels count as if they were right."""
-        image = scene.exposures.applied(frame.rgb, view.name)
-        photo = moved(view.photo, image.device)
-        if view.ignored is not None:
-            image = torch.where(moved(view.ignored, image.device)[..., None], photo.to(image.dtype) / 255, image)
-        found = photometric(image, photo)
+        image = with_ignored_right(scene.exposures.applied(frame.rgb, view.name), view)
+        found = photometric(image, moved(view.photo, image.device))
         return found.l1.lerp(1 - found.ssim, self.ssim_weight)
