@@ -45,8 +45,7 @@ class Train(Generic[RecipeKind]):
         mask_polarity: which value of black-and-white masks is the pane.
         checkpoint_every: seconds of training from one checkpoint to the next; there is one at the end, and when the
             run is interrupted, in any case.
-        view: look at the scene in the browser while it is trained, on this machine; pause and save it there. Drawing
-            takes at most 15 % of the time while somebody looks, and none while nobody does. Needs glassplat[view].
+        view: look at it in the browser meanwhile, pause and save it there; needs glassplat[view].
         port: where the browser finds it.
     """
 
