@@ -9,6 +9,7 @@ import torch
 
 from glassplat.data.corrected_views import plain
 from glassplat.data.dataset import Dataset
+from glassplat.data.ignored import with_ignored_right
 from glassplat.data.view import View
 from glassplat.kernels.photometric import photometric
 from glassplat.render.frame import Renderer
@@ -55,14 +56,15 @@ def aligned_camera(scene: Scene, renderer: Renderer, view: View, *, steps: int =
     """
     device = scene.primary.means.device
     still = scene.with_parameters({name: tensor.detach() for name, tensor in scene.parameters().items()})
-    photo, camera = view.photo.to(device), view.camera.to(device)
+    camera, photo = view.camera.to(device), view.photo.to(device)
     twist = torch.zeros(6, device=device, requires_grad=True)
     optimizer = torch.optim.Adam([twist], lr=FIRST_STEP, betas=(0.8, 0.95))
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST_STEP / FIRST_STEP) ** (1 / max(steps, 1)))
     best, lowest = torch.zeros_like(twist), torch.inf
     for _ in range(steps):
         optimizer.zero_grad()
-        found = photometric(renderer(still, moved_camera(camera, twist, scene.extent)).rgb, photo)
+        image = renderer(still, moved_camera(camera, twist, scene.extent)).rgb
+        found = photometric(with_ignored_right(image, view), photo)
         loss = found.l1.lerp(1 - found.ssim, SSIM_SHARE)
         if (value := float(loss.detach())) < lowest:
             best, lowest = twist.detach().clone(), value

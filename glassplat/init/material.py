@@ -76,6 +76,8 @@ def pane_pixels(scene: Scene, view: View) -> PanePixels:
     photo = scene.exposures.undone(view.photo.to(mirrored.device).to(mirrored.dtype) / 255, view.name)
     labels = None if view.pane_labels is None else view.pane_labels.to(mirrored.device)
     known = coverage > LEAST_COVERAGE
+    if view.ignored is not None:
+        known &= ~view.ignored.to(known.device)
     pixels = {}
     for label in scene.planes.labels:
         region = known if labels is None else known & (labels == label)
