@@ -221,7 +221,9 @@ def annotated_views(place: Place, poses: list[Array], masks: int) -> set[int]:
     labels = np.stack([see(place, poses[number], *PREVIEW).label for number in training])
     chosen = set()
     for pane in place.panes:
-        largest = np.argsort(-(labels == pane.label).sum(axis=(1, 2, 3)), kind="stable")[: len(training) // 3]
+        sizes = (labels == pane.label).sum(axis=(1, 2, 3))
+        # A pane that few views show is not looked for in others.
+        largest = [v for v in np.argsort(-sizes, kind="stable")[: len(training) // 3] if 4 * sizes[v] > sizes.max()]
         chosen |= {training[index] for index in sorted(largest)[:: max(len(largest) // masks, 1)][:masks]}
     return chosen
 

@@ -1,25 +1,29 @@
 """A copy of a capture with a flaw that real ones have; its true layers, poses and masks stay as they are.
 
-python -m tools.spoil_capture CAPTURE --output COPY [--exposure STOPS] [--white-balance STOPS] [--seed N]
+python -m tools.spoil_capture CAPTURE --output COPY [--exposure STOPS] [--white-balance STOPS]
+                             [--pose-noise DEGREES] [--seed N]
 
 Photographs are brightened and tinted in linear radiance, as a camera's automatic exposure and white balance do, each by
-factors of its own, and clipped at white.
+factors of its own, and clipped at white. Cameras of a COLMAP model in text are turned about each of their axes, and
+shifted by as much as the turn moves what is one radius of the cameras away; `true_images.txt` keeps the true poses.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import shutil
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from glassplat.files.images import read_image, write_image
 from glassplat.kernels.color_space import linear_from_srgb, srgb_from_linear
 
-IMAGES = "images"
+IMAGES, MODEL, TRUE_MODEL = "images", "sparse/0/images.txt", "true_images.txt"
 
 
 def main() -> None:
@@ -29,13 +33,19 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True, help="a folder that does not exist yet")
     parser.add_argument("--exposure", type=float, default=0.0, help="standard deviation of the exposure, in stops")
     parser.add_argument("--white-balance", type=float, default=0.0, help="the same of each channel beside it")
+    parser.add_argument("--pose-noise", type=float, default=0.0, help="standard deviation of the turns, in degrees")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     if not (given.capture / IMAGES).is_dir():
         parser.error(f"{given.capture} has no folder {IMAGES}")
     if given.output.exists():
         parser.error(f"{given.output} exists already; choose another --output")
-    spoil(given.capture, given.output, given.exposure, given.white_balance, np.random.default_rng(given.seed))
+    if given.pose_noise and not (given.capture / MODEL).is_file():
+        parser.error(f"{given.capture} has no {MODEL}; --pose-noise takes a COLMAP model in text")
+    random = np.random.default_rng(given.seed)
+    spoil(given.capture, given.output, given.exposure, given.white_balance, random)
+    if given.pose_noise:
+        disturb_poses(given.output / MODEL, math.radians(given.pose_noise), random)
 
 
 def spoil(
@@ -51,15 +61,41 @@ def spoil(
         random: where they come from.
 
     Returns:
-        The factors [3] on the linear channels, by photograph.
+        The factors [3] on the linear channels, by photograph; none where photographs stay as they are.
     """
     shutil.copytree(capture, output)
-    factors = {}
+    factors: dict[str, NDArray[np.float64]] = {}
+    if not exposure and not white_balance:
+        return factors
     for path in sorted(path for path in (output / IMAGES).rglob("*") if path.is_file()):
         stops = exposure * random.standard_normal() + white_balance * random.standard_normal(3)
         factors[path.relative_to(output / IMAGES).as_posix()] = 2.0**stops
         write_image(path, exposed(read_image(path), 2.0**stops))
     return factors
+
+
+def disturb_poses(path: Path, noise: float, random: np.random.Generator) -> None:
+    """Moves every camera of a COLMAP model a little, each by itself.
+
+    Args:
+        path: its `images.txt`; the true one is kept beside it.
+        noise: standard deviation of the turns about each axis, radians, and of the shifts, in radii of the cameras.
+        random: where they come from.
+    """
+    lines = path.read_text().splitlines()
+    shutil.copyfile(path, path.with_name(TRUE_MODEL))
+    places = [n for n, line in enumerate(lines) if len(line.split()) == 10 and not line.startswith("#")]
+    poses = np.array([[float(word) for word in lines[n].split()[1:8]] for n in places])
+    turns = Rotation.from_quat(poses[:, [1, 2, 3, 0]])
+    centers = -turns.inv().apply(poses[:, 4:])
+    radius = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    wobbles = Rotation.from_rotvec(noise * random.standard_normal((len(places), 3)))
+    shifts = wobbles.apply(poses[:, 4:]) + noise * radius * random.standard_normal((len(places), 3))
+    for n, (x, y, z, w), shift in zip(places, (wobbles * turns).as_quat(), shifts, strict=True):
+        first, *_, camera, name = lines[n].split()
+        values = " ".join(f"{value:.9f}" for value in (w, x, y, z, *shift))
+        lines[n] = f"{first} {values} {camera} {name}"
+    path.write_text("\n".join(lines) + "\n")
 
 
 def exposed(photo: NDArray[np.uint8], factors: NDArray[np.float64]) -> torch.Tensor:

@@ -69,7 +69,8 @@ class Dereflect:
         if self.source == "render":
             return quantized(frame.layers["without_panes"])
         # Not `view.photo`, which stays in memory: a capture may be larger than that.
-        return dereflected_photo(frame, view.read_photo(), renderer.blend)
+        exposures = stored.scene.exposures.to("cpu")
+        return dereflected_photo(frame, view.read_photo(), renderer.blend, exposures=exposures, name=view.name)
 
 
 def planar_renderer(stored: StoredRun) -> Planar:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 from rich.console import Console
@@ -13,6 +14,7 @@ from rich.table import Table
 from glassplat.commands.messages import say
 from glassplat.commands.pane_source import PaneSource, pane_regions
 from glassplat.commands.stored_run import StoredRun, open_run
+from glassplat.evaluate.alignment import with_aligned_test_views
 from glassplat.evaluate.evaluate import Evaluation, evaluate
 from glassplat.evaluate.metric_names import PLANE_COLUMNS, missing_reasons, shown_metrics, written
 from glassplat.evaluate.report import Report
@@ -20,6 +22,9 @@ from glassplat.kernels.devices import DeviceName
 from glassplat.render.planar import Planar, with_photographer
 from glassplat.train.checkpoint import recorded_seconds
 from glassplat.train.run_directory import write_text
+
+Align = Literal["auto", "always", "never"]
+"""Whether test cameras are moved before they are scored."""
 
 
 @dataclass(frozen=True)
@@ -33,18 +38,21 @@ class Evaluate:
         panes: where views show panes, for the metric over them: what the ground truth says, the masks and the planes
             that are fitted to them, or the mask that the run renders; auto takes the first of these that there is.
             Runs of different methods compare over the same pixels with the first two.
+        align: move the camera of each test view to where its photograph agrees best with the scene, before it is
+            scored; auto does so for runs that refined the cameras of training views.
     """
 
     run_directory: tyro.conf.Positional[Path]
     device: DeviceName = "auto"
     data: Path | None = None
     panes: PaneSource = "auto"
+    align: Align = "auto"
 
     def run(self, console: Console) -> None:
         """Evaluates and reports."""
         stored = open_run(self.run_directory, self.device, self.data)
         with console.status(f"rendering {len(stored.dataset.test)} test views"):
-            results = evaluate_run(stored, self.panes)
+            results = evaluate_run(stored, self.panes, align=self.align)
         print_results(console, results)
         say(console, f"pictures: {stored.directory.path / 'index.html'}")
 
@@ -53,13 +61,17 @@ class Evaluate:
         return f"{self.run_directory} itself is as it was: repeat the command to evaluate it"
 
 
-def evaluate_run(stored: StoredRun, panes: PaneSource = "auto") -> dict:
+def evaluate_run(stored: StoredRun, panes: PaneSource = "auto", *, align: Align = "auto") -> dict:
     """Evaluates a run, writes `results.json`, `per_view.json`, sheets and overview; returns the results.
 
     Raises:
         InputError: the capture does not say where its panes are in this way.
     """
     regions = pane_regions(stored.dataset, panes)
+    aligned = align == "always" or (align == "auto" and len(stored.scene.poses) > 0)
+    if aligned:
+        photographed = with_photographer(stored.renderer, "present")
+        stored = stored._replace(dataset=with_aligned_test_views(stored.scene, photographed, stored.dataset))
     settings, path = stored.directory.settings(), stored.directory.path
     blend = stored.renderer.blend if isinstance(stored.renderer, Planar) else None
     report = Report(path, stored.dataset, blend)
@@ -76,6 +88,7 @@ def evaluate_run(stored: StoredRun, panes: PaneSource = "auto") -> dict:
         "seed": settings.seed,
         "downscale": settings.downscale,
         "train_seconds": train_seconds(stored),
+        "test_cameras": "aligned with their photographs" if aligned else "as the capture has them",
         **evaluation.results,
     }
     write_text(path / "results.json", json.dumps(results, indent=2))

@@ -80,6 +80,8 @@ def _prepared(path: Path, finding: Finding) -> None:
 
 
 def _panes(path: Path, dataset: Dataset, finding: Finding) -> None:
+    if ignoring := sum(view.read_ignored is not None for view in (*dataset.train, *dataset.test)):
+        finding.facts["ignored"] = f"parts of {ignoring} photographs, marked in ignore/"
     annotated = sum(view.is_annotated for view in dataset.train)
     if not dataset.pane_labels and dataset.planes is None:
         finding.facts["panes"] = "none marked"

@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from glassplat.data.corrected_views import with_corrected_cameras
 from glassplat.data.dataset import TEST_EVERY, Dataset, PointCloud, View, load_dataset
 from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.files.cameras_json import read_cameras
@@ -51,7 +52,7 @@ def open_run(path: Path, device: DeviceName = "auto", data: Path | None = None) 
     with input_checked():
         recorded.renderer().check(scene)
     scene = scene.to(chosen_device(device))
-    dataset = _capture(directory, recorded, data)
+    dataset = with_corrected_cameras(_capture(directory, recorded, data), scene)
     recipe = settled(recorded, dataset)
     return StoredRun(directory, recipe, scene, recipe.renderer(), dataset, iterations)
 

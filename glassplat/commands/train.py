@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Generic, TypeVar
@@ -17,8 +19,9 @@ from glassplat.data.ranges import Downscale, Positive, Seed, Several
 from glassplat.interface.training import Training
 from glassplat.kernels.devices import DeviceName, chosen_device
 from glassplat.train.background import photo_background
+from glassplat.train.messages import Message
 from glassplat.train.recipe import Preset, Recipe
-from glassplat.train.run import CHECKPOINT_SECONDS, check_output
+from glassplat.train.run import CHECKPOINT_SECONDS, Listener, check_output
 from glassplat.train.run_directory import RunDirectory, RunSettings
 
 RecipeKind = TypeVar("RecipeKind", bound=Recipe)
@@ -30,8 +33,7 @@ class Train(Generic[RecipeKind]):
 
     Attributes:
         recipe: method and its options; `train_options` tells the command line which there are.
-        preset: what the options of the method are unless they are given: those that this project found best, or those
-            of the paper, to compare with its results.
+        preset: what the options are unless they are given: the best that this project found, or those of the paper.
         data: directory of the capture (COLMAP or transforms.json; pane masks in masks/).
         output: directory of the run.
         iterations: length of the run; every schedule stretches with it.
@@ -40,8 +42,8 @@ class Train(Generic[RecipeKind]):
         device: where to train; auto takes an NVIDIA GPU where one can be used.
         resume: go on with the run in `output`.
         mask_polarity: which value of black-and-white masks is the pane.
-        checkpoint_every: seconds of training from one checkpoint to the next; there is one at the end, and when the
-            run is interrupted, in any case.
+        checkpoint_every: seconds from one checkpoint to the next; an end or an interrupt writes one in any case.
+        view: look at it in the browser meanwhile.
     """
 
     recipe: Annotated[RecipeKind, tyro.conf.arg(name="")]
@@ -55,6 +57,7 @@ class Train(Generic[RecipeKind]):
     mask_polarity: Polarity = "auto"
     checkpoint_every: Positive = CHECKPOINT_SECONDS
     preset: Preset = "glassplat"
+    view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
 
     def run(self, console: Console) -> None:
         """Trains, with a progress bar or lines."""
@@ -74,14 +77,37 @@ class Train(Generic[RecipeKind]):
             resume=self.resume,
             checkpoint_every=self.checkpoint_every,
         )
-        with TrainingProgress(console, self.iterations) as progress:
-            scene = training.run(progress.show).scene
+        with TrainingProgress(console, self.iterations) as progress, self._watched(training, dataset, console) as watch:
+
+            def listen(message: Message) -> None:
+                progress.show(message)
+                watch(message)
+
+            scene = training.run(listen).scene
         say(
             console,
             f"trained {self.recipe.method} for {training.step} iterations in {training.seconds:.0f} s: "
             f"{len(scene.primary)} Gaussians, {len(scene.planes)} panes -> {self.output}",
         )
         say(console, f"next: glassplat eval {self.output}")
+
+    @contextmanager
+    def _watched(self, training: Training, dataset: Dataset, console: Console) -> Iterator[Listener]:
+        """What else listens: the viewer, where it is asked for."""
+        if not self.view:
+            yield lambda message: None
+            return
+        from glassplat.commands.view import announce
+        from glassplat.interface.watching import WatchedTraining
+        from glassplat.viewer.server import LOCAL, vacant_port
+
+        watched = WatchedTraining(
+            training, dataset, host=LOCAL, port=vacant_port(LOCAL), announce=lambda viewer: announce(viewer, console)
+        )
+        try:
+            yield watched.hear
+        finally:
+            watched.stop()
 
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -20,12 +18,9 @@ from glassplat.commands.stored_run import open_run
 from glassplat.data.errors import InputError
 from glassplat.data.ranges import Range
 from glassplat.interface.loading import load
-from glassplat.interface.model import Model
+from glassplat.interface.watching import shown_of
 from glassplat.kernels.devices import DeviceName
-from glassplat.viewer.server import Shown, Viewer
-
-LOCAL = "127.0.0.1"
-HIDDEN_LAYERS = ("alpha",)
+from glassplat.viewer.server import LOCAL, Viewer
 
 
 @dataclass(frozen=True)
@@ -49,15 +44,11 @@ class View:
     def run(self, console: Console) -> None:
         """Serves until it is interrupted."""
         model = load(self.scene, device=self.device)
-        check_port(self.host, self.port)
-        viewer = self._viewer(model.with_scene(self.edits.applied(model.scene)))
+        model = model.with_scene(self.edits.applied(model.scene))
+        viewer = Viewer(shown_of(model, photographs_of(self.scene)), self.host, self.port)
+        viewer.start()
         try:
-            say(console, f"look at http://{'localhost' if self.host == LOCAL else self.host}:{viewer.port}")
-            if self.host == LOCAL:
-                say(
-                    console,
-                    f"from elsewhere: ssh -L {viewer.port}:localhost:{viewer.port} <this machine>, then the same",
-                )
+            announce(viewer, console)
             say(console, "Ctrl-C ends it")
             while True:
                 time.sleep(3600)
@@ -68,17 +59,12 @@ class View:
         """What an interrupt leaves, and how to go on."""
         return "nothing was changed"
 
-    def _viewer(self, model: Model) -> Viewer:
-        try:
-            layers = [layer for layer in model.layers if layer not in HIDDEN_LAYERS]
-            cameras = tuple(model.cameras.items())
-            shown = Shown(model.name, model.scene, model.renderer, layers, cameras, photographs_of(self.scene))
-            return Viewer(shown, self.host, self.port)
-        except ImportError as error:
-            raise InputError(
-                f"the viewer needs viser, which is not installed ({error}); pip install 'glassplat[view]', or look at "
-                "the page of `glassplat export`, which needs nothing"
-            ) from error
+
+def announce(viewer: Viewer, console: Console) -> None:
+    """Says where to look."""
+    say(console, f"look at {viewer.address}")
+    if viewer.host == LOCAL:
+        say(console, f"from elsewhere: ssh -L {viewer.port}:localhost:{viewer.port} <this machine>, then the same")
 
 
 def photographs_of(run: Path) -> dict[str, Callable[[], Tensor]]:
@@ -91,18 +77,3 @@ def photographs_of(run: Path) -> dict[str, Callable[[], Tensor]]:
         return {}
     views = [view for view in (*dataset.train, *dataset.test) if view.image_path.is_file()]
     return {view.name: view.read_photo for view in views}
-
-
-def check_port(host: str, port: int) -> None:
-    """Refuses a port that is taken, or an address that is not this machine's, before anything is served.
-
-    Raises:
-        InputError: nothing can listen there.
-    """
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError as error:
-            reason = "in use by another program" if error.errno == errno.EADDRINUSE else (error.strerror or str(error))
-            raise InputError(f"port {port} of {host} cannot be used ({reason}); choose another --port") from error

@@ -15,7 +15,7 @@ from glassplat.data.axes import axes_evidence
 from glassplat.data.capture import Capture, Loader, PointCloud, Shot
 from glassplat.data.errors import InputError, UnknownFormatError, first_names, input_checked
 from glassplat.data.given_planes import given_planes
-from glassplat.data.masks import MaskSet, Polarity, find_masks, known_masks
+from glassplat.data.masks import MaskSet, Polarity, find_ignored, find_masks, known_masks
 from glassplat.data.random_points import points_in_view
 from glassplat.data.view import WHITE, PreparedView, Rgb, View, ViewOptions, prepare_view
 from glassplat.files.fields import LARGEST_COORDINATE
@@ -100,7 +100,10 @@ def load_dataset(
     _check_names(shots)
     masks = _masks(root, capture, shots, mask_polarity)
     options = ViewOptions(downscale, background)
-    prepared = [prepare_view(shot, masks.masks.get(shot.name), options) for shot in shots]
+    ignored = find_ignored(root, {shot.name: shot.image_path for shot in shots})
+    prepared = [
+        prepare_view(shot, masks.masks.get(shot.name), options, ignored=ignored.get(shot.name)) for shot in shots
+    ]
     transparent = _any_transparent(shots)
     train, test, split = _split([p.view for p in prepared], capture)
     points, point_warnings = _points(capture, train)

@@ -20,7 +20,7 @@ from glassplat.data.errors import InputError, first_names
 from glassplat.data.mask_values import MaskValues, read_mask_at_threshold, read_mask_values
 from glassplat.files.images import IMAGE_SUFFIXES
 
-MASK_FOLDER = "masks"
+MASK_FOLDER, IGNORE_FOLDER = "masks", "ignore"
 MASK_MARK = "_mask"
 FRAMED_BY_PANE = 0.8
 MOSTLY_PANE = 0.5
@@ -72,12 +72,30 @@ def find_masks(root: Path, photographs: Mapping[str, Path], polarity: Polarity =
     Raises:
         InputError: masks that match no photograph, two for one photograph, values of no clear meaning, no pane in any.
     """
-    paths = _match(root / MASK_FOLDER, photographs)
+    paths = _match(root / MASK_FOLDER, photographs, beside=_beside)
     if not paths:
         if (root / MASK_FOLDER).is_dir():
             raise InputError(f"{root / MASK_FOLDER} holds no mask images; add masks, or remove the folder")
         return MaskSet({})
     return _understood(root, paths, polarity, read_mask_values)
+
+
+def find_ignored(root: Path, photographs: Mapping[str, Path]) -> Mapping[str, PaneMask]:
+    """The masks of what is not to be learned, by name of the photograph: `ignore/`, named as pane masks are.
+
+    Every value above black is ignored; what that is, whether a passer-by or a car, does not matter.
+
+    Args:
+        root: the capture's folder.
+        photographs: path of every photograph by name.
+
+    Raises:
+        InputError: masks that match no photograph, two for one photograph, files that are no masks.
+    """
+    found = {name: PaneMask(path, inverted=False) for name, path in _match(root / IGNORE_FOLDER, photographs).items()}
+    for mask in found.values():
+        mask.labels()
+    return found
 
 
 def known_masks(root: Path, paths: Mapping[str, Path], polarity: Polarity = "auto") -> MaskSet:
@@ -125,8 +143,10 @@ def _present(labels: NDArray[np.uint8]) -> set[int]:
     return {int(label) for label in np.flatnonzero(np.bincount(labels.ravel())) if label > 0}
 
 
-def _match(folder: Path, photographs: Mapping[str, Path]) -> dict[str, Path]:
-    """Mask path by name of the photograph, in the order of the names."""
+def _match(
+    folder: Path, photographs: Mapping[str, Path], *, beside: Callable[[Path], list[Path]] = lambda path: []
+) -> dict[str, Path]:
+    """Mask path by name of the photograph, in the order of the names; in the folder, or beside the photographs."""
     found: dict[str, list[Path]] = defaultdict(list)
     names = _names_by_key(photographs)
     unmatched: list[str] = []
@@ -146,7 +166,7 @@ def _match(folder: Path, photographs: Mapping[str, Path]) -> dict[str, Path]:
             f"like its photograph, such as {PurePosixPath(min(photographs)).with_suffix('.png')}"
         )
     for name, path in photographs.items():
-        found[name].extend(_beside(path))
+        found[name].extend(beside(path))
     for name, several in found.items():
         if len(several) > 1:
             raise InputError(f"{name} has {len(several)} masks: {first_names([str(p) for p in several])}; keep one")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -36,6 +37,7 @@ class View:
         image_path: the file.
         read_photo: returns `photo`.
         read_pane_labels: returns `pane_labels`; None where the view is not annotated.
+        read_ignored: returns `ignored`; None where all pixels count.
     """
 
     name: str
@@ -43,6 +45,7 @@ class View:
     image_path: Path
     read_photo: Callable[[], Tensor]
     read_pane_labels: Callable[[], Tensor] | None = None
+    read_ignored: Callable[[], Tensor] | None = None
     _read: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
@@ -64,10 +67,21 @@ class View:
         """[H, W] uint8 pane label per pixel, 0 for no pane; None where the view is not annotated."""
         return None if self.read_pane_labels is None else self.read_pane_labels()
 
+    @cached_property
+    def ignored(self) -> Tensor | None:
+        """[H, W] bool, the pixels that show what is not to be learned or measured; None where there are none."""
+        return None if self.read_ignored is None else self.read_ignored() > 0
+
     @property
     def is_annotated(self) -> bool:
         """Whether there is a mask; does not read it."""
         return self.read_pane_labels is not None
+
+    def with_camera(self, camera: Camera) -> View:
+        """The same photograph from another camera; what was read of it stays read."""
+        other = copy(self)
+        object.__setattr__(other, "camera", camera)
+        return other
 
     @staticmethod
     def in_memory(name: str, camera: Camera, *, photo: Tensor, pane_labels: Tensor | None = None) -> View:
@@ -124,7 +138,9 @@ class PreparedView:
     rescaled: bool
 
 
-def prepare_view(shot: Shot, mask: PaneMask | None, options: ViewOptions) -> PreparedView:
+def prepare_view(
+    shot: Shot, mask: PaneMask | None, options: ViewOptions, *, ignored: PaneMask | None = None
+) -> PreparedView:
     """Check one photograph against its camera and set up how it is read; decodes no pixels of it.
 
     Raises:
@@ -144,6 +160,7 @@ def prepare_view(shot: Shot, mask: PaneMask | None, options: ViewOptions) -> Pre
         image_path=shot.image_path,
         read_photo=PhotoFile(shot.image_path, pixel_map, options.background),
         read_pane_labels=None if mask is None else _mask_file(mask, (width, height), pixel_map),
+        read_ignored=None if ignored is None else _mask_file(ignored, (width, height), pixel_map),
     )
     return PreparedView(view, lens is not shot.lens)
 

@@ -107,5 +107,7 @@ def residual_sums(scene: Scene, view: View, renderer: Renderer) -> Tensor:
         frame = renderer(scene.with_parameters({"primary.sh": sh}), view.camera)
         image = scene.exposures.applied(frame.rgb.detach(), view.name)
         residual = view.photo.to(image) / 255 - image
+        if view.ignored is not None:
+            residual = residual.masked_fill(view.ignored.to(image.device)[..., None], 0)
         (gradient,) = torch.autograd.grad((residual * frame.layers.get("base", frame.rgb)).sum(), sh)
     return gradient[:, 0] / SH_ZERO

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from glassplat.data.dataset import Dataset, View
 from glassplat.data.errors import InputError
+from glassplat.data.ignored import with_ignored_right
 from glassplat.evaluate.environment_metrics import environment_metrics, learned_environment, true_environment
 from glassplat.evaluate.lpips import Lpips, load_lpips
 from glassplat.evaluate.metrics import color_corrected, psnr, quantized, reflection_gain, ssim
@@ -36,6 +37,7 @@ from glassplat.scene.scene import Scene
 
 MIRROR_STRENGTH = 0.999
 """From this true strength on, nothing is transmitted."""
+ALL_IGNORED = f"all but fewer than {SMALLEST_REGION} pixels are ignored"
 TOO_FEW = f"fewer than {SMALLEST_REGION} pixels show a pane"
 
 Truths = tuple[GroundTruth | None, TrueView | None]
@@ -115,6 +117,8 @@ def evaluate(
     difference of the layer `strength` from the true one. `environment_psnr` compares the learned environment with the
     capture's `environment.exr` or `.png`, after one gain. `peak_memory_mib` is that of the whole process so far.
 
+    Pixels that a view ignores are left out; `ssim` and `lpips`, which are taken over windows, take them for right.
+
     Args:
         scene: what to render.
         renderer: how; called under `no_grad`. The median of its times is `seconds_per_frame`.
@@ -139,7 +143,7 @@ def evaluate(
         true_view = truth.view(view.name, view.camera.width, view.camera.height) if truth else None
         surface = true_surface(view)
         pane = regions.of(view, frame, true_view)
-        measured = _measure(frame, seconds, view.photo, pane, truth=(truth, true_view), surface=surface, lpips=lpips)
+        measured = _measure(frame, seconds, view, pane, truth=(truth, true_view), surface=surface, lpips=lpips)
         measurements[view.name] = measured
         listen(EvaluatedView(view, frame, true_view, surface, plain(measured.metrics)))
     gain = _add_reflection(measurements.values())
@@ -197,7 +201,7 @@ def _available_lpips(folder: Path | None) -> Lpips | str:
 def _measure(
     frame: Frame,
     seconds: float,
-    photo: Tensor,
+    view: View,
     pane: Tensor | str,
     *,
     truth: Truths,
@@ -205,11 +209,14 @@ def _measure(
     lpips: Lpips | str,
 ) -> _Measurement:
     """Every metric of one view except the reflection's, which needs all views."""
-    image = frame.photographed
+    image, photo, counted = frame.photographed, view.photo, None if view.ignored is None else ~view.ignored
+    if counted is not None:
+        image = with_ignored_right(image, view)
+        pane = pane if isinstance(pane, str) else pane & counted
     metrics: dict[str, Outcome] = {
-        "psnr": psnr(image, photo),
-        "corrected_psnr": psnr(color_corrected(image, photo), photo),
-        "right_half_psnr": _right_half_psnr(image, photo),
+        "psnr": _counted_psnr(image, photo, counted),
+        "corrected_psnr": _counted_psnr(color_corrected(image, photo, region=counted), photo, counted),
+        "right_half_psnr": _right_half_psnr(image, photo, counted),
         "ssim": ssim(image, photo),
         "lpips": NO_WEIGHTS if isinstance(lpips, str) else lpips(quantized(image), quantized(photo)),
         "pane_psnr": pane if isinstance(pane, str) else _region_psnr(image, photo, pane, TOO_FEW),
@@ -219,11 +226,17 @@ def _measure(
     return _Measurement(metrics, seconds, _reflection_pixels(frame, *truth))
 
 
-def _right_half_psnr(image: Tensor, photo: Tensor) -> float:
+def _counted_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> Outcome:
+    """Of the pixels that are not ignored, if any are."""
+    return psnr(image, photo) if counted is None else _region_psnr(image, photo, counted, ALL_IGNORED)
+
+
+def _right_half_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> Outcome:
     """Of the right half, in the colours that the left half tells (as is done for NeRF in the Wild)."""
     middle = max(photo.shape[1] // 2, 1)
-    corrected = color_corrected(image, photo, slice(0, middle))
-    return psnr(corrected[:, middle - 1 :], photo[:, middle - 1 :])
+    corrected = color_corrected(image, photo, slice(0, middle), counted)
+    right = slice(middle - 1, None)
+    return _counted_psnr(corrected[:, right], photo[:, right], None if counted is None else counted[:, right])
 
 
 def _region_psnr(image: Tensor, target: Tensor, region: Tensor, reason: str) -> Outcome:

@@ -51,7 +51,9 @@ def psnr(image: Tensor, target: Tensor, region: Tensor | None = None) -> float:
     return math.inf if mean_square == 0 else 10 * math.log10(255**2 / mean_square)
 
 
-def color_corrected(image: Tensor, target: Tensor, columns: slice = slice(None)) -> Tensor:
+def color_corrected(
+    image: Tensor, target: Tensor, columns: slice = slice(None), region: Tensor | None = None
+) -> Tensor:
     """The image [H, W, 3] in the colours of another, by the affine transform that brings it closest in least squares.
 
     Exposure and white balance of a photograph that nobody trained on are not known; what is left then is what the
@@ -61,13 +63,15 @@ def color_corrected(image: Tensor, target: Tensor, columns: slice = slice(None))
         image: sRGB, uint8 or floating point in [0, 1].
         target: of the same shape.
         columns: of the pixels that the transform is found from.
+        region: [H, W] bool, of them those that count; None takes all.
     """
     _check_shapes(image, target)
     source, wanted = (quantized(picture).to(torch.float64) / 255 for picture in (image, target))
-    known = source[:, columns].reshape(-1, 3)
+    chosen = torch.ones(image.shape[:2], dtype=torch.bool) if region is None else region
+    known = source[:, columns][chosen[:, columns]]
     known = torch.cat([known, torch.ones_like(known[:, :1])], dim=1)
     # The identity where the pixels leave the transform open, as those of one colour do.
-    rest = wanted[:, columns].reshape(-1, 3) - known[:, :3]
+    rest = wanted[:, columns][chosen[:, columns]] - known[:, :3]
     transform = torch.linalg.solve(known.T @ known + 1e-3 * torch.eye(4, dtype=torch.float64), known.T @ rest)
     return (source + source @ transform[:3] + transform[3]).to(torch.float32)
 

@@ -16,13 +16,15 @@ from glassplat.files.fields import LARGEST_COORDINATE, Choice, Field, Items, Nul
 from glassplat.files.json_text import read_json
 from glassplat.files.planes_json import read_planes, write_planes
 from glassplat.files.ply import read_gaussians, write_gaussians
+from glassplat.files.poses_json import read_poses, write_poses
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.photographer import Direction
 from glassplat.scene.scene import Scene
 
 PRIMARY, GLASS, PLANES, SCENE = "point_cloud.ply", "glass.ply", "planes.json", "scene.json"
 ENVIRONMENT, SURROUNDINGS, EXPOSURES = "environment.safetensors", "surroundings.ply", "exposures.json"
-PHOTOGRAPHER = "photographer.ply"
+PHOTOGRAPHER, POSES = "photographer.ply", "poses.json"
+FILES = (PRIMARY, GLASS, PLANES, ENVIRONMENT, SURROUNDINGS, EXPOSURES, PHOTOGRAPHER, POSES)
 LARGEST_COLOR = 1e6
 LARGEST_LOG = 40.0
 """Of a logarithm: its exponential, squared, fits float32."""
@@ -36,7 +38,7 @@ HEADER: dict[str, Field] = {
     "surroundings_sh_degree": Optional(SH_DEGREE),
     "photographer_sh_degree": Optional(SH_DEGREE),
     "up": Optional(DIRECTION),
-    "files": Optional(Items(Choice((PRIMARY, GLASS, PLANES, ENVIRONMENT, SURROUNDINGS, EXPOSURES, PHOTOGRAPHER)))),
+    "files": Optional(Items(Choice(FILES))),
 }
 """`files` is what the scene consists of, so that one that is lost is missed; folders of earlier versions lack it."""
 
@@ -48,7 +50,8 @@ def write_scene(folder: Path, scene: Scene) -> None:
     `glass.ply` and `planes.json` hold what a viewer that knows panes needs on top, `environment.safetensors` the raw
     texels of the environment's cube map, `surroundings.ply` the Gaussians that reflections show, `exposures.json` how
     the photographs were exposed, `photographer.ply` whom the panes show in them, in a frame that goes along with the
-    camera. Each is there only where the scene has it.
+    camera, `poses.json` how far their cameras are from where they were said to be. Each is there only where the scene
+    has it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = [PRIMARY]
@@ -72,6 +75,9 @@ def write_scene(folder: Path, scene: Scene) -> None:
     if len(scene.exposures):
         write_exposures(folder / EXPOSURES, scene.exposures)
         files += [EXPOSURES]
+    if len(scene.poses):
+        write_poses(folder / POSES, scene.poses)
+        files += [POSES]
     with atomic_write(folder / SCENE) as temporary:
         temporary.write_text(json.dumps(header, indent=2) + "\n", encoding="utf-8")
 
@@ -98,6 +104,8 @@ def read_scene(folder: Path) -> Scene:
         scene = replace(scene, photographer=photographer, up=direction(header["up"], str(folder / SCENE)))
     if (folder / EXPOSURES).is_file():
         scene = replace(scene, exposures=read_exposures(folder / EXPOSURES))
+    if (folder / POSES).is_file():
+        scene = replace(scene, poses=read_poses(folder / POSES))
     return scene
 
 

@@ -73,9 +73,11 @@ PanePixels = Mapping[int, tuple[Tensor, Tensor]]
 def pane_pixels(scene: Scene, view: View) -> PanePixels:
     """Mirrored and photographed colours [P, 3] of each pane's pixels in one view, by label, about their local means."""
     mirrored, coverage, _ = mirrored_image(scene, view.camera)
-    photo = view.photo.to(mirrored.device).to(mirrored.dtype) / 255
+    photo = scene.exposures.undone(view.photo.to(mirrored.device).to(mirrored.dtype) / 255, view.name)
     labels = None if view.pane_labels is None else view.pane_labels.to(mirrored.device)
     known = coverage > LEAST_COVERAGE
+    if view.ignored is not None:
+        known &= ~view.ignored.to(known.device)
     pixels = {}
     for label in scene.planes.labels:
         region = known if labels is None else known & (labels == label)

@@ -141,6 +141,11 @@ class Training:
         return self.state.seconds
 
     @property
+    def is_stopping(self) -> bool:
+        """Whether the user has asked the run to end, as with Ctrl-C; it does after the step."""
+        return self._run is not None and self._run.is_stopping
+
+    @property
     def model(self) -> Model:
         """The scene as trained so far; its tensors go on changing, so `save` it, or clone what has to stay.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from glassplat.data.dataset import View
+from glassplat.data.ignored import with_ignored_right
 from glassplat.kernels.photometric import photometric
 from glassplat.render.frame import Frame
 from glassplat.scene.scene import Scene
@@ -24,7 +25,7 @@ class PhotometricLoss:
     ssim_weight: float
 
     def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor:
-        """The loss of a view, in the colours of its photograph; scalar."""
-        image = scene.exposures.applied(frame.rgb, view.name)
+        """The loss of a view, in the colours of its photograph; scalar. Ignored pixels count as if they were right."""
+        image = with_ignored_right(scene.exposures.applied(frame.rgb, view.name), view)
         found = photometric(image, moved(view.photo, image.device))
         return found.l1.lerp(1 - found.ssim, self.ssim_weight)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from glassplat.render.frame import Frame
 from glassplat.render.glazing import Blend, curves
+from glassplat.scene.exposure import Exposures
 
 TRUSTED_STRENGTH, DISTRUSTED_STRENGTH = 0.35, 0.65
 """Between these shares of reflected light, the photograph gives way to the rendered transmission."""
@@ -21,7 +22,9 @@ TRUST_WINDOW = 5
 DARKEST = 1e-3
 
 
-def dereflected_photo(frame: Frame, photo: Tensor, blend: Blend) -> Tensor:
+def dereflected_photo(
+    frame: Frame, photo: Tensor, blend: Blend, *, exposures: Exposures | None = None, name: str = ""
+) -> Tensor:
     """The photograph [H, W, 3] uint8 with the reflection taken off where the frame shows a pane.
 
     Solves Eq. 1, C = (1 - R) C_t + R C_r, for C_t from the photographed C and the rendered R and R C_r, so
@@ -32,9 +35,12 @@ def dereflected_photo(frame: Frame, photo: Tensor, blend: Blend) -> Tensor:
     photograph's, bit for bit.
 
     Args:
-        frame: a view rendered by `planar`, with `without_panes` and `share`; on the CPU.
+        frame: a view rendered by `planar`, with `without_panes` and `share`; on the CPU. Where
+            it has the layer `photographed`, who took the photograph is taken off as well.
         photo: [H, W, 3] uint8, of that view.
         blend: the space in which the run holds Eq. 1.
+        exposures: of the photographs of the run; it is in the scene's colours that layers add up.
+        name: of this photograph among them.
 
     Raises:
         ValueError: photograph and frame differ in size.
@@ -43,14 +49,19 @@ def dereflected_photo(frame: Frame, photo: Tensor, blend: Blend) -> Tensor:
         raise ValueError(f"the photograph is {list(photo.shape)}, the frame {list(frame.rgb.shape)}; expected one size")
     decode, encode = curves(blend)
     without_panes, share = frame.layers["without_panes"], frame.layers["share"][..., None]
+    exposures = exposures or Exposures.neutral()
     photographed = photo.to(torch.float32) / 255
-    light, reflected = decode(photographed), decode(frame.rgb) - (1 - share) * decode(without_panes)
+    # Clipping is the camera's, all else the scene's.
+    clipped = photographed
+    photographed = exposures.undone(photographed, name).clamp(0, 1)
+    light, reflected = decode(photographed), decode(frame.photographed) - (1 - share) * decode(without_panes)
     # The trust is almost zero before this division would blow up noise.
     solved = (light - reflected) / (1 - share).clamp(min=1 - DISTRUSTED_STRENGTH)
     rendered = decode(without_panes.clamp(0, 1))
-    trust = _trust(photographed, light, reflected, share[..., 0])
+    trust = _trust(clipped, light, reflected, share[..., 0])
     behind = rendered + trust[..., None] * (solved - rendered)
-    pixels = torch.round(encode(behind.clamp(0, 1)).clamp(0, 1) * 255).to(torch.uint8)
+    colors = exposures.applied(encode(behind.clamp(0, 1)), name)
+    pixels = torch.round(colors.clamp(0, 1) * 255).to(torch.uint8)
     return torch.where(share > 0, pixels, photo)
 
 

@@ -48,6 +48,14 @@ class Exposures:
             return image
         return image @ (torch.eye(3, dtype=image.dtype, device=image.device) + own[:, :3].T) + own[:, 3]
 
+    def undone(self, photo: Tensor, name: str) -> Tensor:
+        """A photograph [..., 3] in the colours of the scene: what `applied` would have made the photograph."""
+        own = self.of(name)
+        if own is None:
+            return photo
+        own = own.to(photo)
+        return (photo - own[:, 3]) @ torch.linalg.inv(torch.eye(3).to(photo) + own[:, :3].T)
+
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name."""
         return {name: getattr(self, name) for name in TRAINABLE}

@@ -14,11 +14,12 @@ from glassplat.scene.exposure import Exposures
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.photographer import Direction
 from glassplat.scene.plane import TRAINABLE, Planes
+from glassplat.scene.pose_correction import PoseCorrections
 
 GAUSSIAN_SETS = ("primary", "glass", "surroundings", "photographer")
 OPTIONAL_SETS = GAUSSIAN_SETS[2:]
 """Those that most scenes have not."""
-PARTS = (*GAUSSIAN_SETS, "planes", "environment", "exposures")
+PARTS = (*GAUSSIAN_SETS, "planes", "environment", "exposures", "poses")
 """Fields of `Scene` that hold tensors."""
 
 
@@ -38,6 +39,7 @@ class Scene:
             show; empty for most methods.
         up: the direction in which the photographer stands, unit; None where the body leans with the camera.
         exposures: how the photographs were exposed that it was trained on; empty where all are taken as alike.
+        poses: how far their cameras are from where they were said to be; empty where they are taken as right.
     """
 
     primary: Gaussians
@@ -49,6 +51,7 @@ class Scene:
     photographer: Gaussians = field(default_factory=Gaussians.empty)
     up: Direction | None = None
     exposures: Exposures = field(default_factory=Exposures.neutral)
+    poses: PoseCorrections = field(default_factory=PoseCorrections.none)
 
     def gaussian_sets(self) -> dict[str, Gaussians]:
         """The sets of Gaussians by name; surroundings and photographer are among them where there are any."""
@@ -58,13 +61,15 @@ class Scene:
     def parameters(self) -> dict[str, Tensor]:
         """Every trainable tensor by dotted name (`primary.means`, `planes.centers`, ...).
 
-        The environment (`environment.raw`) and the exposures are among them where there are any.
+        The environment (`environment.raw`), the exposures and the poses are among them where there are any.
         """
         found = {f"{part}.{name}": t for part, g in self.gaussian_sets().items() for name, t in g.tensors().items()}
         found |= {f"planes.{name}": getattr(self.planes, name) for name in TRAINABLE}
         distant = {} if self.environment.is_empty else self.environment.tensors()
         found |= {f"environment.{name}": tensor for name, tensor in distant.items()}
         exposed = self.exposures.tensors() if len(self.exposures) else {}
+        moved = self.poses.tensors() if len(self.poses) else {}
+        found |= {f"poses.{name}": tensor for name, tensor in moved.items()}
         return found | {f"exposures.{name}": tensor for name, tensor in exposed.items()}
 
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> Scene:

@@ -21,6 +21,7 @@ from glassplat.scene.environment import Environment
 from glassplat.scene.exposure import Exposures
 from glassplat.scene.gaussians import DISC_SCALES, PER_GAUSSIAN, Gaussians
 from glassplat.scene.plane import Planes
+from glassplat.scene.pose_correction import PoseCorrections
 from glassplat.scene.scene import OPTIONAL_SETS, Scene
 from glassplat.train.optimizer import Optimizer
 from glassplat.train.state import TrainState
@@ -42,6 +43,7 @@ HEADER: dict[str, Field] = {
     "hurried": Optional(ByName(Number(0)), {}),
     "records": Optional(ByName(Number()), {}),
     "photographs": Optional(Items(Text()), ()),
+    "corrected": Optional(Items(Text()), ()),
     "up": Optional(DIRECTION),
 }
 """What is `Optional` was added after the first checkpoints were written."""
@@ -70,6 +72,8 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
     tensors |= {f"scene/planes/{name}": t for name, t in scene.planes.tensors().items()}
     if not scene.environment.is_empty:
         tensors |= {f"scene/environment/{name}": t for name, t in scene.environment.tensors().items()}
+    if len(scene.poses):
+        tensors |= {f"scene/poses/{name}": t for name, t in scene.poses.tensors().items()}
     if len(scene.exposures):
         tensors |= {f"scene/exposures/{name}": t for name, t in scene.exposures.tensors().items()}
     for name, (first, second) in state.optimizer.moments.items():
@@ -93,6 +97,7 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
         "hurried": state.optimizer.hurried,
         "records": state.records,
         "photographs": list(scene.exposures.names),
+        "corrected": list(scene.poses.names),
         "up": scene.up,
     }
     write_tensors(path, tensors, header)
@@ -216,7 +221,10 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     environment = Environment(**distant, region=header["region"]) if distant else empty.environment
     exposed = under(tensors, "scene/exposures/")
     check_shapes(exposed, {"affine": (3, 4)} if exposed else {}, "exposures")
+    moved = under(tensors, "scene/poses/")
+    check_shapes(moved, {"twists": (6,)} if moved else {}, "poses")
     return Scene(
+        poses=PoseCorrections(**moved, names=tuple(header["corrected"])) if moved else empty.poses,
         extent=header["extent"],
         planes=Planes(**planes, labels=header["labels"], mirrors=header["mirrors"]),
         environment=environment,

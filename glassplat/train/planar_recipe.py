@@ -35,6 +35,7 @@ from glassplat.train.optimizer import PUBLISHED_ITERATIONS, Rate
 from glassplat.train.photo_exposure import PhotoExposure
 from glassplat.train.photographer_entry import Photographer
 from glassplat.train.plane_entry import PlaneEntry, fitted_planes
+from glassplat.train.pose_refinement import PoseRefinement
 from glassplat.train.splat_recipe import GaussianRates, image_terms
 from glassplat.train.stage import Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
@@ -154,6 +155,7 @@ class PlanarRecipe:
         densify: when and how Gaussians are added and pruned under `default`.
         mcmc: when and how Gaussians are relocated and added under `mcmc`.
         exposure: whether the exposure of each photograph is learned.
+        poses: whether the camera of each photograph is corrected.
         photographer: whether panes show who took the photographs.
     """
 
@@ -187,6 +189,7 @@ class PlanarRecipe:
     densify: DefaultDensify = field(default_factory=DefaultDensify)
     mcmc: McmcDensify = field(default_factory=McmcDensify)
     exposure: PhotoExposure = field(default_factory=PhotoExposure)
+    poses: PoseRefinement = field(default_factory=PoseRefinement)
     photographer: Photographer = field(default_factory=Photographer)
 
     @classmethod
@@ -228,7 +231,7 @@ class PlanarRecipe:
         if dataset.measured_points:
             fitted_planes(dataset, None, self.plane_fit)
         scene = Scene(self._population().initial(dataset.points, self.sh_degree), dataset.extent)
-        return self.exposure.begun(scene, dataset)
+        return self.poses.begun(self.exposure.begun(scene, dataset), dataset)
 
     @staticmethod
     def _lack_of_masks(dataset: Dataset) -> str:
@@ -271,7 +274,8 @@ class PlanarRecipe:
             stages: tuple[Stage, ...] = (initialisation, replace(self._joint(second + third), entry=entry))
         else:
             stages = (initialisation, self._adjustment(second, entry), self._joint(third))
-        return self.exposure.learnt_in(self.photographer.learnt_in(stages, self.densify, seed))
+        stages = self.photographer.learnt_in(stages, self.densify, seed)
+        return self.poses.learnt_in(self.exposure.learnt_in(stages))
 
     def _adjustment(self, share: float, entry: PlaneEntry) -> Stage:
         """Stage 2: the reflection's gradient reaches the planes, not the Gaussians."""

@@ -202,7 +202,12 @@ class Run:
                 self._sitting = Sitting(directory, self.state, log=log, checkpoint_every=self._every)
                 yield from self._sitting.told(RunBegun(self.state.step, settings.iterations, anew))
                 yield from self._sitting.trained(self._stages, self._dataset, settings.iterations)
-            directory.export(self.state.scene, self.state.step)
+            self._export()
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether the user has asked the run to end; it does after the step."""
+        return self._sitting is not None and self._sitting.is_stopping
 
     def save(self) -> None:
         """Writes a checkpoint and the scene, between two messages of which the last one is `StepDone` or later.
@@ -214,7 +219,12 @@ class Run:
         if self._sitting is None or self.state is None:
             raise RuntimeError("nothing to save: the run has not begun")
         self._sitting.save()
+        self._export()
+
+    def _export(self) -> None:
+        assert self.state is not None
         self._directory.export(self.state.scene, self.state.step)
+        self._directory.write_refined(self._dataset, self.state.scene)
 
 
 def first_state(recipe: Any, settings: RunSettings, dataset: Dataset) -> TrainState:
@@ -279,6 +289,11 @@ class Sitting:
             if self._stop.requested and isinstance(error, OSError):
                 self._stop.end()  # A terminal that was closed can show nothing, and that is no failure.
             raise
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether a signal asked for the end."""
+        return self._stop.requested
 
     def save(self) -> None:
         """Writes a checkpoint; the state must not be in the middle of a change."""

@@ -7,9 +7,11 @@ import json
 import os
 import re
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+from glassplat.data.corrected_views import with_corrected_cameras
 from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.data.masks import Polarity
@@ -17,6 +19,7 @@ from glassplat.data.options import options_from_json
 from glassplat.data.ranges import Downscale, Seed, Several
 from glassplat.files.atomic import atomic_write
 from glassplat.files.cameras_json import write_cameras
+from glassplat.files.colmap_text import write_colmap
 from glassplat.files.environment_image import write_equirect
 from glassplat.files.folders import make_folder
 from glassplat.files.json_text import parse_json, read_json
@@ -72,7 +75,8 @@ class RunDirectory:
     log.jsonl                          one line per logged step
     train.lock                         held while a training writes here
     checkpoint.safetensors             to resume from
-    cameras.json                       all cameras
+    cameras.json                       all cameras, where training refined them if it did
+    sparse/0/                          the same as a COLMAP model, only of refined ones
     point_cloud/iteration_N/           point_cloud.ply, scene.json, and what else the scene has
     results.json  per_view.json        metrics
     sheets/  uses.png  index.html      pictures
@@ -155,6 +159,19 @@ class RunDirectory:
         write_text(self.path / "recipe.json", recipe_to_json(recipe))
         write_text(self.path / "settings.json", json.dumps(dataclasses.asdict(settings), indent=2))
         write_cameras(self.path / "cameras.json", [(v.name, v.camera) for v in (*dataset.train, *dataset.test)])
+
+    def write_refined(self, dataset: Dataset, scene: Scene) -> None:
+        """Replaces the recorded cameras by those that training found, if it looked for them.
+
+        `sparse/0` is the same as a COLMAP model, of the photographs as training saw them: undistorted and reduced.
+        """
+        if not len(scene.poses):
+            return
+        refined = with_corrected_cameras(dataset, scene)
+        cameras = [(view.name, view.camera) for view in (*refined.train, *refined.test)]
+        write_cameras(self.path / "cameras.json", cameras)
+        positions, colors = dataset.points.positions.numpy(), dataset.points.colors.numpy()
+        write_colmap(self.path / "sparse" / "0", sorted(cameras, key=itemgetter(0)), positions, colors)
 
     def recipe(self) -> Any:
         """The recorded recipe."""

@@ -20,6 +20,7 @@ from glassplat.train.actions import GrowSh
 from glassplat.train.background import BLACK
 from glassplat.train.optimizer import PUBLISHED_ITERATIONS, Rate
 from glassplat.train.photo_exposure import PhotoExposure
+from glassplat.train.pose_refinement import PoseRefinement
 from glassplat.train.stage import Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
 
@@ -115,6 +116,7 @@ class SplatRecipe:
         mcmc: when and how Gaussians are relocated and added under `mcmc`.
         discs: what keeps discs on one surface.
         exposure: whether the exposure of each photograph is learned.
+        poses: whether the camera of each photograph is corrected.
     """
 
     method: ClassVar[str] = "splat"
@@ -131,6 +133,7 @@ class SplatRecipe:
     mcmc: McmcDensify = field(default_factory=McmcDensify)
     discs: DiscTerms = field(default_factory=DiscTerms)
     exposure: PhotoExposure = field(default_factory=PhotoExposure)
+    poses: PoseRefinement = field(default_factory=PoseRefinement)
 
     @classmethod
     def paper(cls) -> SplatRecipe:
@@ -146,7 +149,7 @@ class SplatRecipe:
         """The first scene: one Gaussian per point."""
         first = self._population().initial(dataset.points, self.sh_degree)
         scene = Scene(as_discs(first) if self.primitive == "disc" else first, dataset.extent)
-        return self.exposure.begun(scene, dataset)
+        return self.poses.begun(self.exposure.begun(scene, dataset), dataset)
 
     def renderer(self) -> Splat:
         """The renderer of the finished scene, with all its layers."""
@@ -174,7 +177,8 @@ class SplatRecipe:
             name = f"{last.name}, {term.name}"
             stages.append(replace(last, name=name, renderer=self._bare(normal=with_normals), losses=losses))
             began = start
-        return self.exposure.learnt_in((*stages[:-1], replace(stages[-1], share=1 - began)))
+        stages[-1] = replace(stages[-1], share=1 - began)
+        return self.poses.learnt_in(self.exposure.learnt_in(tuple(stages)))
 
     def _bare(self, *, normal: bool = False) -> Splat:
         """The renderer with what the losses need and no more."""

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from glassplat.data.corrected_views import with_corrected_cameras
 from glassplat.data.dataset import Dataset, View
 from glassplat.densify.default import ScreenStatistics
 from glassplat.kernels.screen_statistics import Views
@@ -76,7 +77,7 @@ def train(stages: tuple[Stage, ...], dataset: Dataset, state: TrainState, iterat
             continue
         if state.step == start:
             if stage.entry is not None:
-                yield from carried_out(stage.entry(state, dataset))
+                yield from carried_out(stage.entry(state, with_corrected_cameras(dataset, state.scene)))
             yield StageEntered(state.step, stage.name, counts_of(state.scene))
         while state.step < end:
             yield from advance(stage, dataset, state, iterations, sight)
@@ -97,7 +98,9 @@ def advance(stage: Stage, dataset: Dataset, state: TrainState, iterations: int, 
         motion(state, clock, result.visible)
     done = []
     for action in stage.actions:
-        if action.due(clock) and (yield from carried_out(action.apply(state, dataset, clock))):
+        if not action.due(clock):
+            continue
+        if (yield from carried_out(action.apply(state, with_corrected_cameras(dataset, state.scene), clock))):
             done.append(action)
     check_population(state)
     yield StepDone(state.step, view.name, sum(result.losses.values()), result.losses, counts_of(state.scene))
@@ -180,6 +183,7 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Di
         if name in stage.rates and tensor.numel() > 0
     }
     learning = scene.with_parameters(leaves)
+    view = seen_from(view, learning)
     frame = stage.renderer(learning, view.camera, probed=probed)
     terms, weights = loss_terms(stage, frame, view, learning)
     tracked = [record for record in frame.screen if record.means2d.requires_grad and record.means2d.numel() > 0]
@@ -199,6 +203,12 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Di
     values = torch.stack([term.detach() for term in terms.values()]) * weights
     losses = dict(zip(terms, values.tolist(), strict=True))
     return Differentiated(losses, gradients, screen, frame.space, frame.visible)
+
+
+def seen_from(view: View, scene: Scene) -> View:
+    """The view from where the scene says that its camera is; differentiable."""
+    camera = scene.poses.corrected(view.camera, view.name, scene.extent)
+    return view if camera is view.camera else view.with_camera(camera)
 
 
 def loss_terms(stage: Stage, frame: Frame, view: View, scene: Scene) -> tuple[dict[str, Tensor], Tensor]:

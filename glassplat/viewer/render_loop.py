@@ -1,6 +1,9 @@
-"""One thread that renders for all clients: coarse at once, sharp when nobody asks for anything else.
+"""Pictures for all clients, one at a time: coarse at once, sharp when nobody asks for anything else.
 
 A wish has a generation. When a picture is done whose client has meanwhile asked for another view, it is dropped.
+
+One thread draws, since kernels are not entered twice at a time: a `RenderThread`, or one that has other work to do and
+keeps what it spends on pictures to a share of its time, a `DrawingShare`.
 """
 
 from __future__ import annotations
@@ -10,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +22,12 @@ Wanted = TypeVar("Wanted")
 Picture = NDArray[np.uint8]
 
 LEAST_WIDTH = 320
+LONGEST_WAIT = 0.5
+"""Seconds after which a thread that has nothing to draw looks whether it should end."""
+MOST_SHARE = 0.15
+"""Of its time, what a program spends on pictures that has other work to do."""
+MOST_SAVED = 2.0
+"""Seconds of drawing that may be saved up while nobody looks."""
 COARSE_SECONDS = 0.08
 """What the first picture after a move may take; its size follows from how long the last ones took."""
 SMOOTHING = 0.3
@@ -43,22 +52,20 @@ class Request(Generic[Wanted]):
 
 
 class RenderLoop(Generic[Wanted]):
-    """Draws the newest wish of each client, in a thread of its own."""
+    """Knows the newest wish of each client, and draws the next picture when it is told to."""
 
     def __init__(self, draw: Callable[[Wanted, int], Picture], show: Callable[[int, Picture, bool], None]) -> None:
         """Begins to wait for wishes.
 
         Args:
-            draw: the picture of a wish with so many rows; called from one thread only.
+            draw: the picture of a wish with so many rows; called by `serve` only.
             show: sends a picture to a client, and says whether it is the sharp one.
         """
         self._draw, self._show = draw, show
         self._requests: dict[int, Request[Wanted]] = {}
         self._changed = threading.Condition()
-        self._generation, self._turn, self._stopped = 0, 0, False
+        self._generation, self._turn = 0, 0
         self._seconds_per_pixel = 1e-7
-        self._thread = threading.Thread(target=self._run, name="render", daemon=True)
-        self._thread.start()
 
     def ask(self, client: int, wish: Wanted, size: tuple[int, int]) -> None:
         """Replaces what a client wants to see."""
@@ -72,28 +79,38 @@ class RenderLoop(Generic[Wanted]):
         with self._changed:
             self._requests.pop(client, None)
 
-    def stop(self) -> None:
-        """Ends the thread, after the picture that it is drawing."""
+    def serve(self) -> bool:
+        """Draws a picture, if somebody waits for one, and returns whether; to be called by one thread only."""
         with self._changed:
-            self._stopped = True
-            self._changed.notify()
-        self._thread.join()
+            if not self._requests:
+                return False
+            client, request = self._next()
+        self._serve(client, request)
+        return True
+
+    def wait(self, seconds: float) -> None:
+        """Waits until somebody asks for something, or for so long."""
+        with self._changed:
+            if not self._requests:
+                self._changed.wait(seconds)
+
+    def expected_seconds(self) -> float | None:
+        """What the next picture is likely to take; None where nobody waits for one."""
+        with self._changed:
+            if not self._requests:
+                return None
+            turn = self._turn
+            _, request = self._next()
+            self._turn = turn
+        width, height = request.size
+        rows = height if request.is_coarse_shown else self.coarse_height(request.size)
+        return self._seconds_per_pixel * width * rows * rows / height
 
     def coarse_height(self, size: tuple[int, int]) -> int:
         """Rows of a picture that can be drawn in `COARSE_SECONDS`; no narrower than `LEAST_WIDTH`."""
         width, height = size
         share = (COARSE_SECONDS / (self._seconds_per_pixel * width * height)) ** 0.5
         return max(1, round(height * min(1.0, max(share, LEAST_WIDTH / width))))
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                while not (self._stopped or self._requests):
-                    self._changed.wait()
-                if self._stopped:
-                    return
-                client, request = self._next()
-            self._serve(client, request)
 
     def _next(self) -> tuple[int, Request[Wanted]]:
         """Clients that see nothing of their wish yet come first, in turn."""
@@ -131,3 +148,42 @@ class RenderLoop(Generic[Wanted]):
         seconds = (time.perf_counter() - begun) / (picture.shape[0] * picture.shape[1])
         self._seconds_per_pixel += SMOOTHING * (seconds - self._seconds_per_pixel)
         return picture
+
+
+class RenderThread:
+    """A thread that does nothing but draw."""
+
+    def __init__(self, loop: RenderLoop[Any]) -> None:
+        """Begins to draw."""
+        self._loop, self._stopped = loop, False
+        self._thread = threading.Thread(target=self._run, name="render", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ends the thread, after the picture that it is drawing."""
+        self._stopped = True
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stopped:
+            if not self._loop.serve():
+                self._loop.wait(LONGEST_WAIT)
+
+
+class DrawingShare:
+    """Keeps the drawing of a program that has other work to a share of its time, and to nothing while nobody looks."""
+
+    def __init__(self, loop: RenderLoop[Any], clock: Callable[[], float] = time.perf_counter) -> None:
+        """Counts from now on; a picture may be drawn at once."""
+        self._loop, self._clock = loop, clock
+        self._saved, self._since = MOST_SAVED, clock()
+
+    def draw(self) -> None:
+        """To be called between two pieces of work: draws what there is time for."""
+        worked = self._clock() - self._since
+        self._saved = min(self._saved + MOST_SHARE * worked, MOST_SAVED)
+        while (expected := self._loop.expected_seconds()) is not None and self._saved >= min(expected, MOST_SAVED):
+            begun = self._clock()
+            self._loop.serve()
+            self._saved -= self._clock() - begun
+        self._since = self._clock()

@@ -13,6 +13,7 @@ from glassplat.data.dataset import View
 from glassplat.init.glass import glass_gaussians
 from glassplat.init.material import WINDOW, about_local_mean, likeness, mirror_labels, window_sums
 from glassplat.render.planar import Planar
+from glassplat.scene.exposure import Exposures
 from glassplat.scene.scene import Scene
 from tests.render.tiny_scene import camera_at, in_single_precision, pane, showcase, shown_panes
 
@@ -45,6 +46,21 @@ def test_a_mirror_is_found_and_glass_is_not(base_reflectance: float, expected: t
     views = photographs(scene_with(base_reflectance))
     unknown = scene_with(0.2)
     assert mirror_labels(unknown, views) == expected
+
+
+def test_an_exposure_does_not_turn_a_mirror_into_glass() -> None:
+    """Photographed at 0.3 of its brightness, a mirror has the slope of glass."""
+    affine = torch.zeros(3, 3, 4)
+    affine[:, :, :3] = -0.7 * torch.eye(3)
+    views = photographs(scene_with(0.995))
+    exposures = Exposures(affine, tuple(view.name for view in views))
+    dark = [
+        View.in_memory(v.name, v.camera, photo=(exposures.applied(v.photo.float(), v.name)).to(torch.uint8),
+                       pane_labels=v.pane_labels)
+        for v in views
+    ]  # fmt: skip
+    assert mirror_labels(scene_with(0.2), dark) == ()
+    assert mirror_labels(replace(scene_with(0.2), exposures=exposures), dark) == (1,)
 
 
 def test_views_without_masks_say_nothing() -> None:

@@ -12,6 +12,7 @@ from glassplat.render.dereflect import as_mirror_image, dereflected_photo
 from glassplat.render.frame import Frame
 from glassplat.render.glazing import Blend
 from glassplat.render.planar import Planar
+from glassplat.scene.exposure import Exposures
 from glassplat.scene.plane_edits import as_mirrors
 from tests.render.tiny_scene import camera_at, in_single_precision, showcase
 
@@ -110,3 +111,26 @@ def test_the_mirror_made_of_layers_is_the_mirror_rendered(blend: Blend) -> None:
     renderer = Planar(blend=blend)
     rendered = renderer(as_mirrors(scene, [1]), camera).rgb
     torch.testing.assert_close(as_mirror_image(renderer(scene, camera), blend), rendered, rtol=1e-3, atol=1e-4)
+
+
+def test_what_the_exposure_made_of_the_photograph_is_left_as_it_is() -> None:
+    frame, photo, truth = case(0.1, "linear")
+    affine = torch.zeros(1, 3, 4)
+    affine[0, :, :3], affine[0, :, 3] = torch.diag(torch.tensor([-0.3, -0.2, -0.25])), torch.tensor([0.02, 0.0, -0.01])
+    exposures = Exposures(affine, ("dark.png",))
+    dark = uint8(exposures.applied(photo.float() / 255, "dark.png"))
+    result = dereflected_photo(frame, dark, "linear", exposures=exposures, name="dark.png")
+    expected = exposures.applied(truth, "dark.png")
+    torch.testing.assert_close(result.float() / 255, expected, rtol=0, atol=4 / 255)
+    assert torch.equal(result[:, 16:], dark[:, 16:])
+    unaware = dereflected_photo(frame, dark, "linear").float() / 255
+    assert float((unaware - expected)[:, :16].abs().mean()) > 0.005
+
+
+def test_the_photographer_is_taken_off_too() -> None:
+    frame, photo, truth = case(0.1, "linear", reflection=0.6)
+    room = torch.full((*SIZE, 3), 0.2)
+    nobody = model(frame.layers["without_panes"], room, frame.layers["share"], "linear")
+    beside = replace(nobody, layers={**nobody.layers, "photographed": frame.rgb})
+    result = dereflected_photo(beside, photo, "linear").float() / 255
+    torch.testing.assert_close(result, truth, rtol=0, atol=2.5 / 255)

@@ -68,3 +68,10 @@ def test_the_departure_holds_the_mean_and_each() -> None:
     )
     assert float(both) == pytest.approx(0.04 / 2 + 0.04)
     assert exposure_departure(Frame(torch.zeros(1, 1, 3)), view, scene) is None
+
+
+def test_what_an_exposure_does_can_be_undone() -> None:
+    exposures = Exposures(0.2 * drawn(2, 3, 4, seed=1), ("a", "b"))
+    image = drawn(4, 5, 3)
+    torch.testing.assert_close(exposures.undone(exposures.applied(image, "b"), "b"), image)
+    assert exposures.undone(image, "c") is image

@@ -2,11 +2,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from glassplat.files.images import read_image
 from glassplat.kernels.color_space import linear_from_srgb
 from tests.train.tiny_capture import write_tiny_capture
-from tools.spoil_capture import spoil
+from tools.spoil_capture import disturb_poses, spoil
 
 
 def test_photographs_differ_by_their_factors_and_nothing_else_does(tmp_path: Path) -> None:
@@ -23,3 +24,21 @@ def test_photographs_differ_by_their_factors_and_nothing_else_does(tmp_path: Pat
     assert np.std([np.log2(factor).mean() for factor in factors.values()]) > 0.1
     for path in ("transforms.json", "masks/1.png", "points3d.ply"):
         assert (capture / path).read_bytes() == (tmp_path / "copy" / path).read_bytes()
+
+
+def test_cameras_are_moved_by_as_much_as_was_asked(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    turns = Rotation.random(200, random_state=1)
+    lines = ["# comment"]
+    for number, (x, y, z, w) in enumerate(turns.as_quat()):
+        shift = " ".join(f"{value:.9f}" for value in generator.standard_normal(3))
+        lines += [f"{number + 1} {w:.9f} {x:.9f} {y:.9f} {z:.9f} {shift} 1 {number}.png", ""]
+    path = tmp_path / "images.txt"
+    path.write_text("\n".join(lines) + "\n")
+    disturb_poses(path, 0.01, np.random.default_rng(4))
+    assert (tmp_path / "true_images.txt").read_text() == "\n".join(lines) + "\n"
+    disturbed = [line.split() for line in path.read_text().splitlines() if line and not line.startswith("#")]
+    assert [words[9] for words in disturbed] == [f"{number}.png" for number in range(200)]
+    after = Rotation.from_quat([[float(words[n]) for n in (2, 3, 4, 1)] for words in disturbed])
+    wobbles = (after * turns.inv()).as_rotvec()
+    np.testing.assert_allclose(wobbles.std(axis=0), 0.01, rtol=0.15)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from glassplat.viewer.render_loop import LEAST_WIDTH, Picture, RenderLoop
+from glassplat.viewer.render_loop import LEAST_WIDTH, MOST_SHARE, DrawingShare, Picture, RenderLoop, RenderThread
 
 SIZE = (1280, 720)
 
@@ -24,6 +24,7 @@ class Recorder:
         if not held:
             self.let.set()
         self.loop: RenderLoop[int] = RenderLoop(self.draw, self.show)
+        self.thread = RenderThread(self.loop)
 
     def draw(self, wish: int, rows: int) -> Picture:
         self._at_once += 1
@@ -57,7 +58,7 @@ def test_a_coarse_picture_comes_first_and_a_sharp_one_follows() -> None:
     recorder.loop.ask(1, 7, SIZE)
     recorder.let.set()
     wait_until(lambda: len(recorder.shown) == 2)
-    recorder.loop.stop()
+    recorder.thread.stop()
     assert recorder.shown == [(1, 7, False), (1, 7, True)]
     (_, coarse), (_, sharp) = recorder.drawn
     assert sharp == SIZE[1] and coarse < sharp and coarse * SIZE[0] / SIZE[1] >= LEAST_WIDTH - 1
@@ -67,7 +68,7 @@ def test_what_is_drawn_quickly_is_sharp_at_once() -> None:
     recorder = Recorder()
     recorder.loop.ask(1, 7, (640, 360))
     wait_until(lambda: bool(recorder.shown))
-    recorder.loop.stop()
+    recorder.thread.stop()
     assert recorder.shown == [(1, 7, True)]
 
 
@@ -79,7 +80,7 @@ def test_pictures_of_the_past_are_not_shown() -> None:
         recorder.loop.ask(1, wish, SIZE)
     recorder.let.set()
     wait_until(lambda: (1, 4, True) in recorder.shown)
-    recorder.loop.stop()
+    recorder.thread.stop()
     assert {wish for _, wish, _ in recorder.shown} == {4}
 
 
@@ -90,7 +91,7 @@ def test_clients_take_turns_and_one_picture_is_drawn_at_a_time() -> None:
         recorder.loop.ask(client, 10 + client, SIZE)
     recorder.let.set()
     wait_until(lambda: sum(sharp for *_, sharp in recorder.shown) == 5)
-    recorder.loop.stop()
+    recorder.thread.stop()
     assert {client for client, *_ in recorder.shown[:5]} == set(range(5))
     assert recorder.most_at_once == 1
 
@@ -104,5 +105,38 @@ def test_who_has_gone_is_forgotten_and_errors_end_nothing() -> None:
     recorder.loop.ask(3, 3, SIZE)
     recorder.let.set()
     wait_until(lambda: (3, 3, True) in recorder.shown)
-    recorder.loop.stop()
+    recorder.thread.stop()
     assert {client for client, *_ in recorder.shown} == {3}
+
+
+class Clock:
+    """Time that passes when a picture is drawn, and when it is told to."""
+
+    def __init__(self) -> None:
+        self.now, self.drawing = 0.0, 0.0
+        self.loop: RenderLoop[int] = RenderLoop(self.draw, lambda *shown: None)
+        self.share = DrawingShare(self.loop, lambda: self.now)
+
+    def draw(self, wish: int, rows: int) -> Picture:
+        seconds = 1e-6 * rows * rows * SIZE[0] / SIZE[1]
+        self.now, self.drawing = self.now + seconds, self.drawing + seconds
+        return np.zeros((rows, round(rows * SIZE[0] / SIZE[1]), 3), dtype=np.uint8)
+
+
+def test_drawing_takes_its_share_of_the_time_and_no_more() -> None:
+    clock = Clock()
+    clock.share.draw()
+    assert clock.drawing == 0
+    for step in range(2000):
+        clock.loop.ask(step % 3, step, SIZE)
+        clock.now += 0.2
+        clock.share.draw()
+    assert 0.5 * MOST_SHARE < clock.drawing / clock.now <= MOST_SHARE
+
+
+def test_a_picture_that_takes_longer_than_can_be_saved_is_drawn_all_the_same() -> None:
+    clock = Clock()
+    clock.loop._seconds_per_pixel = 1e-3
+    clock.loop.ask(1, 1, SIZE)
+    clock.share.draw()
+    assert clock.drawing > 0

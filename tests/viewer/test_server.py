@@ -14,6 +14,7 @@ from glassplat.render.planar import Planar
 from glassplat.viewer.server import Shown, Viewer
 from tests.commands.tiny_run import write_run
 from tests.train.tiny_capture import tiny_capture, true_scene
+from tests.viewer.free_port import free_port
 from tools.headless import Browser, find_chromium
 
 VIEWS = tiny_capture().train
@@ -37,10 +38,11 @@ def eventually(happens: Callable[[], bool], seconds: float = 120) -> None:
 
 @pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
 def test_a_browser_is_shown_sharp_pictures_and_may_leave() -> None:
-    viewer = Viewer(SHOWN, "127.0.0.1", 8790)
+    viewer = Viewer(SHOWN, "127.0.0.1", free_port())
+    viewer.start()
     shown: list[bool] = []
     show = viewer._show
-    viewer._loop._show = lambda client, picture, is_sharp: (shown.append(is_sharp), show(client, picture, is_sharp))
+    viewer.loop._show = lambda client, picture, is_sharp: (shown.append(is_sharp), show(client, picture, is_sharp))
     try:
         with Browser(f"http://127.0.0.1:{viewer.port}/", 400, 300) as browser:
             eventually(lambda: any(shown))

@@ -1,0 +1,178 @@
+"""Cameras are corrected beside the scene, stored with it, and taken up again; test cameras follow their photographs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from glassplat.data.corrected_views import with_corrected_cameras
+from glassplat.data.dataset import Dataset, load_dataset
+from glassplat.evaluate.alignment import aligned_camera, with_aligned_test_views
+from glassplat.files.cameras_json import read_cameras
+from glassplat.files.colmap_text import write_colmap
+from glassplat.files.scene_folder import read_scene, write_scene
+from glassplat.render.planar import Planar
+from glassplat.scene.camera import Camera
+from glassplat.scene.pose_correction import PoseCorrections, moved_camera
+from glassplat.scene.scene import Scene
+from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
+from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.pose_refinement import PoseRefinement
+from glassplat.train.run import run_training
+from glassplat.train.run_directory import RunDirectory, RunSettings
+from glassplat.train.splat_recipe import SplatRecipe
+from glassplat.train.state import TrainState
+from glassplat.train.trainer import train
+from tests.render.test_planar import CAMERA
+from tests.render.tiny_scene import showcase
+from tests.train.tiny_capture import tiny_capture, true_scene, write_tiny_capture
+
+TWIST = torch.tensor([0.011, -0.014, 0.008, 0.012, -0.006, 0.004])
+REFINED = PoseRefinement(rate=1e-3, rate_end=0.05)
+
+
+def shaken(dataset: Dataset, numbers: tuple[int, ...] = (2,)) -> Dataset:
+    """The capture with some of its training cameras, and its test cameras, where they were not."""
+    views = [
+        view.with_camera(moved_camera(view.camera, TWIST, dataset.extent)) if number in numbers else view
+        for number, view in enumerate(dataset.train)
+    ]
+    test = [view.with_camera(moved_camera(view.camera, TWIST, dataset.extent)) for view in dataset.test]
+    return replace(dataset, train=tuple(views), test=tuple(test))
+
+
+def misplacement(camera: Camera, other: Camera) -> float:
+    return float((camera.cam_from_world - other.cam_from_world).abs().max())
+
+
+def pixels_off(camera: Camera, other: Camera) -> float:
+    """Mean distance on screen of what is before both; a turn and a shift may look alike."""
+    places = true_scene().primary.means[:14]
+    return float((camera.project(places)[0] - other.project(places)[0]).norm(dim=1).mean())
+
+
+def test_a_twist_is_a_rigid_motion_in_the_cameras_frame() -> None:
+    camera = tiny_capture().train[0].camera
+    turned = moved_camera(camera, torch.tensor([0.0, 0.0, torch.pi / 2, 0.0, 0.0, 0.5]), 2.0)
+    motion = turned.cam_from_world @ torch.linalg.inv(camera.cam_from_world)
+    expected = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]])
+    torch.testing.assert_close(motion, expected, atol=1e-6, rtol=0)
+    rotation = moved_camera(camera, TWIST, 2.0).cam_from_world[:3, :3]
+    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-6, rtol=0)
+    assert misplacement(moved_camera(camera, torch.zeros(6), 2.0), camera) == 0
+
+
+@pytest.mark.parametrize("twist", [torch.zeros(6).double(), TWIST.double()])
+def test_pose_gradients_match_finite_differences_through_the_whole_renderer(twist: Tensor) -> None:
+    scene = showcase()
+    weights = torch.randn(28, 40, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+
+    def objective(values: Tensor) -> Tensor:
+        return (Planar()(scene, moved_camera(CAMERA, values, scene.extent)).rgb * weights).sum()
+
+    values = twist.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(objective(values), values)
+    with torch.no_grad():
+        steps = 1e-6 * torch.eye(6, dtype=torch.float64)
+        numerical = torch.stack([(objective(twist + s) - objective(twist - s)) / 2e-6 for s in steps])
+    torch.testing.assert_close(gradient, numerical, rtol=1e-3, atol=1e-3 * float(numerical.abs().max()))
+
+
+def test_a_view_keeps_its_photograph_when_its_camera_moves() -> None:
+    read: list[int] = []
+
+    def photo() -> Tensor:
+        read.append(1)
+        return torch.zeros(4, 5, 3, dtype=torch.uint8)
+
+    view = replace(tiny_capture().train[0], read_photo=photo)
+    assert view.photo.shape == view.with_camera(CAMERA).photo.shape == (4, 5, 3)
+    assert len(read) == 1 and view.with_camera(CAMERA).camera is CAMERA and view.camera is not CAMERA
+
+
+def test_a_camera_that_is_off_finds_its_place() -> None:
+    dataset = shaken(tiny_capture())
+    recipe = SplatRecipe(poses=REFINED)
+    scene = recipe.poses.begun(true_scene(), dataset)
+    stages = tuple(
+        replace(s, renderer=Planar(), rates={"poses.twists": s.rates["poses.twists"]}, actions=(), motions=())
+        for s in recipe.stages(0)
+    )
+    state = TrainState(scene, 0)
+    for _ in train(stages, dataset, state, 360):
+        pass
+    refined, before, truth = with_corrected_cameras(dataset, state.scene), dataset.train, tiny_capture().train
+    off = pixels_off(before[2].camera, truth[2].camera)
+    assert off > 0.4
+    assert refined.train[0].camera is before[0].camera
+    assert max(pixels_off(a.camera, b.camera) for a, b in zip(refined.train, truth, strict=True)) < 0.25 * off
+
+
+def test_test_cameras_are_aligned_with_their_photographs() -> None:
+    dataset, truth = shaken(tiny_capture()), tiny_capture()
+    aligned = with_aligned_test_views(true_scene(), Planar(), dataset)
+    off = pixels_off(dataset.test[0].camera, truth.test[0].camera)
+    assert pixels_off(aligned.test[0].camera, truth.test[0].camera) < 0.25 * off
+    assert aligned.train is dataset.train
+
+
+def test_where_nothing_is_in_sight_the_camera_stays() -> None:
+    view = tiny_capture().test[0]
+    away = view.with_camera(moved_camera(view.camera, torch.tensor([0.0, 0, 0, 0, 0, -50.0]), 2.0))
+    assert misplacement(aligned_camera(true_scene(), Planar(), away), away.camera) < 1e-6
+
+
+@pytest.mark.parametrize("recipe", [SplatRecipe(poses=REFINED), PlanarRecipe(poses=REFINED)])
+def test_every_stage_refines(recipe: SplatRecipe | PlanarRecipe) -> None:
+    assert all("poses.twists" in stage.rates for stage in recipe.stages(0))
+    capture = replace(tiny_capture(), measured_points=False)
+    assert recipe.initialise(capture).poses.names == tuple(view.name for view in capture.train[1:])
+    off = replace(recipe, poses=PoseRefinement(rate=0.0))
+    assert not any("poses.twists" in stage.rates for stage in off.stages(0))
+    assert len(off.initialise(capture).poses) == 0
+
+
+def corrected_scene() -> Scene:
+    return replace(true_scene(), poses=PoseCorrections(TWIST.repeat(2, 1), ("1.png", "a/b.png")))
+
+
+def test_corrections_are_stored_with_the_scene_and_in_checkpoints(tmp_path: Path) -> None:
+    state = TrainState(corrected_scene(), 0)
+    write_scene(tmp_path / "scene", state.scene)
+    save_checkpoint(tmp_path / "checkpoint.safetensors", state)
+    for scene in (read_scene(tmp_path / "scene"), load_checkpoint(tmp_path / "checkpoint.safetensors").scene):
+        assert scene.poses.names == state.scene.poses.names
+        assert torch.equal(scene.poses.twists, state.scene.poses.twists)
+
+
+def test_a_run_leaves_the_refined_cameras(tmp_path: Path) -> None:
+    dataset = load_dataset(write_tiny_capture(tmp_path / "capture"))
+    directory = RunDirectory(tmp_path / "run")
+    settings = RunSettings(str(tmp_path / "capture"), 30)
+    recipe = SplatRecipe(poses=PoseRefinement(rate=1e-2, fixed=2))
+    state = run_training(recipe, settings, directory, dataset, resume=False, listen=lambda message: None)
+    refined = with_corrected_cameras(dataset, state.scene)
+    recorded = dict(read_cameras(directory.path / "cameras.json"))
+    for before, after in zip(dataset.train, refined.train, strict=True):
+        assert misplacement(recorded[after.name], after.camera) < 1e-5
+        assert (misplacement(before.camera, after.camera) > 1e-4) == (before.name in state.scene.poses.names)
+    assert len(state.scene.poses) == len(dataset.train) - 2
+
+
+def test_a_refined_model_is_read_as_colmap(tmp_path: Path) -> None:
+    capture = load_dataset(write_tiny_capture(tmp_path / "capture"))
+    cameras = [(view.name, view.camera) for view in (*capture.train, *capture.test)]
+    points = capture.points
+    write_colmap(tmp_path / "capture/sparse/0", cameras, points.positions.numpy(), points.colors.numpy())
+    (tmp_path / "capture/transforms.json").unlink()
+    (tmp_path / "capture/points3d.ply").unlink()
+    again = load_dataset(tmp_path / "capture")
+    for view, other in zip(capture.train, again.train, strict=True):
+        assert view.name == other.name and misplacement(view.camera, other.camera) < 1e-5
+        assert other.camera.fx == pytest.approx(view.camera.fx)
+    np.testing.assert_allclose(again.points.positions, points.positions, rtol=1e-5, atol=1e-6)

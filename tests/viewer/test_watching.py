@@ -1,0 +1,116 @@
+"""A training that is watched: drawn between its steps, paused, saved, and left alone while nobody looks."""
+
+from __future__ import annotations
+
+import re
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from glassplat import Training
+from glassplat.cli import main
+from glassplat.interface.watching import WatchedTraining, renderer_now
+from glassplat.render.splat import Splat
+from glassplat.train.deferred_recipe import DeferredRecipe
+from glassplat.train.messages import Message
+from glassplat.train.splat_recipe import SplatRecipe
+from glassplat.viewer.server import Viewer, vacant_port
+from tests.interface.test_model import model
+from tests.train.tiny_capture import tiny_capture, write_tiny_capture
+from tests.viewer.free_port import free_port
+from tests.viewer.test_server import eventually
+from tools.headless import Browser, find_chromium
+
+
+class EnoughError(Exception):
+    """Ends a training from within."""
+
+
+class Watch:
+    """A training in a thread of its own, with its viewer."""
+
+    def __init__(self, output: Path) -> None:
+        recipe = SplatRecipe(sh_degree=1)
+        self.training = Training(tiny_capture(), recipe, iterations=100_000, output=output, device="cpu")
+        self.viewers: list[Viewer] = []
+        self.is_enough = False
+        self.watched = WatchedTraining(
+            self.training, tiny_capture(), host="127.0.0.1", port=free_port(), announce=self.viewers.append
+        )
+        self.thread = threading.Thread(target=self._run)
+        self.thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.training.run(self._listen)
+        except EnoughError:
+            self.watched.stop()
+
+    def _listen(self, message: Message) -> None:
+        if self.is_enough:
+            raise EnoughError
+        self.watched.hear(message)
+
+
+@contextmanager
+def watch(output: Path) -> Iterator[Watch]:
+    found = Watch(output)
+    try:
+        yield found
+    finally:
+        found.is_enough, found.watched._is_paused = True, False
+        found.thread.join()
+
+
+def stands_still(training: Training) -> bool:
+    at = training.step
+    time.sleep(0.5)
+    return training.step == at
+
+
+@pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
+def test_a_training_is_drawn_paused_and_saved_while_it_goes_on(tmp_path: Path) -> None:
+    with watch(tmp_path / "run") as found:
+        eventually(lambda: bool(found.viewers) and found.training.step > 20)
+        (viewer,) = found.viewers
+        drawn: list[int] = []
+        draw = viewer.loop._draw
+        viewer.loop._draw = lambda wish, rows: (drawn.append(found.training.step), draw(wish, rows))[1]
+        before = found.training.step
+        eventually(lambda: found.training.step > before + 20)
+        assert not drawn
+        with Browser(f"http://127.0.0.1:{viewer.port}/", 400, 300) as browser:
+            eventually(lambda: len(set(drawn)) > 1)
+            eventually(lambda: "step" in browser.evaluate("document.body.innerText"))
+            viewer.buttons["pause"]()
+            eventually(lambda: "paused" in browser.evaluate("document.body.innerText"))
+            eventually(lambda: stands_still(found.training))
+            at = found.training.step
+            viewer.buttons["save"]()
+            eventually((tmp_path / "run" / "point_cloud" / f"iteration_{at}" / "scene.json").is_file)
+            assert found.training.step == at and (tmp_path / "run" / "checkpoint.safetensors").is_file()
+            viewer.buttons["pause"]()
+            eventually(lambda: found.training.step > at)
+
+
+def test_a_training_that_nobody_watches_says_where_to_look(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = write_tiny_capture(tmp_path / "data")
+    options = ["--data", str(data), "--output", str(tmp_path / "run"), "--iterations", "5", "--device", "cpu"]
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", first := vacant_port("127.0.0.1")))
+        taken.listen()
+        assert main(["train", "splat", *options, "--view"]) == 0
+    found = re.search(r"look at http://localhost:(\d+)", capsys.readouterr().out)
+    assert found is not None and int(found[1]) > first
+
+
+def test_a_scene_that_lacks_what_its_method_mirrors_is_drawn_plainly() -> None:
+    early = replace(model(), recipe=DeferredRecipe(background=(0.0, 0.0, 0.0)))
+    assert isinstance(renderer_now(early), Splat)
+    assert renderer_now(model()) == model().renderer
