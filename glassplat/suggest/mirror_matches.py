@@ -45,14 +45,16 @@ class Prediction:
     Attributes:
         away: [N] pixels between the mirror image of the point and where it is seen.
         alike: [N] whether feature sizes and directions agree as well.
-        by_mirror: [N] the mirror image is seen through the plane, the thing itself is not: as mirrors have it.
-        impossible: [N] both or none look through the plane, which no mirror does, but whatever else is symmetric.
+        by_mirror: [N] the camera that sees the mirror image is on the side of the thing itself, as mirrors have it.
+        impossible: [N] neither of both is seen through the plane, which no mirror does, but whatever else is symmetric.
+        both: [N] the thing itself is seen through the plane as well, which may be beside the pane.
     """
 
     away: Array
     alike: NDArray[np.bool_]
     by_mirror: NDArray[np.bool_]
     impossible: NDArray[np.bool_]
+    both: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -122,8 +124,9 @@ class MirrorMatches:
         return Prediction(
             away=np.nan_to_num(np.hypot(*(pixels - seen.pixels[virtual]).T), nan=np.inf),
             alike=alike,
-            by_mirror=through & ~other_through,
-            impossible=through == other_through,
+            by_mirror=through,
+            impossible=~through & ~other_through,
+            both=through & other_through,
         )
 
 

@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 from glassplat.suggest.mirror_matches import MirrorMatches, Plane
+from glassplat.suggest.pane_extent import seen_within
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -56,29 +57,45 @@ def mirror_planes(matches: MirrorMatches, extent: float) -> list[MirrorPlane]:
     """The planes that explain matches as mirror images; the best supported first.
 
     Every pair of matched tracks is a plane. Those that its own match confirms vote for each other; the ones with the
-    most votes are fitted to all matches, and kept where these agree as a mirror has it.
+    most votes are fitted to all matches, and kept where these agree as a mirror has it. What is seen within a pane that
+    was found speaks for no other one: things that repeat themselves would make copies of it.
 
     Args:
         matches: photographs against mirror images of others.
         extent: of the cameras, world units.
     """
-    found: list[MirrorPlane] = []
+    likely = []
     for plane in _voted(*_hypotheses(matches, extent), matches=matches, extent=extent):
-        if judged(plane, matches, extent, ROUGH).places < LEAST_PLACES / 2:
-            continue
-        fitted = judged(refined(plane, matches, extent), matches, extent)
-        if fitted.is_mirror and not any(
-            _distance(fitted.plane, one.plane, matches, extent) < SAME_PLANE for one in found
-        ):
-            found.append(fitted)
-    return sorted(found, key=lambda one: -one.places)
+        if judged(plane, matches, extent, ROUGH).places >= LEAST_PLACES / 2:
+            likely.append(judged(refined(plane, matches, extent), matches, extent))
+    found: list[MirrorPlane] = []
+    free = np.ones(len(matches), dtype=bool)
+    for one in sorted(likely, key=lambda one: -one.places):
+        left = _without(one, free, matches, extent)
+        known = any(_distance(left.plane, other.plane, matches, extent) < SAME_PLANE for other in found)
+        if left.is_mirror and not known:
+            found.append(left)
+            for role in (matches.virtual, matches.real):
+                free &= ~seen_within(left.plane, matches.seen, matches.virtual[left.matches], role)
+    return found
+
+
+def _without(one: MirrorPlane, free: NDArray[np.bool_], matches: MirrorMatches, extent: float) -> MirrorPlane:
+    """What is left for a plane when only some matches count."""
+    kept = one.matches[free[one.matches]]
+    return MirrorPlane(one.plane, _places(matches, kept, extent), one.impossible, kept)
 
 
 def judged(plane: Plane, matches: MirrorMatches, extent: float, reach: float = FINE) -> MirrorPlane:
     """What speaks for and against a plane: matches that agree with it to within `reach` image diagonals."""
     told = matches.predicted(plane, np.arange(len(matches)))
     agreeing = (told.away < reach * matches.seen.diagonal) & told.alike
-    right, wrong = np.flatnonzero(agreeing & told.by_mirror), np.flatnonzero(agreeing & told.impossible)
+    right, wrong = agreeing & told.by_mirror, agreeing & told.impossible
+    both = np.flatnonzero(right & told.both)
+    if len(both):  # Beside the pane a camera may look past it; in the pane it would see the mirror image.
+        within = seen_within(plane, matches.seen, matches.virtual[right], matches.real[both])
+        wrong[both[within]], right[both[within]] = True, False
+    right, wrong = np.flatnonzero(right), np.flatnonzero(wrong)
     return MirrorPlane(plane, _places(matches, right, extent), _places(matches, wrong, extent), right)
 
 

@@ -16,6 +16,8 @@ Grey = Callable[[int], NDArray[np.uint8]]
 
 OUTLIERS = 1.0
 """Per cent of the crossings beyond each side that do not count."""
+BESIDE = 0.1
+"""Of the sides of what is known of a pane: how much larger it may be."""
 FARTHEST = 1.0
 """Of the search for a frame, in half sides beyond the crossings."""
 STEPS = 48
@@ -43,6 +45,19 @@ def pane_axes(plane: Plane, eyes: Sequence[Eye]) -> Array:
         level = level - (level @ plane.normal) * plane.normal
     level = level / np.linalg.norm(level)
     return np.stack([level, np.cross(plane.normal, level)])
+
+
+def seen_within(
+    plane: Plane, seen: Observations, virtual: NDArray[np.int64], asked: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """[A] which observations look through the part of a plane in which others, `virtual`, show mirror images."""
+    axes = pane_axes(plane, seen.eyes)
+    low, high = np.percentile(crossings(plane, seen, virtual) @ axes.T, [OUTLIERS, 100 - OUTLIERS], axis=0)
+    room = BESIDE * (high - low)
+    places = crossings(plane, seen, asked)
+    ahead = ((places - seen.centers_of(asked)) * seen.rays[asked]).sum(axis=1) > 0
+    flat = places @ axes.T
+    return np.asarray(ahead & (flat > low - room).all(axis=1) & (flat < high + room).all(axis=1))
 
 
 def pane_corners(plane: Plane, seen: Observations, virtual: NDArray[np.int64], grey: Grey) -> Array:
