@@ -47,12 +47,14 @@ class Prediction:
         alike: [N] whether feature sizes and directions agree as well.
         by_mirror: [N] the camera that sees the mirror image is on the side of the thing itself, as mirrors have it.
         impossible: [N] neither of both is seen through the plane, which no mirror does, but whatever else is symmetric.
+        both: [N] the thing itself is seen through the plane as well, which may be beside the pane.
     """
 
     away: Array
     alike: NDArray[np.bool_]
     by_mirror: NDArray[np.bool_]
     impossible: NDArray[np.bool_]
+    both: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,7 @@ class MirrorMatches:
             alike=alike,
             by_mirror=through,
             impossible=~through & ~other_through,
+            both=through & other_through,
         )
 
 

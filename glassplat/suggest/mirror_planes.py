@@ -27,7 +27,7 @@ MOST_TRIED = 40
 PLACE = 0.03
 """In extents: points in one cube of this size count once, since one thing may be in several tracks."""
 LEAST_PLACES = 15
-MOST_IMPOSSIBLE = 0.15
+MOST_IMPOSSIBLE = 0.2
 """Of places whose matches agree with the plane, but as no mirror has them, for each one as a mirror has it."""
 
 
@@ -90,7 +90,12 @@ def judged(plane: Plane, matches: MirrorMatches, extent: float, reach: float = F
     """What speaks for and against a plane: matches that agree with it to within `reach` image diagonals."""
     told = matches.predicted(plane, np.arange(len(matches)))
     agreeing = (told.away < reach * matches.seen.diagonal) & told.alike
-    right, wrong = np.flatnonzero(agreeing & told.by_mirror), np.flatnonzero(agreeing & told.impossible)
+    right, wrong = agreeing & told.by_mirror, agreeing & told.impossible
+    both = np.flatnonzero(right & told.both)
+    if len(both):  # Beside the pane a camera may look past it; in the pane it would see the mirror image.
+        within = seen_within(plane, matches.seen, matches.virtual[right], matches.real[both])
+        wrong[both[within]], right[both[within]] = True, False
+    right, wrong = np.flatnonzero(right), np.flatnonzero(wrong)
     return MirrorPlane(plane, _places(matches, right, extent), _places(matches, wrong, extent), right)
 
 
