@@ -28,7 +28,7 @@ from PIL import Image
 
 from glassplat.annotate.server import AnnotationServer
 from glassplat.annotate.session import opened_session
-from tools.browser import Browser, browser
+from tools.browser import Browser
 
 Places = Sequence[Any] | np.ndarray
 WHOLE = 1.5
@@ -120,7 +120,7 @@ def marking_page(capture: Path, *, width: int = 1400, height: int = 900) -> Iter
         thread = Thread(target=server.serve_forever, args=(0.02,))
         thread.start()
         try:
-            with browser(width, height) as window:
+            with Browser(width=width, height=height) as window:
                 page = MarkingPage(window, server)
                 page.open()
                 yield page
