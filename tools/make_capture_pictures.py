@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from glassplat.annotate.eye import Eye
+from glassplat.scene.eye import Eye
 from tools.marking_page import MarkingPage, marking_page
 
 SIZE = (1180, 700)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from glassplat.annotate.document import Stroke
-from glassplat.annotate.eye import Eye
+from glassplat.scene.eye import Eye
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from glassplat.annotate.eye import Eye
 from glassplat.annotate.pane_shape import PaneShape, polygon_pane, rectangle_pane
+from glassplat.scene.eye import Eye
 
 Array = NDArray[np.float64]
 Shape = Literal["rectangle", "polygon"]

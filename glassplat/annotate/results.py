@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 
 from glassplat.annotate.document import MarkedPane
-from glassplat.annotate.eye import Eye
 from glassplat.annotate.outline import depths, filled, seen_outline, with_strokes
 from glassplat.annotate.pane_fit import PaneFit
 from glassplat.data.errors import InputError, first_names
@@ -25,6 +24,7 @@ from glassplat.files.json_text import read_json
 from glassplat.files.planes_json import GLASS_REFLECTANCE, write_planes
 from glassplat.init.rectangle import min_area_rectangle
 from glassplat.scene.activations import logit
+from glassplat.scene.eye import Eye
 from glassplat.scene.plane import Planes
 
 Labels = NDArray[np.uint8]

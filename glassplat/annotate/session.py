@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
@@ -14,15 +15,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from glassplat.annotate.document import MarkedPane, parsed_document, read_document, write_document
-from glassplat.annotate.eye import Eye
 from glassplat.annotate.outline import seen_outline
 from glassplat.annotate.pane_fit import Marks, PaneFit, TooFewMarksError, fitted_pane
+from glassplat.annotate.proposals import proposals
 from glassplat.annotate.results import earlier_masks, write_results
 from glassplat.annotate.view_advice import first_view, second_views, settling_views
 from glassplat.data.dataset import Dataset, load_dataset
 from glassplat.data.errors import InputError, input_checked
 from glassplat.data.view import View
 from glassplat.files.folders import check_folder
+from glassplat.scene.eye import Eye
+from glassplat.suggest.suggestion import Suggestion
 
 Array = NDArray[np.float64]
 
@@ -53,10 +56,12 @@ class Session:
         root: the capture's folder.
         views: all views, by name.
         eyes: their cameras.
+        suggestions: panes that the page proposes.
     """
 
-    def __init__(self, dataset: Dataset) -> None:
+    def __init__(self, dataset: Dataset, suggestions: Sequence[Suggestion] = ()) -> None:
         self.root = dataset.root
+        self.suggestions = suggestions
         self.views: tuple[View, ...] = tuple(sorted((*dataset.train, *dataset.test), key=lambda view: view.name))
         self.eyes = [Eye.of(view.camera) for view in self.views]
         points = dataset.points.positions.double().numpy() if dataset.measured_points else np.zeros((0, 3))
@@ -81,7 +86,13 @@ class Session:
             ],
             "first": first_view(self.eyes, self._points),
             "document": self._document,
+            "suggestions": self._proposals(),
         }
+
+    def _proposals(self) -> list[dict[str, Any]]:
+        """The suggestions that were not taken yet, for the page."""
+        known = [self.solve(pane).fit for pane in parsed_document(self._document, "the document")]
+        return proposals(self.suggestions, [fit.shape for fit in known if fit is not None], self.views, self.eyes)
 
     def picture(self, number: int, longest: int) -> bytes:
         """A photograph as JPEG, without distortion, reduced to `longest` pixels.
@@ -227,8 +238,12 @@ def _places(eye: Eye, corners: Array) -> list[list[float] | None]:
     return [place if depth > 0 else None for place, depth in zip(places, eye.in_camera(corners)[:, 2], strict=True)]
 
 
-def opened_session(root: Path) -> Session:
+def opened_session(root: Path, suggest: Callable[[Dataset], Sequence[Suggestion]] = lambda _: ()) -> Session:
     """The session of a capture.
+
+    Args:
+        root: folder of the capture.
+        suggest: looks for panes to propose.
 
     Raises:
         InputError: it cannot be read, or nothing may be written in it.
@@ -236,4 +251,4 @@ def opened_session(root: Path) -> Session:
     dataset = load_dataset(root)
     check_folder(root)
     earlier_masks(root)
-    return Session(dataset)
+    return Session(dataset, suggest(dataset))

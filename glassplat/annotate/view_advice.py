@@ -7,9 +7,9 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from glassplat.annotate.eye import Eye
 from glassplat.annotate.outline import filled
 from glassplat.annotate.pane_fit import PaneFit, corner_information, tilt_deviation
+from glassplat.scene.eye import Eye
 
 Array = NDArray[np.float64]
 

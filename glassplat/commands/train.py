@@ -15,7 +15,7 @@ from glassplat.commands.messages import say, warn
 from glassplat.commands.training_progress import TrainingProgress
 from glassplat.data.dataset import Dataset, load_dataset
 from glassplat.data.masks import Polarity
-from glassplat.data.ranges import Downscale, Positive, Range, Seed, Several
+from glassplat.data.ranges import Downscale, Positive, Seed, Several
 from glassplat.interface.training import Training
 from glassplat.kernels.devices import DeviceName, chosen_device
 from glassplat.train.background import photo_background
@@ -33,8 +33,7 @@ class Train(Generic[RecipeKind]):
 
     Attributes:
         recipe: method and its options; `train_options` tells the command line which there are.
-        preset: what the options of the method are unless they are given: those that this project found best, or those
-            of the paper, to compare with its results.
+        preset: what the options are unless they are given: the best that this project found, or those of the paper.
         data: directory of the capture (COLMAP or transforms.json; pane masks in masks/).
         output: directory of the run.
         iterations: length of the run; every schedule stretches with it.
@@ -43,10 +42,8 @@ class Train(Generic[RecipeKind]):
         device: where to train; auto takes an NVIDIA GPU where one can be used.
         resume: go on with the run in `output`.
         mask_polarity: which value of black-and-white masks is the pane.
-        checkpoint_every: seconds of training from one checkpoint to the next; there is one at the end, and when the
-            run is interrupted, in any case.
-        view: look at it in the browser meanwhile, pause and save it there; needs glassplat[view].
-        port: where the browser finds it.
+        checkpoint_every: seconds from one checkpoint to the next; an end or an interrupt writes one in any case.
+        view: look at it in the browser meanwhile.
     """
 
     recipe: Annotated[RecipeKind, tyro.conf.arg(name="")]
@@ -60,8 +57,7 @@ class Train(Generic[RecipeKind]):
     mask_polarity: Polarity = "auto"
     checkpoint_every: Positive = CHECKPOINT_SECONDS
     preset: Preset = "glassplat"
-    view: bool = False
-    port: Annotated[int, Range(1, 65535)] = 8080
+    view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
 
     def run(self, console: Console) -> None:
         """Trains, with a progress bar or lines."""
@@ -103,10 +99,10 @@ class Train(Generic[RecipeKind]):
             return
         from glassplat.commands.view import announce
         from glassplat.interface.watching import WatchedTraining
-        from glassplat.viewer.server import LOCAL
+        from glassplat.viewer.server import LOCAL, vacant_port
 
         watched = WatchedTraining(
-            training, dataset, host=LOCAL, port=self.port, announce=lambda viewer: announce(viewer, console)
+            training, dataset, host=LOCAL, port=vacant_port(LOCAL), announce=lambda viewer: announce(viewer, console)
         )
         try:
             yield watched.hear

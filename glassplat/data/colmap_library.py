@@ -23,3 +23,9 @@ def __getattr__(name: str) -> Any:
         signal.signal(signal.SIGTERM, before)
     globals()[name] = pycolmap
     return pycolmap
+
+
+def quiet_pycolmap() -> None:
+    """Keeps pycolmap from printing; what matters of it is said in this package's own words."""
+    logging = __getattr__("pycolmap").logging
+    logging.minloglevel = int(logging.FATAL)

@@ -48,8 +48,3 @@ def interruptible(work: Callable[[Any], Result], meanwhile: Callable[[], None] =
     if errors:
         raise errors[0]
     return results[0]
-
-
-def quiet_pycolmap() -> None:
-    """Keeps pycolmap from printing; what matters of it is said in this package's own words."""
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)

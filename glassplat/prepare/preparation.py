@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from glassplat import __version__
+from glassplat.data.colmap_library import quiet_pycolmap
 from glassplat.data.errors import InputError
 from glassplat.prepare.capture_writer import write_capture
 from glassplat.prepare.messages import Listener
-from glassplat.prepare.native_call import quiet_pycolmap
 from glassplat.prepare.photographs import Photograph, photographs_in
 from glassplat.prepare.reconstruction import Settings, best_solution
 from glassplat.prepare.report import Report, report_of

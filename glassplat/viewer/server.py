@@ -26,6 +26,7 @@ from glassplat.viewer.drawing import LEAST_GAIN, MOST_GAIN, Wish, drawn
 from glassplat.viewer.render_loop import RenderLoop, RenderThread
 
 LOCAL = "127.0.0.1"
+FIRST_PORT, MOST_PORTS = 8080, 100
 LARGEST_HEIGHT = 1080
 SHARP_QUALITY, COARSE_QUALITY = 90, 60
 PHOTO_WIDTH = 360
@@ -251,6 +252,21 @@ class Client:
         photo = self._viewer.shown.photographs[name]()
         step = max(1, photo.shape[1] // PHOTO_WIDTH)
         self._photo.image = photo[::step, ::step].numpy()
+
+
+def vacant_port(host: str) -> int:
+    """The first port from 8080 on that can be used.
+
+    Raises:
+        InputError: none of a hundred can.
+    """
+    for port in range(FIRST_PORT, FIRST_PORT + MOST_PORTS):
+        try:
+            check_port(host, port)
+        except InputError:
+            continue
+        return port
+    raise InputError(f"no port from {FIRST_PORT} on can be used; end what serves there")
 
 
 def check_port(host: str, port: int) -> None:

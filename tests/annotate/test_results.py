@@ -10,7 +10,6 @@ import pytest
 from PIL import Image
 
 from glassplat.annotate.document import parsed_document
-from glassplat.annotate.eye import Eye
 from glassplat.annotate.outline import filled, seen_outline, with_strokes
 from glassplat.annotate.pane_fit import fitted_pane
 from glassplat.annotate.results import in_photograph, pane_labels
@@ -21,6 +20,7 @@ from glassplat.data.errors import InputError
 from glassplat.data.view import PhotoFile
 from glassplat.files.images import read_image
 from glassplat.init.planes import fit_planes
+from glassplat.scene.eye import Eye
 from tests.annotate.conftest import NAMES, PLACES, marked_document
 from tests.init.pane_scene import FRONT, Pane, camera_from, label_image, normal_error, offset_error
 
