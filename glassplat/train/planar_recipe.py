@@ -36,7 +36,6 @@ from glassplat.train.photo_exposure import PhotoExposure
 from glassplat.train.photographer_entry import Photographer
 from glassplat.train.plane_entry import PlaneEntry, fitted_planes
 from glassplat.train.pose_refinement import PoseRefinement
-from glassplat.train.robust_weighting import Robustness
 from glassplat.train.splat_recipe import GaussianRates, image_terms
 from glassplat.train.stage import Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
@@ -157,7 +156,6 @@ class PlanarRecipe:
         mcmc: when and how Gaussians are relocated and added under `mcmc`.
         exposure: whether the exposure of each photograph is learned.
         poses: whether the camera of each photograph is corrected.
-        robust: whether what only one photograph shows is left out.
         photographer: whether panes show who took the photographs.
     """
 
@@ -192,7 +190,6 @@ class PlanarRecipe:
     mcmc: McmcDensify = field(default_factory=McmcDensify)
     exposure: PhotoExposure = field(default_factory=PhotoExposure)
     poses: PoseRefinement = field(default_factory=PoseRefinement)
-    robust: Robustness = field(default_factory=Robustness)
     photographer: Photographer = field(default_factory=Photographer)
 
     @classmethod
@@ -278,7 +275,7 @@ class PlanarRecipe:
         else:
             stages = (initialisation, self._adjustment(second, entry), self._joint(third))
         stages = self.photographer.learnt_in(stages, self.densify, seed)
-        return self.robust.applied_to(self.poses.learnt_in(self.exposure.learnt_in(stages)))
+        return self.poses.learnt_in(self.exposure.learnt_in(stages))
 
     def _adjustment(self, share: float, entry: PlaneEntry) -> Stage:
         """Stage 2: the reflection's gradient reaches the planes, not the Gaussians."""

@@ -21,7 +21,6 @@ from glassplat.train.background import BLACK
 from glassplat.train.optimizer import PUBLISHED_ITERATIONS, Rate
 from glassplat.train.photo_exposure import PhotoExposure
 from glassplat.train.pose_refinement import PoseRefinement
-from glassplat.train.robust_weighting import Robustness
 from glassplat.train.stage import Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
 
@@ -118,7 +117,6 @@ class SplatRecipe:
         discs: what keeps discs on one surface.
         exposure: whether the exposure of each photograph is learned.
         poses: whether the camera of each photograph is corrected.
-        robust: whether what only one photograph shows is left out.
     """
 
     method: ClassVar[str] = "splat"
@@ -136,7 +134,6 @@ class SplatRecipe:
     discs: DiscTerms = field(default_factory=DiscTerms)
     exposure: PhotoExposure = field(default_factory=PhotoExposure)
     poses: PoseRefinement = field(default_factory=PoseRefinement)
-    robust: Robustness = field(default_factory=Robustness)
 
     @classmethod
     def paper(cls) -> SplatRecipe:
@@ -181,7 +178,7 @@ class SplatRecipe:
             stages.append(replace(last, name=name, renderer=self._bare(normal=with_normals), losses=losses))
             began = start
         stages[-1] = replace(stages[-1], share=1 - began)
-        return self.robust.applied_to(self.poses.learnt_in(self.exposure.learnt_in(tuple(stages))))
+        return self.poses.learnt_in(self.exposure.learnt_in(tuple(stages)))
 
     def _bare(self, *, normal: bool = False) -> Splat:
         """The renderer with what the losses need and no more."""
