@@ -34,9 +34,9 @@ $(STAMP): pyproject.toml constraints.txt
 
 # Tests of pages are skipped, and said to be, where there is no Chromium.
 browser:
-	@command -v chromium >/dev/null && command -v chromedriver >/dev/null || \
+	@command -v chromium >/dev/null || \
 		{ as_root=$$([ "$$(id -u)" = 0 ] || echo sudo); $$as_root apt-get update -q && \
-		$$as_root apt-get install -q -y chromium chromium-driver; }
+		$$as_root apt-get install -q -y chromium; }
 
 demo: $(STAMP)
 	$(BIN)/glassplat demo

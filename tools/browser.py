@@ -1,113 +1,43 @@
-"""A headless Chromium that is driven like a person drives it: clicks, keys, and pictures of what it shows.
+"""A headless Chromium without a GPU that is driven as a person drives it: clicks, keys, and pictures of what it shows.
 
-It is spoken to in the W3C's WebDriver protocol, which chromedriver serves; both are Debian packages (`make browser`).
+It is spoken to over a pipe, in the protocol of its developer tools; it is a Debian package (`make browser`).
 """
 
 from __future__ import annotations
 
 import base64
 import io
+import itertools
 import json
-import re
+import os
 import shutil
 import subprocess
 import tempfile
 import time
-import urllib.error
-import urllib.request
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-DRIVER = shutil.which("chromedriver")
-FLAGS = (
-    "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
-    "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage",
-    "--force-device-scale-factor=1", "--hide-scrollbars",
+STEPS = 5
+"""Moves of the mouse from one place of a drag to the next."""
+OPTIONS = (
+    "--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--disable-extensions", "--disable-dev-shm-usage",
+    "--hide-scrollbars", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
+    "--remote-debugging-pipe",
+    "--force-color-profile=srgb", "--proxy-server=127.0.0.1:9",
 )  # fmt: skip
+"""The last one sends whatever a page would load from anywhere into the void."""
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 PATIENCE = 60.0
 """Seconds that anything on the page may take, on a machine that does much else."""
-KEYS = {
-    "Enter": "\ue007",
-    "Escape": "\ue00c",
-    "Right": "\ue014",
-    "Left": "\ue012",
-    "Control": "\ue009",
-    "Tab": "\ue004",
-}
-
-
-class Browser:
-    """One window."""
-
-    def __init__(self, driver: str, session: str) -> None:
-        self._base = f"{driver}/session/{session}"
-
-    def ask(self, path: str, body: Any = None) -> Any:
-        """One command of the protocol; its value."""
-        return _ask(f"{self._base}{path}", body)
-
-    def open(self, address: str) -> None:
-        """Goes to an address."""
-        self.ask("/url", {"url": address})
-
-    def run(self, script: str, *arguments: Any) -> Any:
-        """The value of a function body in the page."""
-        return self.ask("/execute/sync", {"script": script, "args": list(arguments)})
-
-    def wait(self, script: str, what: str) -> Any:
-        """Waits until an expression is true in the page."""
-        return wait_until(lambda: self.run(f"return {script}"), what)
-
-    def click(self, x: float, y: float, *, times: int = 1) -> None:
-        """Clicks at a place of the window."""
-        press = [{"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0}] * times
-        self._pointer([_move(x, y), *press])
-
-    def drag(self, path: Sequence[tuple[float, float]]) -> None:
-        """Presses at the first place, moves through the others and lets go at the last."""
-        ways = [_move(x, y, 30) for x, y in path[1:]]
-        down, up = ({"type": kind, "button": 0} for kind in ("pointerDown", "pointerUp"))
-        self._pointer([_move(*path[0]), down, *ways, up])
-
-    def keys(self, *names: str) -> None:
-        """Presses keys together, by their letter or name."""
-        codes = [KEYS.get(name, name) for name in names]
-        down = [{"type": "keyDown", "value": code} for code in codes]
-        up = [{"type": "keyUp", "value": code} for code in reversed(codes)]
-        self.ask("/actions", {"actions": [{"type": "key", "id": "keyboard", "actions": down + up}]})
-
-    def press(self, selector: str) -> None:
-        """Clicks an element by its CSS selector."""
-        found = self.ask("/element", {"using": "css selector", "value": selector})
-        self.ask(f"/element/{next(iter(found.values()))}/click", {})
-
-    def picture(self) -> np.ndarray:
-        """[H, W, 3] uint8, what the window shows."""
-        return np.array(Image.open(io.BytesIO(base64.b64decode(self.ask("/screenshot")))).convert("RGB"))
-
-    def _pointer(self, actions: list[dict]) -> None:
-        pointer = {"type": "pointer", "id": "mouse", "parameters": {"pointerType": "mouse"}, "actions": actions}
-        self.ask("/actions", {"actions": [pointer]})
-
-
-def _move(x: float, y: float, duration: int = 0) -> dict:
-    return {"type": "pointerMove", "x": round(x), "y": round(y), "duration": duration, "origin": "viewport"}
-
-
-def _ask(address: str, body: Any = None) -> Any:
-    data = None if body is None else json.dumps(body).encode()
-    request = urllib.request.Request(address, data=data, headers={"Content-Type": "application/json"})
-    try:
-        with urllib.request.urlopen(request, timeout=PATIENCE) as response:
-            return json.load(response)["value"]
-    except urllib.error.HTTPError as error:
-        with error:
-            raise AssertionError(json.load(error)["value"]["message"]) from error
+KEYS = {"Right": "ArrowRight", "Left": "ArrowLeft", "Up": "ArrowUp", "Down": "ArrowDown"}
+MODIFIERS = {"Alt": 1, "Control": 2, "Meta": 4, "Shift": 8}
+CODES = {"Enter": 13, "Escape": 27, "Tab": 9, "ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40}
+"""What Windows calls the keys that are no letters; Chromium tells by it what a key does."""
 
 
 def wait_until(holds: Callable[[], Any], what: str) -> Any:
@@ -124,34 +54,173 @@ def wait_until(holds: Callable[[], Any], what: str) -> Any:
     raise AssertionError(f"waited {PATIENCE:.0f} s in vain for {what}")
 
 
-@contextmanager
-def browser(width: int = 1400, height: int = 900) -> Iterator[Browser]:
-    """A window of its own profile, closed at the end."""
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile, _driver() as driver:
-        arguments = [*FLAGS, f"--window-size={width},{height}", f"--user-data-dir={profile}"]
-        options = {"goog:chromeOptions": {"args": arguments, "binary": CHROMIUM}}
-        session = _ask(f"{driver}/session", {"capabilities": {"alwaysMatch": options}})["sessionId"]
-        window = Browser(driver, session)
-        try:
-            yield window
-        finally:
-            request = urllib.request.Request(f"{driver}/session/{session}", method="DELETE")
-            urllib.request.urlopen(request, timeout=PATIENCE).close()
+class Browser:
+    """One tab of one browser; use it in a `with` statement."""
+
+    def __init__(
+        self, page: Path | str = "about:blank", width: int = 640, height: int = 480, *, query: str = "#still"
+    ) -> None:
+        """Opens a page from its file, with what stands behind its address, or from its address."""
+        self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        (to_read, self._to_write), (self._from_read, from_write) = os.pipe(), os.pipe()
+        # The browser reads its third descriptor and writes its fourth; a shell moves them there.
+        command = [
+            str(CHROMIUM),
+            *OPTIONS,
+            f"--window-size={width},{height}",
+            f"--user-data-dir={self._profile.name}",
+        ]
+        shell = f'exec "$@" 3<&{to_read} 4>&{from_write}'
+        self._process = subprocess.Popen(
+            ["bash", "-c", shell, "bash", *command, "about:blank"],
+            pass_fds=(to_read, from_write),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        os.close(to_read)
+        os.close(from_write)
+        self._buffer, self._number, self.events = b"", 0, []
+        targets = self._ask("Target.getTargets")["targetInfos"]
+        tab = next(target["targetId"] for target in targets if target["type"] == "page")
+        self._session = None
+        self._session = self._ask("Target.attachToTarget", targetId=tab, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Network", "Log"):
+            self._ask(f"{domain}.enable")
+        self._ask("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.open(page if isinstance(page, str) else page.resolve().as_uri() + query)
+
+    _session: str | None = None
+
+    def __enter__(self) -> Browser:
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        self._process.kill()
+        self._process.wait()
+        os.close(self._to_write)
+        os.close(self._from_read)
+        self._profile.cleanup()
+
+    def open(self, address: str) -> None:
+        """Goes to an address, and waits until it is loaded."""
+        begun = len(self.events)
+        if "loaderId" not in self._ask("Page.navigate", url=address):
+            self._ask("Page.reload")  # The same page at another place in it is not loaded again by itself.
+        while not any(event.get("method") == "Page.loadEventFired" for event in self.events[begun:]):
+            self.events.append(self._next())
+
+    def evaluate(self, expression: str) -> Any:
+        """The value of an expression, awaited; raises RuntimeError with what the page threw."""
+        answer = self._ask("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
+        if "exceptionDetails" in answer:
+            details = answer["exceptionDetails"]
+            raise RuntimeError(details.get("exception", {}).get("description", details["text"]))
+        return answer["result"].get("value")
+
+    def run(self, script: str, *arguments: Any) -> Any:
+        """The value of a function body in the page."""
+        return self.evaluate(f"(function () {{ {script} }}).apply(null, {json.dumps(arguments)})")
+
+    def wait(self, expression: str, what: str) -> Any:
+        """Waits until an expression is true in the page."""
+        return wait_until(lambda: self.evaluate(expression), what)
+
+    def screenshot(self) -> bytes:
+        """What the window shows, as PNG."""
+        return base64.b64decode(self._ask("Page.captureScreenshot", format="png")["data"])
+
+    def picture(self) -> np.ndarray:
+        """[H, W, 3] uint8, what the window shows."""
+        return np.array(Image.open(io.BytesIO(self.screenshot())).convert("RGB"))
+
+    def keys(self, *names: str) -> None:
+        """Presses keys together, by their letter or name."""
+        keys = [KEYS.get(name, name) for name in names]
+        held = sum(MODIFIERS.get(key, 0) for key in keys)
+        for key in keys:
+            typed = {"text": "\r" if key == "Enter" else key} if not held and (len(key) == 1 or key == "Enter") else {}
+            self._ask("Input.dispatchKeyEvent", type="keyDown", **typed, **_key(key, held))
+        for key in reversed(keys):
+            self._ask("Input.dispatchKeyEvent", type="keyUp", **_key(key, held))
+
+    def press(self, selector: str) -> None:
+        """Clicks an element by its CSS selector."""
+        x, y = self.run(
+            "const one = document.querySelector(arguments[0]); one.scrollIntoView({ block: 'nearest' });"
+            "const box = one.getBoundingClientRect(); return [box.left + box.width / 2, box.top + box.height / 2]",
+            selector,
+        )
+        self.click(x, y)
+
+    def click(self, x: float, y: float, *, times: int = 1) -> None:
+        """Clicks at a place of the window."""
+        self._mouse("mouseMoved", x, y)
+        for count in range(1, times + 1):
+            self._mouse("mousePressed", x, y, button="left", clickCount=count)
+            self._mouse("mouseReleased", x, y, button="left", clickCount=count)
+
+    def drag(self, path: Sequence[tuple[float, float]]) -> None:
+        """Presses at the first place, moves through the others and lets go at the last."""
+        self._mouse("mouseMoved", *path[0])
+        self._mouse("mousePressed", *path[0], button="left", clickCount=1)
+        for (x, y), (to_x, to_y) in itertools.pairwise(path):
+            for step in range(1, STEPS + 1):
+                share = step / STEPS
+                self._mouse("mouseMoved", x + (to_x - x) * share, y + (to_y - y) * share, button="left", buttons=1)
+        self._mouse("mouseReleased", *path[-1], button="left", clickCount=1)
+
+    def _mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
+        self._ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
+
+    def requests(self) -> list[str]:
+        """Every address that the page asked for."""
+        sent = (event["params"] for event in self.events if event.get("method") == "Network.requestWillBeSent")
+        return [params["request"]["url"] for params in sent]
+
+    def complaints(self) -> list[str]:
+        """What the page reported as an error."""
+        found = []
+        for event in self.events:
+            if event.get("method") == "Runtime.exceptionThrown":
+                found.append(str(event["params"]["exceptionDetails"]))
+            if event.get("method") == "Log.entryAdded" and event["params"]["entry"]["level"] == "error":
+                found.append(event["params"]["entry"]["text"])
+        return found
+
+    def _ask(self, method: str, **parameters: Any) -> dict[str, Any]:
+        number = self._send(method, parameters)
+        while True:
+            answer = self._next()
+            if answer.get("method") == "Page.javascriptDialogOpening":  # As when a page asks whether to leave it.
+                self._send("Page.handleJavaScriptDialog", {"accept": True})
+            if answer.get("id") != number:
+                self.events.append(answer)
+            elif "error" in answer:
+                raise RuntimeError(f"{method}: {answer['error']['message']}")
+            else:
+                result: dict[str, Any] = answer["result"]
+                return result
+
+    def _send(self, method: str, parameters: dict[str, Any]) -> int:
+        self._number += 1
+        message: dict[str, Any] = {"id": self._number, "method": method, "params": parameters}
+        if self._session:
+            message["sessionId"] = self._session
+        os.write(self._to_write, json.dumps(message).encode() + b"\0")
+        return self._number
+
+    def _next(self) -> dict[str, Any]:
+        while b"\0" not in self._buffer:
+            chunk = os.read(self._from_read, 1 << 20)
+            if not chunk:
+                raise RuntimeError("the browser has ended")
+            self._buffer += chunk
+        message, _, self._buffer = self._buffer.partition(b"\0")
+        answer: dict[str, Any] = json.loads(message)
+        return answer
 
 
-@contextmanager
-def _driver() -> Iterator[str]:
-    assert DRIVER is not None
-    process = subprocess.Popen([DRIVER, "--port=0"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-    try:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if found := re.search(r"started successfully on port (\d+)", line):
-                yield f"http://127.0.0.1:{found.group(1)}"
-                return
-        raise AssertionError("chromedriver said no port")
-    finally:
-        process.terminate()
-        process.wait(timeout=PATIENCE)
-        if process.stdout is not None:
-            process.stdout.close()
+def _key(key: str, held: int) -> dict[str, Any]:
+    """What tells Chromium which key it is."""
+    code = CODES.get(key, ord(key.upper()) if len(key) == 1 else 0)
+    return {"key": key, "modifiers": held, "windowsVirtualKeyCode": code}

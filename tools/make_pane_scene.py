@@ -20,13 +20,14 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import Rotation
 
 from tools.make_demo_scene import TEST_EVERY, srgb_from_linear
 from tools.make_scenes import GOLDEN_ANGLE_RAD, as_bytes, world_from_opengl
 from tools.pane_draws import OPENGL_FROM_CAM, DrawnPlace, draw_place, standing_pane
 from tools.pane_tracer import Array, Ball, Box, Place, Seen
-from tools.photographer_body import photographer
+from tools.photographer_body import passer_by, photographer
 from tools.window_place import window_place, window_poses
 
 LOOKED_AT = np.array([0.0, 0.1, 0.8])
@@ -40,6 +41,8 @@ SUBPIXELS = 3
 """Rays per pixel and axis."""
 POINT_NOISE = 0.005
 """Standard deviation of the sparse points about the surfaces, world units."""
+PASSERS = 77
+"""Keeps what is drawn for those who walk by apart from all else."""
 VIRTUAL_IN_GLASS, VIRTUAL_IN_MIRROR = 0.4, 1.0
 """Share of the sparse points seen in a pane that lie where it shows what it mirrors, as structure from motion finds."""
 
@@ -64,6 +67,8 @@ class Arguments:
     """Seed of a place drawn by chance, to make in place of `screens`."""
     window: bool = False
     """Make a large window before a dark case, photographed from the front, in place of `screens`."""
+    passers_by: float = 0.0
+    """Share of the training views in which somebody stands somewhere in the room, in each elsewhere."""
     photographer: bool = False
     """Somebody stands behind the camera with a phone before the face, and is seen in panes and mirrors."""
 
@@ -228,11 +233,33 @@ def annotated_views(place: Place, poses: list[Array], masks: int) -> set[int]:
     return chosen
 
 
+def with_passer_by(arguments: Arguments, place: Place, number: int, pose: Array) -> Place:
+    """The place when a photograph was taken: the same, or with somebody in it."""
+    generator = np.random.default_rng([arguments.seed, number, PASSERS])
+    if generator.random() >= arguments.passers_by:
+        return place
+    room = next(thing for thing in place.things if isinstance(thing, Box) and thing.room)
+    return replace(place, things=(*place.things, *passer_by(room, pose[:3, 3], generator)))
+
+
+def write_difference(path: Path, picture: NDArray[np.uint8], other: NDArray[np.uint8]) -> None:
+    """Writes a mask of the pixels in which two pictures differ by more than rounding, and their neighbours."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    differs = np.abs(picture.astype(int) - other).max(axis=2) > 2
+    mask = maximum_filter(255 * differs.astype(np.uint8), 3)
+    Image.fromarray(mask).save(path)
+
+
 def write_view(arguments: Arguments, place: Place, number: int, pose: Array, *, annotated: bool) -> None:
     """Writes all that there is of a view; true layers are those without a photographer, and beside them with one."""
     folder, name, size = arguments.output, view_name(number), (arguments.width, arguments.width * 3 // 4)
     peopled = replace(place, photographer=photographer(pose)) if arguments.photographer else place
     seen = see(peopled, pose, *size)
+    if number % TEST_EVERY:
+        passed = with_passer_by(arguments, peopled, number, pose)
+        if passed is not peopled:
+            alone, seen = seen, see(passed, pose, *size)
+            write_difference(folder / "gt/passers_by" / name, picture(seen.radiance), picture(alone.radiance))
     write_photograph(folder, name, seen, annotated=annotated)
     if number % TEST_EVERY:
         return

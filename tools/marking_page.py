@@ -29,7 +29,7 @@ from PIL import Image
 from glassplat.annotate.server import AnnotationServer
 from glassplat.annotate.session import opened_session
 from glassplat.suggest.suggestion import Suggestion
-from tools.browser import Browser, browser
+from tools.browser import Browser
 
 Places = Sequence[Any] | np.ndarray
 WHOLE = 1.5
@@ -123,7 +123,7 @@ def marking_page(
         thread = Thread(target=server.serve_forever, args=(0.02,))
         thread.start()
         try:
-            with browser(width, height) as window:
+            with Browser(width=width, height=height) as window:
                 page = MarkingPage(window, server)
                 page.open()
                 yield page

@@ -21,7 +21,7 @@ from glassplat.files.spz_sections import FLIP
 from glassplat.interface.loading import load
 from glassplat.interface.model import Model
 from glassplat.scene.camera import Camera
-from tools.headless import Browser
+from tools.browser import Browser
 
 VIEWS = 5
 FRAMES = 6

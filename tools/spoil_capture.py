@@ -1,11 +1,13 @@
 """A copy of a capture with a flaw that real ones have; its true layers, poses and masks stay as they are.
 
 python -m tools.spoil_capture CAPTURE --output COPY [--exposure STOPS] [--white-balance STOPS]
-                             [--pose-noise DEGREES] [--seed N]
+                             [--pose-noise DEGREES] [--passers-by SHARE] [--seed N]
 
 Photographs are brightened and tinted in linear radiance, as a camera's automatic exposure and white balance do, each by
 factors of its own, and clipped at white. Cameras of a COLMAP model in text are turned about each of their axes, and
 shifted by as much as the turn moves what is one radius of the cameras away; `true_images.txt` keeps the true poses.
+Passers-by stand before everything in some photographs, but in no eighth one, which is a test view; `gt/passers_by/` has
+masks of them.
 """
 
 from __future__ import annotations
@@ -20,9 +22,12 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from glassplat.data.dataset import TEST_EVERY
 from glassplat.files.images import read_image, write_image
 from glassplat.kernels.color_space import linear_from_srgb, srgb_from_linear
 
+FIGURES = (0.4, 0.9)
+"""Heights of passers-by, as shares of the photograph's."""
 IMAGES, MODEL, TRUE_MODEL = "images", "sparse/0/images.txt", "true_images.txt"
 
 
@@ -34,6 +39,7 @@ def main() -> None:
     parser.add_argument("--exposure", type=float, default=0.0, help="standard deviation of the exposure, in stops")
     parser.add_argument("--white-balance", type=float, default=0.0, help="the same of each channel beside it")
     parser.add_argument("--pose-noise", type=float, default=0.0, help="standard deviation of the turns, in degrees")
+    parser.add_argument("--passers-by", type=float, default=0.0, help="share of the photographs that show somebody")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     if not (given.capture / IMAGES).is_dir():
@@ -44,6 +50,8 @@ def main() -> None:
         parser.error(f"{given.capture} has no {MODEL}; --pose-noise takes a COLMAP model in text")
     random = np.random.default_rng(given.seed)
     spoil(given.capture, given.output, given.exposure, given.white_balance, random)
+    if given.passers_by:
+        add_passers_by(given.output, given.passers_by, random)
     if given.pose_noise:
         disturb_poses(given.output / MODEL, math.radians(given.pose_noise), random)
 
@@ -96,6 +104,39 @@ def disturb_poses(path: Path, noise: float, random: np.random.Generator) -> None
         values = " ".join(f"{value:.9f}" for value in (w, x, y, z, *shift))
         lines[n] = f"{first} {values} {camera} {name}"
     path.write_text("\n".join(lines) + "\n")
+
+
+def add_passers_by(capture: Path, share: float, random: np.random.Generator) -> None:
+    """Paints somebody into photographs of a capture, and writes masks of where.
+
+    Args:
+        capture: its folder.
+        share: of the photographs that are not test views.
+        random: who stands where.
+    """
+    paths = sorted(path for path in (capture / IMAGES).rglob("*") if path.is_file())
+    for number, path in enumerate(paths):
+        if number % TEST_EVERY == 0 or random.random() >= share:
+            continue
+        photo = read_image(path)[..., :3].copy()
+        body = figure(photo.shape[0], photo.shape[1], random)
+        clothes = random.uniform(0, 255, 3) + random.normal(scale=12, size=(int(body.sum()), 3))
+        photo[body] = np.clip(clothes, 0, 255).astype(np.uint8)
+        write_image(path, torch.from_numpy(photo))
+        mask = capture / "gt/passers_by" / path.relative_to(capture / IMAGES).with_suffix(".png")
+        mask.parent.mkdir(parents=True, exist_ok=True)
+        write_image(mask, torch.from_numpy(255 * body.astype(np.uint8)))
+
+
+def figure(height: int, width: int, random: np.random.Generator) -> NDArray[np.bool_]:
+    """[H, W] the pixels of somebody who stands in the picture: a head, and a body down to the feet."""
+    size = random.uniform(*FIGURES) * height
+    middle, feet = random.uniform(0.1, 0.9) * width, random.uniform(0.7, 1.2) * height
+    y, x = np.mgrid[:height, :width] + 0.5
+    head = (x - middle) ** 2 + (y - (feet - 0.92 * size)) ** 2 < (0.08 * size) ** 2
+    body = ((x - middle) / (0.17 * size)) ** 4 + ((y - (feet - 0.42 * size)) / (0.42 * size)) ** 4 < 1
+    found: NDArray[np.bool_] = head | body
+    return found
 
 
 def exposed(photo: NDArray[np.uint8], factors: NDArray[np.float64]) -> torch.Tensor:

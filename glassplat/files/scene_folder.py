@@ -100,7 +100,9 @@ def read_scene(folder: Path) -> Scene:
     if (folder / SURROUNDINGS).is_file():
         scene = replace(scene, surroundings=_colored(folder, SURROUNDINGS, header["surroundings_sh_degree"]))
     if (folder / PHOTOGRAPHER).is_file():
-        photographer = _colored(folder, PHOTOGRAPHER, header["photographer_sh_degree"])
+        photographer = _ellipsoids(
+            _colored(folder, PHOTOGRAPHER, header["photographer_sh_degree"]), folder / PHOTOGRAPHER
+        )
         scene = replace(scene, photographer=photographer, up=direction(header["up"], str(folder / SCENE)))
     if (folder / EXPOSURES).is_file():
         scene = replace(scene, exposures=read_exposures(folder / EXPOSURES))
@@ -136,10 +138,17 @@ def _colored(folder: Path, name: str, active_sh_degree: int | None) -> Gaussians
 
 def _glass(path: Path) -> Gaussians:
     """Glass with its marks, without which nothing tells where it reflects."""
-    glass = _drawable(path)
+    glass = _ellipsoids(_drawable(path), path)
     if "logit_mark" not in glass.channels:
         raise ValueError(f"{path} has no property logit_mark; expected glass as `planar` exports it")
     return glass
+
+
+def _ellipsoids(gaussians: Gaussians, path: Path) -> Gaussians:
+    """Gaussians that are composited with others of three scales."""
+    if gaussians.are_discs:
+        raise ValueError(f"{path} has two scales, scale_0 and scale_1; expected three, as `planar` exports it")
+    return gaussians
 
 
 def _drawable(path: Path) -> Gaussians:

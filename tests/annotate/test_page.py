@@ -12,8 +12,8 @@ import pytest
 
 from glassplat.data.dataset import load_dataset
 from glassplat.files.images import read_image
-from tests.annotate.browser_needed import needs_browser
 from tests.annotate.conftest import NAMES, true_corners
+from tests.browser_needed import needs_browser
 from tests.init.pane_scene import FRONT
 from tools.browser import wait_until
 from tools.marking_page import MarkingPage, marking_page

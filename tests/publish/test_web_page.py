@@ -17,12 +17,12 @@ from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
 from glassplat.scene.plane_edits import as_mirrors, without_glass
 from glassplat.scene.scene import Scene
+from tests.browser_needed import needs_browser
 from tests.render.tiny_scene import in_single_precision, joined, pane, showcase
 from tests.train.tiny_capture import tiny_capture, true_scene
-from tools.headless import Browser, find_chromium
+from tools.browser import Browser
 from tools.page_likeness import picture
 
-needs_chromium = pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
 CAMERAS = [(view.name, view.camera) for view in tiny_capture().train]
 LARGEST_SCRIPT = 64_000
 
@@ -44,30 +44,30 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
         yield browser
 
 
-@needs_chromium
+@needs_browser
 @pytest.mark.parametrize("layer", ["rgb", "without_panes", "reflection", "strength"])
 def test_every_layer_is_what_the_renderer_shows(opened: Browser, layer: str) -> None:
     for _, camera in CAMERAS[:2]:
         assert likeness(opened, true_scene(), Planar(), camera, layer) > 36
 
 
-@needs_chromium
+@needs_browser
 def test_the_buttons_do_what_they_say(opened: Browser) -> None:
     camera = CAMERAS[1][1]
     plain = picture(opened, camera)
-    opened.press("m")
+    opened.keys("m")
     assert likeness(opened, as_mirrors(true_scene(), [1]), Planar(), camera) > 36
-    opened.press("m")
-    opened.press("g")
+    opened.keys("m")
+    opened.keys("g")
     assert likeness(opened, without_glass(true_scene()), Planar(), camera) > 36
-    opened.press("g")
+    opened.keys("g")
     assert torch.equal(picture(opened, camera), plain)
     opened.evaluate("document.querySelector('[data-set=\"layer=strength\"]').click()")
     assert opened.evaluate("glassplat.then(page => page.panel.state.layer)") == "strength"
-    opened.press("1")
+    opened.keys("1")
 
 
-@needs_chromium
+@needs_browser
 def test_people_stay_near_the_photographs(opened: Browser) -> None:
     farthest = """glassplat.then(({ navigation, scene }) => {
       let most = 0;
@@ -86,16 +86,16 @@ def test_people_stay_near_the_photographs(opened: Browser) -> None:
     assert 0.5 < opened.evaluate(farthest) < 1.001
 
 
-@needs_chromium
+@needs_browser
 def test_nothing_is_asked_for_and_nothing_complained_of(opened: Browser) -> None:
-    opened.drag((100, 100), (160, 120))
-    opened.press("ArrowRight")
+    opened.drag([(100, 100), (160, 120)])
+    opened.keys("Right")
     assert {address.split(":")[0] for address in opened.requests()} <= {"file", "data", "blob"}
     assert opened.complaints() == []
     assert opened.evaluate("document.title") == "A <tiny> scene & more"
 
 
-@needs_chromium
+@needs_browser
 def test_panes_behind_panes_and_scenes_without_any(tmp_path: Path) -> None:
     two = in_single_precision(showcase(joined(pane(2.0, half=0.8), pane(3.0, half=0.9, label=2))))
     for name, scene, renderer in (("two", two, Planar()), ("none", Scene(two.primary, two.extent), Splat())):

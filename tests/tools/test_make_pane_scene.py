@@ -12,12 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from glassplat.data.dataset import load_dataset
 from glassplat.evaluate.truth import load_truth
+from glassplat.files.images import read_image
 from glassplat.kernels.blend_panes.reference import two_surfaces
 from glassplat.kernels.pane_hits.reference import pane_hits
 from glassplat.kernels.panes import Panes
 from tools.make_pane_scene import Arguments, main
 from tools.pane_tracer import Ball, Box, Carried, Pane, Place
-from tools.photographer_body import photographer, upright_frame
+from tools.photographer_body import passer_by, photographer, upright_frame
 
 ROOM = Box((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), seed=1, room=True)
 X, Y = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
@@ -190,6 +191,36 @@ def test_layers_are_those_without_a_photographer_and_beside_them_with_one(tmp_pa
         for name in names
     )
     assert (peopled / "images/0000.png").read_bytes() != (empty / "images/0000.png").read_bytes()
+
+
+def test_those_who_walk_by_are_in_the_masks_that_tell_of_them_and_in_no_test_view(tmp_path: Path) -> None:
+    arguments = Arguments(tmp_path / "passed", width=32, views=10, masks=1, points=10, window=True, passers_by=1.0)
+    main(arguments)
+    main(replace(arguments, output=tmp_path / "empty", passers_by=0.0))
+    shown = 0
+    for path in sorted((tmp_path / "empty/images").iterdir()):
+        alone, passed = read_image(path), read_image(tmp_path / "passed/images" / path.name)
+        mask = tmp_path / "passed/gt/passers_by" / path.name
+        if path.name in ("0000.png", "0008.png"):
+            assert not mask.exists() and (alone == passed).all()
+            continue
+        there = read_image(mask)[..., 0] > 0
+        assert np.abs(alone.astype(int) - passed)[~there].max(initial=0) <= 2
+        shown += int(there.any())
+    assert shown >= 2
+
+
+def test_nobody_walks_through_walls_or_the_camera() -> None:
+    room, camera = Box((-2.0, -2.0, 0.0), (2.0, 2.0, 2.5), seed=1, room=True), np.array([0.5, 0.2, 1.4])
+    generator = np.random.default_rng(0)
+    places = []
+    for _ in range(30):
+        head = passer_by(room, camera, generator)[1]
+        assert isinstance(head, Carried)
+        places.append(head.world_from_thing[:3, 3])
+    assert np.abs(np.array(places)[:, :2]).max() <= 1.6 and np.array(places)[:, 2].max() < 1.8
+    assert np.linalg.norm(np.array(places)[:, :2] - camera[:2], axis=1).min() >= 0.7
+    assert np.ptp(np.array(places), axis=0).min() > 0.15
 
 
 def test_a_scene_is_not_overwritten(tmp_path: Path) -> None:

@@ -1,3 +1,4 @@
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from glassplat.files.images import read_image
 from glassplat.kernels.color_space import linear_from_srgb
 from tests.train.tiny_capture import write_tiny_capture
-from tools.spoil_capture import disturb_poses, spoil
+from tools.spoil_capture import add_passers_by, disturb_poses, spoil
 
 
 def test_photographs_differ_by_their_factors_and_nothing_else_does(tmp_path: Path) -> None:
@@ -42,3 +43,17 @@ def test_cameras_are_moved_by_as_much_as_was_asked(tmp_path: Path) -> None:
     after = Rotation.from_quat([[float(words[n]) for n in (2, 3, 4, 1)] for words in disturbed])
     wobbles = (after * turns.inv()).as_rotvec()
     np.testing.assert_allclose(wobbles.std(axis=0), 0.01, rtol=0.15)
+
+
+def test_passers_by_are_where_their_masks_say_and_in_no_test_view(tmp_path: Path) -> None:
+    capture = write_tiny_capture(tmp_path / "capture")
+    shutil.copytree(capture, tmp_path / "copy")
+    add_passers_by(tmp_path / "copy", 1.0, np.random.default_rng(2))
+    masks = sorted(path.name for path in (tmp_path / "copy/gt/passers_by").iterdir())
+    assert masks == [f"{index}.png" for index in range(1, 6)]
+    for name in masks:
+        before, after = (read_image(folder / "images" / name) for folder in (capture, tmp_path / "copy"))
+        there = read_image(tmp_path / "copy/gt/passers_by" / name)[..., 0] > 0
+        assert 0.02 < there.mean() < 0.5
+        assert (before[~there] == after[~there]).all() and (before[there] != after[there]).any(axis=1).mean() > 0.9
+    assert (capture / "images/0.png").read_bytes() == (tmp_path / "copy/images/0.png").read_bytes()

@@ -17,9 +17,11 @@ from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
+from glassplat.train.messages import StepDone
 from glassplat.train.photographer_entry import AddPhotographer, Photographer
 from glassplat.train.planar_recipe import PlanarRecipe
-from glassplat.train.stage import Clock, carried_out
+from glassplat.train.splat_recipe import SplatRecipe
+from glassplat.train.stage import Clock, Stage, carried_out
 from glassplat.train.state import TrainState
 from glassplat.train.trainer import train
 from tests.render.test_photographer import body
@@ -129,3 +131,41 @@ def test_a_photographer_who_has_vanished_leaves_nothing_behind(tmp_path: Path) -
     assert not densify.apply(state, tiny_capture(), Clock(200, 1000, 6))
     save_checkpoint(tmp_path / "checkpoint.safetensors", state)
     assert len(load_checkpoint(tmp_path / "checkpoint.safetensors").scene.photographer) == 0
+
+
+def planar_stages() -> tuple[Stage, ...]:
+    """All three stages, with the true planes in place of fitted ones."""
+
+    def place_true_planes(state: TrainState, dataset: Dataset) -> None:
+        truth = true_scene()
+        state.scene = replace(state.scene, planes=truth.planes, glass=truth.glass)
+
+    densify = replace(PlanarRecipe().densify, interval=8, start=0.0, stop=1.0, whole_passes=False)
+    densify = replace(densify, gradient_threshold=1e-8, pull_threshold=1e-8)
+    recipe = PlanarRecipe(sh_degree=1, stage_shares=(0.2, 0.3, 0.5), photographer=LEARNED, densify=densify)
+    return tuple(
+        replace(s, entry=replace(s.entry, after=place_true_planes)) if isinstance(s.entry, AddPhotographer) else s
+        for s in recipe.stages(seed=0)
+    )
+
+
+def test_a_run_that_was_interrupted_ends_as_one_that_was_not(tmp_path: Path) -> None:
+    dataset, path = peopled_capture(), tmp_path / "checkpoint.safetensors"
+    whole = TrainState(SplatRecipe(sh_degree=1).initialise(dataset), 0)
+    sizes = set()
+    for message in train(planar_stages(), dataset, whole, 40):
+        if isinstance(message, StepDone):
+            sizes.add(message.counts.get("photographer", 0))
+    interrupted = TrainState(SplatRecipe(sh_degree=1).initialise(dataset), 0)
+    for message in train(planar_stages(), dataset, interrupted, 40):
+        if isinstance(message, StepDone) and message.step == 21:
+            break
+    save_checkpoint(path, interrupted)
+    resumed = load_checkpoint(path)
+    for _ in train(planar_stages(), dataset, resumed, 40):
+        pass
+    assert len(sizes) > 2  # Nobody, the first cloud, and what densification makes of it.
+    assert resumed.scene.up == whole.scene.up is not None
+    expected = whole.scene.parameters()
+    assert resumed.scene.parameters().keys() == expected.keys()
+    assert all(torch.equal(tensor, expected[name]) for name, tensor in resumed.scene.parameters().items())

@@ -80,6 +80,13 @@ def test_glass_without_marks_is_named(run: Path) -> None:
         RunDirectory(run).latest_scene()
 
 
+def test_glass_of_discs_is_named(run: Path) -> None:
+    glass = true_scene().glass
+    write_gaussians(run / SCENE / "glass.ply", replace(glass, log_scales=glass.log_scales[:, :2]))
+    with pytest.raises(InputError, match=r"glass\.ply has two scales, scale_0 and scale_1; expected three"):
+        RunDirectory(run).latest_scene()
+
+
 @pytest.mark.parametrize(
     ("recipe", "message"),
     [

@@ -12,10 +12,11 @@ import pytest
 from glassplat.cli import main
 from glassplat.render.planar import Planar
 from glassplat.viewer.server import Shown, Viewer
+from tests.browser_needed import needs_browser
 from tests.commands.tiny_run import write_run
 from tests.train.tiny_capture import tiny_capture, true_scene
 from tests.viewer.free_port import free_port
-from tools.headless import Browser, find_chromium
+from tools.browser import Browser
 
 VIEWS = tiny_capture().train
 SHOWN = Shown(
@@ -36,7 +37,7 @@ def eventually(happens: Callable[[], bool], seconds: float = 120) -> None:
         time.sleep(0.05)
 
 
-@pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
+@needs_browser
 def test_a_browser_is_shown_sharp_pictures_and_may_leave() -> None:
     viewer = Viewer(SHOWN, "127.0.0.1", free_port())
     viewer.start()

@@ -21,11 +21,12 @@ from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.messages import Message
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.viewer.server import Viewer, vacant_port
+from tests.browser_needed import needs_browser
 from tests.interface.test_model import model
 from tests.train.tiny_capture import tiny_capture, write_tiny_capture
 from tests.viewer.free_port import free_port
 from tests.viewer.test_server import eventually
-from tools.headless import Browser, find_chromium
+from tools.browser import Browser
 
 
 class EnoughError(Exception):
@@ -74,7 +75,7 @@ def stands_still(training: Training) -> bool:
     return training.step == at
 
 
-@pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
+@needs_browser
 def test_a_training_is_drawn_paused_and_saved_while_it_goes_on(tmp_path: Path) -> None:
     with watch(tmp_path / "run") as found:
         eventually(lambda: bool(found.viewers) and found.training.step > 20)
