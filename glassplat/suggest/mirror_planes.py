@@ -95,8 +95,8 @@ def judged(plane: Plane, matches: MirrorMatches, extent: float, reach: float = F
     if len(both):  # Beside the pane a camera may look past it; in the pane it would see the mirror image.
         within = seen_within(plane, matches.seen, matches.virtual[right], matches.real[both])
         wrong[both[within]], right[both[within]] = True, False
-    right, wrong = np.flatnonzero(right), np.flatnonzero(wrong)
-    return MirrorPlane(plane, _places(matches, right, extent), _places(matches, wrong, extent), right)
+    shown = np.flatnonzero(right)
+    return MirrorPlane(plane, _places(matches, shown, extent), _places(matches, np.flatnonzero(wrong), extent), shown)
 
 
 def refined(plane: Plane, matches: MirrorMatches, extent: float) -> Plane:
