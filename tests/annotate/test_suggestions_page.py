@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from glassplat.data.dataset import load_dataset
-from tests.annotate.browser_needed import needs_browser
 from tests.annotate.conftest import true_corners
 from tests.annotate.suggested import suggestions
+from tests.browser_needed import needs_browser
 from tests.init.pane_scene import FRONT
 from tools.browser import wait_until
 from tools.marking_page import MarkingPage, marking_page
