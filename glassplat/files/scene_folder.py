@@ -28,7 +28,8 @@ FILES = (PRIMARY, GLASS, PLANES, ENVIRONMENT, SURROUNDINGS, EXPOSURES, PHOTOGRAP
 LARGEST_COLOR = 1e6
 LARGEST_LOG = 40.0
 """Of a logarithm: its exponential, squared, fits float32."""
-EXTENT = Number(above=0, most=4 * LARGEST_COORDINATE)
+EXTENT = Number(above=1 / LARGEST_COORDINATE, most=4 * LARGEST_COORDINATE)
+"""World units; the squares of smaller ones do not fit float32 either."""
 SH_DEGREE = Whole(0, 3)
 DIRECTION = Nullable(Items(Number(-1.001, 1.001), 3))
 UNIT_TOLERANCE = 1e-3

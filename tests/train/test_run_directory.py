@@ -45,11 +45,14 @@ def test_copies_of_a_scene_under_other_names_are_left_alone(run: Path) -> None:
     [
         ("null", "scene.json is None; expected an object with extent"),
         ("[]", r"scene.json is \[\]; expected an object with extent"),
-        ("{}", "scene.json has no extent; expected a finite number above 0"),
+        ("{}", "scene.json has no extent; expected a finite number above 1e-12"),
         ("", "scene.json is not valid JSON"),
         ("[" * 10**5, "scene.json is nested more than"),
-        ('{"extent": NaN, "active_sh_degree": 0}', "extent of .*scene.json is nan; expected a finite number above 0"),
-        ('{"extent": -1, "active_sh_degree": 0}', "extent of .*scene.json is -1; expected a finite number above 0"),
+        (
+            '{"extent": NaN, "active_sh_degree": 0}',
+            "extent of .*scene.json is nan; expected a finite number above 1e-12",
+        ),
+        ('{"extent": -1, "active_sh_degree": 0}', "extent of .*scene.json is -1; expected a finite number above 1e-12"),
         ('{"extent": "1", "active_sh_degree": 0}', "extent of .*scene.json is '1'; expected a finite number"),
         ('{"extent": 1, "active_sh_degree": 1.5}', "active_sh_degree of .*scene.json is 1.5; expected a whole number"),
         ('{"extent": 1, "active_sh_degree": 3}', r"scene.json and .*point_cloud.ply do not belong together: active_sh"),
