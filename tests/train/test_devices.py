@@ -31,6 +31,7 @@ ON_THE_CPU = (
     "/scene/plane.py",
     "/scene/environment.py",
     "/scene/exposure.py",
+    "/scene/pose_correction.py",
 )
 
 
