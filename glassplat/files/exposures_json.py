@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-import torch
-
-from glassplat.files.atomic import atomic_write
-from glassplat.files.fields import ByName, Items, Number
-from glassplat.files.json_text import read_json
+from glassplat.files.by_photograph import read_by_photograph, write_by_photograph
+from glassplat.files.fields import Items, Number
 from glassplat.scene.exposure import Exposures
 
 LARGEST = 1e3
-TRANSFORMS = ByName(Items(Items(Number(-LARGEST, LARGEST), 4), 3))
+TRANSFORM = Items(Items(Number(-LARGEST, LARGEST), 4), 3)
 
 
 def write_exposures(path: Path, exposures: Exposures) -> None:
     """Writes the transforms by photograph; `read_exposures` returns them exactly."""
-    transforms = dict(zip(exposures.names, exposures.affine.detach().cpu().tolist(), strict=True))
-    with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(transforms, indent=1) + "\n", encoding="utf-8")
+    write_by_photograph(path, exposures.names, exposures.affine)
 
 
 def read_exposures(path: Path) -> Exposures:
@@ -29,6 +23,5 @@ def read_exposures(path: Path) -> Exposures:
     Raises:
         FileNotFoundError, ValueError: the file is missing or foreign; says what is wrong.
     """
-    transforms = TRANSFORMS.read(read_json(path), str(path))
-    names = tuple(transforms)
-    return Exposures(torch.tensor(list(transforms.values()), dtype=torch.float32).reshape(len(names), 3, 4), names)
+    names, affine = read_by_photograph(path, TRANSFORM, (3, 4))
+    return Exposures(affine, names)
