@@ -148,6 +148,24 @@ def test_edges_do_where_no_corner_shows(page: Page) -> None:
     assert is_blue(page.color_at(tuple(true_corners(3).mean(axis=0))))
 
 
+def test_what_changes_while_it_is_saved_is_not_said_to_be_saved(page: Page) -> None:
+    page.mark_true(0)
+    page.window.run(
+        "const asked = window.fetch; window.fetch = async (...request) => {"
+        "  const answer = await asked(...request);"
+        "  if (!window.seen) {"
+        "    window.seen = 'nothing'; document.getElementById('undo').click();"
+        "    setTimeout(() => { window.seen = document.body.dataset.state }, 60);"  # Before the next sending begins.
+        "  }"
+        "  return answer; };"
+    )
+    page.window.press("#undo")
+    page.window.wait("window.seen && window.seen !== 'nothing'", "a change during an answer")
+    assert page.window.run("return window.seen") == "changed"
+    page.saved()
+    assert [len(places) for places in page.document()["corners"]] == [1, 1, 0, 0]
+
+
 def test_what_is_not_to_be_seen_is_skipped(page: Page) -> None:
     for view, hidden in ((0, 1), (1, 3), (2, 0)):
         corners: list = list(true_corners(view))

@@ -17,6 +17,7 @@ let capture, marking, drawing;
 let current = 0, tool = "corner", radius = 20, pending = null, drag = null, gestures = 0;
 let skipped = { corner: new Set(), edge: new Set() }; // In this photograph: what is not to be seen in it.
 let answers = {}, sending = false, waiting = false, saveTimer = null, spaceHeld = false;
+let revision = 0; // Counts changes.
 const images = new Map();
 
 async function ask(path, body) {
@@ -34,6 +35,7 @@ function tell(text, isBad = false) {
 
 // Sends the document a moment after the last change; one request at a time.
 function changed() {
+  revision += 1;
   document.body.dataset.state = "changed";
   clearTimeout(saveTimer);
   saveTimer = setTimeout(send, 120);
@@ -43,11 +45,15 @@ function changed() {
 async function send() {
   if (sending) { waiting = true; return; }
   sending = true;
+  const sent = revision;
   try {
     const answer = await ask("/document", marking.document);
     answers = Object.fromEntries(answer.panes.map((pane) => [pane.label, pane]));
-    if (!waiting) document.body.dataset.state = "saved";
-    tell("saved");
+    // What changed while the answer was on its way is not saved yet, whether or not its own sending has begun.
+    if (revision === sent) {
+      document.body.dataset.state = "saved";
+      tell("saved");
+    }
   } catch (error) {
     document.body.dataset.state = "failed";
     tell(`not saved: ${error.message}`, true);
