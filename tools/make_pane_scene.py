@@ -24,8 +24,8 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import Rotation
 
 from tools.make_demo_scene import TEST_EVERY, srgb_from_linear
-from tools.make_scenes import GOLDEN_ANGLE_RAD, as_bytes, world_from_opengl
-from tools.pane_draws import OPENGL_FROM_CAM, DrawnPlace, draw_place, standing_pane
+from tools.make_scenes import GOLDEN_ANGLE_RAD, as_bytes
+from tools.pane_draws import DrawnPlace, draw_place, standing_pane, world_from_cam
 from tools.pane_tracer import Array, Ball, Box, Place, Seen
 from tools.photographer_body import passer_by, photographer
 from tools.window_place import window_place, window_poses
@@ -106,7 +106,7 @@ def camera_poses(count: int, seed: int) -> list[Array]:
             # Across the room, past the panes.
             turned = Rotation.from_euler("z", 180 + generator.choice([-55, 55]), degrees=True).as_matrix() @ around
             target = position + turned + [0, 0, generator.uniform(-0.35, 0.25)]
-        poses.append(world_from_opengl(position, target) @ OPENGL_FROM_CAM)
+        poses.append(world_from_cam(position, target))
     return poses
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tools.make_scenes import world_from_opengl
+from tools.make_scenes import GOLDEN_ANGLE_RAD, world_from_opengl
 from tools.pane_tracer import Array, Ball, Box, Lamp, Pane, Place, Thing
 
 Generator = np.random.Generator
@@ -58,6 +58,11 @@ def draw_place(seed: int, views: int) -> DrawnPlace:
     all_around = generator.random() < 0.5
     poses = [_draw_pose(generator, place, all_around, number) for number in range(views)]
     return DrawnPlace(place, poses)
+
+
+def world_from_cam(position: Array, target: Array) -> Array:
+    """Camera-to-world [4, 4], OpenCV axes, of an upright camera at `position` [3] that looks at `target` [3]."""
+    return world_from_opengl(position, target) @ OPENGL_FROM_CAM
 
 
 def standing_pane(
@@ -158,7 +163,7 @@ def _draw_pose(generator: Generator, place: Place, all_around: bool, number: int
     if number % LOOK_AROUND == LOOK_AROUND - 1:
         azimuth = generator.uniform(0, 2 * math.pi)
         target = position + np.array([math.cos(azimuth), math.sin(azimuth), generator.uniform(-0.4, 0.2)])
-    return world_from_opengl(position, target) @ OPENGL_FROM_CAM
+    return world_from_cam(position, target)
 
 
 def _draw_position(generator: Generator, place: Place, all_around: bool) -> Array:
@@ -178,7 +183,7 @@ def _draw_position(generator: Generator, place: Place, all_around: bool) -> Arra
 def is_clear(place: Place, position: Array) -> bool:
     """Whether nothing is nearer to a position [3] than `CLEARANCE`, panes included, and no thing is around it."""
     z = np.linspace(-1, 1, 64)
-    turn = math.pi * (3 - math.sqrt(5)) * np.arange(64)
+    turn = GOLDEN_ANGLE_RAD * np.arange(64)
     flat = np.sqrt(1 - z**2)
     directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
     origins = np.broadcast_to(position, directions.shape)

@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from tools.make_scenes import world_from_opengl
-from tools.pane_draws import OPENGL_FROM_CAM
+from tools.pane_draws import world_from_cam
 from tools.pane_tracer import Array, Ball, Box, Pane, Place
 
 WINDOW_HEIGHT = 1.25
@@ -46,5 +45,5 @@ def window_poses(count: int, seed: int) -> list[Array]:
             target = position + np.array([math.cos(angle), math.sin(angle), generator.uniform(-0.3, 0.2)])
         else:
             target = np.array([generator.uniform(-0.6, 0.6), 0.0, generator.uniform(0.85, 1.4)])
-        poses.append(world_from_opengl(position, target) @ OPENGL_FROM_CAM)
+        poses.append(world_from_cam(position, target))
     return poses

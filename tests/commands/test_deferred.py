@@ -19,7 +19,7 @@ from glassplat.interface import layers
 from glassplat.render.environment import equirect_from_environment
 from glassplat.scene.environment import Environment
 from glassplat.train.checkpoint import load_checkpoint
-from tests.train.object_capture import write_object_capture
+from tests.train.object_capture import few_steps, write_object_capture
 
 LAYERS = layers.LAYERS["deferred"]
 
@@ -29,17 +29,7 @@ def run(tmp_path: Path) -> Path:
     """A run of a few steps, whose capture knows its environment."""
     capture = write_object_capture(tmp_path / "ball")
     write_equirect(capture / "environment.exr", 0.2 + 0.6 * torch.rand(8, 16, 3))
-    options = [
-        "--data",
-        str(capture),
-        "--output",
-        str(tmp_path / "run"),
-        "--iterations",
-        "12",
-        "--least-iterations",
-        "1",
-    ]
-    assert main(["train", "deferred", *options, "--sh-degree", "1", "--texels", "8", "--first-texels", "4"]) == 0
+    assert main(["train", "deferred", *few_steps(capture, tmp_path / "run")]) == 0
     return tmp_path / "run"
 
 

@@ -13,7 +13,7 @@ from glassplat.cli import main
 from glassplat.commands.stored_run import open_run
 from glassplat.interface import layers
 from glassplat.train.checkpoint import load_checkpoint
-from tests.train.object_capture import write_object_capture
+from tests.train.object_capture import few_steps, write_object_capture
 
 LAYERS = layers.LAYERS["traced"]
 
@@ -22,17 +22,7 @@ LAYERS = layers.LAYERS["traced"]
 def run(tmp_path: Path) -> Path:
     """A run of a few steps."""
     capture = write_object_capture(tmp_path / "ball")
-    options = [
-        "--data",
-        str(capture),
-        "--output",
-        str(tmp_path / "run"),
-        "--iterations",
-        "12",
-        "--least-iterations",
-        "1",
-    ]
-    options += ["--surroundings.start.cells", "3", "--sh-degree", "1", "--texels", "8", "--first-texels", "4"]
+    options = [*few_steps(capture, tmp_path / "run"), "--surroundings.start.cells", "3"]
     assert main(["train", "traced", *options]) == 0
     return tmp_path / "run"
 

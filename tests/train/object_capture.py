@@ -73,3 +73,9 @@ def write_object_capture(root: Path) -> Path:
     rows = np.concatenate([positions, np.tile(COLOR, (POINTS, 1))], axis=1).astype(np.float32)
     write_table(root / "points3d.ply", ["x", "y", "z", "red", "green", "blue"], rows)
     return root
+
+
+def few_steps(capture: Path, output: Path) -> list[str]:
+    """Options of a run of a few small steps that `train` takes for `deferred` and `traced`."""
+    run = ["--data", str(capture), "--output", str(output), "--iterations", "12", "--least-iterations", "1"]
+    return [*run, "--sh-degree", "1", "--texels", "8", "--first-texels", "4"]
