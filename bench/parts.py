@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -82,17 +82,17 @@ def add_step(stage: Seconds, kernels: Seconds, taken: float) -> None:
         stage[name] += seconds
 
 
-def parts_table(costs: Costs, title: str) -> Table:
+def parts_table(costs: Mapping[str, Mapping[str, float]], title: str) -> Table:
     """Milliseconds of a step by part, for each stage."""
     note = "Milliseconds of processor time a step on one thread, but for the rows that say otherwise."
-    table = Table(title, ("part", *costs), note)
-    table.add("steps", *(int(stage[STEPS]) for stage in costs.values()))
-    table.add(f"{BEFORE}, seconds in all", *(stage[BEFORE] for stage in costs.values()))
-    kernels = {part for stage in costs.values() for part in stage} - {STEPS, BEFORE, TOTAL, BETWEEN}
-    shares = {k: max(stage[k] / max(stage[TOTAL], 1e-9) for stage in costs.values()) for k in kernels}
+    table, stages = Table(title, ("part", *costs), note), list(costs.values())
+    table.add("steps", *(round(stage.get(STEPS, 0)) for stage in stages))
+    table.add(f"{BEFORE}, seconds in all", *(stage.get(BEFORE, 0.0) for stage in stages))
+    kernels = {part for stage in stages for part in stage} - {STEPS, BEFORE, TOTAL, BETWEEN}
+    shares = {k: max(stage.get(k, 0.0) / max(stage.get(TOTAL, 0.0), 1e-9) for stage in stages) for k in kernels}
     shown = sorted((k for k in kernels if shares[k] >= LEAST_SHARE), key=shares.__getitem__, reverse=True)
     for part in (TOTAL, BETWEEN, *shown):
-        means = (1e3 * stage[part] / max(1.0, stage[STEPS]) for stage in costs.values())
+        means = (1e3 * stage.get(part, 0.0) / max(1.0, stage.get(STEPS, 0)) for stage in stages)
         table.add(part.removesuffix("_float32"), *means)
     return table
 

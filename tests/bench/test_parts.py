@@ -41,7 +41,7 @@ def test_every_second_belongs_to_one_part() -> None:
 
 
 def test_the_table_tells_what_a_step_takes_on_average() -> None:
-    table = parts_table({"only": {STEPS: 2, BEFORE: 3.0, TOTAL: 0.4, BETWEEN: 0.1, "blend_float32": 0.3}}, "A run")  # type: ignore[arg-type]
+    table = parts_table({"only": {STEPS: 2, BEFORE: 3.0, TOTAL: 0.4, BETWEEN: 0.1, "blend_float32": 0.3}}, "A run")
     assert table.rows == [
         ("steps", "2"),
         ("before its first step, seconds in all", "3"),
