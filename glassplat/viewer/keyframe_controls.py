@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -13,6 +14,7 @@ from glassplat.publish.camera_paths import interpolated
 from glassplat.scene.camera import Camera
 from glassplat.viewer.pane_controls import wxyz_of
 
+MOST_KEYFRAMES = 200
 FRUSTUM_SHARE = 0.06
 """Size of a keyframe in the view, of the scene's extent."""
 PLAYED_PER_SECOND, SECONDS_BETWEEN = 8, 2
@@ -55,7 +57,7 @@ class KeyframeControls:
     def add(self) -> None:
         """One more keyframe, where the client stands."""
         camera = self._camera()
-        if camera is None:
+        if camera is None or len(self.keyframes) == MOST_KEYFRAMES:
             return
         self.keyframes.append(camera)
         rotation = Rotation.from_matrix(camera.cam_from_world[:3, :3].double().numpy().T)
@@ -81,14 +83,19 @@ class KeyframeControls:
             self._count.content = self._counted()
 
     def play(self, go: Callable[[Camera], None]) -> None:
-        """Moves the client along the path as the film will, or stops that; called by a thread that may wait."""
+        """Begins to move the client along the path as the film will, or stops that."""
         if self._is_playing or len(self.keyframes) < 2:
             self._is_playing = False
             return
         self._is_playing = True
-        for camera in interpolated(self.keyframes, (len(self.keyframes) - 1) * SECONDS_BETWEEN * PLAYED_PER_SECOND + 1):
+        frames = (len(self.keyframes) - 1) * SECONDS_BETWEEN * PLAYED_PER_SECOND + 1
+        # A thread of its own: viser has few, and all clients share them.
+        threading.Thread(target=self._play, args=(interpolated(self.keyframes, frames), go), daemon=True).start()
+
+    def _play(self, path: list[Camera], go: Callable[[Camera], None]) -> None:
+        for camera in path:
             if not self._is_playing:
-                break
+                return
             go(camera)
             time.sleep(1 / PLAYED_PER_SECOND)
         self._is_playing = False

@@ -51,7 +51,7 @@ def test_a_browser_is_shown_sharp_pictures_and_may_leave() -> None:
             (client,) = viewer._clients.values()
             shown.clear()
             client.stand_at(2)
-            client._glass.value = "mirror"
+            client._panes._glass.value = "mirror"
             eventually(lambda: any(shown))
             eventually(lambda: "Layer" in browser.evaluate("document.body.innerText"))
             client.keep_scene("mine")
