@@ -14,9 +14,10 @@ from torch import Tensor
 from glassplat.data.dataset import Dataset
 from glassplat.evaluate.layer_image import layer_image
 from glassplat.init.glass import with_pane
-from glassplat.interface.layers import Layer, check_layers, layers_of, renderer_with
+from glassplat.interface.layers import Layer, check_layers, layers_of
 from glassplat.publish.camera_paths import orbit
 from glassplat.render.frame import Frame, Renderer
+from glassplat.render.layers import renderer_with
 from glassplat.scene import plane_edits
 from glassplat.scene.camera import Camera
 from glassplat.scene.plane import Planes
