@@ -181,6 +181,16 @@ def lane_of(x, y):
 
 
 @inlined
+def list_plain_block(entries, pairs, first, last, block):
+    """As `list_block`, where none of the fetched splats is glass."""
+    count = 0
+    for p in range(first, last):
+        entries[count] = np.int32(p - first)
+        count += (item(pairs, p) >> block) & 1
+    return count
+
+
+@inlined
 def list_block(entries, pairs, first, last, block):
     """Lists which of the fetched splats reach a block, glass as the complement; returns how many there are."""
     count = 0
