@@ -15,7 +15,6 @@ import numpy as np
 from numba import prange
 
 from glassplat.kernels.composite import cpu_tile as tile
-from glassplat.kernels.composite.cpu_forward import TILES
 from glassplat.kernels.composite.cpu_pair_rows import PAIR_VALUES
 from glassplat.kernels.composite.cpu_tile import exponent, lane_of
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
@@ -312,7 +311,7 @@ def composite_backward(real: type, probed: bool) -> Kernel:
     load_gradients, load_deviation = _load_gradients(real), _load_deviation(real)
     zero = real(0.0)
     LANES, PIXELS, STATE, CHUNK, GLASS = tile.LANES, tile.PIXELS, tile.STATE, tile.CHUNK, tile.GLASS
-    ORDER, REACHED = tile.ORDER, (1 << tile.BLOCKS) - 1
+    ORDER, REACHED, TILES = tile.ORDER, (1 << tile.BLOCKS) - 1, tile.TILES
 
     @kernel("composite_backward_probed" if probed else "composite_backward", real)
     def backward(

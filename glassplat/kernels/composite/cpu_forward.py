@@ -22,8 +22,6 @@ from glassplat.kernels.splats import LEAST_ALPHA
 # Planes of a tile's results; SUMS has one per channel. T_AGAIN, CENTER, DEVIATION and LEAN belong to the second
 # traversal, which sums distances from the mean that the first one has found.
 MASK, T_AGAIN, CENTER, DEVIATION, LEAN, SUMS = (plane * tile.PIXELS for plane in range(6))
-TILES = 4
-"""Tiles of a task, which asks for memory once for all of them."""
 STOP_AFTER = 8
 """Splats after which a block looks whether all of its pixels have stopped."""
 
@@ -155,32 +153,6 @@ def _deviate_block(real: type) -> Scalar:
     return deviate_block
 
 
-def _begin(real: type) -> Scalar:
-    full = vector_kind(real, tile.LANES).full
-    zero, one, never = real(0.0), real(1.0), real(-1.0)
-    BLOCK, ACROSS, LANES = tile.BLOCK, tile.ACROSS, tile.LANES
-    T, LAST, T_GLASS, LAST_GLASS = tile.T, tile.LAST, tile.T_GLASS, tile.LAST_GLASS
-
-    @inlined
-    def begin(state, at, columns, rows):
-        """Fresh transmittances; pixels beyond the image's edge start as stopped. Returns bits of blocks that run."""
-        running = np.int64(0)
-        for b in range(tile.BLOCKS):
-            x, y, i = b % ACROSS * BLOCK, b // ACROSS * BLOCK, at + b * LANES
-            running |= np.int64(x < columns and y < rows) << b
-            store(state, i + T, full(one))
-            store(state, i + T_GLASS, full(one))
-            store(state, i + LAST, full(never))
-            store(state, i + LAST_GLASS, full(never))
-            if x + BLOCK > columns or y + BLOCK > rows:
-                for lane in range(LANES):
-                    if x + lane % BLOCK >= columns or y + lane // BLOCK >= rows:
-                        state[i + T + lane] = zero
-        return running
-
-    return begin
-
-
 def _clear(real: type) -> Scalar:
     full, zero, LANES, PIXELS = vector_kind(real, tile.LANES).full, real(0.0), tile.LANES, tile.PIXELS
 
@@ -193,20 +165,6 @@ def _clear(real: type) -> Scalar:
             store(planes, i, full(zero))
 
     return clear
-
-
-def _finish(real: type) -> Scalar:
-    load = vector_kind(real, tile.LANES).load
-    LANES, PIXELS, T, T_GLASS = tile.LANES, tile.PIXELS, tile.T, tile.T_GLASS
-
-    @inlined
-    def finish(state, at):
-        """Takes off the signs that tell which pixels have stopped."""
-        for i in range(0, PIXELS, LANES):
-            store(state, at + T + i, absolute(load(state, at + T + i)))
-            store(state, at + T_GLASS + i, absolute(load(state, at + T_GLASS + i)))
-
-    return finish
 
 
 def _write_tile(real: type) -> Scalar:
@@ -297,10 +255,11 @@ def composite_forward(real: type) -> Kernel:
     pack, place, fetch, reached, _ = tile.tile_functions(real)
     blend_plain, blend_mixed = _blend_block(real, False), _blend_block(real, True)
     blend_more, deviate_block = _blend_more(real), _deviate_block(real)
-    begin, clear, finish, write_tile = _begin(real), _clear(real), _finish(real), _write_tile(real)
+    begin, clear, finish, write_tile = tile.begin_state(real), _clear(real), tile.finish_state(real), _write_tile(real)
     begin_deviation, zero = _begin_deviation(real), real(0.0)
     BLOCK, ACROSS, BLOCKS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.BLOCKS, tile.LANES, tile.PIXELS
     VALUES, ORDER, CHUNK, GLASS, STATE = tile.VALUES, tile.ORDER, tile.CHUNK, tile.GLASS, tile.STATE
+    TILES = tile.TILES
 
     @kernel("composite_forward", real)
     def forward(
