@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import json
+import shutil
 import struct
 from collections.abc import Callable
 from contextlib import suppress
@@ -14,24 +16,42 @@ from typing import Any
 import gsply
 import numpy as np
 import torch
+from PIL import Image
 
+from glassplat.annotate.document import FILE, read_document
 from glassplat.data.colmap_model import read_model
+from glassplat.data.dataset import View
+from glassplat.data.mask_values import read_mask_values
+from glassplat.data.normal_maps import estimated_normals
 from glassplat.data.transforms import load_transforms
+from glassplat.densify.default import ScreenStatistics
 from glassplat.files.cameras_json import read_cameras, write_cameras
 from glassplat.files.environment_file import read_environment, write_environment
+from glassplat.files.environment_image import read_equirect, write_equirect
 from glassplat.files.exposures_json import read_exposures, write_exposures
 from glassplat.files.glb import write_glb
+from glassplat.files.images import read_image
 from glassplat.files.planes_json import read_planes, write_planes
 from glassplat.files.ply import write_gaussians
 from glassplat.files.scene_folder import read_scene, write_scene
 from glassplat.files.splat_files import drawable, read_splats
 from glassplat.files.spz import HEADER, MAGIC, write_spz
+from glassplat.publish.kept_pictures import KeptPictures
 from glassplat.scene.camera import Camera
 from glassplat.scene.environment import Environment
 from glassplat.scene.exposure import Exposures
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
+from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
+from glassplat.train.optimizer import Optimizer
+from glassplat.train.recipe import RECIPES, recipe_to_json
+from glassplat.train.run_directory import RunDirectory, RunSettings
+from glassplat.train.run_log import lines_until
+from glassplat.train.state import TrainState
+
+LARGEST_PICTURE_MIB = 2048
+"""At the 134 megapixels that are the most which is read."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +62,15 @@ class Reader:
         name: of the file that it is given, in a folder of its own.
         read: reads it; may raise ValueError or FileNotFoundError.
         seeds: writes files to begin with into a folder.
+        longest: bytes of a file.
+        most_mib: at once.
     """
 
     name: str
     read: Callable[[Path], Any]
     seeds: Callable[[Path], None]
+    longest: int = 4096
+    most_mib: int = 512
 
 
 def gaussians_of(coefficients: int, count: int = 3) -> Gaussians:
@@ -145,6 +169,87 @@ def _transforms(path: Path) -> None:
         assert capture is None or capture.shots is not None
 
 
+def _checkpoint_seeds(folder: Path) -> None:
+    scene = Scene(gaussians_of(1), 1.0, planes=planes_of())
+    parameters = scene.parameters()
+    state = TrainState(
+        scene,
+        seed=3,
+        step=7,
+        optimizer=Optimizer(
+            {name: (torch.zeros_like(t), torch.ones_like(t)) for name, t in parameters.items()},
+            updates=dict.fromkeys(parameters, 7),
+        ),
+        statistics={"primary": ScreenStatistics.zeros(len(scene.primary))},
+        records={"grew": 4.0},
+        method="planar",
+    )
+    save_checkpoint(folder / "a.safetensors", state)
+
+
+def _recipe_seeds(folder: Path) -> None:
+    for method, recipe in RECIPES.items():
+        (folder / f"{method}.json").write_text(recipe_to_json(recipe()))
+
+
+def _settings_seeds(folder: Path) -> None:
+    (folder / "a.json").write_text(json.dumps(dataclasses.asdict(RunSettings("/capture", 7000))))
+
+
+def _log_seeds(folder: Path) -> None:
+    (folder / "a.jsonl").write_text("".join(json.dumps({"message": "StepDone", "step": k}) + "\n" for k in range(3)))
+
+
+def _annotations_seeds(folder: Path) -> None:
+    corners = [{"0.png": [1.0, 2.0], "1.png": [3.0, 4.0]} for _ in range(4)]
+    stroke = {"kind": "brush", "effect": "cut", "radius": 3.0, "points": [[1.0, 2.0], [3.0, 4.0]]}
+    pane = {"label": 1, "material": "glass", "shape": "rectangle", "corners": corners, "edges": []}
+    (folder / "a.json").write_text(json.dumps({"version": 1, "panes": [{**pane, "strokes": {"0.png": [stroke]}}]}))
+
+
+def _annotations(path: Path) -> None:
+    read_document(path.parent)
+
+
+def _film_seeds(folder: Path) -> None:
+    (folder / "a.json").write_text(json.dumps({"--layers": ["rgb"], "--fps": 30}))
+
+
+def _film(path: Path) -> None:
+    kept = KeptPictures(path.parent / "film.mp4")
+    kept.folder.mkdir(exist_ok=True)
+    shutil.copy(path, kept.folder / path.name)
+    kept.check_same({"--layers": ["rgb"], "--fps": 30})
+
+
+def _picture_seeds(folder: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (5, 7, 4), dtype=np.uint8)
+    color = Image.fromarray(pixels[..., :3])
+    for suffix in ("png", "jpg", "webp", "bmp", "tif", "gif", "ppm", "tga", "jp2"):
+        color.save(folder / f"color.{suffix}")
+    Image.fromarray(pixels).save(folder / "transparent.png")
+    Image.fromarray(pixels[..., 0].astype(np.uint16) * 257).save(folder / "deep.png")
+    color.quantize(4).save(folder / "palette.png")
+
+
+def _mask_seeds(folder: Path) -> None:
+    labels = np.random.default_rng(0).integers(0, 3, (5, 7), dtype=np.uint8)
+    Image.fromarray(labels).save(folder / "labels.png")
+    Image.fromarray(255 * (labels > 0).astype(np.uint8)).save(folder / "white.png")
+    Image.fromarray(labels.astype(np.uint16)).save(folder / "deep.png")
+
+
+def _normals(path: Path) -> None:
+    beside = path.parent / "normals"
+    beside.mkdir(exist_ok=True)
+    shutil.copy(path, beside / path.name)
+
+    def no_photograph() -> torch.Tensor:
+        raise FileNotFoundError
+
+    estimated_normals(View("a.png", camera_of(), path.parent / "a.png", no_photograph))
+
+
 READERS: dict[str, Reader] = {
     "ply": Reader("a.ply", _splats, _ply_seeds),
     "compressed": Reader("a.ply", _splats, _compressed_seeds),
@@ -168,4 +273,16 @@ READERS: dict[str, Reader] = {
     "scene": Reader("scene.json", lambda path: read_scene(path.parent), _scene_seeds),
     "transforms": Reader("transforms.json", _transforms, _transforms_seeds),
     "colmap": Reader("model.bin", _colmap, _colmap_seeds),
+    "checkpoint": Reader("checkpoint.safetensors", load_checkpoint, _checkpoint_seeds, longest=16_384),
+    "recipe": Reader("recipe.json", lambda path: RunDirectory(path.parent).recipe(), _recipe_seeds, longest=16_384),
+    "settings": Reader("settings.json", lambda path: RunDirectory(path.parent).settings(), _settings_seeds),
+    "log": Reader("log.jsonl", lambda path: lines_until(path, 10), _log_seeds),
+    "annotations": Reader(FILE, _annotations, _annotations_seeds),
+    "film": Reader("film.json", _film, _film_seeds),
+    "photograph": Reader("a.png", read_image, _picture_seeds, most_mib=LARGEST_PICTURE_MIB),
+    "mask": Reader("a.png", read_mask_values, _mask_seeds, most_mib=LARGEST_PICTURE_MIB),
+    "panorama": Reader(
+        "a.exr", read_equirect, lambda folder: write_equirect(folder / "a.exr", torch.rand(4, 8, 3)), most_mib=2048
+    ),
+    "normals": Reader("a.npy", _normals, lambda folder: np.save(folder / "a.npy", np.ones((2, 3, 3), np.float32))),
 }

@@ -17,12 +17,15 @@ Mask = NDArray[np.bool_]
 NEAR = 1e-3
 """Camera z before which an outline is cut off, as a share of its largest distance."""
 FARTHEST = 1e5
-"""Pixels beyond which a point of an outline is as good as at infinity."""
+"""Pixels beyond which a point of a stroke is as good as at infinity."""
 
 
 def seen_outline(eye: Eye, corners: Array) -> Array:
-    """[P, 2] the outline of a polygon [K, 3] in a view, cut off where it passes the camera; empty if it is behind."""
-    return np.clip(eye.pixels(_before_camera(eye.in_camera(corners))), -FARTHEST, FARTHEST)
+    """[P, 2] the outline of a polygon [K, 3] in a view, cut off where it passes the camera; empty if it is behind.
+
+    It reaches far beside the photograph there, which keeps its edges straight: 1 / `NEAR` focal lengths at most.
+    """
+    return eye.pixels(_before_camera(eye.in_camera(corners)))
 
 
 def _before_camera(points: Array) -> Array:

@@ -87,18 +87,8 @@ def fitted_pane(marks: Marks, eyes: Sequence[Eye], shape: Shape) -> PaneFit:
     Raises:
         TooFewMarksError: a corner of too few is known from two places; the message says what to mark.
     """
-    from scipy.optimize import least_squares
-
-    start = polygon_pane(_first_corners(marks, eyes))
-    begun: PaneShape = rectangle_pane(start) if shape == "rectangle" and len(marks.corners) == 4 else start
-
-    def residuals(step: Array) -> Array:
-        return mark_residuals(marks, eyes, begun.stepped(step))
-
-    step = np.zeros(begun.freedom)
-    for loss in ("soft_l1", "cauchy"):  # The second lets go of what is far off, and would stay there if it came first.
-        step = least_squares(residuals, step, loss=loss, f_scale=OUTLIER, x_scale="jac", max_nfev=100).x
-    fitted = begun.stepped(step)
+    fits = [_fitted(marks, eyes, start) for start in _starts(marks, eyes, shape)]
+    _, fitted = min(fits, key=lambda fit: fit[0])
     away = mark_residuals(marks, eyes, fitted)
     jacobian = _jacobian(marks, eyes, fitted)
     spread = max(1.0, float(np.sqrt((away**2).sum() / max(len(away) - fitted.freedom, 1))))
@@ -106,6 +96,20 @@ def fitted_pane(marks: Marks, eyes: Sequence[Eye], shape: Shape) -> PaneFit:
     largest = {view: max(one for number, one in pixels if number == view) for view in marks.views()}
     error = float(np.sqrt(np.mean([one**2 for _, one in pixels])))
     return PaneFit(fitted, error, largest, jacobian.T @ jacobian / spread**2)
+
+
+def _fitted(marks: Marks, eyes: Sequence[Eye], begun: PaneShape) -> tuple[float, PaneShape]:
+    """What marks leave unexplained, and the shape that is nearest to them from where it begins."""
+    from scipy.optimize import least_squares
+
+    def residuals(step: Array) -> Array:
+        return mark_residuals(marks, eyes, begun.stepped(step))
+
+    step, cost = np.zeros(begun.freedom), np.inf
+    for loss in ("soft_l1", "cauchy"):  # The second lets go of what is far off, and would stay there if it came first.
+        found = least_squares(residuals, step, loss=loss, f_scale=OUTLIER, x_scale="jac", max_nfev=100)
+        step, cost = found.x, float(found.cost)
+    return cost, begun.stepped(step)
 
 
 def mark_residuals(marks: Marks, eyes: Sequence[Eye], shape: PaneShape) -> Array:
@@ -157,6 +161,53 @@ def _across(line: Array, places: Array) -> Array:
 
 def _pixel_distances(marks: Marks, eyes: Sequence[Eye], shape: PaneShape) -> list[tuple[int, float]]:
     return [(view, float(np.linalg.norm(away))) for view, away in _distances(marks, eyes, shape)]
+
+
+def _starts(marks: Marks, eyes: Sequence[Eye], shape: Shape) -> list[PaneShape]:
+    """Outlines to begin with, one at least.
+
+    An edge of one view only says nothing about the plane, but how far a pane goes: the second start is the pane that
+    all other marks give, which such edges cut off.
+
+    Raises:
+        TooFewMarksError: the marks leave the plane open.
+    """
+    corners = [_first_corners(marks, eyes)]
+    loose = [number for number, places in enumerate(marks.edges) if len(places) == 1]
+    if loose:
+        firm = Marks(marks.corners, [{} if number in loose else places for number, places in enumerate(marks.edges)])
+        corners += [_cut_by_edges(marks, eyes, fitted_pane(firm, eyes, shape).shape, loose)]
+    starts = [polygon_pane(one) for one in corners]
+    return [rectangle_pane(start) if shape == "rectangle" and len(marks.corners) == 4 else start for start in starts]
+
+
+def _cut_by_edges(marks: Marks, eyes: Sequence[Eye], pane: PaneShape, loose: Sequence[int]) -> Array:
+    """[K, 3] the corners of a pane, some edges of which are moved to where one view shows them."""
+    corners = pane.corners()
+    for number in loose:
+        corners = _cut_at(corners, number, _line_on_plane(marks.edges[number], eyes, pane))
+    return corners
+
+
+def _cut_at(corners: Array, edge: int, line: tuple[Array, Array] | None) -> Array:
+    """[K, 3] an outline, one edge of which is moved to a line in its plane."""
+    around = [corners[(edge + step) % len(corners)] for step in (-1, 0, 1, 2)]
+    first, second = (_meeting(line, (around[before], around[before + 1])) for before in (0, 2))
+    found = corners.copy()
+    if first is not None and second is not None:
+        found[edge], found[(edge + 1) % len(corners)] = first, second
+    return found
+
+
+def _line_on_plane(places: Mapping[int, Array], eyes: Sequence[Eye], pane: PaneShape) -> tuple[Array, Array] | None:
+    """Where the two sight lines of an edge that one view shows meet a pane's plane; None if they run away from it."""
+    ((view, ends),) = places.items()
+    rays, normal, center = eyes[view].rays(np.asarray(ends)), pane.frame[2], eyes[view].center
+    heights, slopes = (pane.corners().mean(axis=0) - center) @ normal, rays @ normal
+    if (slopes * heights <= 1e-3 * abs(heights)).any():
+        return None
+    first, second = center + rays * (heights / slopes)[:, None]
+    return first, second
 
 
 def _first_corners(marks: Marks, eyes: Sequence[Eye]) -> Array:

@@ -17,8 +17,9 @@ from glassplat.commands.stored_run import Split, chosen_views, open_run, photogr
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.evaluate.layer_image import layer_image
 from glassplat.files.images import write_image
-from glassplat.interface.layers import Layer, check_layers, renderer_with
+from glassplat.interface.layers import Layer, check_layers
 from glassplat.kernels.devices import DeviceName
+from glassplat.render.layers import renderer_with
 
 
 @dataclass(frozen=True)

@@ -52,13 +52,18 @@ def open_run(path: Path, device: DeviceName = "auto", data: Path | None = None) 
     with input_checked():
         recorded.renderer().check(scene)
     scene = scene.to(chosen_device(device))
-    dataset = with_corrected_cameras(_capture(directory, recorded, data), scene)
+    dataset = with_corrected_cameras(capture_of(directory, recorded, data), scene)
     recipe = settled(recorded, dataset)
     return StoredRun(directory, recipe, scene, recipe.renderer(), dataset, iterations)
 
 
-def _capture(directory: RunDirectory, recipe: Any, moved: Path | None) -> Dataset:
-    """The capture of a run, where it was or where it is said to be now; of an imported scene its cameras alone."""
+def capture_of(directory: RunDirectory, recipe: Any, moved: Path | None = None) -> Dataset:
+    """The capture of a run, where it was or where it is said to be now; of an imported scene its cameras alone.
+
+    Raises:
+        InputError: it cannot be read, or is another one.
+        FileNotFoundError: it is no longer where it was.
+    """
     if directory.imported.is_file() and moved is None:
         return _without_photographs(directory)
     settings = directory.settings()

@@ -99,7 +99,7 @@ class Train(Generic[RecipeKind]):
             return
         from glassplat.commands.view import announce
         from glassplat.interface.watching import WatchedTraining
-        from glassplat.viewer.server import LOCAL, vacant_port
+        from glassplat.viewer.ports import LOCAL, vacant_port
 
         watched = WatchedTraining(
             training, dataset, host=LOCAL, port=vacant_port(LOCAL), announce=lambda viewer: announce(viewer, console)

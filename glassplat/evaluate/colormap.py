@@ -28,6 +28,8 @@ LABEL_COLORS = (
     (213, 94, 0),
     (160, 160, 160),
 )
+ERROR_SCALE = 0.2
+"""The colour error that is drawn brightest; the same everywhere, so that pictures can be compared."""
 COVERED = 0.5
 """Below this coverage a pixel has no depth worth showing."""
 
@@ -39,6 +41,12 @@ def heat_colors(values: Tensor) -> Tensor:
     lower = position.floor().clamp(max=len(HEAT_STOPS) - 2).long()
     share = (position - lower)[..., None]
     return stops[lower] * (1 - share) + stops[lower + 1] * share
+
+
+def error_colors(image: Tensor, photo: Tensor) -> Tensor:
+    """Colours [H, W, 3] in [0, 1] of how far an image [H, W, 3] is from a photograph [H, W, 3] of 0 to 255, by mean."""
+    error = (image.clamp(0, 1) - photo.to(image) / 255).abs().mean(dim=-1)
+    return heat_colors(error / ERROR_SCALE)
 
 
 def depth_colors(depth: Tensor, alpha: Tensor | None = None) -> Tensor:

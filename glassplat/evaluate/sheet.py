@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from glassplat.evaluate.colormap import depth_colors, heat_colors, label_colors, normal_colors
+from glassplat.evaluate.colormap import ERROR_SCALE, depth_colors, error_colors, label_colors, normal_colors
 from glassplat.evaluate.metrics import quantized
 from glassplat.evaluate.surface_truth import NOTHING_KNOWN, TrueSurface
 from glassplat.evaluate.truth import TrueView
@@ -22,8 +21,6 @@ MARGIN, GAP = 16, 10
 CAPTION_HEIGHT, TITLE_HEIGHT = 24, 34
 CAPTION_SIZE, TITLE_SIZE = 15, 19
 BACKGROUND, TEXT, QUIET_TEXT = (22, 24, 28), (236, 236, 236), (160, 166, 174)
-ERROR_SCALE = 0.2
-"""The colour error that is drawn brightest; the same in every sheet, so that sheets can be compared."""
 SMALLEST_STRENGTH_SCALE = 0.05
 COLORED = ("transmission", "base", "reflection", "environment")
 COLUMNS = (*COLORED, "strength", "normal", "mask")
@@ -92,11 +89,10 @@ def composed(rows: Sequence[Row], title: str, subtitle: str) -> NDArray[np.uint8
 
 
 def _image_row(frame: Frame, photo: Tensor) -> list[Panel]:
-    error = (frame.photographed.clamp(0, 1) - photo.to(torch.float32) / 255).abs().mean(dim=-1)
     row = [
         Panel("photograph", photo),
         Panel("render", frame.photographed),
-        Panel(f"error (brightest: {ERROR_SCALE:g} and more)", heat_colors(error / ERROR_SCALE)),
+        Panel(f"error (brightest: {ERROR_SCALE:g} and more)", error_colors(frame.photographed, photo)),
     ]
     if "photographed" in frame.layers:
         row.append(Panel("without the photographer", frame.rgb))

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, Literal
 
 from glassplat.data.errors import InputError
-from glassplat.render.deferred import Deferred
-from glassplat.render.frame import Renderer
-from glassplat.render.planar import with_photographer
-from glassplat.render.traced import Traced
+from glassplat.render.layers import PHOTOGRAPHED
 
 Layer = Literal[
     "rgb",
@@ -40,9 +36,6 @@ LAYERS: dict[str, tuple[Layer, ...]] = {
 DISC_LAYERS: tuple[Layer, ...] = ("rgb", "normal", "depth", "median_depth", "alpha")
 """What `splat` renders of discs."""
 
-PHOTOGRAPHED: Layer = "photographed"
-"""The image with whom the panes of a photograph show, of runs that looked for somebody."""
-
 
 def layers_of(recipe: Any) -> tuple[Layer, ...]:
     """What a run of a recipe renders that is worth looking at."""
@@ -62,12 +55,3 @@ def check_layers(layers: Sequence[str], recipe: Any) -> None:
     if foreign or not layers:
         asked = f"renders no layer {', '.join(foreign)}" if foreign else "renders nothing without --layers"
         raise InputError(f"{method} {asked}; expected --layers out of {', '.join(known)}")
-
-
-def renderer_with(renderer: Renderer, layers: Sequence[str]) -> Renderer:
-    """The renderer, also of those of the layers that it renders only when asked."""
-    if isinstance(renderer, Deferred) and "environment" in layers:
-        return replace(renderer, environment=True)
-    if isinstance(renderer, Traced) and "surroundings" in layers:
-        return replace(renderer, surroundings=True)
-    return with_photographer(renderer, "beside") if PHOTOGRAPHED in layers else renderer

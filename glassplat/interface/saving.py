@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,6 +16,7 @@ from glassplat.files.folders import make_folder
 from glassplat.files.glb import write_glb
 from glassplat.files.planes_json import write_planes
 from glassplat.files.ply import write_gaussians
+from glassplat.files.reading import read_text
 from glassplat.files.spz import write_spz
 from glassplat.publish.web_page import can_show, write_page
 from glassplat.render.environment import equirect_from_environment
@@ -27,6 +29,7 @@ from glassplat.train.run_directory import RunDirectory, write_text
 
 WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {".ply": write_gaussians, ".spz": write_spz, ".glb": write_glb}
 PLANES, GLASS, CAMERAS = "planes.json", "glass.ply", "cameras.json"
+SETTINGS = "settings.json"
 PANORAMA, ENVIRONMENT = "environment.png", "environment.json"
 
 
@@ -63,7 +66,7 @@ def save_model(model: Savable, path: Path, *, overwrite: bool) -> Path:
     """
     kind = path.suffix.lower()
     if not kind:
-        return _save_folder(model, path)
+        return save_folder(model, path)
     if kind not in (*WRITERS, ".html"):
         raise InputError(f"{path}: expected a name that ends in {', '.join((*WRITERS, '.html'))}, or a folder's")
     beside = [] if kind == ".html" else [path.with_name(name) for name in (PLANES, GLASS, CAMERAS)]
@@ -127,7 +130,9 @@ def write_environment_files(folder: Path, scene: Scene) -> None:
 
 
 def write_as_run(folder: Path, model: Savable, source: Path | None) -> None:
-    """Writes a scene without photographs as a run; the record comes last, so that a part of one is none.
+    """Writes a scene as a run that was not trained; the record comes last, so that a part of one is none.
+
+    What comes of a run knows its capture, as far as the run does.
 
     Args:
         folder: new or empty.
@@ -138,12 +143,20 @@ def write_as_run(folder: Path, model: Savable, source: Path | None) -> None:
     directory = RunDirectory(folder)
     directory.export(model.scene, step=0)
     write_cameras(folder / CAMERAS, model.cameras.items())
-    write_text(directory.imported, json.dumps({"file": None if source is None else str(source.resolve())}))
+    if source is not None and (source / SETTINGS).is_file():
+        write_text(folder / SETTINGS, read_text(source / SETTINGS).rstrip("\n"))
+    else:
+        write_text(directory.imported, json.dumps({"file": None if source is None else str(source.resolve())}))
     write_text(folder / "recipe.json", recipe_to_json(model.recipe))
 
 
-def _save_folder(model: Savable, folder: Path) -> Path:
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+def save_folder(model: Savable, folder: Path) -> Path:
+    """Writes a model as a run of its own, which `load` reads bit for bit; returns the folder.
+
+    Raises:
+        FileExistsError: something is there; nothing was written.
+    """
+    if os.path.lexists(folder) and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder} is already there and not empty; nothing was written. Choose a new folder")
     write_as_run(folder, model, getattr(model, "path", None))
     return folder

@@ -11,10 +11,14 @@ from glassplat.data.dataset import Dataset
 from glassplat.interface.model import Model
 from glassplat.interface.training import Training
 from glassplat.render.frame import Renderer
+from glassplat.render.layers import PHOTOGRAPHED
 from glassplat.render.splat import Splat
 from glassplat.train.messages import Message, StepDone
+from glassplat.viewer.drawing import ERROR
+from glassplat.viewer.ports import check_port
 from glassplat.viewer.render_loop import DrawingShare
-from glassplat.viewer.server import Shown, Viewer, check_port
+from glassplat.viewer.server import Viewer
+from glassplat.viewer.shown import Keeper, Shown
 
 HIDDEN_LAYERS = ("alpha",)
 REFRESH_SECONDS = 2.0
@@ -23,10 +27,20 @@ PAUSE_SECONDS = 0.2
 """How soon a paused training hears that it should end."""
 
 
-def shown_of(model: Model, photographs: Mapping[str, Callable[[], Tensor]]) -> Shown:
-    """A model as the viewer shows it, with photographs [H, W, 3] uint8 by name, read when asked for."""
-    layers = [layer for layer in model.layers if layer not in HIDDEN_LAYERS]
-    return Shown(model.name, model.scene, model.renderer, layers, tuple(model.cameras.items()), photographs)
+def shown_of(model: Model, photographs: Mapping[str, Callable[[], Tensor]], keeper: Keeper | None = None) -> Shown:
+    """A model as the viewer shows it.
+
+    Args:
+        model: what to look at.
+        photographs: [H, W, 3] uint8 by name, read when asked for.
+        keeper: writes what is made in the browser; None where nothing may be written.
+    """
+    layers: list[str] = [layer for layer in model.layers if layer not in HIDDEN_LAYERS]
+    if len(model.scene.photographer):
+        layers.append(PHOTOGRAPHED)
+    if photographs:
+        layers.append(ERROR)
+    return Shown(model.name, model.scene, model.renderer, layers, tuple(model.cameras.items()), photographs, keeper)
 
 
 class WatchedTraining:

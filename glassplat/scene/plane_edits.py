@@ -83,16 +83,7 @@ def tilted(scene: Scene, label: int, about_tangent: float, about_bitangent: floa
         return scene
     tangent, bitangent = (axes[row] for axes in scene.planes.axes())
     axis = torch.nn.functional.normalize(about_tangent * tangent + about_bitangent * bitangent, dim=0)
-    turn = torch.cat([axis.new_tensor([math.cos(angle / 2)]), math.sin(angle / 2) * axis])
-    rotation = rotation_from_quat(turn)
-    planes = scene.planes
-    turned = {name: _with_row(getattr(planes, name), row, rotation) for name in ("raw_normals", "tangents")}
-    glass, of_pane = scene.glass, glass_of_pane(scene, row)[:, None]
-    center = planes.centers[row].to(glass.means)
-    means = (glass.means - center) @ rotation.to(glass.means).T + center
-    quats = quat_product(turn.to(glass.quats).expand_as(glass.quats), glass.quats)
-    moved = {"means": torch.where(of_pane, means, glass.means), "quats": torch.where(of_pane, quats, glass.quats)}
-    return replace(scene, glass=glass.with_tensors(moved), planes=planes.with_tensors(turned))
+    return _turned(scene, row, torch.cat([axis.new_tensor([math.cos(angle / 2)]), math.sin(angle / 2) * axis]))
 
 
 def shifted(scene: Scene, label: int, distance: float) -> Scene:
@@ -110,13 +101,29 @@ def shifted(scene: Scene, label: int, distance: float) -> Scene:
     _check_finite(label, distance)
     if distance == 0:
         return scene
-    step = distance * scene.planes.normals[row]
-    centers = scene.planes.centers.clone()
-    centers[row] += step
-    means = scene.glass.means
-    moved = torch.where(glass_of_pane(scene, row)[:, None], means + step.to(means), means)
-    planes = scene.planes.with_tensors({"centers": centers})
-    return replace(scene, glass=scene.glass.with_tensors({"means": moved}), planes=planes)
+    return _translated(scene, row, distance * scene.planes.normals[row])
+
+
+def moved(scene: Scene, label: int, turn: Sequence[float], step: Sequence[float]) -> Scene:
+    """The pane and its glass, turned about the rectangle's middle and then taken elsewhere; not to move changes no bit.
+
+    Args:
+        scene: what to edit; it is left as it is.
+        label: which pane.
+        turn: [4] quaternion, `wxyz`, of any length, in world axes.
+        step: [3] from where the middle was to where it is, world units.
+
+    Raises:
+        ValueError: no pane has the label, a number is not finite, or the quaternion has no length.
+    """
+    row = row_of(scene.planes, label)
+    _check_finite(label, *turn, *step)
+    if not any(turn):
+        raise ValueError(f"pane {label} cannot be turned by a quaternion of no length; expected w, x, y, z")
+    if any(turn[1:]):
+        quat = torch.nn.functional.normalize(scene.planes.centers.new_tensor(turn), dim=0)
+        scene = _turned(scene, row, quat)
+    return _translated(scene, row, scene.planes.centers.new_tensor(step)) if any(step) else scene
 
 
 def glass_of_pane(scene: Scene, row: int) -> Tensor:
@@ -135,6 +142,29 @@ def row_of(planes: Planes, label: int) -> int:
         there_are = f"the panes are {', '.join(map(str, sorted(planes.labels)))}" if len(planes) else "it has no panes"
         raise ValueError(f"the scene has no pane {label}; {there_are}")
     return planes.labels.index(label)
+
+
+def _turned(scene: Scene, row: int, turn: Tensor) -> Scene:
+    """A pane and its glass, turned about its middle by a unit quaternion [4]."""
+    rotation = rotation_from_quat(turn)
+    planes = scene.planes
+    turned = {name: _with_row(getattr(planes, name), row, rotation) for name in ("raw_normals", "tangents")}
+    glass, of_pane = scene.glass, glass_of_pane(scene, row)[:, None]
+    center = planes.centers[row].to(glass.means)
+    means = (glass.means - center) @ rotation.to(glass.means).T + center
+    quats = quat_product(turn.to(glass.quats).expand_as(glass.quats), glass.quats)
+    placed = {"means": torch.where(of_pane, means, glass.means), "quats": torch.where(of_pane, quats, glass.quats)}
+    return replace(scene, glass=glass.with_tensors(placed), planes=planes.with_tensors(turned))
+
+
+def _translated(scene: Scene, row: int, step: Tensor) -> Scene:
+    """A pane and its glass, taken elsewhere by a step [3]."""
+    centers = scene.planes.centers.clone()
+    centers[row] += step
+    means = scene.glass.means
+    placed = torch.where(glass_of_pane(scene, row)[:, None], means + step.to(means), means)
+    planes = scene.planes.with_tensors({"centers": centers})
+    return replace(scene, glass=scene.glass.with_tensors({"means": placed}), planes=planes)
 
 
 def _distances(planes: Planes, row: int, glass: Gaussians) -> Tensor:

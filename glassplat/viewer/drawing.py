@@ -3,21 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.evaluate.colormap import depth_colors, normal_colors
-from glassplat.render.frame import Renderer
+from glassplat.evaluate.colormap import error_colors
+from glassplat.evaluate.layer_image import layer_image
+from glassplat.render.frame import Frame, Renderer
+from glassplat.render.layers import PHOTOGRAPHED, renderer_with
 from glassplat.scene.camera import Camera
-from glassplat.scene.plane_edits import as_mirrors, with_reflectance, without_glass
+from glassplat.scene.plane_edits import as_mirrors, moved, with_reflectance, without_glass
 from glassplat.scene.scene import Scene
 
 Glass = Literal["as it is", "mirror", "none"]
 LEAST_GAIN, MOST_GAIN = 0.1, 10.0
+ERROR = "error"
+"""The layer that compares with a photograph."""
+
+
+class PaneMove(NamedTuple):
+    """Where a pane is taken: turned by a quaternion [4], `wxyz`, about its middle, then shifted by [3] world units."""
+
+    label: int
+    turn: tuple[float, ...]
+    step: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -28,10 +40,12 @@ class Wish:
         cam_from_world: [4, 4] rigid.
         fov_rad: vertical field of view.
         aspect: width over height.
-        layer: `rgb` or a layer of the renderer's frames.
+        layer: `rgb`, a layer of the renderer's frames, or `error`.
         glass: what becomes of the panes.
         reflectances: R0 of each pane by label, where it is not the scene's own.
         gain: factor on what the panes mirror.
+        moves: panes that are elsewhere than in the scene.
+        against: position of the photograph that the layer `error` compares with; None for the other layers.
     """
 
     cam_from_world: Tensor
@@ -41,6 +55,8 @@ class Wish:
     glass: Glass = "as it is"
     reflectances: tuple[tuple[int, float], ...] = ()
     gain: float = 1.0
+    moves: tuple[PaneMove, ...] = ()
+    against: int | None = None
 
     def camera(self, height: int) -> Camera:
         """The camera of a picture with that many rows."""
@@ -50,9 +66,11 @@ class Wish:
 
 
 def edited(scene: Scene, wish: Wish) -> Scene:
-    """The scene with the panes as they are wished for."""
+    """The scene with the panes as they are wished for; what is not wished for keeps every bit."""
     if not len(scene.planes) or wish.glass == "none":
         return without_glass(scene) if len(scene.planes) else scene
+    for move in wish.moves:
+        scene = moved(scene, *move)
     for label, reflectance in wish.reflectances:
         scene = with_reflectance(scene, label, reflectance)
     if wish.glass == "mirror":
@@ -67,12 +85,45 @@ def edited(scene: Scene, wish: Wish) -> Scene:
 @torch.no_grad()
 def drawn(scene: Scene, renderer: Renderer, wish: Wish, height: int) -> NDArray[np.uint8]:
     """The picture [H, W, 3] of a wish; a layer that the scene does not have shows as the image itself."""
-    frame = renderer(edited(scene, wish), wish.camera(height))
-    image = frame.layers.get(wish.layer, frame.rgb)
-    if wish.layer == "depth":
-        image = depth_colors(image, frame.layers["alpha"])
-    elif wish.layer == "normal":
-        image = normal_colors(image)
+    frame = renderer_with(renderer, [wish.layer])(edited(scene, wish), wish.camera(height))
+    return _picture(layer_image(frame, wish.layer if _has(frame, wish.layer) else "rgb"))
+
+
+@torch.no_grad()
+def error_drawn(
+    scene: Scene, renderer: Renderer, wish: Wish, height: int, camera: Camera, photo: Tensor
+) -> NDArray[np.uint8]:
+    """How far the edited scene is from a photograph, seen from its camera: [H, W, 3], W by the wish's aspect.
+
+    The photograph fills the height, is black beside its edges and cut off where the picture is narrower. Both are
+    compared pixel by pixel, so that the picture has no more rows than the photograph.
+
+    Args:
+        scene: what is shown.
+        renderer: of its frames.
+        wish: whose edits and aspect count; not its camera.
+        height: rows of the picture, at most.
+        camera: of the photograph.
+        photo: [H, W, 3] uint8.
+    """
+    rows = min(height, photo.shape[0])
+    columns = max(1, round(rows * camera.width / camera.height))
+    frame = renderer_with(renderer, [PHOTOGRAPHED])(edited(scene, wish), camera.resized(columns, rows))
+    small = torch.nn.functional.interpolate(
+        photo.to(frame.rgb).movedim(-1, 0)[None], (rows, columns), mode="bilinear", antialias=True
+    )[0].movedim(0, -1)
+    colors = error_colors(frame.photographed, small)
+    missing = max(1, round(wish.aspect * rows)) - columns
+    left = missing // 2
+    return _picture(torch.nn.functional.pad(colors, (0, 0, left, missing - left)))
+
+
+def _has(frame: Frame, layer: str) -> bool:
+    return layer in frame.layers or layer in ("rgb", PHOTOGRAPHED)
+
+
+def _picture(image: Tensor) -> NDArray[np.uint8]:
+    """An image [H, W] or [H, W, 3] in [0, 1] as bytes."""
     if image.dim() == 2:
         image = image[..., None].expand(-1, -1, 3)
     pixels: NDArray[np.uint8] = torch.round(image.clamp(0, 1) * 255).to("cpu", torch.uint8).contiguous().numpy()

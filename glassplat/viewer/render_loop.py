@@ -63,6 +63,7 @@ class RenderLoop(Generic[Wanted]):
         """
         self._draw, self._show = draw, show
         self._requests: dict[int, Request[Wanted]] = {}
+        self._calls: list[Callable[[], None]] = []
         self._changed = threading.Condition()
         self._generation, self._turn = 0, 0
         self._seconds_per_pixel = 1e-7
@@ -79,24 +80,36 @@ class RenderLoop(Generic[Wanted]):
         with self._changed:
             self._requests.pop(client, None)
 
-    def serve(self) -> bool:
-        """Draws a picture, if somebody waits for one, and returns whether; to be called by one thread only."""
+    def call(self, work: Callable[[], None]) -> None:
+        """Has something done by the thread that draws, before the next picture."""
         with self._changed:
-            if not self._requests:
+            self._calls.append(work)
+            self._changed.notify()
+
+    def serve(self) -> bool:
+        """Draws a picture or does what was called for, if there is any, and returns whether; for one thread only."""
+        with self._changed:
+            call = self._calls.pop(0) if self._calls else None
+            if call is None and not self._requests:
                 return False
-            client, request = self._next()
-        self._serve(client, request)
+            waiting = None if call else self._next()
+        if waiting is not None:
+            self._serve(*waiting)
+        elif call is not None:
+            call()
         return True
 
     def wait(self, seconds: float) -> None:
         """Waits until somebody asks for something, or for so long."""
         with self._changed:
-            if not self._requests:
+            if not self._requests and not self._calls:
                 self._changed.wait(seconds)
 
     def expected_seconds(self) -> float | None:
-        """What the next picture is likely to take; None where nobody waits for one."""
+        """What the next picture is likely to take, what is called for nothing; None where nobody waits."""
         with self._changed:
+            if self._calls:
+                return 0.0
             if not self._requests:
                 return None
             turn = self._turn

@@ -118,6 +118,31 @@ def test_two_edges_give_the_plane_and_as_much_of_the_pane_as_was_marked() -> Non
     assert sizes[0] == pytest.approx(1.6, rel=0.02)
 
 
+def test_where_a_long_front_ends_may_be_marked_in_one_photograph_only() -> None:
+    """As on a walk along a facade: no photograph beside the one that shows its near end does so too."""
+    front = Pane(np.array([0.0, 0, 0]), np.array([0.0, 0, 1.0]), np.array([1.0, 0, 0]), (7.0, 1.7))
+    walk = {-1.5: -5.5, -2.5: -6.5, -4.0: -7.0, 1.5: -4.0, 5.5: 2.5}
+    eyes = [Eye.of(camera_from((x, 0.2, 5.0 - 0.2 * x), np.array([target, 0, 0]))) for x, target in walk.items()]
+    corners = front.at(U, V)
+    pieces = {0: (0.0, 0.2), 1: (0.0, 0.15), 3: (0.1, 0.3), 4: (0.45, 0.9)}
+    rng = np.random.default_rng(0)
+
+    def seen(view: int, begin: int, end: int, piece: Sequence[float] = (0.0, 1.0)) -> np.ndarray:
+        ends = [corners[begin] + share * (corners[end] - corners[begin]) for share in piece]
+        return np.stack([eyes[view].project(one) + 0.3 * rng.standard_normal(2) for one in ends])
+
+    edges: list[dict[int, np.ndarray]] = [
+        {view: seen(view, 0, 1, piece) for view, piece in pieces.items()},
+        {4: seen(4, 1, 2)},
+        {view: seen(view, 3, 2, piece) for view, piece in pieces.items()},
+        {view: seen(view, 3, 0) for view in (0, 2)},
+    ]
+    places: list[dict[int, np.ndarray]] = [{}, {}, {}, {view: eyes[view].project(corners[3]) for view in (0, 1, 2)}]
+    fit = fitted_pane(Marks(places, edges), eyes, "rectangle")
+    assert normal_off(fit.shape.frame, front) < 2 * fit.doubt < 4
+    np.testing.assert_allclose(fit.shape.corners(), corners, atol=0.5)
+
+
 def test_edges_of_five_corners_are_fitted_too() -> None:
     eyes = eyes_on(FRONT)
     outline = FRONT.at(np.array([-1, 1, 1, 0.2, -1.0]), np.array([-1, -1, 1, 0.4, 1.0]))

@@ -120,6 +120,18 @@ def test_an_outline_that_passes_the_camera_is_cut_off() -> None:
     assert not filled(seen_outline(eye, behind), (300, 220)).any()
 
 
+def test_an_outline_that_passes_the_camera_keeps_its_edges_straight() -> None:
+    eye = Eye.of(camera_from((0.0, 0.0, 0.0), np.array([0.0, 0.0, 1.0])))
+    wall = np.array([[-2.0, -1, 6], [2.5, -1, -20], [2.5, 1, -20], [-2, 1, 6]])
+    mask = filled(seen_outline(eye, wall), (300, 220))
+    x, y = np.meshgrid(np.arange(300) + 0.5, np.arange(220) + 0.5)
+    rays = eye.rays(np.stack([x, y], axis=-1))
+    normal = np.cross(wall[1] - wall[0], wall[3] - wall[0])
+    met = rays * (wall[0] @ normal / (rays @ normal))[..., None]
+    truth = (np.abs(met[..., 1]) < 1) & (met[..., 0] > -2) & (met[..., 2] > 0)
+    assert 0.1 < truth.mean() < 0.9 and (mask != truth).mean() < 1e-3
+
+
 def test_put_back_restores_no_more_than_there_was() -> None:
     mask = np.zeros((40, 40), dtype=bool)
     mask[10:30, 10:30] = True

@@ -12,7 +12,8 @@ from glassplat.cli import main
 from glassplat.commands.scene_edits import SceneEdits
 from glassplat.data.errors import InputError
 from glassplat.files.images import read_image
-from glassplat.interface.layers import DISC_LAYERS, LAYERS, PHOTOGRAPHED, Layer
+from glassplat.interface.layers import DISC_LAYERS, LAYERS, Layer
+from glassplat.render.layers import PHOTOGRAPHED
 from glassplat.scene.plane_edits import as_mirrors, shifted, tilted, with_reflectance, without_glass
 from glassplat.scene.scene import Scene
 from glassplat.train.recipe import RECIPES

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -10,7 +11,15 @@ import torch
 
 from glassplat.render.planar import Planar
 from glassplat.scene.plane import Planes
-from glassplat.scene.plane_edits import as_mirrors, glass_of_pane, shifted, tilted, with_reflectance, without_glass
+from glassplat.scene.plane_edits import (
+    as_mirrors,
+    glass_of_pane,
+    moved,
+    shifted,
+    tilted,
+    with_reflectance,
+    without_glass,
+)
 from glassplat.scene.scene import Scene
 from tests.render.tiny_scene import (
     camera_at,
@@ -71,6 +80,7 @@ def test_no_motion_changes_no_bit() -> None:
     scene = showcase()
     assert_same(tilted(scene, 1, 0.0, 0.0), scene)
     assert_same(shifted(scene, 1, 0.0), scene)
+    assert_same(moved(scene, 1, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), scene)
     assert torch.equal(Planar()(tilted(scene, 1, 0, 0), CAMERA).rgb, Planar()(scene, CAMERA).rgb)
 
 
@@ -84,6 +94,18 @@ def test_a_quarter_turn_about_a_side_turns_the_normal_into_the_other_side() -> N
     torch.testing.assert_close(about_bitangent.normals[0], tangent)
     torch.testing.assert_close(about_bitangent.axes()[0][0], -normal)
     torch.testing.assert_close(about_tangent.centers, scene.planes.centers)
+
+
+def test_a_turn_and_a_step_are_a_tilt_and_a_shift() -> None:
+    scene = two_panes()
+    half = math.radians(30.0) / 2
+    tangent, normal = scene.planes.axes()[0][1], scene.planes.normals[1]
+    turn = (2 * math.cos(half), *(2 * math.sin(half) * tangent).tolist())
+    expected = tilted(shifted(scene, 7, 0.5), 7, 30.0, 0.0)
+    edited = moved(scene, 7, turn, (0.5 * normal).tolist())
+    for name, tensor in edited.parameters().items():
+        torch.testing.assert_close(tensor, expected.parameters()[name])
+    assert torch.equal(edited.glass.means[:12], scene.glass.means[:12])
 
 
 def test_there_and_back_is_the_identity() -> None:
@@ -131,6 +153,7 @@ def test_the_scene_that_is_edited_stays_as_it_is() -> None:
         lambda s: with_reflectance(s, 3, 0.5),
         lambda s: tilted(s, 3, 1.0, 0.0),
         lambda s: shifted(s, 3, 1.0),
+        lambda s: moved(s, 3, (1, 0, 0, 0), (0, 0, 1)),
     ],
 )
 def test_an_unknown_label_lists_those_there_are(edit: Callable[[Scene], Scene]) -> None:
@@ -151,3 +174,7 @@ def test_an_infinite_motion_is_refused() -> None:
         shifted(showcase(), 1, float("inf"))
     with pytest.raises(ValueError, match="expected finite numbers"):
         tilted(showcase(), 1, float("nan"), 0.0)
+    with pytest.raises(ValueError, match="expected finite numbers"):
+        moved(showcase(), 1, (1, 0, 0, 0), (0, float("nan"), 0))
+    with pytest.raises(ValueError, match="quaternion of no length"):
+        moved(showcase(), 1, (0, 0, 0, 0), (0, 0, 0))

@@ -9,10 +9,14 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from glassplat.render.deferred import Deferred
 from glassplat.render.planar import Planar
-from glassplat.scene.plane_edits import as_mirrors, with_reflectance, without_glass
-from glassplat.viewer.drawing import Wish, drawn, edited
-from glassplat.viewer.server import cam_from_world
+from glassplat.scene.environment import Environment
+from glassplat.scene.plane_edits import as_mirrors, moved, with_reflectance, without_glass
+from glassplat.scene.scene import Scene
+from glassplat.viewer.client import cam_from_world
+from glassplat.viewer.drawing import PaneMove, Wish, drawn, edited, error_drawn
+from glassplat.viewer.shown import Viewpoints
 from tests.train.tiny_capture import tiny_capture, true_scene
 
 POSE = tiny_capture().train[1].camera.cam_from_world
@@ -21,6 +25,10 @@ EDITS = {
     "as it is": (WISH, true_scene()),
     "mirror": (replace(WISH, glass="mirror"), as_mirrors(true_scene(), [1])),
     "none": (replace(WISH, glass="none"), without_glass(true_scene())),
+    "moved": (
+        replace(WISH, moves=(PaneMove(1, (1.0, 0.0, 0.1, 0.0), (0.0, 0.2, 0.0)),)),
+        moved(true_scene(), 1, (1.0, 0.0, 0.1, 0.0), (0.0, 0.2, 0.0)),
+    ),
     "reflectance": (replace(WISH, reflectances=((1, 0.9),)), with_reflectance(true_scene(), 1, 0.9)),
 }
 
@@ -37,6 +45,48 @@ def test_a_wish_is_the_render_of_the_edited_scene(wish: Wish, scene: object) -> 
 @pytest.mark.parametrize("layer", ["transmission", "reflection", "strength", "depth", "mask", "no such layer"])
 def test_every_layer_is_a_picture(layer: str) -> None:
     assert drawn(true_scene(), Planar(), replace(WISH, layer=layer), 24).shape == (24, 34, 3)
+
+
+def test_what_is_not_wished_for_keeps_every_bit() -> None:
+    for name, tensor in edited(true_scene(), WISH).parameters().items():
+        assert torch.equal(tensor, true_scene().parameters()[name]), name
+
+
+def test_a_layer_that_is_drawn_on_request_is_drawn() -> None:
+    primary = true_scene().primary
+    scene = Scene(
+        replace(primary, channels={"logit_strength": torch.zeros(len(primary))}),
+        true_scene().extent,
+        environment=Environment.random(8, generator=torch.Generator().manual_seed(2)),
+    )
+    surroundings = drawn(scene, Deferred(), replace(WISH, layer="environment"), 24)
+    with torch.no_grad():
+        truth = Deferred(environment=True)(scene, WISH.camera(24)).layers["environment"]
+    assert np.abs(surroundings / 255 - truth.clamp(0, 1).numpy()).max() < 0.003
+
+
+def test_the_error_is_none_where_the_photograph_is_the_render_and_follows_edits() -> None:
+    view = tiny_capture().train[1]
+    wide = replace(WISH, aspect=3.0)
+    same = error_drawn(true_scene(), Planar(), wide, 4000, view.camera, view.photo)
+    assert same.shape == (28, 84, 3)
+    assert same[..., 0].max() <= 5 and not same[:, :22].any() and not same[:, 62:].any()
+    elsewhere = error_drawn(true_scene(), Planar(), replace(wide, glass="mirror"), 28, view.camera, view.photo)
+    assert elsewhere[:, 22:62, 0].max() > 100
+    assert error_drawn(true_scene(), Planar(), replace(WISH, aspect=0.5), 20, view.camera, view.photo).shape == (
+        20,
+        10,
+        3,
+    )
+
+
+def test_the_nearest_photograph_is_near_in_place_and_direction() -> None:
+    cameras = [view.camera for view in tiny_capture().train]
+    turned = replace(cameras[2], cam_from_world=torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ cameras[2].cam_from_world)
+    viewpoints = Viewpoints([*cameras, turned], extent=1.0)
+    for index, camera in enumerate([*cameras, turned]):
+        center, forward = camera.center.double().numpy(), camera.cam_from_world[2, :3].double().numpy()
+        assert viewpoints.nearest(center + 0.05, forward) == index
 
 
 def test_gain_brightens_what_is_mirrored() -> None:

@@ -109,6 +109,21 @@ def test_who_has_gone_is_forgotten_and_errors_end_nothing() -> None:
     assert {client for client, *_ in recorder.shown} == {3}
 
 
+def test_what_is_called_for_is_done_by_the_thread_that_draws() -> None:
+    recorder = Recorder(held=True)
+    threads: list[str] = []
+    recorder.loop.ask(1, 1, SIZE)
+    wait_until(lambda: len(recorder.drawn) == 1)
+    for _ in range(2):
+        recorder.loop.call(lambda: threads.append(threading.current_thread().name))
+    recorder.let.set()
+    wait_until(lambda: len(threads) == 2)
+    recorder.loop.call(lambda: threads.append("while nothing is drawn"))
+    wait_until(lambda: len(threads) == 3)
+    recorder.thread.stop()
+    assert threads[:2] == ["render", "render"]
+
+
 class Clock:
     """Time that passes when a picture is drawn, and when it is told to."""
 
@@ -132,6 +147,14 @@ def test_drawing_takes_its_share_of_the_time_and_no_more() -> None:
         clock.now += 0.2
         clock.share.draw()
     assert 0.5 * MOST_SHARE < clock.drawing / clock.now <= MOST_SHARE
+
+
+def test_what_is_called_for_waits_for_no_saved_time() -> None:
+    clock = Clock()
+    done: list[bool] = []
+    clock.loop.call(lambda: done.append(True))
+    clock.share.draw()
+    assert done and clock.loop.expected_seconds() is None
 
 
 def test_a_picture_that_takes_longer_than_can_be_saved_is_drawn_all_the_same() -> None:

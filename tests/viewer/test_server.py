@@ -11,7 +11,8 @@ import pytest
 
 from glassplat.cli import main
 from glassplat.render.planar import Planar
-from glassplat.viewer.server import Shown, Viewer
+from glassplat.viewer.server import Viewer
+from glassplat.viewer.shown import Shown
 from tests.browser_needed import needs_browser
 from tests.commands.tiny_run import write_run
 from tests.train.tiny_capture import tiny_capture, true_scene
@@ -50,9 +51,12 @@ def test_a_browser_is_shown_sharp_pictures_and_may_leave() -> None:
             (client,) = viewer._clients.values()
             shown.clear()
             client.stand_at(2)
-            client._glass.value = "mirror"
+            client._panes._glass.value = "mirror"
             eventually(lambda: any(shown))
             eventually(lambda: "Layer" in browser.evaluate("document.body.innerText"))
+            client.keep_scene("mine")
+            client.keep_keyframes("mine")
+            assert "Edited scene" not in browser.evaluate("document.body.innerText")  # Nobody said where to.
         eventually(lambda: not viewer._clients)
     finally:
         viewer.stop()

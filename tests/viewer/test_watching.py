@@ -20,7 +20,8 @@ from glassplat.render.splat import Splat
 from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.messages import Message
 from glassplat.train.splat_recipe import SplatRecipe
-from glassplat.viewer.server import Viewer, vacant_port
+from glassplat.viewer.ports import vacant_port
+from glassplat.viewer.server import Viewer
 from tests.browser_needed import needs_browser
 from tests.interface.test_model import model
 from tests.train.tiny_capture import tiny_capture, write_tiny_capture

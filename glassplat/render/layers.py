@@ -1,0 +1,24 @@
+"""Layers that renderers draw only when they are asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+from glassplat.render.deferred import Deferred
+from glassplat.render.frame import Renderer
+from glassplat.render.planar import with_photographer
+from glassplat.render.traced import Traced
+
+PHOTOGRAPHED: Final = "photographed"
+"""The image with whom the panes of a photograph show, of runs that looked for somebody."""
+
+
+def renderer_with(renderer: Renderer, layers: Sequence[str]) -> Renderer:
+    """The renderer, also of those of the layers that it renders only when asked."""
+    if isinstance(renderer, Deferred) and "environment" in layers:
+        return replace(renderer, environment=True)
+    if isinstance(renderer, Traced) and "surroundings" in layers:
+        return replace(renderer, surroundings=True)
+    return with_photographer(renderer, "beside") if PHOTOGRAPHED in layers else renderer

@@ -1,0 +1,149 @@
+"""The controls of the panes: what becomes of the glass, how much each reflects, and where it stands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from glassplat.evaluate.colormap import LABEL_COLORS
+from glassplat.scene.plane import Planes
+from glassplat.viewer.drawing import LEAST_GAIN, MOST_GAIN, PaneMove, Wish
+
+NO_PANE = "none"
+HANDLE_SHARE = 0.7
+"""Length of a gizmo's arrows, of the mean half side of its pane."""
+OUTLINE_PIXELS = 2.0
+
+
+class PaneGizmo:
+    """Arrows and arcs on one pane that move and turn it, with its outline; hidden until it is shown."""
+
+    def __init__(self, scene: Any, planes: Planes, row: int, changed: Callable[[], None]) -> None:
+        """Puts it where the pane is.
+
+        Args:
+            scene: a client's.
+            planes: of the scene that is looked at.
+            row: which of them.
+            changed: called whenever it is moved.
+        """
+        self.label, self._name = planes.labels[row], f"/panes/{planes.labels[row]}"
+        axes = torch.stack([*(axis[row] for axis in planes.axes()), planes.normals[row]], dim=1)
+        self._start = wxyz_of(Rotation.from_matrix(axes.detach().double().cpu().numpy()))
+        self._center = planes.centers[row].detach().double().cpu().numpy()
+        half = planes.half_sizes[row].detach().double().cpu().numpy()
+        self._handle = scene.add_transform_controls(
+            self._name,
+            scale=HANDLE_SHARE * float(half.mean()),
+            wxyz=self._start,
+            position=self._center,
+            depth_test=False,
+            visible=False,
+        )
+        corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * [*half, 0]
+        scene.add_line_segments(
+            f"{self._name}/outline",
+            np.stack([corners, np.roll(corners, -1, axis=0)], axis=1).astype(np.float32),
+            LABEL_COLORS[row % len(LABEL_COLORS)],
+            thickness=OUTLINE_PIXELS,
+            thickness_units="screen",
+        )
+        self._handle.on_update(lambda _: changed())
+
+    def show(self, visible: bool) -> None:
+        """Shows or hides it; where it stands counts in either case."""
+        self._handle.visible = visible
+
+    def put_back(self) -> None:
+        """Back to where the pane is in the scene."""
+        self._handle.wxyz, self._handle.position = self._start, self._center
+
+    def remove(self) -> None:
+        """Takes it and its outline off the view."""
+        self._handle.remove()
+
+    def move(self) -> PaneMove | None:
+        """How it was moved; None if it was not."""
+        wxyz, position = np.asarray(self._handle.wxyz), np.asarray(self._handle.position)
+        if np.array_equal(wxyz, self._start) and np.array_equal(position, self._center):
+            return None
+        turn = np.array([1.0, 0, 0, 0])
+        if not np.array_equal(wxyz, self._start):
+            turn = wxyz_of(rotation_of(wxyz) * rotation_of(self._start).inv())
+        return PaneMove(self.label, tuple(turn.tolist()), tuple((position - self._center).tolist()))
+
+
+class PaneControls:
+    """A folder of controls of the glass; to be made only for scenes that have panes."""
+
+    def __init__(self, handle: Any, planes: Planes, changed: Callable[[], None]) -> None:
+        """Lays them out.
+
+        Args:
+            handle: of the client.
+            planes: of the scene that is looked at; at least one.
+            changed: called whenever something else is wished for.
+        """
+        gui = handle.gui
+        self._changed = changed
+        self._own = dict(zip(planes.labels, planes.base_reflectances.tolist(), strict=True))
+        with gui.add_folder("Glass"):
+            self._glass = self._told(gui.add_dropdown("Panes", ("as it is", "mirror", "none")))
+            self._reflectances = {
+                label: self._told(gui.add_slider(f"R0 of pane {label}", 0.0, 1.0, 0.005, round(value, 3)))
+                for label, value in self._own.items()
+            }
+            self._gain = self._told(gui.add_slider("Gain", LEAST_GAIN, MOST_GAIN, 0.05, 1.0))
+            self._chosen = gui.add_dropdown("Move pane", (NO_PANE, *map(str, planes.labels)))
+            self._chosen.on_update(lambda _: self._show_gizmo())
+            gui.add_button("Put panes back").on_click(lambda _: self._put_back())
+        self._gizmos = [PaneGizmo(handle.scene, planes, row, changed) for row in range(len(planes))]
+
+    def applied(self, wish: Wish) -> Wish:
+        """The wish, with the panes as the controls say."""
+        sliders = self._reflectances.items()
+        changed = [(label, slider.value) for label, slider in sliders if slider.value != round(self._own[label], 3)]
+        moves = [move for gizmo in self._gizmos if (move := gizmo.move()) is not None]
+        return replace(
+            wish,
+            glass=self._glass.value,
+            reflectances=tuple(changed),
+            gain=self._gain.value,
+            moves=tuple(moves),
+        )
+
+    def remove(self) -> None:
+        """Takes the gizmos off the view; the controls go with their layout."""
+        for gizmo in self._gizmos:
+            gizmo.remove()
+
+    def _told(self, control: Any) -> Any:
+        control.on_update(lambda _: self._changed())
+        return control
+
+    def _show_gizmo(self) -> None:
+        for gizmo in self._gizmos:
+            gizmo.show(str(gizmo.label) == self._chosen.value)
+
+    def _put_back(self) -> None:
+        for gizmo in self._gizmos:
+            gizmo.put_back()
+        self._changed()
+
+
+def rotation_of(wxyz: NDArray[np.float64]) -> Rotation:
+    """A rotation from a quaternion in viser's order."""
+    w, x, y, z = wxyz
+    return Rotation.from_quat([x, y, z, w])
+
+
+def wxyz_of(rotation: Rotation) -> NDArray[np.float64]:
+    """[4] in viser's order, with w >= 0."""
+    x, y, z, w = rotation.as_quat(canonical=True)
+    return np.array([w, x, y, z])

@@ -1,0 +1,54 @@
+"""The photographs: standing where one was taken, and the nearest one beside the view."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from glassplat.viewer.shown import Shown
+
+PHOTO_WIDTH = 360
+
+
+class PhotographControls:
+    """A folder of controls: a list of photographs to stand at, and the picture of the nearest one."""
+
+    def __init__(self, gui: Any, shown: Shown, at: int, stand_at: Callable[[int], None]) -> None:
+        """Lays them out.
+
+        Args:
+            gui: of the client.
+            shown: what is looked at.
+            at: the photograph to begin with.
+            stand_at: moves the camera to where a photograph was taken.
+        """
+        self._shown, self._at, self._on_screen = shown, at, -1
+        names = tuple(name for name, _ in shown.cameras)
+        with gui.add_folder("Photographs"):
+            self._name = gui.add_dropdown("Stand at", names, initial_value=names[at])
+            self._name.on_update(
+                lambda event: stand_at(names.index(self._name.value)) if event.client is not None else None
+            )
+            steps = gui.add_button_group("Step", ("previous", "next"))
+            steps.on_click(lambda _: stand_at((self._at + (1 if steps.value == "next" else -1)) % len(names)))
+            self._photo = None
+            if shown.photographs:
+                self._photo = gui.add_image(np.zeros((2, 3, 3), dtype=np.uint8), label="Nearest photograph")
+
+    def stands_at(self, index: int) -> None:
+        """The camera is where a photograph was taken."""
+        self._at = index
+        self._name.value = self._shown.cameras[index][0]
+
+    def show_nearest(self, index: int) -> None:
+        """Shows a photograph, unless it is there already."""
+        name = self._shown.cameras[index][0]
+        if self._photo is None or index == self._on_screen or name not in self._shown.photographs:
+            return
+        self._at = self._on_screen = index
+        photo = self._shown.photographs[name]()
+        step = max(1, photo.shape[1] // PHOTO_WIDTH)
+        self._photo.image = photo[::step, ::step].numpy()
+        self._photo.label = f"Nearest photograph: {name}"

@@ -1,0 +1,163 @@
+"""Panes are moved with the mouse, keyframes set, and both saved, as a person does it in the browser."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import glassplat
+from glassplat.files.cameras_json import read_cameras
+from glassplat.interface.keeping import KeptBeside
+from glassplat.interface.watching import shown_of
+from glassplat.scene.camera import Camera
+from glassplat.viewer.client import Client
+from glassplat.viewer.pane_controls import HANDLE_SHARE
+from glassplat.viewer.server import Viewer
+from tests.browser_needed import needs_browser
+from tests.interface.test_model import model
+from tests.train.tiny_capture import tiny_capture, true_scene
+from tests.viewer.free_port import free_port
+from tests.viewer.test_server import eventually
+from tools.browser import Browser
+
+WINDOW = (1200, 700)
+"""So wide that the controls cover no pane."""
+FIND = """
+    const all = [...document.querySelectorAll('body *')].filter(one => one.textContent.trim() === arguments[0]);
+    const one = all.length && all[all.length - 1].getBoundingClientRect().height ? all[all.length - 1] : null;
+"""
+"""The smallest element that says just this, if it has been laid out."""
+PHOTOGRAPHS = {view.name: (lambda view=view: view.photo) for view in tiny_capture().train}
+
+
+@contextmanager
+def watched(folder: Path) -> Iterator[tuple[Viewer, Client, Browser]]:
+    """A viewer of the tiny scene with one browser, which writes into a folder."""
+    shown = shown_of(model(), PHOTOGRAPHS, KeptBeside(model(), folder))
+    viewer = Viewer(shown, "127.0.0.1", free_port())
+    viewer.start()
+    try:
+        with Browser(f"http://127.0.0.1:{viewer.port}/", *WINDOW) as browser:
+            eventually(lambda: bool(viewer._clients))
+            (client,) = viewer._clients.values()
+            eventually(lambda: "Edited scene" in browser.evaluate("document.body.innerText"))
+            yield viewer, client, browser
+    finally:
+        viewer.stop()
+
+
+def click(browser: Browser, text: str) -> None:
+    """Clicks what says just this, wherever it is on the page, as soon as it is there."""
+    eventually(lambda: browser.run(f"{FIND} if (one) one.click(); return one !== null", text))
+
+
+def says(browser: Browser, text: str) -> bool:
+    return text in browser.evaluate("document.body.innerText")
+
+
+def on_screen(client: Client, point: torch.Tensor) -> tuple[float, float]:
+    """Pixels of the window."""
+    camera = client.camera()
+    assert camera is not None
+    x, y, z = (camera.cam_from_world[:3, :3] @ point + camera.cam_from_world[:3, 3]).tolist()
+    return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+
+
+def unfold(browser: Browser, title: str, content: str) -> None:
+    """Opens a folder of controls; a page that is still being laid out may miss a click."""
+
+    def is_open() -> bool:
+        found = browser.run(f"{FIND} return one !== null", content)
+        if not found:
+            click(browser, title)
+            time.sleep(1)
+        return bool(found)
+
+    eventually(is_open)
+
+
+@needs_browser
+def test_a_person_moves_a_pane_sets_keyframes_and_saves_both(tmp_path: Path) -> None:
+    with watched(tmp_path) as (viewer, client, browser):
+        step = pane_is_dragged(client, browser)
+        unfold(browser, "Edited scene", "Save as a run")
+        click(browser, "Save as a run")
+        eventually(lambda: says(browser, "look at it with"))
+        click(browser, "Save as a run")
+        eventually(lambda: says(browser, "already there and not empty"))
+        click(browser, "Put panes back")
+        eventually(lambda: not client.wish().moves)
+        stood = keyframes_are_set_and_played(client, browser)
+        error_is_shown(viewer, client, browser)
+    saved = glassplat.load(tmp_path / "tiny-edited", device="cpu").scene
+    torch.testing.assert_close(saved.planes.centers[0], true_scene().planes.centers[0] + step)
+    assert torch.equal(saved.primary.means, true_scene().primary.means)
+    keyframes = [camera for _, camera in read_cameras(tmp_path / "keyframes.json")]
+    assert len(keyframes) == 2
+    for camera, expected in zip(keyframes, stood[:2], strict=True):
+        torch.testing.assert_close(camera.cam_from_world, expected.cam_from_world, atol=1e-5, rtol=0)
+        assert (camera.width, camera.height) == WINDOW
+        assert abs(camera.fy - expected.fy) < 0.01
+
+
+def pane_is_dragged(client: Client, browser: Browser) -> torch.Tensor:
+    """Drags the pane along one of its sides, by an arrow of its gizmo; returns how far [3]."""
+    planes = true_scene().planes
+    center, side = planes.centers[0], planes.axes()[1][0]
+    arrow = HANDLE_SHARE * float(planes.half_sizes[0].mean())
+    client._panes._chosen.value = "1"
+
+    def is_dragged() -> bool:
+        client.stand_at(2)
+        eventually(lambda: client._nearest == 2)
+        time.sleep(0.5)  # The gizmo is drawn after the camera has moved.
+        browser.drag([on_screen(client, center + arrow * length * side) for length in (0.85, 1.3)])
+        time.sleep(0.5)
+        return bool(client.wish().moves)
+
+    eventually(is_dragged)
+    ((label, turn, step),) = client.wish().moves
+    assert (label, turn) == (1, (1.0, 0.0, 0.0, 0.0))
+    found = torch.tensor(step, dtype=torch.float32)
+    assert float(found @ side) > 0.2 * arrow
+    torch.testing.assert_close(found, (found @ side) * side, atol=1e-4, rtol=0)
+    return found
+
+
+def keyframes_are_set_and_played(client: Client, browser: Browser) -> list[Camera]:
+    """Sets three keyframes, removes one, plays and saves; returns where the browser stood."""
+    unfold(browser, "Keyframes", "Add this view")
+    stood: list[Camera] = []
+    for index in (1, 4, 0):
+        client.stand_at(index)
+        eventually(lambda index=index: client._nearest == index)
+        click(browser, "Add this view")
+        eventually(lambda: len(client.keyframes.keyframes) == len(stood) + 1)
+        stood.append(client.camera())
+    click(browser, "Remove the last")
+    eventually(lambda: says(browser, "2 keyframes"))
+    click(browser, "Play or stop")
+    eventually(lambda: client._nearest in (2, 3))
+    eventually(lambda: client._nearest == 4)
+    click(browser, "Save keyframes")
+    eventually(lambda: says(browser, "film them with"))
+    return stood
+
+
+def error_is_shown(viewer: Viewer, client: Client, browser: Browser) -> None:
+    """The error layer compares with the photograph that is shown beside, and follows edits."""
+    client.stand_at(3)
+    eventually(lambda: says(browser, "Nearest photograph: 3.png"))
+    pictures: list[np.ndarray] = []
+    show = viewer._show
+    viewer.loop._show = lambda to, picture, is_sharp: (pictures.append(picture), show(to, picture, is_sharp))
+    client._layer.value = "error"
+    eventually(lambda: bool(pictures) and pictures[-1][..., 0].max() <= 5)
+    assert client.wish().against == 3
+    client._panes._glass.value = "mirror"
+    eventually(lambda: pictures[-1][..., 0].max() > 100)

@@ -1,0 +1,274 @@
+"""Many clients that click at random look at a scene for long: does memory stay flat, does everybody get pictures?
+
+    python -m tools.soak_viewer RUN --clients 50 --minutes 120
+
+Starts `glassplat view` in a process of its own and speaks viser's protocol, as browsers do: cameras that move, every
+control that the page has, panes that are dragged, connections that are cut. At the end all clients rest, and each has
+to get a picture. Memory is that of the viewer's process; its slope is fitted to the second half of the time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import os
+import random
+import signal
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec.msgpack
+import numpy as np
+import viser
+import zstandard
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed
+
+from tests.viewer.free_port import free_port
+
+SIZES = ((640, 480), (1280, 720), (390, 844))
+PAUSE = 0.25
+"""Mean seconds between two actions of a client."""
+LEAVES = 0.01
+"""Of the actions, how many cut the connection."""
+BETWEEN_SAMPLES = 5.0
+LAST_PICTURE = 300.0
+"""Seconds in which every client that rests has to get a picture."""
+COMPLAINTS = ("Traceback", "Error", "could not be drawn")
+
+
+@dataclass
+class Count:
+    """What happened."""
+
+    pictures: int = 0
+    actions: int = 0
+    connections: int = 0
+    refused: list[str] = field(default_factory=list)
+
+
+class Browser:
+    """One client that does what people do, and some things that they do not."""
+
+    def __init__(self, address: str, seed: int, count: Count) -> None:
+        self._address, self._random, self._count = address, random.Random(seed), count
+        self._controls: dict[str, dict[str, Any]] = {}
+        self._gizmos: dict[str, dict[str, Any]] = {}
+        self._angle, self._size = self._random.uniform(0, 6.28), self._random.choice(SIZES)
+        self.rests, self.pictures = False, 0
+
+    async def live(self) -> None:
+        """Connects, acts and connects again, until it is cancelled."""
+        while True:
+            self._controls, self._gizmos = {}, {}
+            try:
+                async with connect(
+                    self._address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None, open_timeout=60
+                ) as connection:
+                    self._count.connections += 1
+                    await self._look(connection)
+                    hearing = asyncio.create_task(self._hear(connection))
+                    try:
+                        await self._act(connection)
+                    finally:
+                        hearing.cancel()
+                        await asyncio.gather(hearing, return_exceptions=True)
+                        if self._random.random() < 0.5:
+                            connection.transport.abort()  # As when a laptop is closed.
+            except (ConnectionClosed, OSError, TimeoutError) as error:
+                self._count.refused.append(f"{type(error).__name__}: {error}")
+                await asyncio.sleep(1)
+
+    async def _act(self, connection: ClientConnection) -> None:
+        """Acts until it leaves; while it rests, it only listens."""
+        rested = False
+        while True:
+            await asyncio.sleep(self._random.expovariate(1 / PAUSE))
+            if self.rests:
+                if not rested:
+                    self.pictures, rested = 0, True
+                    await self._look(connection)
+                continue
+            rested = False
+            if self._random.random() < LEAVES:
+                return
+            self._count.actions += 1
+            await self._random.choice((self._look, self._look, self._click, self._drag))(connection)
+
+    async def _send(self, connection: ClientConnection, kind: str, **fields: Any) -> None:
+        await connection.send(msgspec.msgpack.encode({"type": kind, **fields}))
+
+    async def _look(self, connection: ClientConnection) -> None:
+        """The camera moves on a circle round the origin."""
+        self._angle += self._random.gauss(0, 0.1)
+        half = self._angle / 2
+        width, height = self._size
+        await self._send(
+            connection,
+            "ViewerCameraMessage",
+            wxyz=(float(np.cos(half)), 0.0, float(np.sin(half)), 0.0),
+            position=(float(-2 * np.sin(self._angle)), 0.0, float(-2 * np.cos(self._angle))),
+            fov=self._random.uniform(0.5, 1.5),
+            near=0.01,
+            far=1000.0,
+            image_height=height,
+            image_width=width,
+            look_at=(0.0, 0.0, 0.0),
+            up_direction=(0.0, -1.0, 0.0),
+        )
+
+    async def _click(self, connection: ClientConnection) -> None:
+        """One control of the page, whichever."""
+        if not self._controls:
+            return
+        uuid, made = self._random.choice(list(self._controls.items()))
+        properties = made["props"]
+        if "options" in properties:
+            value: Any = self._random.choice(properties["options"])
+        elif made["type"] == "GuiButtonMessage":
+            value = True
+        elif made["type"] == "GuiSliderMessage":
+            value = self._random.uniform(properties["min"], properties["max"])
+        else:
+            return
+        await self._send(connection, "GuiUpdateMessage", uuid=uuid, updates={"value": value})
+
+    async def _drag(self, connection: ClientConnection) -> None:
+        """A pane is moved and turned a little."""
+        if not self._gizmos:
+            return
+        name, made = self._random.choice(list(self._gizmos.items()))
+        turn = np.array([1.0, *(self._random.gauss(0, 0.1) for _ in range(3))])
+        await self._send(
+            connection,
+            "TransformControlsUpdateMessage",
+            name=name,
+            owner=made.get("owner", ""),
+            wxyz=(turn / np.linalg.norm(turn)).tolist(),
+            position=[self._random.gauss(0, 0.5) for _ in range(3)],
+        )
+
+    async def _hear(self, connection: ClientConnection) -> None:
+        unpack = zstandard.ZstdDecompressor()
+        async for data in connection:
+            assert isinstance(data, bytes)
+            size, packed = (int.from_bytes(data[at : at + 8], "little") for at in (0, 8))
+            for message in msgspec.msgpack.decode(unpack.decompress(data[16 : 16 + packed], size))["messages"]:
+                self._learn(message)
+
+    def _learn(self, message: dict[str, Any]) -> None:
+        kind = message["type"]
+        if kind == "BackgroundImageMessage":
+            self._count.pictures += 1
+            self.pictures += 1
+        elif kind in ("GuiDropdownMessage", "GuiSliderMessage", "GuiButtonMessage", "GuiButtonGroupMessage"):
+            self._controls[message["uuid"]] = message
+        elif kind == "TransformControlsMessage":
+            self._gizmos[message["name"]] = message
+
+
+@dataclass
+class Soaked:
+    """What a soak found: seconds and MiB of samples, counts, and lines in which the viewer complained."""
+
+    samples: list[tuple[float, float]]
+    count: Count
+    without_picture: int
+    complaints: list[str]
+    seconds_to_last: float
+
+    @property
+    def slope(self) -> float:
+        """MiB an hour, over the second half of the samples."""
+        half = np.array(self.samples[len(self.samples) // 2 :])
+        return float(3600 * np.polyfit(half[:, 0], half[:, 1], 1)[0]) if len(half) > 2 else 0.0
+
+
+def resident_mib(pid: int) -> float:
+    """Memory of a process, MiB."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+async def soak(run: Path, clients: int, minutes: float, say: Any = print) -> Soaked:
+    """Starts a viewer and its clients, waits, and ends them all."""
+    port, count = free_port(), Count()
+    with tempfile.TemporaryDirectory() as kept, tempfile.TemporaryFile("w+") as log:
+        command = ["-m", "glassplat", "view", str(run), "--port", str(port), "--output", kept]
+        viewer = await asyncio.create_subprocess_exec(sys.executable, *command, stdout=log, stderr=log)
+        try:
+            await until_it_listens(port, viewer)
+            browsers = [Browser(f"ws://127.0.0.1:{port}", seed, count) for seed in range(clients)]
+            tasks = [asyncio.create_task(browser.live()) for browser in browsers]
+            samples = await sampled(viewer.pid, 60 * minutes, count, say)
+            for browser in browsers:
+                browser.rests = True
+            begun = time.monotonic()
+            await asyncio.sleep(4 * PAUSE)
+            while any(not one.pictures for one in browsers) and time.monotonic() - begun < LAST_PICTURE:
+                await asyncio.sleep(0.5)
+            seconds = time.monotonic() - begun
+            missing = sum(not one.pictures for one in browsers)
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                viewer.send_signal(signal.SIGINT)
+            await viewer.wait()
+        log.seek(0)
+        complaints = [line.strip() for line in log if any(word in line for word in COMPLAINTS)]
+    return Soaked(samples, count, missing, complaints, seconds)
+
+
+async def until_it_listens(port: int, viewer: asyncio.subprocess.Process) -> None:
+    """Waits for the viewer; raises RuntimeError if it ends."""
+    while viewer.returncode is None:
+        with contextlib.suppress(OSError):
+            _, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.close()
+            return
+        await asyncio.sleep(0.2)
+    raise RuntimeError("the viewer ended before it listened; try `glassplat view` with the same run")
+
+
+async def sampled(pid: int, seconds: float, count: Count, say: Any) -> list[tuple[float, float]]:
+    """Memory over time, with a line ten times on the way."""
+    begun, samples, said = time.monotonic(), list[tuple[float, float]](), 0
+    while (now := time.monotonic() - begun) < seconds:
+        samples.append((now, resident_mib(pid)))
+        if now >= said * seconds / 10:
+            said += 1
+            say(
+                f"{now / 60:6.1f} min {samples[-1][1]:7.0f} MiB {count.pictures:8d} pictures {count.actions:8d} actions"
+            )
+        await asyncio.sleep(min(BETWEEN_SAMPLES, seconds / 20))
+    return samples
+
+
+def main() -> int:
+    """Soaks, and says how it went; 1 if somebody got no picture or the viewer complained."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--clients", type=int, default=50)
+    parser.add_argument("--minutes", type=float, default=120)
+    options = parser.parse_args()
+    found = asyncio.run(soak(options.run, options.clients, options.minutes, lambda line: print(line, flush=True)))
+    first, last = found.samples[len(found.samples) // 2][1], found.samples[-1][1]
+    print(
+        f"{found.count.connections} connections, {found.count.actions} actions, {found.count.pictures} pictures; "
+        f"half-way {first:.0f} MiB, at the end {last:.0f}, slope {found.slope:+.1f} MiB/h; all at rest: "
+        f"{found.without_picture} of {options.clients} without a picture after {found.seconds_to_last:.1f} s"
+    )
+    for line in [*found.complaints[:10], *found.count.refused[:10]]:
+        print(line)
+    return 1 if found.without_picture or found.complaints else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
