@@ -18,7 +18,7 @@ from unittest import mock
 import numba
 import torch
 
-from glassplat.commands.demo import SCENE
+from glassplat.commands.measuring.demo import SCENE
 from glassplat.data.dataset import load_dataset
 from glassplat.files.markdown_table import Table
 from glassplat.kernels.cpu.jit import Kernel
