@@ -11,6 +11,7 @@ import numba
 import torch
 
 from bench.kernels import kernel_times, twin_ratios
+from bench.looking import looking_times
 from bench.methods import deferred_costs, method_costs, scaling
 from bench.steps import step_costs
 
@@ -38,7 +39,7 @@ def main() -> None:
     arguments = parser.parse_args()
     parts = [f"Machine: {machine()}.\n"]
     print(parts[0])
-    for measure in (kernel_times, twin_ratios, step_costs, method_costs, deferred_costs, scaling):
+    for measure in (kernel_times, twin_ratios, step_costs, method_costs, deferred_costs, scaling, looking_times):
         parts.append(measure().markdown())
         print(parts[-1], flush=True)
     if arguments.write:

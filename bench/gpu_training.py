@@ -10,9 +10,9 @@ from typing import Any
 
 from rich.console import Console
 
-from glassplat.commands.evaluate import evaluate_run
-from glassplat.commands.stored_run import open_run
-from glassplat.commands.train import Train
+from glassplat.commands.measuring.evaluate import evaluate_run
+from glassplat.commands.runs.stored_run import open_run
+from glassplat.commands.training.train import Train
 from glassplat.files.markdown_table import Table
 from glassplat.kernels.devices import DeviceName
 from glassplat.train.planar_recipe import PlanarRecipe

@@ -15,8 +15,8 @@ import numba
 
 from bench.methods import doublings, thread_count
 from bench.timing import clocks_of
-from glassplat.commands.demo import SCENE
-from glassplat.commands.stored_run import open_run
+from glassplat.commands.measuring.demo import SCENE
+from glassplat.commands.runs.stored_run import open_run
 from glassplat.data.dataset import Dataset, load_dataset
 from glassplat.files.markdown_table import Table
 from glassplat.train.background import photo_background, settled

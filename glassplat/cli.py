@@ -29,46 +29,52 @@ class Listed(NamedTuple):
 
 
 COMMANDS = {
-    "prepare": Listed("prepare", "Prepare", "Find out where photographs were taken, and make a capture of them."),
+    "prepare": Listed(
+        "capture.prepare", "Prepare", "Find out where photographs were taken, and make a capture of them."
+    ),
     "annotate": Listed(
-        "annotate",
+        "capture.annotate",
         "Annotate",
         "Mark the panes of a capture in the browser: corners in a few photographs, and what stands before them.",
     ),
-    "train": Listed("train", "Train", "Train a scene from photographs."),
-    "eval": Listed("evaluate", "Evaluate", "Measure a run on its test views and write comparison sheets."),
+    "train": Listed("training.train", "Train", "Train a scene from photographs."),
+    "eval": Listed("measuring.evaluate", "Evaluate", "Measure a run on its test views and write comparison sheets."),
     "render": Listed(
-        "render", "Render", "Render the layers of a run from its cameras, with its panes as they are or edited."
+        "looking.render", "Render", "Render the layers of a run from its cameras, with its panes as they are or edited."
     ),
     "dereflect": Listed(
-        "dereflect",
+        "publishing.dereflect",
         "Dereflect",
         "Take the reflections out of a planar run's photographs; one PNG per photograph, under its name.",
     ),
     "view": Listed(
-        "view", "View", "Look at a scene in the browser, layer by layer, with its panes as they are or edited."
+        "looking.view", "View", "Look at a scene in the browser, layer by layer, with its panes as they are or edited."
     ),
     "video": Listed(
-        "video", "Video", "Film a scene along a path: one layer, several side by side, or one wiped over another."
+        "looking.video",
+        "Video",
+        "Film a scene along a path: one layer, several side by side, or one wiped over another.",
     ),
     "import": Listed(
-        "import_splats",
+        "publishing.import_splats",
         "Import",
         "Read a splat file (PLY, SPZ, GLB, .splat) of any program as a scene to look at, film and export.",
     ),
     "export": Listed(
-        "export",
+        "publishing.export",
         "Export",
         "Write a scene as others read it: PLY, SPZ, GLB, a web page with live panes, and the panes beside them.",
     ),
-    "info": Listed("info", "Info", "Say what a folder or file is, whether it is healthy, and what to do next."),
+    "info": Listed(
+        "inspecting.info", "Info", "Say what a folder or file is, whether it is healthy, and what to do next."
+    ),
     "demo": Listed(
-        "demo",
+        "measuring.demo",
         "Demo",
         "Train planar and splat on the bundled showcase and compare them; goes on where it was interrupted.",
     ),
     "bench": Listed(
-        "bench",
+        "measuring.bench",
         "Bench",
         "Compare methods over scenes or in a given time, or the parts of a method with each other.",
     ),
@@ -97,9 +103,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def guarded(arguments: list[str], *, is_program: bool) -> int:
     """Runs a command; whatever happens ends in one readable message and an exit code."""
-    from glassplat.commands.endings import ending
-    from glassplat.commands.messages import complain, drop_output, plain_streams
-    from glassplat.commands.signals import immediate_end, raised_signals
+    from glassplat.commands.console.endings import ending
+    from glassplat.commands.console.messages import complain, drop_output, plain_streams
+    from glassplat.commands.console.signals import immediate_end, raised_signals
 
     plain_streams()
     command = None
@@ -134,7 +140,7 @@ def parsed(arguments: list[str]) -> Any:
     """
     import tyro
 
-    from glassplat.commands.arguments import check_arguments
+    from glassplat.commands.console.arguments import check_arguments
     from glassplat.data.options import check_options
 
     if arguments[:1] == ["--version"]:
@@ -158,7 +164,7 @@ def parsed(arguments: list[str]) -> Any:
 def command_line(name: str, options: list[str]) -> tuple[Any, list[str]]:
     """What tyro should make of a command's options, and how it should see them; that of `train` depends on them."""
     if name == "train":
-        from glassplat.commands.train_options import train_command
+        from glassplat.commands.training.train_options import train_command
 
         return train_command(options)
     return command_class(name), options
@@ -192,7 +198,7 @@ def overview(kinds: Mapping[str, type]) -> type:
 
 def run(command: Any) -> None:
     """Runs a command; its console shows the package's log too, and what libraries warn of."""
-    from glassplat.commands.messages import heard_by, message_console
+    from glassplat.commands.console.messages import heard_by, message_console
 
     console = message_console()
     with heard_by(console):
@@ -201,8 +207,8 @@ def run(command: Any) -> None:
 
 def interrupted(stop: KeyboardInterrupt, command: Any) -> int:
     """Says what an interrupted command leaves behind, and how to go on."""
-    from glassplat.commands.messages import drop_output, message_console, say
-    from glassplat.commands.signals import code_of
+    from glassplat.commands.console.messages import drop_output, message_console, say
+    from glassplat.commands.console.signals import code_of
 
     left = "" if command is None else f"; {command.left_behind()}"
     try:

@@ -6,6 +6,7 @@ import ast
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -169,6 +170,20 @@ def test_the_diagram_names_only_what_exists(rows: dict[str, int]) -> None:
 def test_the_diagram_has_kernels_and_scene_side_by_side_at_the_bottom(rows: dict[str, int]) -> None:
     assert rows["kernels"] == rows["scene"] == max(rows.values())
     assert rows["cli"] == 0
+
+
+def test_the_folders_of_commands_import_each_other_in_no_circle() -> None:
+    commands = ROOT / PACKAGE / "commands"
+    imports: dict[str, set[str]] = {
+        folder.name: set() for folder in commands.iterdir() if (folder / "__init__.py").is_file()
+    }
+    for path in sorted(commands.glob("*/*.py")):
+        for module, _ in imported_modules(ast.parse(path.read_text()), path.relative_to(ROOT)):
+            parts = module.split(".")
+            if parts[:2] == [PACKAGE, "commands"] and len(parts) > 2 and parts[2] != path.parent.name:
+                imports[path.parent.name].add(parts[2])
+    assert {"console", "runs"} <= imports["looking"]
+    TopologicalSorter(imports).prepare()  # Raises CycleError, and names the circle.
 
 
 SMALL_ROWS = {"cli": 0, "train": 1, "render": 2, "files": 2, "kernels": 3, "scene": 3}

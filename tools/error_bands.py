@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from glassplat.commands.stored_run import StoredRun, open_run
+from glassplat.commands.runs.stored_run import StoredRun, open_run
 from glassplat.data.dataset import Dataset
 from glassplat.data.view import View
 from glassplat.evaluate.evaluate import timed_render

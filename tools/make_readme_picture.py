@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from glassplat.commands.stored_run import open_run
+from glassplat.commands.runs.stored_run import open_run
 from glassplat.evaluate.colormap import normal_colors
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.evaluate.metrics import quantized

@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from glassplat.commands.stored_run import StoredRun, open_run
+from glassplat.commands.runs.stored_run import StoredRun, open_run
 from glassplat.data.view import View
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.evaluate.surface_metrics import REFLECTIVE, angular_errors_deg

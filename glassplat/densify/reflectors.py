@@ -54,17 +54,15 @@ class Search:
         reflects = scene.primary.channels["logit_strength"] > logit(self.strength)
         return mean_in_region(scene, shown, ~reflects & (spreads > self.spread))
 
-    @torch.no_grad()
-    def matte(self, scene: Scene, views: Sequence[View], renderer: Renderer) -> Tensor:
-        """[N] bool: which primary Gaussians are seen, do not reflect and do not look as if they should."""
-        shown, spreads = residual_spreads(scene, self._chosen(views), renderer)
-        reflects = scene.primary.channels["logit_strength"] > logit(self.strength)
-        return (shown > LEAST_SHOWN) & ~reflects & (spreads <= self.spread)
-
     def _chosen(self, views: Sequence[View]) -> list[View]:
         """Evenly among all of them."""
-        count = min(self.views, len(views))
-        return [views[len(views) * number // count] for number in range(count)]
+        return evenly(views, self.views)
+
+
+def evenly(views: Sequence[View], most: int) -> list[View]:
+    """No more than so many of the views, evenly among all of them."""
+    count = min(most, len(views))
+    return [views[len(views) * number // count] for number in range(count)]
 
 
 def mean_in_region(scene: Scene, shown: Tensor, values: Tensor) -> float:

@@ -6,7 +6,6 @@ from os.path import isfile
 from pathlib import Path
 
 import numpy as np
-import OpenEXR
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -62,6 +61,8 @@ def write_equirect(path: Path | str, image: Tensor) -> None:
     if path.suffix.lower() == PNG:
         write_image(path, image)
         return
+    import OpenEXR  # Only where there are such files.
+
     radiance = linear_from_srgb(image.detach().cpu().double()).float().contiguous().numpy()
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic_write(path) as temporary:
@@ -78,6 +79,8 @@ def _check_suffix(path: Path) -> None:
 
 def _read_exr(path: Path) -> NDArray[np.float32]:
     """Linear radiance [H, W, 3]."""
+    import OpenEXR  # As above.
+
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: channel.pixels for name, channel in file.channels().items()}

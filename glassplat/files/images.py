@@ -19,6 +19,8 @@ FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF", "PPM", "TGA", "JPEG2000"
 """What a photograph or a mask may be, whatever its suffix; not PostScript and others that start programs."""
 MOST_PIXELS = 2**27
 """Of one image; decoding takes about ten bytes a pixel."""
+COMPRESSION = 4
+"""Of PNG files, of 9: half of the time of Pillow's 6 for a twentieth more bytes."""
 SHADES_16 = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 _FULL_SCALE_16 = 65535
 
@@ -110,7 +112,7 @@ def write_image(path: Path | str, image: Tensor | NDArray[np.generic]) -> None:
     if Path(path).suffix.lower() not in IMAGE_SUFFIXES:
         raise ValueError(f"cannot tell the image format of {path}; use one of the suffixes {', '.join(IMAGE_SUFFIXES)}")
     with atomic_write(path) as temporary:
-        Image.fromarray(pixels).save(temporary)
+        Image.fromarray(pixels).save(temporary, compress_level=COMPRESSION)
 
 
 @contextmanager

@@ -12,11 +12,9 @@ import torch
 from torch import Tensor
 
 from glassplat.data.dataset import Dataset
-from glassplat.evaluate.evaluate import evaluate
 from glassplat.evaluate.layer_image import layer_image
 from glassplat.init.glass import with_pane
 from glassplat.interface.layers import Layer, check_layers, layers_of
-from glassplat.interface.saving import save_model
 from glassplat.publish.camera_paths import orbit
 from glassplat.render.frame import Frame, Renderer
 from glassplat.render.layers import renderer_with
@@ -112,6 +110,8 @@ class Model:
 
         Where one is None, `<name>_reason` says why.
         """
+        from glassplat.evaluate.evaluate import evaluate  # Training imports this file, and may never need it.
+
         return evaluate(self.scene, self.renderer, dataset).results
 
     def to(self, device: torch.device | str) -> Model:
@@ -218,6 +218,8 @@ class Model:
             FileExistsError: something is there, also beside it; nothing was written.
             InputError: the format is not known, or cannot hold this model.
         """
+        from glassplat.interface.saving import save_model  # As above: all formats and the web page.
+
         return save_model(self, Path(path), overwrite=overwrite)
 
 

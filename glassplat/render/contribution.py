@@ -34,7 +34,7 @@ def contributions(scene: Scene, camera: Camera) -> Tensor:
     # Colours do not matter here.
     primary, near = replace(detached(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
     if primary.are_discs:
-        return _disc_weight_sums(primary, camera, near)
+        return _disc_sums(primary, camera, near, primary.means.new_ones(camera.height, camera.width, 1))[:, 0]
     most = _weight_sums(project_gaussians(primary, camera, near=near), camera)
     seen = seen_panes(scene.planes, camera, nearest_hits(panes_in_camera(scene.planes, camera), camera))
     if seen is None:
@@ -43,21 +43,36 @@ def contributions(scene: Scene, camera: Camera) -> Tensor:
     return torch.maximum(most, _weight_sums(mirrored, camera, seen.tiles))
 
 
+def gathered(scene: Scene, camera: Camera, values: Tensor) -> Tensor:
+    """[N, D] an image [H, W, D] summed over the pixels of each primary Gaussian, by its blending weights."""
+    camera = camera.to(scene.primary.means.device)
+    primary, near = replace(detached(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
+    if primary.are_discs:
+        return _disc_sums(primary, camera, near, values)
+    return _sums(project_gaussians(primary, camera, near=near), camera, values)[0]
+
+
 def _weight_sums(projected: Projected, camera: Camera, tiles: Tensor | None = None) -> Tensor:
-    """[N] blending weights summed over the pixels of the images, which is what a channel of ones has for a gradient."""
+    """[N] blending weights summed over the pixels of the images."""
+    ones = projected.depths.new_ones(camera.height, camera.width, 1)
+    return _sums(projected, camera, ones, tiles)[..., 0].amax(dim=0)
+
+
+def _sums(projected: Projected, camera: Camera, values: Tensor, tiles: Tensor | None = None) -> Tensor:
+    """[C, N, D] what a constant channel has for a gradient where `values` [H, W, D] are those of the images."""
     splats = joined_splats(projected)
     with torch.enable_grad():
-        ones = torch.ones_like(projected.depths)[..., None].requires_grad_()
+        ones = projected.depths.new_ones(*projected.depths.shape, values.shape[-1]).requires_grad_()
         image = composite(splats, ones, bin_tiles(splats, camera.width, camera.height, tiles)).image
-        (sums,) = torch.autograd.grad(image.sum(), ones)
-    return sums[..., 0].amax(dim=0)
+        (sums,) = torch.autograd.grad((image * values).sum(), ones)
+    return sums
 
 
-def _disc_weight_sums(discs: Gaussians, camera: Camera, near: float) -> Tensor:
-    """As `_weight_sums`, of discs."""
+def _disc_sums(discs: Gaussians, camera: Camera, near: float, values: Tensor) -> Tensor:
+    """[N, D] as `_sums`, of discs and one camera."""
     projected = projected_discs(discs, camera, near=near)
     with torch.enable_grad():
-        ones = torch.ones_like(projected.depths)[..., None].requires_grad_()
+        ones = projected.depths.new_ones(*projected.depths.shape, values.shape[-1]).requires_grad_()
         image = blended_discs(projected, ones, camera, near=near).image
-        (sums,) = torch.autograd.grad(image.sum(), ones)
-    return sums[0, :, 0]
+        (sums,) = torch.autograd.grad((image * values).sum(), ones)
+    return sums[0]

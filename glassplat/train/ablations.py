@@ -39,6 +39,7 @@ Switch = Literal[
     "surroundings",
     "environment",
     "copied-surroundings",
+    "found-mirrors",
     "monocular-normals",
     "normal-consistency",
     "culling",
@@ -90,6 +91,10 @@ def _without_sabotage(recipe: Reflective) -> Reflective:
     return replace(recipe, propagation=replace(recipe.propagation, sabotage=0.0))
 
 
+def _without_search(recipe: TracedRecipe) -> TracedRecipe:
+    return replace(recipe, search=replace(recipe.search, begin_found=False))
+
+
 def _spread_over_the_box(recipe: TracedRecipe) -> TracedRecipe:
     start = replace(recipe.surroundings.start, source="box")
     return replace(recipe, surroundings=replace(recipe.surroundings, start=start))
@@ -132,6 +137,7 @@ TRACED: dict[Switch, Ablation] = {
     "propagation": Ablation("w/o normal propagation", _without_propagation, -0.43),
     "environment": Ablation("surroundings alone (the paper's)", lambda r: replace(r, mirrors="surroundings")),
     "copied-surroundings": Ablation("surroundings spread over the box (the paper's)", _spread_over_the_box),
+    "found-mirrors": Ablation("strengths that grow from nothing (the paper's)", _without_search),
     "normal-consistency": Ablation("w/o normal consistency", lambda r: replace(r, consistency_weight=0.0)),
     "culling": Ablation("rays wherever anything reflects", lambda r: replace(r, least_strength=0.0)),
 }

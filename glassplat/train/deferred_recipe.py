@@ -26,6 +26,7 @@ from glassplat.data.ranges import (
 )
 from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
+from glassplat.densify.mirrors import MirrorSearch
 from glassplat.densify.propagate import NormalPropagation
 from glassplat.losses.geometry import normal_consistency
 from glassplat.losses.reflectors import mean_strength, strength_outside
@@ -35,7 +36,7 @@ from glassplat.render.splat import Splat
 from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import SH_ZERO
 from glassplat.scene.scene import Scene
-from glassplat.train.actions import Densify, ResetOpacity
+from glassplat.train.actions import Densify, GrowSh, ResetOpacity
 from glassplat.train.background import BLACK
 from glassplat.train.environment_entry import AddEnvironment, StayMatte
 from glassplat.train.optimizer import PUBLISHED_ITERATIONS, Rate
@@ -47,6 +48,7 @@ from glassplat.train.propagation import (
     RefineEnvironment,
     ResetRaised,
 )
+from glassplat.train.reflection_entry import BeginReflections
 from glassplat.train.splat_recipe import GaussianRates, SplatRecipe, image_terms
 from glassplat.train.stage import Action, Every, Stage
 from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
@@ -83,12 +85,14 @@ class DeferredRecipe:
         view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
         background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         shading: per pixel (`deferred`), or per Gaussian (`forward`, ablation).
-        bootstrap: share of the run without reflection (paper: a few thousand iterations).
+        bootstrap: share of the run without reflection (paper: a few thousand iterations); where mirrors are searched
+            for afterwards it is a run of `splat`, else harmonics wait.
         texels: edge length of the environment's cube faces in the end.
         first_texels: edge length at the start.
         refinements: shares of the run at which the edge length doubles for the first and for the last time on the way
             from `first_texels` to `texels`; other doublings are spread evenly in between.
         first_strength: reflection strength of every Gaussian at the start.
+        search: what is taken for a mirror at once when reflections begin.
         region: only what lies in this sphere may reflect: centre and radius, world units. None leaves it to
             `find_region`.
         find_region: look for the place that the cameras stand around; if not, everything may reflect unless `region`
@@ -125,6 +129,7 @@ class DeferredRecipe:
     first_texels: Texels = 16
     refinements: Annotated[tuple[Share, Share], Ascending()] = (0.45, 0.65)
     first_strength: InnerShare = 1e-3
+    search: MirrorSearch = field(default_factory=partial(MirrorSearch, begin_found=False))
     region: Annotated[tuple[Finite, Finite, Finite, Positive] | None, ESSENTIAL] = None
     find_region: bool = True
     outside_weight: NotNegative = 0.4
@@ -198,8 +203,8 @@ class DeferredRecipe:
             share=self.bootstrap,
             renderer=Splat(self.background or BLACK, depth=False),
             losses=(*image, *population.terms),
-            rates=self.rates.of("primary"),
-            actions=population.edits,
+            rates=(self._rates_of_splat() if self.search.begin_found else self.rates).of("primary"),
+            actions=(*population.edits, *self._regular(population)),
             motions=population.motions,
             densify_until=population.densify_until,
         )
@@ -225,7 +230,7 @@ class DeferredRecipe:
                 RefineEnvironment(self._doublings(), self.texels),
             ),
             motions=population.motions,
-            entry=self._entry(),
+            entry=self.entry(),
             densify_until=population.densify_until,
         )
         refinement = replace(
@@ -240,24 +245,37 @@ class DeferredRecipe:
 
     def _matte_stages(self, seed: int, iterations: int) -> tuple[Stage, ...]:
         """The one stage of a run that is too short for normals to spread: that of `splat`."""
-        usual, power = Rhythm(), GaussianRates().short_run_power
+        usual = Rhythm()
         plain = SplatRecipe(
             sh_degree=self.sh_degree,
             ssim_weight=self.ssim_weight,
             view_dependence_weight=self.view_dependence_weight,
             background=self.background,
-            rates=replace(self.rates, short_run_power=power) if self.hurry_matte else self.rates,
+            rates=self._rates_of_splat(),
             rhythm=replace(self.rhythm, beat=usual.beat, least=usual.least),
             strategy=self.strategy,
             densify=self.densify,
             mcmc=self.mcmc,
         )
         (stage,) = plain.stages(seed)
-        entry = StayMatte(iterations, self.least_iterations, self._entry())
+        entry = StayMatte(iterations, self.least_iterations, self._environment())
         return (replace(stage, name="as splat", entry=entry),)
 
-    def _entry(self) -> AddEnvironment:
+    def _rates_of_splat(self) -> GaussianRates:
+        """The learning rates where nothing reflects that higher ones would spoil."""
+        return replace(self.rates, short_run_power=GaussianRates().short_run_power) if self.hurry_matte else self.rates
+
+    def _regular(self, population: Population) -> tuple[Action, ...]:
+        """What happens in the bootstrap as in `splat`: a scene has to look right for mirrors to be told from it."""
+        return (GrowSh(Every(self.rhythm.sh)), *population.resets) if self.search.begin_found else ()
+
+    def entry(self) -> BeginReflections:
         """How things begin to reflect."""
+        seen_by = Splat(self.background or BLACK, depth=False)
+        return BeginReflections(self._environment(), None, self.search, seen_by)
+
+    def _environment(self) -> AddEnvironment:
+        """What is mirrored."""
         return AddEnvironment(min(self.first_texels, self.texels), self.region, self.find_region)
 
     def contradiction(self) -> str | None:

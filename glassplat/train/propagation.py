@@ -276,15 +276,3 @@ class RefineEnvironment:
 def has_ended(state: TrainState) -> bool:
     """Whether normal propagation is over."""
     return ENDED in state.records
-
-
-def search_anew(state: TrainState) -> None:
-    """Lets propagation go on, because more can be mirrored from now on; not where nothing reflective was found.
-
-    Patience begins again.
-    """
-    if has_ended(state) and state.records.get(MOST, 0.0) < FOUND:
-        return
-    state.records.pop(ENDED, None)
-    if GREW in state.records:
-        state.records[GREW] = state.step

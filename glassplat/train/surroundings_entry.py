@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
+from torch import Tensor
+
 from glassplat.data.dataset import Dataset
-from glassplat.data.ranges import ESSENTIAL, InnerShare, Range, Share
+from glassplat.data.ranges import ESSENTIAL, InnerShare, Range
 from glassplat.densify.edit import apply_edit
 from glassplat.densify.order import in_morton_order
-from glassplat.densify.reflectors import Search
 from glassplat.init.points import as_discs
 from glassplat.init.surroundings import (
     copied_surroundings,
@@ -18,9 +19,7 @@ from glassplat.init.surroundings import (
     suitable_cells,
     surroundings_in_box,
 )
-from glassplat.render.frame import Renderer
 from glassplat.scene.gaussians import Gaussians
-from glassplat.train.propagation import search_anew
 from glassplat.train.state import TrainState
 
 
@@ -35,9 +34,6 @@ class SurroundingsStart:
         per_cell: Gaussians in each cell.
         outside: share of the points left out of the box at either end of each axis.
         opacity: of those in the box.
-        copied_strength: what reflects more is not copied.
-        copied_spread: what differs from the photographs by residuals that spread by more over the views is not copied:
-            it mirrors, and has what it mirrors painted on, which rays would meet first.
     """
 
     source: Annotated[Literal["box", "scene", "both"], ESSENTIAL] = "scene"
@@ -45,8 +41,6 @@ class SurroundingsStart:
     per_cell: Annotated[int, Range(1, 1000)] = 5
     outside: Annotated[float, Range(0, 0.45)] = 0.005
     opacity: InnerShare = 0.1
-    copied_strength: InnerShare = 0.1
-    copied_spread: Share = 0.04
 
 
 @dataclass(frozen=True)
@@ -56,27 +50,22 @@ class AddSurroundings:
     Attributes:
         start: what they are.
         sh_degree: highest degree of their colours.
-        renderer: that of the stage before.
     """
 
     start: SurroundingsStart
     sh_degree: int
-    renderer: Renderer
 
-    def __call__(self, state: TrainState, dataset: Dataset) -> None:
-        """Edits `state`."""
-        parts = [part for part in self._parts(state, dataset) if len(part)]
+    def __call__(self, state: TrainState, dataset: Dataset, matte: Tensor) -> None:
+        """Edits `state`; `matte` [N] bool tells which primary Gaussians may be copied."""
+        parts = [part for part in self._parts(state, dataset, matte) if len(part)]
         # A scene in which everything reflects has nothing to copy.
         found = joined(*(parts or [self._in_box(state, dataset)]))
         ordered, _ = apply_edit(found, {}, in_morton_order(found.means), part="surroundings")
         state.scene = replace(state.scene, surroundings=ordered)
-        search_anew(state)
 
-    def _parts(self, state: TrainState, dataset: Dataset) -> list[Gaussians]:
+    def _parts(self, state: TrainState, dataset: Dataset, matte: Tensor) -> list[Gaussians]:
         parts = []
         if self.start.source != "box":
-            search = Search(strength=self.start.copied_strength, spread=self.start.copied_spread)
-            matte = search.matte(state.scene, dataset.train, self.renderer)
             parts.append(copied_surroundings(state.scene.primary, matte, sh_degree=self.sh_degree))
         if self.start.source != "scene":
             parts.append(self._in_box(state, dataset))

@@ -21,12 +21,12 @@ from glassplat.data.ranges import (
 )
 from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
+from glassplat.densify.mirrors import MirrorSearch
 from glassplat.densify.propagate import NormalPropagation
 from glassplat.init.points import as_discs
 from glassplat.losses.monocular import MonocularNormals
 from glassplat.losses.term import LossTerm, weighted
 from glassplat.render.deferred import Deferred
-from glassplat.render.splat import Splat
 from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene.gaussians import SH_ZERO
 from glassplat.scene.scene import Scene
@@ -50,8 +50,6 @@ class SurroundingsOptions:
     """How the surroundings learn.
 
     Attributes:
-        begin: share of the run at which they join, where an environment was mirrored before; else with the end of the
-            bootstrap (paper).
         start: what they are at first.
         sh_degree: highest degree of the colours that turn with the ray.
         rates: learning rates.
@@ -59,7 +57,6 @@ class SurroundingsOptions:
         reset: also reset their opacities when those of the scene are (paper).
     """
 
-    begin: Share = 0.25
     start: SurroundingsStart = field(default_factory=SurroundingsStart)
     sh_degree: ShDegree = 1
     rates: GaussianRates = field(default_factory=GaussianRates)
@@ -82,16 +79,17 @@ class TracedRecipe:
         view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
         background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         mirrors: what is mirrored: `surroundings` (paper), an `environment` infinitely far away (ablation), or `both`,
-            the environment alone at first and later behind the surroundings.
+            the environment behind the surroundings.
         joint: reflections also move the surfaces; without, they only teach the surroundings (ablation).
         least_strength: rays are traced where the strength is larger; elsewhere the environment alone is mirrored.
         least_iterations: of the shortest run in which anything reflects; a shorter one trains like `splat`.
-        bootstrap: share of the run without reflection.
+        bootstrap: share of the run without reflection, a run of `splat` if mirrors are searched for at its end.
         surroundings: how the Gaussians learn that reflections show.
         texels: edge length of the environment's cube faces in the end.
         first_texels: edge length at the start.
         refinements: shares of the run at which the edge length doubles for the first and for the last time.
         first_strength: reflection strength of every Gaussian at the start.
+        search: what is taken for a mirror at once when reflections begin.
         region: only what lies in this sphere may reflect: centre and radius, world units. None leaves it to
             `find_region`.
         find_region: look for the place that the cameras stand around; if not, everything may reflect unless `region`
@@ -126,12 +124,13 @@ class TracedRecipe:
     joint: bool = True
     least_strength: Annotated[Share, ESSENTIAL] = 0.02
     least_iterations: Several = 6000
-    bootstrap: Share = 0.043
+    bootstrap: Share = 0.25
     surroundings: SurroundingsOptions = field(default_factory=SurroundingsOptions)
     texels: Annotated[Texels, ESSENTIAL] = 64
     first_texels: Texels = 16
     refinements: Annotated[tuple[Share, Share], Ascending()] = (0.45, 0.65)
     first_strength: InnerShare = 1e-3
+    search: MirrorSearch = field(default_factory=MirrorSearch)
     region: Annotated[tuple[Finite, Finite, Finite, Positive] | None, ESSENTIAL] = None
     find_region: bool = True
     outside_weight: NotNegative = 0.4
@@ -177,6 +176,7 @@ class TracedRecipe:
                 ),
                 reset=True,
             ),
+            search=MirrorSearch(begin_found=False),
             find_region=False,
             strength_weight=0.0,
             consistency_weight=0.04,
@@ -215,7 +215,7 @@ class TracedRecipe:
         return Traced(self.background or BLACK, self.least_strength)
 
     def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
-        """Bootstrap, distant and near reflections, everything without propagation; a short run has one stage."""
+        """Bootstrap, reflections, everything without propagation; a short run has one stage."""
         known = self._distant().stages(seed, iterations)
         if len(known) == 1:
             return known
@@ -228,26 +228,14 @@ class TracedRecipe:
         distant, refinement = (replace(s, losses=(*s.losses, *guided)) for s in (distant, refinement))
         if self.mirrors == "environment":
             return bootstrap, distant, refinement
-        near = self._tracing(distant)
-        seen_by = Splat(self.background or BLACK) if self.mirrors == "surroundings" else distant.renderer
-        around = AddSurroundings(self.surroundings.start, self.surroundings.sh_degree, seen_by)
-        near = replace(near, name="2 reflection", entry=around)
-        refinement = self._tracing(refinement)
-        if self.mirrors == "surroundings":
-            return bootstrap, near, refinement
-        begin = self.surroundings.begin
-        distant = replace(distant, name="2 distant reflections", share=begin - self.bootstrap)
-        near = replace(near, name="3 near reflections", share=self.schedule.stop - begin)
-        return bootstrap, distant, near, replace(refinement, name="4 refinement")
+        entry = self._distant().entry()
+        around = AddSurroundings(self.surroundings.start, self.surroundings.sh_degree)
+        environment = None if self.mirrors == "surroundings" else entry.environment
+        near = replace(self._tracing(distant), entry=replace(entry, environment=environment, surroundings=around))
+        return bootstrap, near, self._tracing(refinement)
 
     def contradiction(self) -> str | None:
         """What is wrong with the options together, if anything."""
-        begin = self.surroundings.begin
-        if self.mirrors == "both" and not self.bootstrap < begin < self.schedule.stop:
-            return (
-                f"--surroundings.begin is {begin}; expected a share of the run between --bootstrap {self.bootstrap} "
-                f"and --schedule.stop {self.schedule.stop}"
-            )
         return self._distant().contradiction()
 
     def _tracing(self, stage: Stage) -> Stage:

@@ -14,9 +14,10 @@ from glassplat.data.errors import InputError
 from glassplat.scene.camera import Camera
 from glassplat.viewer.drawing import ERROR, Wish, edited
 from glassplat.viewer.keyframe_controls import KeyframeControls
-from glassplat.viewer.pane_controls import PaneControls, rotation_of
+from glassplat.viewer.pane_controls import PaneControls
 from glassplat.viewer.photograph_controls import PhotographControls
 from glassplat.viewer.render_loop import RenderLoop
+from glassplat.viewer.rotations import matrix_of
 from glassplat.viewer.shown import Shown, Viewpoints
 
 LARGEST_HEIGHT = 1080
@@ -86,7 +87,7 @@ class Client:
             fov_rad, aspect = float(camera.fov), float(camera.aspect)
         except AssertionError:  # viser has not heard of this camera yet; it will say so.
             return None
-        self._nearest = self._viewer.viewpoints.nearest(position, rotation_of(wxyz).as_matrix()[:, 2])
+        self._nearest = self._viewer.viewpoints.nearest(position, matrix_of(wxyz)[:, 2])
         against = self._nearest if self._layer.value == ERROR else None
         wish = Wish(cam_from_world(wxyz, position), fov_rad, aspect, self._layer.value, against=against)
         return wish if self._panes is None else self._panes.applied(wish)
@@ -169,7 +170,7 @@ class Client:
 
 def cam_from_world(wxyz: NDArray[np.float64], position: NDArray[np.float64]) -> Tensor:
     """[4, 4] float32 from viser's camera, which has the axes of OpenCV."""
-    rotation = rotation_of(wxyz).as_matrix().T
+    rotation = matrix_of(wxyz).T
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
     return torch.from_numpy(pose).float()

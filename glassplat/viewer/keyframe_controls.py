@@ -8,11 +8,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from glassplat.publish.camera_paths import interpolated
 from glassplat.scene.camera import Camera
-from glassplat.viewer.pane_controls import wxyz_of
+from glassplat.viewer.rotations import wxyz_of
 
 MOST_KEYFRAMES = 200
 FRUSTUM_SHARE = 0.06
@@ -60,7 +59,6 @@ class KeyframeControls:
         if camera is None or len(self.keyframes) == MOST_KEYFRAMES:
             return
         self.keyframes.append(camera)
-        rotation = Rotation.from_matrix(camera.cam_from_world[:3, :3].double().numpy().T)
         frustum = self._handle.scene.add_camera_frustum(
             f"/keyframes/{len(self.keyframes)}",
             2 * float(np.arctan(camera.height / 2 / camera.fy)),
@@ -69,7 +67,7 @@ class KeyframeControls:
             thickness=2.0,
             thickness_units="screen",
             color=KEYFRAME_COLOR,
-            wxyz=wxyz_of(rotation),
+            wxyz=wxyz_of(camera.cam_from_world[:3, :3].double().numpy().T),
             position=camera.center.double().numpy(),
         )
         self._frusta.append(frustum)

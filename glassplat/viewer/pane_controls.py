@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from glassplat.evaluate.colormap import LABEL_COLORS
 from glassplat.scene.plane import Planes
 from glassplat.viewer.drawing import LEAST_GAIN, MOST_GAIN, PaneMove, Wish
+from glassplat.viewer.rotations import matrix_of, wxyz_of
 
 NO_PANE = "none"
 HANDLE_SHARE = 0.7
@@ -35,7 +34,7 @@ class PaneGizmo:
         """
         self.label, self._name = planes.labels[row], f"/panes/{planes.labels[row]}"
         axes = torch.stack([*(axis[row] for axis in planes.axes()), planes.normals[row]], dim=1)
-        self._start = wxyz_of(Rotation.from_matrix(axes.detach().double().cpu().numpy()))
+        self._start = wxyz_of(axes.detach().double().cpu().numpy())
         self._center = planes.centers[row].detach().double().cpu().numpy()
         half = planes.half_sizes[row].detach().double().cpu().numpy()
         self._handle = scene.add_transform_controls(
@@ -75,7 +74,7 @@ class PaneGizmo:
             return None
         turn = np.array([1.0, 0, 0, 0])
         if not np.array_equal(wxyz, self._start):
-            turn = wxyz_of(rotation_of(wxyz) * rotation_of(self._start).inv())
+            turn = wxyz_of(matrix_of(wxyz) @ matrix_of(self._start).T)
         return PaneMove(self.label, tuple(turn.tolist()), tuple((position - self._center).tolist()))
 
 
@@ -135,15 +134,3 @@ class PaneControls:
         for gizmo in self._gizmos:
             gizmo.put_back()
         self._changed()
-
-
-def rotation_of(wxyz: NDArray[np.float64]) -> Rotation:
-    """A rotation from a quaternion in viser's order."""
-    w, x, y, z = wxyz
-    return Rotation.from_quat([x, y, z, w])
-
-
-def wxyz_of(rotation: Rotation) -> NDArray[np.float64]:
-    """[4] in viser's order, with w >= 0."""
-    x, y, z, w = rotation.as_quat(canonical=True)
-    return np.array([w, x, y, z])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import logging
+import warnings
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
 from dataclasses import replace
@@ -58,6 +59,8 @@ class Viewer:
         self._thread: RenderThread | None = None
         self._clients: dict[int, Client] = {}
         logging.getLogger("websockets").setLevel(logging.CRITICAL)
+        # A browser that leaves in the middle of something is nothing that anybody needs to know.
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         with redirect_stdout(io.StringIO()):  # It prints a table of addresses, which the commands say themselves.
             self._server = viser.ViserServer(host=host, port=port, label=shown.title, verbose=False)
         cameras = [camera for _, camera in shown.cameras]

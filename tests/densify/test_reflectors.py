@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from glassplat.data.view import View
-from glassplat.densify.reflectors import Search, in_region, residual_spreads
+from glassplat.densify.reflectors import Search, evenly, in_region, residual_spreads
 from glassplat.render.contribution import contributions
 from glassplat.render.deferred import Deferred
 from glassplat.scene.activations import logit
@@ -89,16 +89,5 @@ def test_only_what_does_not_reflect_yet_can_be_overlooked() -> None:
 
 
 def test_views_are_taken_evenly() -> None:
-    seen = Search(views=3)._chosen([*views(*([0.0] * 9))])
-    assert [view.name for view in seen] == ["0.png", "3.png", "6.png"]
-    assert len(Search(views=3)._chosen(views(0.0))) == 1
-
-
-def test_what_is_seen_and_does_not_turn_with_the_view_is_matte() -> None:
-    calm, turning = views(0.3, 0.3, 0.3, 0.3), views(0.2, -0.2, 0.2, -0.2)
-    assert bool(Search().matte(two_discs(), calm, Deferred()).all())
-    assert Search().matte(two_discs(), turning, Deferred()).tolist() == [False, True]
-    assert Search().matte(two_discs(strength=0.9), calm, Deferred()).tolist() == [False, True]
-    hidden = two_discs()
-    means = hidden.primary.means + torch.tensor([[0.0, 0.0, 0.0], [1e3, 0.0, 0.0]])
-    assert Search().matte(hidden.with_parameters({"primary.means": means}), calm, Deferred()).tolist() == [True, False]
+    assert [view.name for view in evenly(views(*([0.0] * 9)), 3)] == ["0.png", "3.png", "6.png"]
+    assert len(evenly(views(0.0), 3)) == 1

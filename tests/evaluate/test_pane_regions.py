@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.commands.evaluate import evaluate_run, plane_text
-from glassplat.commands.pane_source import pane_regions
-from glassplat.commands.stored_run import open_run
+from glassplat.commands.measuring.evaluate import evaluate_run, plane_text
+from glassplat.commands.measuring.pane_source import pane_regions
+from glassplat.commands.runs.stored_run import open_run
 from glassplat.data.errors import InputError
 from glassplat.evaluate.evaluate import evaluate
 from glassplat.evaluate.pane_regions import MarkedRegions, RenderedRegions, TrueRegions

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from glassplat.data.view import View
-from glassplat.losses.geometry import cell_side, depth_normals, normal_consistency
+from glassplat.losses.geometry import normal_consistency
 from glassplat.render.deferred import view_directions
+from glassplat.render.depth_normals import cell_side, depth_normals
 from glassplat.render.frame import Frame
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from glassplat.commands.demo import SCENE
+from glassplat.commands.measuring.demo import SCENE
 from glassplat.prepare.messages import Note, Progress
 
 CONNECTED = ("0000", "0001", "0003", "0004", "0006", "0007", "0009", "0010", "0012", "0013")

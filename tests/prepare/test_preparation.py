@@ -10,7 +10,7 @@ import pytest
 from PIL import Image, ImageOps
 
 from glassplat.cli import main
-from glassplat.commands.demo import SCENE
+from glassplat.commands.measuring.demo import SCENE
 from glassplat.data.dataset import Dataset, load_dataset
 from glassplat.data.errors import InputError
 from glassplat.prepare.messages import Note, Progress

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.commands.demo import SCENE
+from glassplat.commands.measuring.demo import SCENE
 from glassplat.data.dataset import Dataset, load_dataset
 from glassplat.evaluate.truth import GroundTruth, load_truth
 from tools.plane_errors import Fit, fits_of, main, row

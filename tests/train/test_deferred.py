@@ -38,6 +38,7 @@ from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
 from glassplat.train.strategy import Rhythm, Strategy
 from glassplat.train.trainer import train
+from tests.train.progress_of import finished
 from tests.train.tiny_capture import tiny_capture
 
 RECIPE = DeferredRecipe(
@@ -60,7 +61,7 @@ def surrounded_state(recipe: DeferredRecipe) -> TrainState:
     """As the second stage begins."""
     state, entry = fresh_state(recipe), recipe.stages(seed=0)[1].entry
     assert entry is not None
-    entry(state, tiny_capture())
+    finished(entry(state, tiny_capture()))
     return state
 
 

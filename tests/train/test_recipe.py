@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from glassplat.commands.bench import BenchAblation, BenchScenes
-from glassplat.commands.demo import Demo
-from glassplat.commands.render import Render
-from glassplat.commands.train import Train
+from glassplat.commands.looking.render import Render
+from glassplat.commands.measuring.bench import BenchAblation, BenchScenes
+from glassplat.commands.measuring.demo import Demo
+from glassplat.commands.training.train import Train
 from glassplat.data.errors import InputError
 from glassplat.data.options import as_typed, check_options, number_fields, unwrapped
 from glassplat.data.ranges import Range

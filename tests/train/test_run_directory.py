@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from glassplat.commands.stored_run import open_run
+from glassplat.commands.runs.stored_run import open_run
 from glassplat.data.errors import InputError
 from glassplat.files.ply import write_gaussians
 from glassplat.scene.scene import Scene

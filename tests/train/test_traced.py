@@ -10,23 +10,14 @@ import pytest
 import torch
 
 from glassplat.densify.default import DefaultDensify, ScreenStatistics
-from glassplat.render.deferred import Deferred
-from glassplat.render.splat import Splat
+from glassplat.densify.mirrors import MirrorSearch
 from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import Gaussians
 from glassplat.train.actions import Densify, PruneIdle, ResetOpacity
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
-from glassplat.train.propagation import (
-    ENDED,
-    GREW,
-    MOST,
-    Propagate,
-    PropagationSchedule,
-    RefineEnvironment,
-    has_ended,
-)
+from glassplat.train.propagation import Propagate, PropagationSchedule, RefineEnvironment
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
@@ -42,10 +33,10 @@ RECIPE = TracedRecipe(
     least_strength=0.0,
     least_iterations=1,
     first_strength=0.3,
+    search=MirrorSearch(begin_found=False, spread=1.0),
     bootstrap=0.2,
     surroundings=SurroundingsOptions(
-        begin=0.3,
-        start=SurroundingsStart("both", cells=2, copied_strength=0.9, copied_spread=1.0),
+        start=SurroundingsStart("both", cells=2),
         densify=DefaultDensify(split_by="gradient", interval=5, whole_passes=False, stop=0.6, gradient_threshold=1e-7),
     ),
     texels=4,
@@ -64,7 +55,8 @@ def fresh_state(recipe: TracedRecipe = RECIPE) -> TrainState:
 def surrounded_state(start: SurroundingsStart | None = None) -> TrainState:
     """With surroundings, as their stage begins, but for what was learned before."""
     state = fresh_state()
-    AddSurroundings(start or RECIPE.surroundings.start, 1, Splat())(state, tiny_capture())
+    matte = torch.ones(len(state.scene.primary), dtype=torch.bool)
+    AddSurroundings(start or RECIPE.surroundings.start, 1)(state, tiny_capture(), matte)
     return state
 
 
@@ -95,13 +87,12 @@ def test_a_short_run_learns(recipe: TracedRecipe) -> None:
     }
 
 
-def test_the_environment_is_mirrored_first_and_near_things_later() -> None:
+def test_near_and_distant_things_are_mirrored_from_one_moment_on() -> None:
     messages = run(RECIPE, fresh_state())
     entered = {m.stage: m.counts.get("surroundings", 0) for m in messages if isinstance(m, StageEntered)}
-    assert list(entered) == ["1 bootstrap", "2 distant reflections", "3 near reflections", "4 refinement"]
-    assert entered["2 distant reflections"] == 0 < entered["3 near reflections"]
-    renderers = [stage.renderer for stage in RECIPE.stages(0)]
-    assert isinstance(renderers[1], Deferred) and all(isinstance(r, Traced) for r in renderers[2:])
+    assert list(entered) == ["1 bootstrap", "2 reflection", "3 refinement"]
+    assert entered["1 bootstrap"] == 0 < entered["2 reflection"]
+    assert all(isinstance(stage.renderer, Traced) for stage in RECIPE.stages(0)[1:])
     assert sum(stage.share for stage in RECIPE.stages(0)) == pytest.approx(1)
 
 
@@ -152,37 +143,18 @@ def test_recipes_survive_as_json() -> None:
         assert recipe_from_json(recipe_to_json(recipe)) == recipe
 
 
-@pytest.mark.parametrize("begin", [0.2, 0.1, 0.7])
-def test_surroundings_have_to_begin_between_bootstrap_and_the_end_of_propagation(begin: float) -> None:
-    recipe = replace(RECIPE, surroundings=replace(RECIPE.surroundings, begin=begin))
-    assert f"--surroundings.begin is {begin}; expected a share" in (recipe.contradiction() or "")
-    assert replace(recipe, mirrors="surroundings").contradiction() is None
-    assert RECIPE.contradiction() is None
-
-
 def test_surroundings_are_copied_spread_or_both() -> None:
     copied, spread, both = (
-        surrounded_state(SurroundingsStart(source, cells=2, copied_strength=0.9, copied_spread=1.0)).scene.surroundings
-        for source in ("scene", "box", "both")
+        surrounded_state(SurroundingsStart(source, cells=2)).scene.surroundings for source in ("scene", "box", "both")
     )
     assert len(spread) == 40 and len(copied) > 10 and len(both) == 40 + len(copied)
     assert set(copied.means[:, 0].tolist()) <= set(fresh_state().scene.primary.means[:, 0].tolist())
 
 
-@pytest.mark.parametrize(("most", "goes_on"), [(0.2, True), (0.01, False)])
-def test_propagation_goes_on_where_something_reflective_was_found(most: float, goes_on: bool) -> None:
-    state = fresh_state()
-    state.step, state.records = 12, {ENDED: 9.0, MOST: most, GREW: 4.0}
-    AddSurroundings(SurroundingsStart("box", cells=2), 1, Splat())(state, tiny_capture())
-    assert has_ended(state) != goes_on
-    assert state.records[GREW] == (12 if goes_on else 4)
-
-
 def test_where_everything_reflects_there_is_nothing_to_copy() -> None:
     state = fresh_state()
-    channels = {"logit_strength": torch.full((len(state.scene.primary),), 3.0)}
-    state.scene = replace(state.scene, primary=replace(state.scene.primary, channels=channels))
-    AddSurroundings(SurroundingsStart("scene", cells=2), 1, Splat())(state, tiny_capture())
+    nothing = torch.zeros(len(state.scene.primary), dtype=torch.bool)
+    AddSurroundings(SurroundingsStart("scene", cells=2), 1)(state, tiny_capture(), nothing)
     assert len(state.scene.surroundings) == 40
 
 

@@ -1,0 +1,67 @@
+"""`glassplat prepare`: photographs or a video to a capture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from glassplat.commands.console.messages import say, warn
+from glassplat.commands.console.work_progress import WorkProgress
+from glassplat.data.ranges import Range, Share
+from glassplat.prepare.feature_database import Lens
+from glassplat.prepare.mapping import Mapper
+from glassplat.prepare.preparation import Preparation, prepare
+from glassplat.prepare.reconstruction import Settings
+from glassplat.prepare.report_page import PAGE, write_page
+from glassplat.prepare.workplace import Workplace
+
+
+@dataclass(frozen=True)
+class Prepare:
+    """Find out where photographs were taken, and make a capture of them.
+
+    Attributes:
+        input: folder of photographs, or a video.
+        output: the capture; a new folder.
+        max_size: reduce photographs to this many pixels along the longer side.
+        frames: photographs to take from a video, at most.
+        lens: COLMAP's model of the lens; opencv and opencv_fisheye for wide ones.
+        mapper: place one photograph after the other, or all at once.
+        least_registered: share of the photographs that have to be placed.
+        resume: go on where the command was interrupted.
+        force: replace a capture that was prepared before, or begin an interrupted one again.
+    """
+
+    input: tyro.conf.Positional[Path]
+    output: Path
+    max_size: Annotated[int, Range(320, 16384)] = 1600
+    frames: Annotated[int, Range(8, 2000)] = 150
+    lens: Lens = "simple_radial"
+    mapper: Mapper = "incremental"
+    least_registered: Share = 0.8
+    resume: bool = False
+    force: bool = False
+
+    def run(self, console: Console) -> None:
+        """Prepares, with progress, and says what became of the photographs."""
+        settings = Settings(lens=self.lens, mapper=self.mapper)
+        task = Preparation(
+            self.input, self.output, self.max_size, self.frames, self.least_registered, settings=settings
+        )
+        with WorkProgress(console) as progress:
+            report = prepare(task, progress.show, resume=self.resume, force=self.force)
+        for line in report.lines():
+            (warn if line.startswith("advice") else say)(console, line)
+        write_page(self.output, self.output / PAGE)
+        say(console, f"capture: {self.output}, report: {self.output / PAGE}")
+        say(console, f"next: glassplat annotate {self.output}")
+
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        if Workplace(self.output).folder.exists():
+            return f"repeat the command with --resume to go on; what is done so far lies in {self.output}.partial"
+        return "nothing was written: repeat the command to begin again"

@@ -1,0 +1,1 @@
+"""What commands print, how they follow work, and how they end."""

@@ -1,0 +1,1 @@
+"""Pictures of a scene: in the browser, as a film, layer by layer."""

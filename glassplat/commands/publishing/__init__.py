@@ -1,0 +1,1 @@
+"""Scenes and photographs for others, and scenes from others."""

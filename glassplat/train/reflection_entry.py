@@ -1,0 +1,49 @@
+"""How the stage begins in which things learn to reflect."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+
+from glassplat.data.dataset import Dataset
+from glassplat.densify.edit import forget
+from glassplat.densify.mirrors import MirrorSearch
+from glassplat.render.splat import Splat
+from glassplat.train.environment_entry import AddEnvironment
+from glassplat.train.messages import Working
+from glassplat.train.state import TrainState
+from glassplat.train.surroundings_entry import AddSurroundings
+
+
+@dataclass(frozen=True)
+class BeginReflections:
+    """Adds what is there to be mirrored, and takes for mirrors what looks like them.
+
+    Attributes:
+        environment: adds an environment; None where only near things are mirrored.
+        surroundings: adds what is near; None where only the environment is mirrored.
+        mirrors: what looks like a mirror.
+        renderer: that of the stage before.
+    """
+
+    environment: AddEnvironment | None
+    surroundings: AddSurroundings | None
+    mirrors: MirrorSearch
+    renderer: Splat
+
+    def __call__(self, state: TrainState, dataset: Dataset) -> Generator[Working, None, bool]:
+        """Edits `state`."""
+        if self.environment is not None:
+            self.environment(state, dataset)
+        if self.surroundings is None and not self.mirrors.begin_found:
+            return True
+        yield Working("looking for mirrors", 0, 1)
+        seen, mirrors = self.mirrors.looks(state.scene, dataset.train, self.renderer)
+        if self.surroundings is not None:
+            self.surroundings(state, dataset, seen & ~mirrors)
+        if self.mirrors.begin_found:
+            primary = self.mirrors.as_mirrors(state.scene, dataset.train, mirrors)
+            state.scene = replace(state.scene, primary=primary)
+            names = [f"primary.{name}" for name in primary.tensors()]
+            state.optimizer.moments = forget(state.optimizer.moments, names, mirrors)
+        return True

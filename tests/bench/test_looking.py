@@ -1,0 +1,17 @@
+"""What is measured of the viewer is what it shows."""
+
+from __future__ import annotations
+
+from bench.looking import WIDTH, answers, looking_times
+from glassplat.viewer.render_loop import LEAST_WIDTH
+
+
+def test_every_move_gets_a_first_and_a_full_picture() -> None:
+    for moving in (False, True):
+        for answer in answers(3, 500, moving=moving):
+            assert 0 < answer.first <= answer.full and LEAST_WIDTH <= answer.width <= WIDTH
+
+
+def test_the_table_says_both() -> None:
+    table = looking_times(moves=2, count=300).markdown()
+    assert "moves from rest" in table and "while a full picture is drawn" in table

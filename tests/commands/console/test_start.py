@@ -1,0 +1,161 @@
+"""The first half second of a command: what is imported for which question, and what each command says of itself."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import glassplat
+from glassplat.cli import COMMANDS, command_class, main
+
+SLOW = ["torch", "numba", "scipy", "numpy", "PIL", "pycolmap", "OpenEXR", "safetensors"]
+IMPORTS = """
+import json, sys
+from glassplat.cli import main
+try:
+    code = main({arguments})
+except SystemExit as stop:
+    code = stop.code
+slow = [name for name in {slow} if name in sys.modules]
+print(json.dumps([code, slow, sorted(name for name in sys.modules if name.startswith("glassplat.commands."))]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["--help"], 0),
+        (["-h"], 0),
+        (["--version"], 0),
+        ([], 2),
+        (["trian"], 2),
+        (["--no-such-option"], 2),
+        (["--", "train"], 2),
+        (["Train"], 2),
+        ([""], 2),
+    ],
+)
+def test_the_list_of_commands_needs_none_of_the_libraries(arguments: list[str], code: int) -> None:
+    script = IMPORTS.format(arguments=arguments, slow=SLOW)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    found, slow, commands = json.loads(done.stdout.splitlines()[-1])
+    assert found == code
+    assert slow == []
+    assert not {f"glassplat.commands.{listed.module}" for listed in COMMANDS.values()} & set(commands)
+    assert "Traceback" not in done.stderr
+    assert all(name in done.stdout + done.stderr for name in COMMANDS) or arguments == ["--version"]
+
+
+@pytest.mark.parametrize("name", ["train", "eval", "export", "view", "video", "import", "info"])
+def test_a_command_does_not_wait_for_what_it_may_never_need(name: str) -> None:
+    late = ["scipy.spatial", "scipy.ndimage", "scipy.interpolate", "pycolmap", "viser", "cv2", "OpenEXR"]
+    late += ["glassplat.evaluate.evaluate", "zstandard"] if name == "train" else []
+    done = subprocess.run(
+        [sys.executable, "-c", IMPORTS.format(arguments=[name, "--help"], slow=late)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert json.loads(done.stdout.splitlines()[-1])[:2] == [0, []]
+
+
+def test_the_package_runs_as_a_module() -> None:
+    done = subprocess.run([sys.executable, "-m", "glassplat", "--version"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, f"glassplat {glassplat.__version__}\n")
+
+
+def test_a_command_imports_no_other(tmp_path: Path) -> None:
+    script = IMPORTS.format(arguments=["eval", str(tmp_path)], slow=SLOW)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    code, _, commands = json.loads(done.stdout.splitlines()[-1])
+    assert code == 2
+    assert "glassplat.commands.measuring.evaluate" in commands
+    assert not {
+        "glassplat.commands.measuring.bench",
+        "glassplat.commands.training.train",
+        "glassplat.commands.looking.render",
+    } & set(commands)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_list_says_of_a_command_what_the_command_does(name: str) -> None:
+    described = inspect.getdoc(command_class(name)) or ""
+    assert described.splitlines()[0] == COMMANDS[name].summary
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main([name, "--help"])
+    assert stopped.value.code == 0
+    said = capsys.readouterr().out
+    assert f"usage: glassplat {name}" in said
+    assert " ".join(COMMANDS[name].summary.split()) in " ".join(said.split())
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["train"],
+        ["train", "splat"],
+        ["train", "nerf", "--data", "x", "--output", "y"],
+        ["eval"],
+        ["eval", "run", "--device", "tpu"],
+        ["render", "run"],
+        ["render", "run", "--output", "x", "--layers", "hit"],
+        ["dereflect", "run", "--output", "x", "--source", "[bold]"],
+        ["demo", "--iterations", "many"],
+        ["bench"],
+        ["bench", "scenes", "--data", "x", "--output", "y", "--seeds", "one"],
+    ],
+    ids=" ".join,
+)
+def test_options_that_cannot_be_understood_end_with_code_2(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == 2
+    said = capsys.readouterr().err
+    assert f"glassplat {arguments[0]}" in said and "Traceback" not in said
+
+
+def test_completions_for_a_shell_know_the_options_of_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--tyro-print-completion", "bash"])
+    said = capsys.readouterr().out
+    assert "--mask-polarity" in said and "--layers" in said
+
+
+SHELL = {
+    "glassplat --help >&-": (0, ""),
+    "glassplat trian 2>&-": (2, ""),
+    "glassplat --version >&- 2>&-": (0, ""),
+    "glassplat eval none 2>/dev/full": (2, ""),
+    "glassplat --help >/dev/full": (1, "stopped: no space left on device; free some space, then repeat the command\n"),
+    "PYTHONIOENCODING=ascii glassplat --help >/dev/null": (0, ""),
+    "LC_ALL=C PYTHONUTF8=0 glassplat [bold]-ä 2>/dev/null": (2, ""),
+}
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="the machine has no device that is always full")
+@pytest.mark.parametrize(("line", "expected"), SHELL.items(), ids=SHELL)
+def test_output_that_is_closed_full_or_narrow_changes_no_exit_code(line: str, expected: tuple[int, str]) -> None:
+    line = line.replace("glassplat", f"{sys.executable} -m glassplat")
+    done = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == expected
+
+
+def test_a_reader_that_leaves_ends_the_command_in_silence() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "glassplat", "--help"]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, "")

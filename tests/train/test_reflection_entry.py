@@ -1,0 +1,84 @@
+"""Reflections begin: what is there to be mirrored, and what is taken for a mirror."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from glassplat.densify.mirrors import MirrorSearch
+from glassplat.render.splat import Splat
+from glassplat.scene.activations import logit
+from glassplat.train.actions import GrowSh, ResetOpacity
+from glassplat.train.deferred_recipe import DeferredRecipe
+from glassplat.train.environment_entry import AddEnvironment
+from glassplat.train.reflection_entry import BeginReflections
+from glassplat.train.state import TrainState
+from glassplat.train.surroundings_entry import AddSurroundings, SurroundingsStart
+from glassplat.train.traced_recipe import TracedRecipe
+from tests.train.progress_of import followed
+from tests.train.tiny_capture import tiny_capture
+
+
+@dataclass(frozen=True)
+class Every3rd(MirrorSearch):
+    """Takes every third Gaussian for a mirror."""
+
+    def looks(self, scene, views, renderer) -> tuple[Tensor, Tensor]:  # type: ignore[no-untyped-def]
+        rows = torch.arange(len(scene.primary))
+        return torch.ones_like(rows, dtype=torch.bool), rows % 3 == 0
+
+
+def begun(search: MirrorSearch, *, near: bool = True) -> tuple[TrainState, list[str]]:
+    """A state in which reflections have begun, and what was told on the way."""
+    state = TrainState(TracedRecipe(sh_degree=1).initialise(tiny_capture()), seed=0)
+    ones = {name: torch.ones_like(tensor) for name, tensor in state.scene.primary.tensors().items()}
+    state.optimizer.moments = {f"primary.{name}": (tensor, tensor.clone()) for name, tensor in ones.items()}
+    around = AddSurroundings(SurroundingsStart("scene"), 1) if near else None
+    entry = BeginReflections(AddEnvironment(2), around, search, Splat())
+    messages, _ = followed(entry(state, tiny_capture()))
+    return state, [message.what for message in messages]
+
+
+def test_what_looks_like_a_mirror_becomes_one_and_the_rest_is_what_it_mirrors() -> None:
+    state, told = begun(Every3rd())
+    count = len(state.scene.primary)
+    chosen = torch.arange(count) % 3 == 0
+    strengths = torch.sigmoid(state.scene.primary.channels["logit_strength"])
+    assert strengths[chosen].tolist() == pytest.approx([0.73] * int(chosen.sum()))
+    assert strengths[~chosen].max() < 0.01
+    assert len(state.scene.surroundings) == int((~chosen).sum())
+    assert not state.scene.environment.is_empty and told == ["looking for mirrors"]
+    for name, (first, second) in state.optimizer.moments.items():
+        for moment in (first, second):
+            assert not bool(moment[chosen].any()) and bool((moment[~chosen] == 1).all()), name
+
+
+def test_the_papers_start_from_hardly_any_reflection() -> None:
+    state, _ = begun(Every3rd(begin_found=False))
+    assert float(state.scene.primary.channels["logit_strength"].max()) < logit(0.01)
+    assert all(bool((first == 1).all()) for first, _ in state.optimizer.moments.values())
+    # What looks like a mirror is not copied, all the same.
+    assert len(state.scene.surroundings) < len(state.scene.primary)
+
+
+def test_without_anything_near_and_without_a_search_no_mirrors_are_looked_for() -> None:
+    state, told = begun(MirrorSearch(begin_found=False), near=False)
+    assert told == [] and not state.scene.environment.is_empty and not len(state.scene.surroundings)
+
+
+@pytest.mark.parametrize("recipe", [DeferredRecipe(), TracedRecipe(), DeferredRecipe.paper(), TracedRecipe.paper()])
+def test_before_mirrors_are_searched_for_a_scene_is_learned_as_by_splat(recipe: DeferredRecipe | TracedRecipe) -> None:
+    for search in (MirrorSearch(), MirrorSearch(begin_found=False)):
+        bootstrap = replace(recipe, search=search, least_iterations=1).stages(0, 7000)[0]
+        kinds = {type(action) for action in bootstrap.actions}
+        assert ({GrowSh, ResetOpacity} <= kinds) == search.begin_found
+        hurried = bootstrap.rates["primary.means"].short_run_power > 0
+        assert hurried == (search.begin_found and recipe.hurry_matte)
+
+
+def test_only_traced_searches_by_itself() -> None:
+    assert TracedRecipe().search.begin_found and not DeferredRecipe().search.begin_found
+    assert not TracedRecipe.paper().search.begin_found
