@@ -3,8 +3,8 @@
     python -m tools.make_capture_pictures --scene SCENE --capture CAPTURE --run RUN --output docs/images
 
 `--scene` ships the truth about its panes (`gt/planes.json`), which is where corners are clicked on the page of
-`glassplat annotate`; of `--capture`, which `glassplat prepare` made, the report is shown, and of `--run` the overview that
-`glassplat eval` wrote. What is not given keeps its pictures.
+`glassplat annotate`; of `--capture`, which `glassplat prepare` made, the report is shown, and of `--run` the overview
+that `glassplat eval` wrote. What is not given keeps its pictures.
 """
 
 from __future__ import annotations
