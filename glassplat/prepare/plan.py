@@ -83,8 +83,8 @@ def _fitting(places: Array, always: Array) -> Callable[[Array], Array]:
 
 def _points(pixels: Array, colors: NDArray[np.generic], behind: NDArray[np.bool_]) -> list[str]:
     every = max(1, -(-len(pixels) // MOST_POINTS))
-    inside = ((pixels >= 0) & (pixels <= SIZE)).all(axis=1)
-    shown = [row for row in range(0, len(pixels), every) if inside[row]]
+    inside = np.all((pixels >= 0) & (pixels <= np.array(SIZE)), axis=1).reshape(-1)
+    shown = [int(row) for row in np.flatnonzero(inside)[::every]]
     return [_dot(pixels[row], "#ff4fd8" if behind[row] else _hex(colors[row])) for row in shown]
 
 
