@@ -24,6 +24,7 @@ from glassplat.kernels.cpu.vector import (
     absolute,
     item,
     lowest_bit,
+    maximum,
     minimum,
     select,
     store,
@@ -272,12 +273,14 @@ def _load_deviation(real: type) -> Scalar:
 
 
 def _begin(real: type) -> Scalar:
-    load, zero, LANES, PIXELS = vector_kind(real, tile.LANES).load, real(0.0), tile.LANES, tile.PIXELS
+    full, load = vector_kind(real, tile.LANES)
+    zero, LANES, PIXELS = real(0.0), tile.LANES, tile.PIXELS
 
     @inlined
     def begin(planes, state, at, v_mask, first, width, columns, rows, with_glass):
         """Transmittances behind everything; returns how many pairs of the tile any pixel has looked at."""
-        planes[:] = zero
+        for i in range(0, planes.size, LANES):
+            store(planes, i, full(zero))
         for i in range(0, PIXELS, LANES):
             store(planes, T + i, load(state, at + tile.T + i))
             store(planes, T_GLASS + i, load(state, at + tile.T_GLASS + i))
@@ -285,9 +288,15 @@ def _begin(real: type) -> Scalar:
             for y in range(rows):
                 for x in range(columns):
                     planes[V_MASK + lane_of(x, y)] = v_mask[first + y * width + x]
-        most = state[at + tile.LAST]
-        for i in range(PIXELS):
-            most = max(most, state[at + tile.LAST + i], state[at + tile.LAST_GLASS + i])
+        latest = load(state, at + tile.LAST)
+        for i in range(0, PIXELS, LANES):
+            of_both = maximum(load(state, at + tile.LAST + i), load(state, at + tile.LAST_GLASS + i))
+            latest = maximum(latest, of_both)
+        # WEIGHT is written before it is read, and free until then.
+        store(planes, WEIGHT, latest)
+        most = planes[WEIGHT]
+        for i in range(1, LANES):
+            most = max(most, planes[WEIGHT + i])
         return int(most) + 1
 
     return begin
@@ -302,7 +311,7 @@ def composite_backward(real: type, probed: bool) -> Kernel:
     load_gradients, load_deviation = _load_gradients(real), _load_deviation(real)
     zero = real(0.0)
     LANES, PIXELS, STATE, CHUNK, GLASS = tile.LANES, tile.PIXELS, tile.STATE, tile.CHUNK, tile.GLASS
-    ORDER, REACHED = tile.ORDER, (1 << tile.BLOCKS) - 1
+    ORDER, REACHED, TILES = tile.ORDER, (1 << tile.BLOCKS) - 1, tile.TILES
 
     @kernel("composite_backward_probed" if probed else "composite_backward", real)
     def backward(
@@ -312,42 +321,53 @@ def composite_backward(real: type, probed: bool) -> Kernel:
     ):  # fmt: skip
         groups, width = (num_channels + 3) // 4, packed.size // max(1, num_splats)
         row_width = rows.size // max(1, pair_splats.size)
-        stride = even_stride(active.size)
-        for task in prange(active.size):
-            n = task * stride % active.size
-            start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
-            if start == stop:
-                continue
-            camera, x0, y0, columns, lines = place(active[n], image_width, height)
-            corner, at = (camera * height + y0) * image_width + x0, n * STATE
+        num_tasks = (active.size + TILES - 1) // TILES
+        stride = even_stride(num_tasks)
+        for task in prange(num_tasks):
             planes = np.empty(V_IMAGE + groups * 4 * PIXELS, real)
             sums: Any = np.empty(LANES, real)
             batch = np.empty(CHUNK * width, real)
-            looked_at = begin(planes, state, at, v_mask, corner, image_width, columns, lines, with_glass)
-            load_gradients(planes, v_image, v_alpha, corner, image_width, columns, lines, num_channels)
-            deviating = channel
-            if channel >= 0 and not load_deviation(
-                planes, spread, n * 2 * PIXELS, channel, through_mean, v_deviation, corner, image_width, columns, lines
-            ):
-                deviating = -1
-            rows[(start + looked_at) * row_width : stop * row_width] = zero
-            for behind in range(0, looked_at, CHUNK):
-                last = start + looked_at - behind
-                first = max(last - CHUNK, start)
-                fetch(batch, packed, pair_splats, first, last, width, x0, y0)
-                for k in range(last - first):
-                    p = last - 1 - k
-                    splat, row = (p - first) * width, p * row_width
-                    batch[splat + ORDER] = real(np.int32(p - start))
-                    blocks = np.int64(pairs[p]) & REACHED
-                    if blocks == 0:
-                        rows[row : row + row_width] = zero
-                    elif (pairs[p] >> GLASS) & 1:
-                        unblend_glass(planes, state, at, batch, splat, blocks, rows, row)
-                        rows[row + LANES : row + row_width] = zero
-                    else:
-                        unblend_primary(planes, state, at, batch, splat, blocks, groups, deviating, rows, row)
-                        if groups > 1 or deviating >= 0:
-                            sum_more(planes, batch, splat, blocks, groups, deviating, rows, row, sums)
+            begun = task * stride % num_tasks * TILES
+            for n in range(begun, min(active.size, begun + TILES)):
+                start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
+                if start == stop:
+                    continue
+                camera, x0, y0, columns, lines = place(active[n], image_width, height)
+                corner, at = (camera * height + y0) * image_width + x0, n * STATE
+                looked_at = begin(planes, state, at, v_mask, corner, image_width, columns, lines, with_glass)
+                load_gradients(planes, v_image, v_alpha, corner, image_width, columns, lines, num_channels)
+                deviating = channel
+                if channel >= 0 and not load_deviation(
+                    planes,
+                    spread,
+                    n * 2 * PIXELS,
+                    channel,
+                    through_mean,
+                    v_deviation,
+                    corner,
+                    image_width,
+                    columns,
+                    lines,
+                ):
+                    deviating = -1
+                rows[(start + looked_at) * row_width : stop * row_width] = zero
+                for behind in range(0, looked_at, CHUNK):
+                    last = start + looked_at - behind
+                    first = max(last - CHUNK, start)
+                    fetch(batch, packed, pair_splats, first, last, width, x0, y0)
+                    for k in range(last - first):
+                        p = last - 1 - k
+                        splat, row = (p - first) * width, p * row_width
+                        batch[splat + ORDER] = real(np.int32(p - start))
+                        blocks = np.int64(pairs[p]) & REACHED
+                        if blocks == 0:
+                            rows[row : row + row_width] = zero
+                        elif (pairs[p] >> GLASS) & 1:
+                            unblend_glass(planes, state, at, batch, splat, blocks, rows, row)
+                            rows[row + LANES : row + row_width] = zero
+                        else:
+                            unblend_primary(planes, state, at, batch, splat, blocks, groups, deviating, rows, row)
+                            if groups > 1 or deviating >= 0:
+                                sum_more(planes, batch, splat, blocks, groups, deviating, rows, row, sums)
 
     return backward

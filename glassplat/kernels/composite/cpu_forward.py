@@ -11,7 +11,7 @@ from numba import prange
 
 from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.composite.cpu_pair_rows import CHUNK as SPLATS
-from glassplat.kernels.composite.cpu_tile import exponent, lane_of, list_block
+from glassplat.kernels.composite.cpu_tile import exponent, lane_of, list_block, list_plain_block
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
 from glassplat.kernels.cpu.pixel_rows import interleaved, without_fourths
 from glassplat.kernels.cpu.schedule import even_stride
@@ -153,41 +153,18 @@ def _deviate_block(real: type) -> Scalar:
     return deviate_block
 
 
-def _begin(real: type) -> Scalar:
-    zero, one, never = real(0.0), real(1.0), real(-1.0)
-    BLOCK, ACROSS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.LANES, tile.PIXELS
-    T, LAST, T_GLASS, LAST_GLASS = tile.T, tile.LAST, tile.T_GLASS, tile.LAST_GLASS
+def _clear(real: type) -> Scalar:
+    full, zero, LANES, PIXELS = vector_kind(real, tile.LANES).full, real(0.0), tile.LANES, tile.PIXELS
 
     @inlined
-    def begin(state, at, columns, rows):
-        """Fresh transmittances; pixels beyond the image's edge start as stopped. Returns bits of blocks that run."""
-        running = np.int64(0)
-        for b in range(tile.BLOCKS):
-            x, y = b % ACROSS * BLOCK, b // ACROSS * BLOCK
-            running |= np.int64(x < columns and y < rows) << b
-            for i in range(LANES):
-                inside = x + i % BLOCK < columns and y + i // BLOCK < rows
-                state[at + T + b * LANES + i] = one if inside else zero
-        state[at + T_GLASS : at + T_GLASS + PIXELS] = one
-        state[at + LAST : at + LAST + PIXELS] = never
-        state[at + LAST_GLASS : at + LAST_GLASS + PIXELS] = never
-        return running
-
-    return begin
-
-
-def _finish(real: type) -> Scalar:
-    load = vector_kind(real, tile.LANES).load
-    LANES, PIXELS, T, T_GLASS = tile.LANES, tile.PIXELS, tile.T, tile.T_GLASS
-
-    @inlined
-    def finish(state, at):
-        """Takes off the signs that tell which pixels have stopped."""
+    def clear(planes, groups):
+        """No mask and no sums yet."""
         for i in range(0, PIXELS, LANES):
-            store(state, at + T + i, absolute(load(state, at + T + i)))
-            store(state, at + T_GLASS + i, absolute(load(state, at + T_GLASS + i)))
+            store(planes, MASK + i, full(zero))
+        for i in range(SUMS, SUMS + groups * 4 * PIXELS, LANES):
+            store(planes, i, full(zero))
 
-    return finish
+    return clear
 
 
 def _write_tile(real: type) -> Scalar:
@@ -266,6 +243,7 @@ def _begin_deviation(real: type) -> Scalar:
             total = planes[SUMS + channel * PIXELS + i]
             planes[CENTER + i] = total / max(covered, least_alpha) if covered > least_alpha else zero
             planes[T_AGAIN + i] = one
+            planes[DEVIATION + i] = planes[LEAN + i] = zero
         return wanted
 
     return begin_deviation
@@ -277,10 +255,11 @@ def composite_forward(real: type) -> Kernel:
     pack, place, fetch, reached, _ = tile.tile_functions(real)
     blend_plain, blend_mixed = _blend_block(real, False), _blend_block(real, True)
     blend_more, deviate_block = _blend_more(real), _deviate_block(real)
-    begin, finish, write_tile = _begin(real), _finish(real), _write_tile(real)
+    begin, clear, finish, write_tile = tile.begin_state(real), _clear(real), tile.finish_state(real), _write_tile(real)
     begin_deviation, zero = _begin_deviation(real), real(0.0)
     BLOCK, ACROSS, BLOCKS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.BLOCKS, tile.LANES, tile.PIXELS
     VALUES, ORDER, CHUNK, GLASS, STATE = tile.VALUES, tile.ORDER, tile.CHUNK, tile.GLASS, tile.STATE
+    TILES = tile.TILES
 
     @kernel("composite_forward", real)
     def forward(
@@ -303,79 +282,84 @@ def composite_forward(real: type) -> Kernel:
                         packed[s * width + VALUES + d] = channels[s, d] if d < num_channels else zero
                     if glass >= 0:
                         packed[s * width + VALUES] = marks[s // splats_per_camera, glass]
-        stride = even_stride(active.size)
-        for task in prange(active.size):
-            n = task * stride % active.size
-            camera, x0, y0, columns, rows = place(active[n], image_width, height)
-            start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
-            at = n * STATE
-            running = begin(state, at, columns, rows)
-            if start == stop:
-                continue
+        num_tasks = (active.size + TILES - 1) // TILES
+        stride = even_stride(num_tasks)
+        for task in prange(num_tasks):
             planes = np.empty(SUMS + groups * 4 * PIXELS, real)
-            planes[:] = zero
             batch, entries = np.empty(CHUNK * width, real), np.empty(CHUNK + 1, np.int32)
             weights: Any = np.empty(CHUNK * LANES, real)
-            for first in range(start, stop, CHUNK):
-                last = min(first + CHUNK, stop)
-                fetch(batch, packed, pair_splats, first, last, width, x0, y0)
-                any_glass = False
-                for p in range(first, last):
-                    bits = reached(batch, (p - first) * width) & running
-                    if pair_splats[p] - camera * splats_per_camera >= num_primary:
-                        bits |= np.int64(1) << GLASS
-                        any_glass = True
-                    pairs[p] = bits
-                    batch[(p - first) * width + ORDER] = real(np.int32(p - start))
-                for b in range(BLOCKS):
-                    count = list_block(entries, pairs, first, last, b)
-                    if count == 0:
-                        continue
-                    x, y = real(b % ACROSS * BLOCK), real(b // ACROSS * BLOCK)
-                    i = b * LANES
-                    if any_glass:
-                        taken, runs = blend_mixed(
-                            state, at + i, planes, i, batch, width, entries, count, x, y, weights, groups > 1
-                        )
-                    else:
-                        taken, runs = blend_plain(
-                            state, at + i, planes, i, batch, width, entries, count, x, y, weights, groups > 1
-                        )
-                    for group in range(1, groups):
-                        blend_more(planes, i, batch, width, entries, taken, VALUES + 4 * group, weights)
-                    if not runs:
-                        running &= ~(np.int64(1) << b)
-                        # What the block was not asked about any more does not reach it in the backward pass either.
-                        for e in range(taken, count):
-                            k = entries[e]
-                            pairs[first + (~k if k < 0 else k)] &= ~(np.int32(1) << b)
-                if running == 0:
-                    stop = last
-                    break
-            finish(state, at)
-            corner = (camera * height + y0) * image_width + x0
-            write_tile(state, at, planes, image, alpha, corner, image_width, columns, rows, num_channels)
-            if num_primary < splats_per_camera:
-                write_mask(planes, mask, corner, image_width, columns, rows)
-            if deviation_channel < 0:
-                continue
-            if not begin_deviation(state, at, planes, deviation_channel, where, corner, image_width, columns, rows):
-                continue
-            for first in range(start, stop, CHUNK):
-                last = min(first + CHUNK, stop)
-                fetch(batch, packed, pair_splats, first, last, width, x0, y0)
-                for p in range(first, last):
-                    batch[(p - first) * width + ORDER] = real(np.int32(p - start))
-                for b in range(BLOCKS):
-                    count = list_block(entries, pairs, first, last, b)
-                    x, y = real(b % ACROSS * BLOCK), real(b // ACROSS * BLOCK)
-                    deviate_block(
-                        state, at + b * LANES, planes, b * LANES, batch, width, entries, count, x, y,
-                        VALUES + deviation_channel,
-                    )  # fmt: skip
-            keep = n * 2 * PIXELS
-            spread[keep : keep + PIXELS] = planes[CENTER : CENTER + PIXELS]
-            spread[keep + PIXELS : keep + 2 * PIXELS] = planes[LEAN : LEAN + PIXELS]
-            write_deviation(planes, where, deviation, corner, image_width, columns, rows)
+            begun = task * stride % num_tasks * TILES
+            for n in range(begun, min(active.size, begun + TILES)):
+                camera, x0, y0, columns, rows = place(active[n], image_width, height)
+                start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
+                at = n * STATE
+                running = begin(state, at, columns, rows)
+                if start == stop:
+                    continue
+                clear(planes, groups)
+                for first in range(start, stop, CHUNK):
+                    last = min(first + CHUNK, stop)
+                    fetch(batch, packed, pair_splats, first, last, width, x0, y0)
+                    any_glass = False
+                    for p in range(first, last):
+                        bits = reached(batch, (p - first) * width) & running
+                        if pair_splats[p] - camera * splats_per_camera >= num_primary:
+                            bits |= np.int64(1) << GLASS
+                            any_glass = True
+                        pairs[p] = bits
+                        batch[(p - first) * width + ORDER] = real(np.int32(p - start))
+                    for b in range(BLOCKS):
+                        if any_glass:
+                            count = list_block(entries, pairs, first, last, b)
+                        else:
+                            count = list_plain_block(entries, pairs, first, last, b)
+                        if count == 0:
+                            continue
+                        x, y = real(b % ACROSS * BLOCK), real(b // ACROSS * BLOCK)
+                        i = b * LANES
+                        if any_glass:
+                            taken, runs = blend_mixed(
+                                state, at + i, planes, i, batch, width, entries, count, x, y, weights, groups > 1
+                            )
+                        else:
+                            taken, runs = blend_plain(
+                                state, at + i, planes, i, batch, width, entries, count, x, y, weights, groups > 1
+                            )
+                        for group in range(1, groups):
+                            blend_more(planes, i, batch, width, entries, taken, VALUES + 4 * group, weights)
+                        if not runs:
+                            running &= ~(np.int64(1) << b)
+                            # What the block was not asked about any more does not reach it in the backward pass either.
+                            for e in range(taken, count):
+                                k = entries[e]
+                                pairs[first + (~k if k < 0 else k)] &= ~(np.int32(1) << b)
+                    if running == 0:
+                        stop = last
+                        break
+                finish(state, at)
+                corner = (camera * height + y0) * image_width + x0
+                write_tile(state, at, planes, image, alpha, corner, image_width, columns, rows, num_channels)
+                if num_primary < splats_per_camera:
+                    write_mask(planes, mask, corner, image_width, columns, rows)
+                if deviation_channel < 0:
+                    continue
+                if not begin_deviation(state, at, planes, deviation_channel, where, corner, image_width, columns, rows):
+                    continue
+                for first in range(start, stop, CHUNK):
+                    last = min(first + CHUNK, stop)
+                    fetch(batch, packed, pair_splats, first, last, width, x0, y0)
+                    for p in range(first, last):
+                        batch[(p - first) * width + ORDER] = real(np.int32(p - start))
+                    for b in range(BLOCKS):
+                        count = list_block(entries, pairs, first, last, b)
+                        x, y = real(b % ACROSS * BLOCK), real(b // ACROSS * BLOCK)
+                        deviate_block(
+                            state, at + b * LANES, planes, b * LANES, batch, width, entries, count, x, y,
+                            VALUES + deviation_channel,
+                        )  # fmt: skip
+                keep = n * 2 * PIXELS
+                spread[keep : keep + PIXELS] = planes[CENTER : CENTER + PIXELS]
+                spread[keep + PIXELS : keep + 2 * PIXELS] = planes[LEAN : LEAN + PIXELS]
+                write_deviation(planes, where, deviation, corner, image_width, columns, rows)
 
     return forward

@@ -15,6 +15,7 @@ import torch
 
 from glassplat.kernels.cpu.jit import inlined
 from glassplat.kernels.cpu.vector import (
+    absolute,
     bits_of,
     constant,
     exp,
@@ -44,6 +45,9 @@ T, LAST, T_GLASS, LAST_GLASS, STATE = 0, PIXELS, 2 * PIXELS, 3 * PIXELS, 4 * PIX
 
 GROUP = 4
 """Channels are blended four at a time."""
+
+TILES = 4
+"""Tiles of a task, which asks for memory once for all of them."""
 
 CHUNK = 128
 """Pairs that a tile fetches at once; they lie anywhere in memory."""
@@ -104,6 +108,45 @@ def pixel_centers(real: type) -> tuple[Scalar, Scalar]:
     xs = constant(real, tuple(i % BLOCK + 0.5 for i in range(LANES)))
     ys = constant(real, tuple(i // BLOCK + 0.5 for i in range(LANES)))
     return xs, ys
+
+
+def begin_state(real: type) -> Scalar:
+    """Builds the function that makes the state of a tile before its first splat."""
+    full = vector_kind(real, LANES).full
+    zero, one, never = real(0.0), real(1.0), real(-1.0)
+
+    @inlined
+    def begin(state, at, columns, rows):
+        """Fresh transmittances; pixels beyond the image's edge start as stopped. Returns bits of blocks that run."""
+        running = np.int64(0)
+        for b in range(BLOCKS):
+            x, y, i = b % ACROSS * BLOCK, b // ACROSS * BLOCK, at + b * LANES
+            running |= np.int64(x < columns and y < rows) << b
+            store(state, i + T, full(one))
+            store(state, i + T_GLASS, full(one))
+            store(state, i + LAST, full(never))
+            store(state, i + LAST_GLASS, full(never))
+            if x + BLOCK > columns or y + BLOCK > rows:
+                for lane in range(LANES):
+                    if x + lane % BLOCK >= columns or y + lane // BLOCK >= rows:
+                        state[i + T + lane] = zero
+        return running
+
+    return begin
+
+
+def finish_state(real: type) -> Scalar:
+    """Builds the function that makes the state of a tile after its last splat."""
+    load = vector_kind(real, LANES).load
+
+    @inlined
+    def finish(state, at):
+        """Takes off the signs that tell which pixels have stopped."""
+        for i in range(0, PIXELS, LANES):
+            store(state, at + T + i, absolute(load(state, at + T + i)))
+            store(state, at + T_GLASS + i, absolute(load(state, at + T_GLASS + i)))
+
+    return finish
 
 
 def _pack(real: type) -> Scalar:
@@ -178,6 +221,16 @@ def _reached(real: type) -> Scalar:
 def lane_of(x, y):
     """Where a plane holds the pixel in column x and row y of the tile."""
     return (y // BLOCK * ACROSS + x // BLOCK) * LANES + y % BLOCK * BLOCK + x % BLOCK
+
+
+@inlined
+def list_plain_block(entries, pairs, first, last, block):
+    """As `list_block`, where none of the fetched splats is glass."""
+    count = 0
+    for p in range(first, last):
+        entries[count] = np.int32(p - first)
+        count += (item(pairs, p) >> block) & 1
+    return count
 
 
 @inlined
