@@ -1,8 +1,10 @@
-"""Makes the pictures of docs/capture.md: the page of `glassplat annotate` on one of our own scenes.
+"""Makes the screenshots of docs/tutorial.md and docs/capture.md, from scenes of our own.
 
-    python -m tools.make_capture_pictures SCENE --output docs/images
+    python -m tools.make_capture_pictures --scene SCENE --capture CAPTURE --run RUN --output docs/images
 
-The scene ships the truth about its panes (`gt/planes.json`), which is where the corners are clicked.
+`--scene` ships the truth about its panes (`gt/planes.json`), which is where corners are clicked on the page of
+`glassplat annotate`; of `--capture`, which `glassplat prepare` made, the report is shown, and of `--run` the overview
+that `glassplat eval` wrote. What is not given keeps its pictures.
 """
 
 from __future__ import annotations
@@ -18,10 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from glassplat.prepare.report_page import PAGE
 from glassplat.scene.eye import Eye
+from tools.browser import Browser
 from tools.marking_page import MarkingPage, marking_page
 
 SIZE = (1180, 700)
+PAGE_SIZE = (1180, 860)
+PAGE_QUALITY = 82
 COLORS = 128
 APART = 4
 """Of the photographs that show the whole pane, every how manyth is marked."""
@@ -46,6 +52,13 @@ def save(page: MarkingPage, path: Path) -> None:
     print(path)
 
 
+def draw_page(page: Path, picture: Path) -> None:
+    """Saves how a page on disk begins."""
+    with Browser(page, *PAGE_SIZE, query="") as window:
+        Image.fromarray(window.picture()).convert("RGB").save(picture, quality=PAGE_QUALITY, optimize=True)
+    print(picture)
+
+
 def draw(scene: Path, output: Path) -> None:
     """Marks the scene's pane in a copy of it, and saves two pictures on the way."""
     with tempfile.TemporaryDirectory() as folder:
@@ -68,10 +81,17 @@ def draw(scene: Path, output: Path) -> None:
 def main() -> None:
     """Reads the arguments and draws."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", type=Path)
+    parser.add_argument("--scene", type=Path)
+    parser.add_argument("--capture", type=Path)
+    parser.add_argument("--run", type=Path)
     parser.add_argument("--output", type=Path, default=Path("docs/images"))
     options = parser.parse_args()
-    draw(options.scene, options.output)
+    if options.scene:
+        draw(options.scene, options.output)
+    if options.capture:
+        draw_page(options.capture / PAGE, options.output / "tutorial-prepare.jpg")
+    if options.run:
+        draw_page(options.run / "index.html", options.output / "tutorial-eval.jpg")
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from glassplat.prepare.feature_database import Lens
 from glassplat.prepare.mapping import Mapper
 from glassplat.prepare.preparation import Preparation, prepare
 from glassplat.prepare.reconstruction import Settings
+from glassplat.prepare.report_page import PAGE, write_page
 from glassplat.prepare.workplace import Workplace
 
 
@@ -55,7 +56,8 @@ class Prepare:
             report = prepare(task, progress.show, resume=self.resume, force=self.force)
         for line in report.lines():
             (warn if line.startswith("advice") else say)(console, line)
-        say(console, f"capture: {self.output}")
+        write_page(self.output, self.output / PAGE)
+        say(console, f"capture: {self.output}, report: {self.output / PAGE}")
         say(console, f"next: glassplat annotate {self.output}")
 
     def left_behind(self) -> str:

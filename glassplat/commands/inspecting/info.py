@@ -17,6 +17,7 @@ from glassplat.commands.inspecting.info_of_capture import (
     photographs_finding,
     preparation_finding,
     video_finding,
+    write_capture_page,
 )
 from glassplat.commands.inspecting.info_of_scene import SPLAT_READERS, run_finding, scene_finding, splat_finding
 from glassplat.data.errors import InputError, UnknownFormatError, first_names
@@ -34,14 +35,18 @@ class Info:
     Attributes:
         path: anything that glassplat reads or writes.
         json: print it for programs.
+        page: of a capture from `prepare`, its report anew, with the panes and the points behind them, as an HTML file.
     """
 
     path: tyro.conf.Positional[Path]
     json: bool = False
+    page: Path | None = None
 
     def run(self, console: Console) -> None:
         """Looks and tells."""
         finding = find_out(self.path)
+        if self.page is not None:
+            write_capture_page(self.path, self.page)
         if self.json:
             say(console, json.dumps({"path": str(self.path), **finding.as_json()}, indent=1))
             return

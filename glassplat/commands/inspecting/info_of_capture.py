@@ -6,10 +6,12 @@ from pathlib import Path
 
 from glassplat.commands.inspecting.finding import Finding
 from glassplat.data.dataset import Dataset, load_dataset
+from glassplat.data.errors import InputError
 from glassplat.files.images import IMAGE_SUFFIXES
 from glassplat.files.json_text import read_json
 from glassplat.init.planes import PlaneFit, PlaneFitError
 from glassplat.init.virtual_scene import virtual_points
+from glassplat.prepare.report_page import PAGE, write_page
 from glassplat.prepare.workplace import RECORD
 from glassplat.train.plane_entry import fitted_planes
 
@@ -37,6 +39,21 @@ def capture_finding(path: Path) -> Finding:
         finding.problems.append(f"{len(dataset.points)} points are few; more photographs with more overlap give more")
     _panes(path, dataset, finding)
     return finding
+
+
+def write_capture_page(path: Path, target: Path) -> None:
+    """Writes the report of a prepared capture, with the panes that are marked in it.
+
+    Raises:
+        InputError: it is no such capture, or the file is somebody's.
+    """
+    if not (path / RECORD).is_file():
+        raise InputError(f"{path} was not made by `glassplat prepare`: there is no {RECORD} to report on")
+    if target.exists() and target.resolve() != (path / PAGE).resolve():
+        raise InputError(f"{target} exists; choose another name for --page")
+    dataset = load_dataset(path)
+    marked = bool(dataset.pane_labels) or dataset.planes is not None
+    write_page(path, target, fitted_planes(dataset, None, PlaneFit()) if marked else None)
 
 
 def photographs_finding(path: Path) -> Finding | None:

@@ -1,0 +1,189 @@
+"""What became of the photographs, as a page: how well they fit each other, and what each of them shows."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from glassplat.data.colmap_library import pycolmap
+from glassplat.data.dataset import Dataset, View, load_dataset
+from glassplat.evaluate.overview_style import STYLE
+from glassplat.files.atomic import atomic_write
+from glassplat.files.json_text import read_json
+from glassplat.init.virtual_scene import virtual_points
+from glassplat.prepare.plan import plan
+from glassplat.prepare.workplace import RECORD
+from glassplat.scene.plane import Planes
+
+PAGE = "prepare.html"
+THUMBNAIL = (160, 120)
+MOST_THUMBNAILS = 200
+"""Of more photographs only every second or third is shown: the page stays below 2 MB."""
+TRACKS = (2, 3, 4, 5, 7, 10, 15, 1 << 30)
+"""Numbers of photographs that points are counted by: from one up to the next."""
+ERRORS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, np.inf)
+FEW_POINTS = 50
+"""A photograph that shows fewer is badly held."""
+
+PAGE_STYLE = """
+section { display: inline-block; vertical-align: top; margin: 0 36px 20px 0 }
+h2 { font-size: 15px; margin: 12px 0 6px }
+.bar { display: inline-block; height: 11px; background: #5aa9ff; border-radius: 2px }
+.photographs { display: flex; flex-wrap: wrap; gap: 10px }
+.photographs figure { width: 160px; margin: 0; font-size: 12px; color: #a0a6ae }
+.photographs figure.weak { color: #ffb454 }
+.photographs img { cursor: auto }
+.advice { color: #ffb454 }
+svg { background: #0c0d0f; border-radius: 8px }
+"""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What one photograph has in the model.
+
+    Attributes:
+        view: the photograph.
+        points: measured places that it shows.
+        error: mean distance of these from where it shows them, in pixels.
+    """
+
+    view: View
+    points: int
+    error: float
+
+
+def write_page(capture: Path, target: Path, planes: Planes | None = None) -> None:
+    """Writes the page of a capture that `glassplat prepare` made; it refers to nothing outside of itself.
+
+    Args:
+        capture: the folder.
+        target: the file to write.
+        planes: of panes that are marked in it; points behind them are counted and shown.
+
+    Raises:
+        InputError: the capture cannot be read.
+        OSError: it was not prepared here, or the page cannot be written.
+    """
+    report = read_json(capture / RECORD)["report"]
+    dataset = load_dataset(capture)
+    model = pycolmap.Reconstruction(capture / "sparse" / "0")
+    page = _page(report, dataset, model, planes, capture.resolve().name)
+    with atomic_write(target) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def _page(report: Mapping[str, Any], dataset: Dataset, model: Any, planes: Planes | None, title: str) -> str:
+    views = sorted((*dataset.train, *dataset.test), key=lambda view: view.name)
+    behind = _behind(dataset, planes)
+    points = list(model.points3D.values())
+    tracks = np.array([point.track.length() for point in points])
+    errors = np.array([point.error for point in points])
+    body = [
+        f"<h1>{html.escape(title)}</h1>",
+        f'<div class="cards">{"".join(_cards(report, behind, planes))}</div>',
+        *(f'<p class="advice">{html.escape(str(line))}</p>' for line in report["advice"]),
+        f"<section><h2>From above</h2>{plan(views, dataset.points, behind, planes)}<p>{_legend(planes)}</p></section>",
+        f"<section>{_bars('Points by the photographs that show them', tracks, TRACKS)}"
+        f"{_bars('Points by how far off they are, in pixels', errors, ERRORS)}</section>",
+        "<h2>Photographs</h2>",
+        f'<div class="photographs">{"".join(_photographs(_shown(views, model)))}</div>',
+        *_missing(report["missing"]),
+    ]
+    head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{STYLE}{PAGE_STYLE}</style>'
+    return f"<!doctype html>\n<html><head>{head}</head><body>\n" + "\n".join(body) + "\n</body></html>\n"
+
+
+def _behind(dataset: Dataset, planes: Planes | None) -> NDArray[np.bool_]:
+    """[N] which points most photographs show through a pane."""
+    if planes is None:
+        return np.zeros(len(dataset.points), dtype=bool)
+    cameras = [view.camera for view in dataset.train]
+    found: NDArray[np.bool_] = virtual_points(dataset.points.positions, planes, cameras).cpu().numpy()
+    return found
+
+
+def _cards(report: Mapping[str, Any], behind: NDArray[np.bool_], planes: Planes | None) -> list[str]:
+    facts = {
+        "photographs placed": f"{report['registered']} of {report['photographs']}",
+        "points": f"{report['points']:,}",
+        "pixels off, on average": f"{report['reprojection_error']:.2f}",
+        "photographs of a point": f"{report['track_length']:.1f}",
+        "features of a photograph": f"{report['features']:,}",
+        "points behind panes": "no panes yet" if planes is None else f"{behind.sum():,} ({behind.mean():.0%})",
+        "attempt": f"{report['attempt']} ({report['attempts']} made)",
+    }
+    facts |= {f"camera {number}": camera for number, camera in enumerate(report["cameras"], start=1)}
+    return [f"<div><b>{html.escape(str(value))}</b><span>{name}</span></div>" for name, value in facts.items()]
+
+
+def _legend(planes: Planes | None) -> str:
+    seen = "cameras blue, in the order of their names joined by a line; points in their colours"
+    return seen if planes is None else f"{seen}, those behind panes magenta; panes yellow"
+
+
+def _bars(title: str, values: NDArray[Any], edges: Sequence[float]) -> str:
+    """A histogram as a table; the last bin is open."""
+    counts = [int(((values >= low) & (values < high)).sum()) for low, high in itertools.pairwise(edges)]
+    most = max([*counts, 1])
+    rows = [
+        f'<tr><td>{_bin(low, high)}</td><td>{count:,}</td><td style="text-align: left"><span class="bar" '
+        f'style="width: {240 * count / most:.0f}px"></span></td></tr>'
+        for (low, high), count in zip(itertools.pairwise(edges), counts, strict=True)
+    ]
+    return f"<h2>{title}</h2><table>{''.join(rows)}</table>"
+
+
+def _bin(low: float, high: float) -> str:
+    if high >= 1 << 30:
+        return f"{low:g} and more"
+    return f"{low:g}" if isinstance(low, int) and high == low + 1 else f"{low:g} to {high:g}"
+
+
+def _shown(views: Sequence[View], model: Any) -> list[Shown]:
+    images = {image.name: image for image in model.images.values()}
+    found = []
+    for view in views:
+        keys = [point.point3D_id for point in images[view.name].points2D if point.has_point3D()]
+        error = float(np.mean([model.points3D[key].error for key in keys])) if keys else 0.0
+        found.append(Shown(view, len(keys), error))
+    return found
+
+
+def _photographs(shown: Sequence[Shown]) -> list[str]:
+    every = -(-len(shown) // MOST_THUMBNAILS)
+    return [_photograph(one) for one in shown[::every]]
+
+
+def _photograph(shown: Shown) -> str:
+    weak = ' class="weak"' if shown.points < FEW_POINTS else ""
+    name = html.escape(shown.view.name)
+    return (
+        f'<figure{weak}><img src="{_thumbnail(shown.view)}" alt="{name}">{name}<br>{shown.points} points, '
+        f"{shown.error:.2f} pixels off</figure>"
+    )
+
+
+def _thumbnail(view: View) -> str:
+    """A data address of a small JPEG."""
+    small = Image.fromarray(view.photo.cpu().numpy()).convert("RGB")
+    small.thumbnail(THUMBNAIL)
+    buffer = io.BytesIO()
+    small.save(buffer, "JPEG", quality=70)
+    return f"data:image/jpeg;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+
+
+def _missing(names: Sequence[str]) -> list[str]:
+    if not names:
+        return []
+    return ["<h2>Not placed</h2>", f'<p class="advice">{html.escape(", ".join(map(str, names)))}</p>']

@@ -1,0 +1,113 @@
+"""The report's page shows every photograph, where it was taken, and what lies behind panes; it needs no other file."""
+
+from __future__ import annotations
+
+import html.parser
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from glassplat.cli import main
+from glassplat.commands.measuring.demo import SCENE
+from glassplat.data.dataset import load_dataset
+from glassplat.prepare.plan import plan
+from glassplat.prepare.report_page import PAGE, write_page
+
+RECORD = {
+    "command": "prepare",
+    "report": {
+        "photographs": 98,
+        "registered": 96,
+        "missing": ["<b>left & out</b>.jpg"],
+        "groups": [96],
+        "points": 1000,
+        "reprojection_error": 0.5,
+        "track_length": 5.0,
+        "features": 900,
+        "cameras": ["200x150, focal length 166 pixels"],
+        "attempt": "the usual settings",
+        "attempts": 1,
+        "advice": ["photograph once more"],
+    },
+}
+
+
+class Parts(html.parser.HTMLParser):
+    """What a page consists of."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def all(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bundled scene, as if it had been prepared."""
+    folder = tmp_path_factory.mktemp("report") / "the capture"
+    shutil.copytree(SCENE, folder, ignore=shutil.ignore_patterns("gt", "*.md"))
+    (folder / "prepare.json").write_text(json.dumps(RECORD))
+    return folder
+
+
+def test_every_photograph_is_on_the_page_and_nothing_is_loaded(capture: Path) -> None:
+    write_page(capture, capture / PAGE)
+    text = (capture / PAGE).read_text()
+    page = Parts(text)
+    assert len(page.all("img")) == 96
+    assert all(str(one["src"]).startswith("data:image/jpeg;base64,") for one in page.all("img"))
+    assert "no panes yet" in text and "&lt;b&gt;left &amp; out&lt;/b&gt;.jpg" in text and "photograph once more" in text
+    assert not page.all("script") and not page.all("link") and len(text) < 2_000_000
+
+
+def test_with_panes_the_points_behind_them_are_counted(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(capture), "--page", str(capture / PAGE)]) == 0
+    told = re.search(r"points behind panes: (\d+)", capsys.readouterr().out)
+    assert told and int(told[1]) > 0
+    text = (capture / PAGE).read_text()
+    assert f"<b>{int(told[1]):,} (" in text
+    assert text.count('fill="#ff4fd8"') > 0 and text.count('stroke="#ffd24a"') == 1
+
+
+def test_a_foreign_file_is_not_overwritten(capture: Path, tmp_path: Path) -> None:
+    target = tmp_path / "mine.html"
+    target.write_text("mine")
+    assert main(["info", str(capture), "--page", str(target)]) == 2
+    assert target.read_text() == "mine"
+
+
+def test_a_capture_of_others_has_no_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(SCENE), "--page", str(tmp_path / "page.html")]) == 2
+    assert "was not made by `glassplat prepare`" in capsys.readouterr().err
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_cameras_in_the_plan_lie_as_they_stood() -> None:
+    dataset = load_dataset(SCENE)
+    views = sorted(dataset.train, key=lambda view: view.name)
+    drawing = plan(views, dataset.points, np.zeros(len(dataset.points), dtype=bool), None)
+    found = re.findall(r'cx="([\d.-]+)" cy="([\d.-]+)" r="2.6"', drawing)
+    pixels = np.array(found, dtype=np.float64)
+    centers = np.stack([view.camera.center.double().numpy() for view in views])
+    away = np.linalg.norm(pixels[:, None] - pixels, axis=-1)
+    level = np.linalg.norm((centers[:, None] - centers) @ _level(views), axis=-1)
+    scale = away.max() / level.max()
+    np.testing.assert_allclose(away, scale * level, atol=0.3)
+    assert (pixels > 0).all() and (pixels < (640, 440)).all()
+
+
+def _level(views: list) -> np.ndarray:
+    """[3, 3] what takes the height out."""
+    up = -np.mean([view.camera.cam_from_world[1, :3].double().numpy() for view in views], axis=0)
+    up /= np.linalg.norm(up)
+    return np.eye(3) - np.outer(up, up)
