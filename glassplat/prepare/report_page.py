@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from glassplat.data.colmap_library import pycolmap
 from glassplat.data.dataset import Dataset, View, load_dataset
 from glassplat.evaluate.overview_style import STYLE
 from glassplat.files.atomic import atomic_write
@@ -77,6 +76,8 @@ def write_page(capture: Path, target: Path, planes: Planes | None = None) -> Non
     """
     report = read_json(capture / RECORD)["report"]
     dataset = load_dataset(capture)
+    from glassplat.data.colmap_library import pycolmap  # `info` names this page, and need not wait for it.
+
     model = pycolmap.Reconstruction(capture / "sparse" / "0")
     page = _page(report, dataset, model, planes, capture.resolve().name)
     with atomic_write(target) as temporary:
