@@ -18,6 +18,7 @@ import signal
 import sys
 import tempfile
 import time
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,7 @@ LEAVES = 0.01
 BETWEEN_SAMPLES = 5.0
 LAST_PICTURE = 300.0
 """Seconds in which every client that rests has to get a picture."""
+MOST_TOLD = 20
 COMPLAINTS = ("Traceback", "Error", "could not be drawn")
 
 
@@ -265,8 +267,8 @@ def main() -> int:
         f"half-way {first:.0f} MiB, at the end {last:.0f}, slope {found.slope:+.1f} MiB/h; all at rest: "
         f"{found.without_picture} of {options.clients} without a picture after {found.seconds_to_last:.1f} s"
     )
-    for line in [*found.complaints[:10], *found.count.refused[:10]]:
-        print(line)
+    for line, times in Counter([*found.complaints, *found.count.refused]).most_common(MOST_TOLD):
+        print(f"{times} times: {line}")
     return 1 if found.without_picture or found.complaints else 0
 
 

@@ -143,7 +143,7 @@ class Client:
 
     def keep_keyframes(self, name: str) -> None:
         """Saves the keyframes under a new name; says how that went."""
-        keeper, keyframes = self._viewer.shown.keeper, tuple(self.keyframes.keyframes)
+        keeper, keyframes = self._viewer.shown.keeper, self.keyframes.keyframes
         if keeper is not None:
             self._keep(lambda: keeper.keep_keyframes(keyframes, name))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -33,8 +32,10 @@ class KeyframeControls:
         """
         self._handle, self._extent, self._camera = handle, extent, camera
         self._frusta: list[Any] = []
-        self.keyframes: list[Camera] = []
-        self._is_playing = False
+        self.keyframes: tuple[Camera, ...] = ()
+        self._playing: threading.Event | None = None
+        # viser's threads call at once what is clicked in quick succession.
+        self._lock = threading.Lock()
 
     def lay_out(self, go: Callable[[Camera], None], save: Callable[[str], None] | None) -> None:
         """Puts the controls there.
@@ -56,52 +57,60 @@ class KeyframeControls:
     def add(self) -> None:
         """One more keyframe, where the client stands."""
         camera = self._camera()
-        if camera is None or len(self.keyframes) == MOST_KEYFRAMES:
-            return
-        self.keyframes.append(camera)
-        frustum = self._handle.scene.add_camera_frustum(
-            f"/keyframes/{len(self.keyframes)}",
-            2 * float(np.arctan(camera.height / 2 / camera.fy)),
-            camera.width / camera.height,
-            scale=FRUSTUM_SHARE * self._extent,
-            thickness=2.0,
-            thickness_units="screen",
-            color=KEYFRAME_COLOR,
-            wxyz=wxyz_of(camera.cam_from_world[:3, :3].double().numpy().T),
-            position=camera.center.double().numpy(),
-        )
-        self._frusta.append(frustum)
-        self._count.content = self._counted()
+        with self._lock:
+            if camera is None or len(self._frusta) == MOST_KEYFRAMES:
+                return
+            frustum = self._handle.scene.add_camera_frustum(
+                f"/keyframes/{len(self._frusta)}",
+                2 * float(np.arctan(camera.height / 2 / camera.fy)),
+                camera.width / camera.height,
+                scale=FRUSTUM_SHARE * self._extent,
+                thickness=2.0,
+                thickness_units="screen",
+                color=KEYFRAME_COLOR,
+                wxyz=wxyz_of(camera.cam_from_world[:3, :3].double().numpy().T),
+                position=camera.center.double().numpy(),
+            )
+            self._frusta.append(frustum)
+            self.keyframes = (*self.keyframes, camera)
+            self._count.content = self._counted()
 
     def remove(self) -> None:
         """The last keyframe goes."""
-        if self.keyframes:
-            self.keyframes.pop()
-            self._frusta.pop().remove()
-            self._count.content = self._counted()
+        with self._lock:
+            if self._frusta:
+                self._frusta.pop().remove()
+                self.keyframes = self.keyframes[:-1]
+                self._count.content = self._counted()
 
     def play(self, go: Callable[[Camera], None]) -> None:
         """Begins to move the client along the path as the film will, or stops that."""
-        if self._is_playing or len(self.keyframes) < 2:
-            self._is_playing = False
-            return
-        self._is_playing = True
-        frames = (len(self.keyframes) - 1) * SECONDS_BETWEEN * PLAYED_PER_SECOND + 1
-        # A thread of its own: viser has few, and all clients share them.
-        threading.Thread(target=self._play, args=(interpolated(self.keyframes, frames), go), daemon=True).start()
-
-    def _play(self, path: list[Camera], go: Callable[[Camera], None]) -> None:
-        for camera in path:
-            if not self._is_playing:
+        keyframes = self.keyframes
+        with self._lock:
+            was_playing = self._playing is not None and not self._playing.is_set()
+            self.stop()
+            if was_playing or len(keyframes) < 2:
                 return
-            go(camera)
-            time.sleep(1 / PLAYED_PER_SECOND)
-        self._is_playing = False
+            ended = self._playing = threading.Event()
+        frames = (len(keyframes) - 1) * SECONDS_BETWEEN * PLAYED_PER_SECOND + 1
+        # A thread of its own: viser has few, and all clients share them.
+        path = interpolated(keyframes, frames)
+        threading.Thread(target=_play, args=(path, go, ended), daemon=True).start()
 
     def stop(self) -> None:
         """Ends the playing, as when the client leaves."""
-        self._is_playing = False
+        if self._playing is not None:
+            self._playing.set()
 
     def _counted(self) -> str:
         count = len(self.keyframes)
         return f"{count} {'keyframe' if count == 1 else 'keyframes'}" + (", a film needs two" if count < 2 else "")
+
+
+def _play(path: list[Camera], go: Callable[[Camera], None], ended: threading.Event) -> None:
+    """Moves along a path until it or the playing ends."""
+    for camera in path:
+        go(camera)
+        if ended.wait(1 / PLAYED_PER_SECOND):
+            return
+    ended.set()

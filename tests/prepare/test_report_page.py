@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from glassplat.cli import main
-from glassplat.commands.demo import SCENE
+from glassplat.commands.measuring.demo import SCENE
 from glassplat.data.dataset import load_dataset
 from glassplat.prepare.plan import plan
 from glassplat.prepare.report_page import PAGE, write_page

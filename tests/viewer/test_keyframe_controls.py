@@ -1,0 +1,79 @@
+"""Keyframes that are set, removed and played at once, as viser's threads do after quick clicks."""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+from glassplat.scene.camera import Camera
+from glassplat.viewer.keyframe_controls import MOST_KEYFRAMES, KeyframeControls
+from tests.train.tiny_capture import tiny_capture
+
+CAMERAS = [view.camera for view in tiny_capture().train]
+
+
+class Page:
+    """What the controls ask of viser: nothing is shown, and buttons are called by their names."""
+
+    def __init__(self) -> None:
+        self.buttons: dict[str, Callable[[Any], None]] = {}
+        self.gui = self.scene = self
+
+    def __enter__(self) -> Page:
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        pass
+
+    def add_folder(self, name: str, expand_by_default: bool) -> Page:
+        return self
+
+    def add_markdown(self, content: str) -> SimpleNamespace:
+        return SimpleNamespace(content=content)
+
+    def add_button(self, name: str) -> SimpleNamespace:
+        return SimpleNamespace(on_click=lambda act: self.buttons.update({name: act}))
+
+    def add_camera_frustum(self, *given: object, **named: object) -> SimpleNamespace:
+        return SimpleNamespace(remove=lambda: None)
+
+
+def test_quick_clicks_at_once_leave_keyframes_that_fit_together() -> None:
+    page, went = Page(), list[Camera]()
+    controls = KeyframeControls(page, 1.0, lambda: random.choice(CAMERAS))
+    controls.lay_out(went.append, None)
+    failures: list[BaseException] = []
+
+    def click(seed: int) -> None:
+        draw = random.Random(seed)
+        try:
+            for _ in range(300):
+                page.buttons[draw.choice(list(page.buttons))](None)
+        except BaseException as error:  # noqa: BLE001 - A thread's error is told by the test.
+            failures.append(error)
+
+    threads = [threading.Thread(target=click, args=(seed,)) for seed in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    controls.stop()
+    assert not failures
+    assert len(controls.keyframes) == len(controls._frusta) <= MOST_KEYFRAMES
+    time.sleep(0.3)
+    moves = len(went)
+    time.sleep(0.5)
+    assert moves and len(went) == moves
+
+
+def test_there_is_a_most() -> None:
+    page = Page()
+    controls = KeyframeControls(page, 1.0, lambda: CAMERAS[0])
+    controls.lay_out(lambda camera: None, None)
+    for _ in range(MOST_KEYFRAMES + 5):
+        page.buttons["Add this view"](None)
+    assert len(controls.keyframes) == MOST_KEYFRAMES
