@@ -139,6 +139,8 @@ class PageHandler(BaseHTTPRequestHandler):
         body = self._body()
         if path == "/document":
             self._send_json(session.update(parse_json(body, "the document of the page")))
+        elif path == "/grab":
+            self._send_json(session.grab(parse_json(body, "the outline of the page")))
         elif path == "/results":
             self._send_json(session.finish())
         elif path == "/close":

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from glassplat.annotate.document import MarkedPane, parsed_document, read_document, write_document
+from glassplat.annotate.document import PLACE, MarkedPane, parsed_document, read_document, write_document
+from glassplat.annotate.grab import grabbed
 from glassplat.annotate.outline import seen_outline
 from glassplat.annotate.pane_fit import Marks, PaneFit, TooFewMarksError, fitted_pane
 from glassplat.annotate.proposals import proposals
@@ -23,6 +24,7 @@ from glassplat.annotate.view_advice import first_view, second_views, settling_vi
 from glassplat.data.dataset import Dataset, load_dataset
 from glassplat.data.errors import InputError, input_checked
 from glassplat.data.view import View
+from glassplat.files.fields import Field, Items, Whole, checked
 from glassplat.files.folders import check_folder
 from glassplat.scene.eye import Eye
 from glassplat.suggest.suggestion import Suggestion
@@ -38,6 +40,9 @@ KEPT_BYTES = 200_000_000
 POOR_RECTANGLE = 1.5
 """Factor by which a free outline may fit better before a rectangle is called into question."""
 POINTS_USED = 20_000
+MOST_GRABBED = 2000
+"""Points of an outline that is drawn by hand."""
+GRABBED: dict[str, Field] = {"view": Whole(0, 10**9), "points": Items(PLACE)}
 
 
 @dataclass(frozen=True)
@@ -127,6 +132,20 @@ class Session:
             write_document(self.root, document)
             self._document = document
         return {"panes": [self._answer(self.solve(pane)) for pane in panes]}
+
+    def grab(self, asked: Any) -> dict[str, Any]:
+        """The outlines of what stands within a rough outline in a photograph.
+
+        Raises:
+            ValueError: it is no such outline.
+            InputError: OpenCV is missing, or the outline holds nothing of the photograph.
+        """
+        fields = checked(asked, GRABBED, "the outline of the page")
+        if fields["view"] >= len(self.views) or not 3 <= len(fields["points"]) <= MOST_GRABBED:
+            raise ValueError(f"expected 3 to {MOST_GRABBED} points in one of {len(self.views)} views")
+        photo = np.asarray(self.views[fields["view"]].read_photo().numpy())
+        found = grabbed(photo, np.array(fields["points"], dtype=np.float64))
+        return {"outlines": [np.round(outline, 2).tolist() for outline in found]}
 
     def solve(self, pane: MarkedPane) -> SolvedPane:
         """Fits one pane."""

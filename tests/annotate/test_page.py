@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from glassplat.data.dataset import load_dataset
 from glassplat.files.images import read_image
@@ -88,6 +89,38 @@ def test_a_pane_is_marked_cut_and_written(page: Page) -> None:
     assert whole[tuple(true_corners(1).mean(axis=0).astype(int)[::-1])] == 1
     assert cut[round(inside[1]), round(inside[0])] == 0
     assert 0.35 < (cut == 1).sum() / (read_image(page.root / "images" / NAMES[0])[:, :, 0] == 150).sum() < 0.65
+
+
+def test_what_stands_before_the_pane_is_found_within_a_rough_outline(room: Path) -> None:
+    picture = room / "images" / NAMES[0]
+    pixels = read_image(picture).copy()
+    x, y = true_corners(0).mean(axis=0).astype(int)
+    hedge = np.s_[y - 20 : y + 20, x - 25 : x + 10]
+    mottle = np.random.default_rng(0).integers(-8, 9, (40, 35, 1))
+    pixels[hedge] = np.array([90, 40, 30]) + mottle
+    Image.fromarray(pixels).save(picture)
+    with marking_page(room) as opened:
+        page = Page(opened.window, opened.server)
+        for view in range(3):
+            page.mark_true(view)
+        page.show(0)
+        inside, beside = (x - 8, y), (x + 17, y)
+        covered = page.color_at(inside)
+        page.window.keys("6")
+        for place in page.on_screen([(x - 37, y - 30), (x + 22, y - 30), (x + 22, y + 30), (x - 37, y + 30)]):
+            page.window.click(*place)
+        page.window.keys("Enter")
+        page.window.wait("document.body.dataset.grab === 'done'", "the outline")
+        page.saved()
+        assert page.color_at(inside)[2] < covered[2] - 15 and is_blue(page.color_at(beside))
+        page.write()
+        mask = read_image(room / "masks" / NAMES[0])[:, :, 0]
+        assert (mask[hedge] == 0).mean() > 0.97
+        around = mask[y - 30 : y + 30, x - 37 : x + 22].size - mask[hedge].size
+        assert (mask[y - 30 : y + 30, x - 37 : x + 22] == 1).sum() > 0.93 * around
+        page.window.press("#undo")
+        page.saved()
+        assert np.abs(page.color_at(inside) - covered).max() < 4
 
 
 def test_corners_are_dragged_undone_and_survive_a_reload(page: Page) -> None:

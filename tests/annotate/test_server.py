@@ -68,6 +68,21 @@ def test_without_the_key_there_is_nothing(path: str, server: AnnotationServer) -
     assert ask(server, "/document", {}, key="guessed")[0] == 403
 
 
+@pytest.mark.parametrize(
+    "outline",
+    [
+        {},
+        {"view": 0, "points": [[1, 1], [2, 2]]},
+        {"view": 99, "points": [[1, 1], [9, 1], [9, 9]]},
+        {"view": 0, "points": [[1, 1], [9, 1], [1e9, 9]]},
+        {"view": 0, "points": [[-50, -50], [-9, -50], [-9, -9]]},
+    ],
+)
+def test_an_outline_that_makes_no_sense_is_refused(outline: dict, server: AnnotationServer) -> None:
+    status, body = ask(server, "/grab", outline)
+    assert status == 400 and json.loads(body)["error"]
+
+
 def test_another_name_for_this_computer_is_refused(server: AnnotationServer) -> None:
     """As of a site whose name server points to 127.0.0.1."""
     assert ask(server, "/capture", Host="evil.example:80")[0] == 403

@@ -100,10 +100,10 @@ export class Marking {
     return free >= 0 ? free : null;
   }
 
-  addStroke(view, stroke) {
-    this.change(() => {
-      const strokes = this.pane.strokes;
-      (strokes[view] = strokes[view] || []).push({ ...stroke, points: stroke.points.map(rounded) });
+  addStrokes(view, made, label = this.active) {
+    this.change((document) => {
+      const { strokes } = document.panes.find((pane) => pane.label === label);
+      (strokes[view] = strokes[view] || []).push(...made.map((stroke) => ({ ...stroke, points: stroke.points.map(rounded) })));
     });
   }
 

@@ -9,6 +9,7 @@ const HINTS = {
   corner: "click the corners of the pane, one after the other round it; beside the photograph too",
   edge: "drag along an edge, in the direction round the pane",
   polygon: "click round what stands before the pane; Enter or a double click closes it",
+  grab: "click round what stands before the pane, roughly; Enter or a double click closes it, and its outline is found",
   brush: "paint over what stands before the pane; [ and ] change the brush",
   restore: "paint the pane back where too much was cut; [ and ] change the brush",
 };
@@ -224,7 +225,7 @@ function pressed(event) {
   if (!marking.pane) return;
   if (tool === "corner") pressCorner(place);
   else if (tool === "edge") { pending = { kind: "edge", points: [place, place] }; drag = { kind: "edge" }; }
-  else if (tool === "polygon") pressPolygon(place);
+  else if (tool === "polygon" || tool === "grab") pressPolygon(place);
   else { pending = { kind: "brush", effect: tool === "brush" ? "cut" : "keep", radius: radius / drawing.scale, points: [place] }; drag = { kind: "brush" }; }
   draw();
 }
@@ -265,7 +266,7 @@ function released() {
     const number = marking.nextEdge(view().name, skipped.edge);
     if (number !== null) marking.setEdge(view().name, number, pending.points);
   }
-  if (drag && drag.kind === "brush") marking.addStroke(view().name, pending);
+  if (drag && drag.kind === "brush") marking.addStrokes(view().name, [pending]);
   if (!pending || pending.kind !== "polygon") pending = null;
   drag = null;
   draw();
@@ -275,8 +276,28 @@ function closePolygon() {
   if (!pending || pending.kind !== "polygon") return;
   const points = pending.points.slice(0, -1).filter((point, index, all) => !index || distance(point, all[index - 1]) * drawing.scale > 2);
   pending = null;
-  if (points.length > 2) marking.addStroke(view().name, { kind: "polygon", effect: "cut", radius: 1, points });
+  if (points.length > 2) { if (tool === "grab") grab(points); else marking.addStrokes(view().name, [cutting(points)]); }
   draw();
+}
+
+const cutting = (points) => ({ kind: "polygon", effect: "cut", radius: 1, points });
+
+// The server looks for the thing within a rough outline; its pieces are cut out as one step. The pane and the photograph
+// are those of the click, whatever is looked at when the answer comes.
+async function grab(points) {
+  const label = marking.active, name = view().name;
+  document.body.dataset.grab = "looking";
+  tell("looking for the outline ...");
+  try {
+    const { outlines } = await ask("/grab", { view: current, points });
+    if (marking.document.panes.some((pane) => pane.label === label)) {
+      marking.addStrokes(name, outlines.map(cutting), label);
+    }
+    document.body.dataset.grab = "done";
+  } catch (error) {
+    document.body.dataset.grab = "failed";
+    tell(error.message, true);
+  }
 }
 
 function choose(name) { tool = name; pending = null; refresh(); }
@@ -303,6 +324,7 @@ const KEYS = {
   3: () => choose("polygon"),
   4: () => choose("brush"),
   5: () => choose("restore"),
+  6: () => choose("grab"),
   "[": () => { radius = Math.max(2, radius / 1.25); tell(`brush of ${Math.round(radius)} pixels`); },
   "]": () => { radius = Math.min(300, radius * 1.25); tell(`brush of ${Math.round(radius)} pixels`); },
   Enter: closePolygon,
