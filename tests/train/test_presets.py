@@ -295,7 +295,7 @@ def test_a_region_is_looked_for_only_if_asked(monkeypatch: pytest.MonkeyPatch) -
         recipe = DeferredRecipe(**options)
         state, entry = TrainState(recipe.initialise(tiny_capture()), seed=0), recipe.stages(0)[1].entry
         assert entry is not None
-        entry(state, tiny_capture())
+        finished(entry(state, tiny_capture()))
         return state.scene.environment.region
 
     assert region() == (0.0, 0.0, 0.0, 1.0)
