@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from glassplat.data.colmap_library import pycolmap
 from glassplat.data.dataset import Dataset, View, load_dataset
 from glassplat.evaluate.overview_style import STYLE
 from glassplat.files.atomic import atomic_write
@@ -75,6 +74,8 @@ def write_page(capture: Path, target: Path, planes: Planes | None = None) -> Non
         InputError: the capture cannot be read.
         OSError: it was not prepared here, or the page cannot be written.
     """
+    from glassplat.data.colmap_library import pycolmap  # Others of `info`'s questions do not wait for it.
+
     report = read_json(capture / RECORD)["report"]
     dataset = load_dataset(capture)
     model = pycolmap.Reconstruction(capture / "sparse" / "0")
