@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
@@ -108,6 +107,8 @@ def neighbours(points: Tensor, count: int) -> Tensor:
     """[N, count] rows of the nearest of points [N, 3], each its own first neighbour; fewer where there are fewer."""
     if not len(points):
         return torch.zeros(0, 1, dtype=torch.int64, device=points.device)
+    from scipy.spatial import cKDTree  # Takes long to import, and most commands never need it.
+
     places = points.detach().cpu().numpy()
     _, rows = cKDTree(places).query(places, k=range(1, min(count, len(places)) + 1), workers=-1)
     return torch.from_numpy(rows).to(points.device)

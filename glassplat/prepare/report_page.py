@@ -78,6 +78,8 @@ def write_page(capture: Path, target: Path, planes: Planes | None = None) -> Non
 
     report = read_json(capture / RECORD)["report"]
     dataset = load_dataset(capture)
+    from glassplat.data.colmap_library import pycolmap  # `info` names this page, and need not wait for it.
+
     model = pycolmap.Reconstruction(capture / "sparse" / "0")
     page = _page(report, dataset, model, planes, capture.resolve().name)
     with atomic_write(target) as temporary:
