@@ -74,8 +74,6 @@ def write_page(capture: Path, target: Path, planes: Planes | None = None) -> Non
         InputError: the capture cannot be read.
         OSError: it was not prepared here, or the page cannot be written.
     """
-    from glassplat.data.colmap_library import pycolmap  # Others of `info`'s questions do not wait for it.
-
     report = read_json(capture / RECORD)["report"]
     dataset = load_dataset(capture)
     from glassplat.data.colmap_library import pycolmap  # `info` names this page, and need not wait for it.
