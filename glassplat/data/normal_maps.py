@@ -73,7 +73,7 @@ def _vectors(path: Path) -> NDArray[np.float32]:
         return vectors * (pixels[..., 3:] > LEAST_LENGTH) if pixels.shape[2] == 4 else vectors
     try:
         vectors = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
+    except Exception as error:  # It evaluates the head of the file, and damaged ones raise what tokens do.
         raise ValueError(f"{path} is no array that NumPy can read: {error}") from error
     if vectors.ndim != 3 or vectors.shape[2] != 3 or vectors.dtype.kind != "f" or 0 in vectors.shape:
         raise ValueError(f"{path} holds {vectors.dtype} of shape {list(vectors.shape)}; expected floats [H, W, 3]")

@@ -79,7 +79,7 @@ def test_points_have_the_colours_of_the_photographs(prepared: Path) -> None:
 def test_the_record_holds_the_report_and_nothing_else_is_left(prepared: Path) -> None:
     record = json.loads((prepared / "prepare.json").read_text())
     assert record["report"]["registered"] == len(CONNECTED)
-    assert sorted(path.name for path in prepared.iterdir()) == ["images", "prepare.json", "sparse"]
+    assert sorted(path.name for path in prepared.iterdir()) == ["images", "prepare.html", "prepare.json", "sparse"]
     assert not prepared.with_name("the capture.partial").exists()
 
 
