@@ -1,4 +1,4 @@
-"""Random splats, made without the projection, for the tests of what comes after it; kernels use all threads."""
+"""Random splats, made without the projection, for the tests of what comes after it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.cpu import threads
 from glassplat.kernels.splats import Splats
 
 MakeSplats = Callable[..., Splats]
@@ -17,14 +16,6 @@ MakeSplats = Callable[..., Splats]
 
 def _between(low: float, high: float, shape: Sequence[int], generator: torch.Generator) -> Tensor:
     return low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
-
-
-@pytest.fixture(autouse=True)
-def shared_launches(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every launch of a kernel here uses all threads, however short: what depends on their number is to be found."""
-    if request.path.name != "test_threads.py":
-        monkeypatch.setattr(threads, "SHORTEST_SHARED", 0.0)
-        monkeypatch.setattr(threads, "LOOK_AGAIN", 10**9)
 
 
 @pytest.fixture

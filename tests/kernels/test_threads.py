@@ -9,7 +9,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from glassplat.kernels.cpu import threads
@@ -19,6 +18,7 @@ import logging
 import sys
 import threading
 
+import numba
 import numpy as np
 
 from glassplat.kernels.cpu.jit import kernel
@@ -154,73 +154,3 @@ def test_only_the_work_queue_costs_a_lock(layer: str, locked: bool, monkeypatch:
     assert enter(1) is locked
     assert (enter is compiled) is not locked
     assert not threads._alone.locked()
-
-
-class Machine:
-    """A machine of two threads whose launches take `seconds` each."""
-
-    def __init__(self) -> None:
-        self.threads, self.seconds, self._now, self._reads = 2, 1e-5, 0.0, 0
-
-    def get_num_threads(self) -> int:
-        return self.threads
-
-    def set_num_threads(self, count: int) -> None:
-        self.threads = count
-
-    def perf_counter(self) -> float:
-        """Read before each launch that is timed, and after it."""
-        self._now += self.seconds * (self._reads % 2)
-        self._reads += 1
-        return self._now
-
-
-@pytest.fixture
-def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
-    stand_in = Machine()
-    monkeypatch.setattr(threads, "numba", stand_in)
-    monkeypatch.setattr(threads, "time", stand_in)
-    return stand_in
-
-
-def threads_of_launches(launches: threads.Launches, elements: int, count: int) -> list[int]:
-    return [launches(np.zeros(elements)) for _ in range(count)]
-
-
-def test_short_launches_stay_on_one_thread_and_long_ones_are_shared(machine: Machine) -> None:
-    launches = threads.Launches(lambda values: machine.threads)
-    # The first two tell how long an element takes, 10 microseconds for 9 + 1.
-    assert threads_of_launches(launches, 9, 4) == [1, 1, 1, 1]
-    assert threads_of_launches(launches, 9_999, 3) == [2, 2, 2]
-    assert threads_of_launches(launches, 9, 1) == [1]
-    assert machine.threads == 2
-
-
-def test_the_launch_that_compiles_and_those_that_were_held_up_do_not_count(machine: Machine) -> None:
-    launches = threads.Launches(lambda values: machine.threads)
-    machine.seconds = 5.0
-    launches(np.zeros(9))
-    machine.seconds = 1e-5
-    assert threads_of_launches(launches, 9, 2) == [1, 1]
-    machine.seconds = 0.1
-    assert threads_of_launches(launches, 9, 100) == [1] * 100
-
-
-def test_what_was_held_up_from_the_beginning_is_looked_at_again(machine: Machine) -> None:
-    launches = threads.Launches(lambda values: machine.threads)
-    machine.seconds = 0.1
-    assert threads_of_launches(launches, 9, 10) == [1, 1] + [2] * 8
-    machine.seconds = 1e-5
-    assert threads_of_launches(launches, 9, threads.LOOK_AGAIN)[-5:] == [1] * 5
-
-
-def test_who_asks_for_one_thread_gets_one_and_a_failure_gives_the_threads_back(machine: Machine) -> None:
-    def fail(values: np.ndarray) -> None:
-        raise ValueError("no")
-
-    launches = threads.Launches(fail)
-    with pytest.raises(ValueError, match="no"):
-        launches(np.zeros(3))
-    assert machine.threads == 2
-    machine.threads = 1
-    assert threads_of_launches(threads.Launches(lambda values: machine.threads), 10**6, 3) == [1, 1, 1]

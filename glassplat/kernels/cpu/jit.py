@@ -12,7 +12,7 @@ from numba.extending import register_jitable
 
 from glassplat.kernels.cpu.cache import KernelCache
 from glassplat.kernels.cpu.memory import keep_freed_memory
-from glassplat.kernels.cpu.threads import Launches, entrance, prefer_openmp
+from glassplat.kernels.cpu.threads import entrance, prefer_openmp
 
 # Before anything else in the process can start Numba's threads.
 prefer_openmp()
@@ -45,7 +45,7 @@ class Kernel:
 
     def _first_run(self, *arguments: Any) -> Any:
         """Starts the threads: only then it is known which they are, and how a parallel kernel may be entered."""
-        self._run = Launches(entrance(self.dispatcher))
+        self._run = entrance(self.dispatcher)
         return self._run(*arguments)
 
     @property
