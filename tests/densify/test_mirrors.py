@@ -19,6 +19,7 @@ from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import SH_ZERO, Gaussians
 from glassplat.scene.pose import rotation_from_quat
 from glassplat.scene.scene import Scene
+from tests.densify.brightened_views import brightened_views
 
 SIZE, GREY = 96, 0.4
 TILT_DEG = 35.0
@@ -56,12 +57,7 @@ def views(*left: float) -> list[View]:
     plain = slope()
     with torch.no_grad():
         base = Splat()(replace(plain, primary=replace(plain.primary, active_sh_degree=0)), camera()).rgb
-    photos = []
-    for brighter in left:
-        photo = base.clone()
-        photo[:, : SIZE // 2] *= 1 + brighter / GREY
-        photos.append((255 * photo).round().to(torch.uint8))
-    return [View.in_memory(f"{number}.png", camera(), photo=photo) for number, photo in enumerate(photos)]
+    return brightened_views(base, camera(), GREY, *left)
 
 
 def normal_axes(gaussians: Gaussians) -> Tensor:

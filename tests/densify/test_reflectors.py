@@ -16,6 +16,7 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import SH_ZERO, Gaussians
 from glassplat.scene.scene import Scene
+from tests.densify.brightened_views import brightened_views
 
 SIZE = 24
 GREY = 0.5
@@ -43,12 +44,7 @@ def views(*left: float) -> list[View]:
     """Photographs of the discs, each with the left half brighter by so much."""
     with torch.no_grad():
         base = Deferred()(two_discs(), camera()).layers["base"]
-    photos = []
-    for brighter in left:
-        photo = base.clone()
-        photo[:, : SIZE // 2] *= 1 + brighter / GREY
-        photos.append((255 * photo).round().to(torch.uint8))
-    return [View.in_memory(f"{number}.png", camera(), photo=photo) for number, photo in enumerate(photos)]
+    return brightened_views(base, camera(), GREY, *left)
 
 
 @pytest.mark.parametrize("strength", [1e-3, 0.1, 0.5, 0.9])
