@@ -98,7 +98,8 @@ class Client:
         return None if wish is None else wish.camera(max(1, int(self._handle.camera.image_height)))
 
     def stand_at(self, index: int) -> None:
-        """Moves the camera to where a photograph was taken, and shows that."""
+        """Moves the camera to where a photograph was taken, and shows that; keyframes play no further."""
+        self.keyframes.stop()
         self._photographs.stands_at(index)
         self._photographs.show_nearest(index)
         self.go(self._viewer.shown.cameras[index][1])

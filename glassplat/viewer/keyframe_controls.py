@@ -36,6 +36,7 @@ class KeyframeControls:
         self._playing: threading.Event | None = None
         # viser's threads call at once what is clicked in quick succession.
         self._lock = threading.Lock()
+        self._step = threading.Lock()
 
     def lay_out(self, go: Callable[[Camera], None], save: Callable[[str], None] | None) -> None:
         """Puts the controls there.
@@ -95,22 +96,26 @@ class KeyframeControls:
         frames = (len(keyframes) - 1) * SECONDS_BETWEEN * PLAYED_PER_SECOND + 1
         # A thread of its own: viser has few, and all clients share them.
         path = interpolated(keyframes, frames)
-        threading.Thread(target=_play, args=(path, go, ended), daemon=True).start()
+        threading.Thread(target=_play, args=(path, go, ended, self._step), daemon=True).start()
 
     def stop(self) -> None:
-        """Ends the playing, as when the client leaves."""
-        if self._playing is not None:
-            self._playing.set()
+        """Ends the playing, as when the client leaves or stands elsewhere; nothing moves it afterwards."""
+        with self._step:
+            if self._playing is not None:
+                self._playing.set()
 
     def _counted(self) -> str:
         count = len(self.keyframes)
         return f"{count} {'keyframe' if count == 1 else 'keyframes'}" + (", a film needs two" if count < 2 else "")
 
 
-def _play(path: list[Camera], go: Callable[[Camera], None], ended: threading.Event) -> None:
-    """Moves along a path until it or the playing ends."""
+def _play(path: list[Camera], go: Callable[[Camera], None], ended: threading.Event, step: threading.Lock) -> None:
+    """Moves along a path until it or the playing ends; `step` is held while it moves."""
     for camera in path:
-        go(camera)
+        with step:
+            if ended.is_set():
+                return
+            go(camera)
         if ended.wait(1 / PLAYED_PER_SECOND):
             return
     ended.set()

@@ -77,3 +77,23 @@ def test_there_is_a_most() -> None:
     for _ in range(MOST_KEYFRAMES + 5):
         page.buttons["Add this view"](None)
     assert len(controls.keyframes) == MOST_KEYFRAMES
+
+
+def test_nothing_moves_the_camera_once_playing_was_stopped_even_in_the_middle_of_a_move() -> None:
+    page, began, moved = Page(), threading.Event(), list[Camera]()
+
+    def go(camera: Camera) -> None:
+        began.set()
+        time.sleep(0.1)
+        moved.append(camera)
+
+    cameras = iter(CAMERAS)
+    controls = KeyframeControls(page, 1.0, lambda: next(cameras))
+    controls.lay_out(go, None)
+    for name in ("Add this view", "Add this view", "Play or stop"):
+        page.buttons[name](None)
+    assert began.wait(10)
+    controls.stop()
+    moves = len(moved)
+    time.sleep(0.5)
+    assert moves and len(moved) == moves

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from glassplat.cli import main
-from glassplat.commands import annotate
+from glassplat.commands.capture import annotate
 from tests.annotate.conftest import write_room
 from tests.annotate.suggested import suggestions
 

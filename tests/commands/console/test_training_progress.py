@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from glassplat.cli import main
-from glassplat.commands import training_progress
+from glassplat.commands.console import training_progress
 from glassplat.commands.console.training_progress import (
     FIRST_PAUSE,
     LONGEST_PAUSE,

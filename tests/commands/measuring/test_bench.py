@@ -12,7 +12,7 @@ from typing import Any, get_args
 import pytest
 
 from glassplat.cli import main
-from glassplat.commands import bench
+from glassplat.commands.measuring import bench
 from glassplat.commands.measuring.bench_runs import FinishedRun, PlannedRun, RunClock, scene_names
 from glassplat.commands.training.train import Train, TrainingProgress
 from glassplat.data.errors import InputError
