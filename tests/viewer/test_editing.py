@@ -111,9 +111,8 @@ def test_a_person_moves_a_pane_sets_keyframes_and_saves_both(tmp_path: Path) -> 
     assert len(keyframes) == 2
     for camera, expected in zip(keyframes, stood[:2], strict=True):
         torch.testing.assert_close(camera.cam_from_world, expected.cam_from_world, atol=1e-5, rtol=0)
-        # How wide the picture is, a browser may tell later.
-        assert camera.height == expected.height == WINDOW[1]
-        assert abs(camera.fy - expected.fy) < 0.01
+        # How large the picture is, a browser tells late; the angle is the same in any size.
+        assert abs(camera.fy / camera.height - expected.fy / expected.height) < 1e-3
 
 
 def pane_is_dragged(client: Client, browser: Browser) -> torch.Tensor:
