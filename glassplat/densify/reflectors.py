@@ -44,19 +44,15 @@ class Search:
     @torch.no_grad()
     def reflective(self, scene: Scene, views: Sequence[View]) -> float:
         """Share of what is seen that is reflection: the mean strength."""
-        shown = sum((contributions(scene, view.camera) for view in self._chosen(views)), torch.zeros(()))
+        shown = sum((contributions(scene, view.camera) for view in evenly(views, self.views)), torch.zeros(()))
         return mean_in_region(scene, shown, torch.sigmoid(scene.primary.channels["logit_strength"]))
 
     @torch.no_grad()
     def turning(self, scene: Scene, views: Sequence[View], renderer: Renderer) -> float:
         """Share of what is seen that does not reflect, although its residual turns with the view."""
-        shown, spreads = residual_spreads(scene, self._chosen(views), renderer)
+        shown, spreads = residual_spreads(scene, evenly(views, self.views), renderer)
         reflects = scene.primary.channels["logit_strength"] > logit(self.strength)
         return mean_in_region(scene, shown, ~reflects & (spreads > self.spread))
-
-    def _chosen(self, views: Sequence[View]) -> list[View]:
-        """Evenly among all of them."""
-        return evenly(views, self.views)
 
 
 def evenly(views: Sequence[View], most: int) -> list[View]:
