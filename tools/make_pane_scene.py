@@ -4,8 +4,9 @@
     python -m tools.make_pane_scene --output scenes/room-1 --drawn 1
 
 `screens`: two panes of glass, one upright, one leaning, through which the other is seen, stand between things; a mirror
-hangs on a wall. With `--drawn` everything is drawn by chance (`tools/pane_draws.py`). docs/scenes.md describes the
-files. Needs nothing but glassplat's own dependencies.
+hangs on a wall. With `--drawn` everything is drawn by chance (`tools/pane_draws.py`); `--case` puts a silver bowl
+behind glass (`tools/case_place.py`). docs/scenes.md describes the files. Needs nothing but glassplat's own
+dependencies.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from PIL import Image
 from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import Rotation
 
+from tools.case_place import case_place, case_poses
 from tools.make_demo_scene import TEST_EVERY, srgb_from_linear
 from tools.make_scenes import GOLDEN_ANGLE_RAD, as_bytes
 from tools.pane_draws import DrawnPlace, draw_place, standing_pane, world_from_cam
@@ -62,11 +64,13 @@ class Arguments:
     points: int = 6000
     """Sparse points."""
     seed: int = 0
-    """Of cameras and points of `screens` and `window`."""
+    """Of cameras and points of `screens`, `window` and `case`."""
     drawn: int | None = None
     """Seed of a place drawn by chance, to make in place of `screens`."""
     window: bool = False
     """Make a large window before a dark case, photographed from the front, in place of `screens`."""
+    case: bool = False
+    """Make a silver bowl in a case with a glass front and a mirrored back, in place of `screens`."""
     passers_by: float = 0.0
     """Share of the training views in which somebody stands somewhere in the room, in each elsewhere."""
     photographer: bool = False
@@ -158,6 +162,21 @@ def write_strength(folder: Path, name: str, seen: Seen) -> None:
     Image.fromarray(whole_labels(seen.label)).save(folder / name.replace(".png", "_pane.png"))
 
 
+def write_surface(folder: Path, name: str, normals: Array) -> None:
+    """Writes where silver is seen, directly or through panes, and which way it faces; nothing where there is none.
+
+    Args:
+        folder: of the photographs.
+        name: of one.
+        normals: [H, W, S, 3] of its rays, 0 where they do not end on silver.
+    """
+    share = (np.linalg.norm(normals, axis=-1) > 0).mean(axis=2)
+    mean = normals.sum(axis=2) / np.maximum(np.linalg.norm(normals.sum(axis=2), axis=-1, keepdims=True), 1e-9)
+    stem = Path(name).stem
+    Image.fromarray(as_bytes(np.dstack([(mean + 1) / 2, share]))).save(folder / f"{stem}_normal.png")
+    Image.fromarray(as_bytes(share)).save(folder / f"{stem}_strength.png")
+
+
 def sparse_points(place: Place, poses: list[Array], count: int, seed: int) -> tuple[Array, NDArray[np.uint8]]:
     """Positions and colours [P, 3] of surface points that random rays of the cameras meet, some of them mirrored."""
     generator = np.random.default_rng(seed)
@@ -166,13 +185,16 @@ def sparse_points(place: Place, poses: list[Array], count: int, seed: int) -> tu
     directions = np.einsum("nij,nj->ni", eyes[:, :3, :3], rays)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     origins = eyes[:, :3, 3].copy()
-    colors, length = place.without_panes(origins, directions)
+    # Features slide over silver as the camera moves: no points lie there.
+    plain = ~place.silver_normals(origins, directions).any(axis=1)
+    origins, directions, count = origins[plain], directions[plain], int(plain.sum())
+    colors, length = place.matte(origins, directions)
     for pane in place.panes:
         to_pane = pane.distances(origins, directions)
         share = VIRTUAL_IN_GLASS if pane.refraction else VIRTUAL_IN_MIRROR
         chosen = (to_pane < length) & (generator.random(count) < share)
         met = pane.meeting(origins[chosen], directions[chosen], to_pane[chosen])
-        colors[chosen], beyond = place.without_panes(met.points, met.mirrored)
+        colors[chosen], beyond = place.matte(met.points, met.mirrored)
         # Straight on behind the pane, as far as the light has come.
         length[chosen] = to_pane[chosen] + beyond
     positions = origins + length[:, None] * directions + generator.normal(scale=POINT_NOISE, size=(count, 3))
@@ -212,6 +234,22 @@ def write_planes(path: Path, place: Place) -> None:
             "mirror": pane.refraction is None,
             "base_reflectance": pane.base_reflectance,
             "tint": list(pane.tint),
+        }
+        for pane in place.panes
+    ]
+    path.write_text(json.dumps(entries, indent=1) + "\n")
+
+
+def write_rectangles(path: Path, place: Place) -> None:
+    """Writes the panes as they would be marked by hand, for those that are seen through others only."""
+    entries = [
+        {
+            "label": pane.label,
+            "center": pane.center.tolist(),
+            "normal": pane.normal.tolist(),
+            "tangent": pane.tangent.tolist(),
+            "half_sizes": list(pane.half_sizes),
+            "mirror": pane.refraction is None,
         }
         for pane in place.panes
     ]
@@ -267,6 +305,8 @@ def write_view(arguments: Arguments, place: Place, number: int, pose: Array, *, 
     if number % TEST_EVERY:
         return
     write_strength(folder / "gt/strength", name, seen)
+    if place.silver:
+        write_surface(folder / "images", name, seen.normal)
     write_layers(folder / "gt", name, see(place, pose, *size) if arguments.photographer else seen)
     if arguments.photographer:
         write_layers(folder / "gt/with_photographer", name, seen)
@@ -278,6 +318,8 @@ def chosen_place(arguments: Arguments) -> DrawnPlace:
         return draw_place(arguments.drawn, arguments.views)
     if arguments.window:
         return DrawnPlace(window_place(), window_poses(arguments.views, arguments.seed))
+    if arguments.case:
+        return DrawnPlace(case_place(), case_poses(arguments.views, arguments.seed))
     return DrawnPlace(make_place(), camera_poses(arguments.views, arguments.seed))
 
 
@@ -297,6 +339,8 @@ def main(arguments: Arguments) -> None:
     place, poses = tinted(drawn.place, arguments.tint), drawn.poses
     write_model(folder / "sparse/0", arguments, poses, place)
     write_planes(folder / "gt/planes.json", place)
+    if arguments.case:
+        write_rectangles(folder / "planes.json", place)
     annotated, started = annotated_views(place, poses, arguments.masks), time.monotonic()
     for number, pose in enumerate(poses):
         write_view(arguments, place, number, pose, annotated=number in annotated)

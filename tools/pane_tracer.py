@@ -6,7 +6,7 @@ thin: light goes through without a bend, and what comes back is the sum over all
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
@@ -70,13 +70,14 @@ class Ball:
 
 @dataclass(frozen=True)
 class Box:
-    """A box along the axes, seen from outside, or as a room from inside."""
+    """A box along the axes, seen from outside, or as a room from inside; its texture as coarse as it is told."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
     seed: int
     room: bool = False
     shade: float = 1.0
+    coarseness: float = 1.0
 
     def distances(self, origins: Array, directions: Array) -> Array:
         """See `Thing`."""
@@ -89,7 +90,7 @@ class Box:
 
     def on_texture(self, points: Array) -> Array:
         """See `Thing`."""
-        return points
+        return points / self.coarseness
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,32 @@ class Carried:
     def on_texture(self, points: Array) -> Array:
         """See `Thing`."""
         return (points - self.world_from_thing[:3, 3]) @ self.world_from_thing[:3, :3]
+
+
+@dataclass(frozen=True)
+class Silver:
+    """An ellipsoid along the axes that mirrors all light, such as a bowl with its lid on.
+
+    Attributes:
+        center: world units.
+        radii: along the axes.
+    """
+
+    center: tuple[float, float, float]
+    radii: tuple[float, float, float]
+
+    def distances(self, origins: Array, directions: Array) -> Array:
+        """How far [N] rays from outside go until they meet it; infinite where they do not."""
+        offset, along = (origins - self.center) / self.radii, directions / np.array(self.radii)
+        square, middle = (along**2).sum(axis=1), -(offset * along).sum(axis=1)
+        discriminant = middle**2 - square * ((offset**2).sum(axis=1) - 1)
+        near = (middle - np.sqrt(np.maximum(discriminant, 0))) / square
+        return np.where((discriminant > 0) & (near > SELF), near, np.inf)
+
+    def normals(self, points: Array) -> Array:
+        """Unit normals [N, 3] of points on it, outwards."""
+        gradients = (points - self.center) / np.square(self.radii)
+        return gradients / np.linalg.norm(gradients, axis=1, keepdims=True)
 
 
 class Meeting(NamedTuple):
@@ -201,6 +228,7 @@ class Seen(NamedTuple):
         reflection: [N, 3] what the first pane would show as a perfect mirror; 0 without a pane.
         strength: [N] reflectance of the first pane.
         label: [N] the first pane's label, 0 where there is none.
+        normal: [N, 3] of the silver in which a ray ends that goes straight through all panes, 0 where it does not.
     """
 
     radiance: Array
@@ -208,6 +236,7 @@ class Seen(NamedTuple):
     reflection: Array
     strength: Array
     label: NDArray[np.uint8]
+    normal: Array
 
 
 @dataclass(frozen=True)
@@ -232,15 +261,60 @@ class Place:
         panes: glass and mirrors.
         lamp: without one all shine alike.
         photographer: things that stand where the rays come from: light meets them after a reflection only.
+        silver: curved things that mirror everything.
     """
 
     things: Sequence[Thing]
     panes: Sequence[Pane]
     lamp: Lamp | None = None
     photographer: Sequence[Thing] = ()
+    silver: Sequence[Silver] = ()
 
-    def without_panes(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        """Radiance [N, 3] along rays of a place without panes, and how far [N] they go."""
+    def without_panes(self, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> tuple[Array, Array]:
+        """Radiance [N, 3] along rays that go straight through all panes, and how far [N] they go.
+
+        Silver mirrors panes, too; where light meets it after so many reflections, it is not there for it.
+        """
+        radiance, distance = self.matte(origins, directions)
+        if not reflections or not self.silver:
+            return radiance, distance
+        for points, normals, hit in self.silver_met(origins, directions, distance):
+            along = (directions[hit] * normals).sum(axis=1, keepdims=True)
+            onwards = directions[hit] - 2 * along * normals
+            radiance[hit] = self.as_mirrored().radiance(points, onwards, reflections - 1)
+            distance[hit] = np.linalg.norm(points - origins[hit], axis=1)
+        return radiance, distance
+
+    def silver_normals(self, origins: Array, directions: Array) -> Array:
+        """[N, 3] of the silver in which rays end that go straight through all panes, 0 where they end elsewhere."""
+        normals, distance = np.zeros_like(directions), self.matte(origins, directions)[1]
+        for points, outwards, hit in self.silver_met(origins, directions, distance):
+            normals[hit] = outwards
+            distance[hit] = np.linalg.norm(points - origins[hit], axis=1)
+        return normals
+
+    def silver_met(
+        self, origins: Array, directions: Array, distance: Array
+    ) -> Iterator[tuple[Array, Array, NDArray[np.bool_]]]:
+        """Of each silver thing where rays meet it [P, 3], its normals there, and which [N] rays these are.
+
+        Args:
+            origins: [N, 3] of the rays.
+            directions: [N, 3] unit.
+            distance: [N] how far they go, at most; asked anew for each thing.
+        """
+        for silver in self.silver:
+            to_silver = silver.distances(origins, directions)
+            hit = to_silver < distance
+            points = origins[hit] + to_silver[hit, None] * directions[hit]
+            yield points, silver.normals(points), hit
+
+    def as_mirrored(self) -> Place:
+        """The place as light sees it after a reflection: with the photographer."""
+        return replace(self, things=(*self.things, *self.photographer), photographer=())
+
+    def matte(self, origins: Array, directions: Array) -> tuple[Array, Array]:
+        """Radiance [N, 3] along rays of a place without panes and silver, and how far [N] they go."""
         distances = np.stack([thing.distances(origins, directions) for thing in self.things])
         distance, nearest = distances.min(axis=0), distances.argmin(axis=0)
         points = origins + distance[:, None] * directions
@@ -252,14 +326,14 @@ class Place:
 
     def radiance(self, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> Array:
         """Radiance [N, 3] along rays; panes that light meets after so many reflections are not there for it."""
-        if not reflections or not len(origins):
-            return self.without_panes(origins, directions)[0]
+        if not reflections or not len(origins) or not self.panes:
+            return self.without_panes(origins, directions, reflections)[0]
         return self.seen(origins, directions, reflections).radiance
 
     def seen(self, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> Seen:
         """The radiance along rays and its layers; there must be a pane."""
-        radiance, end = self.without_panes(origins, directions)
-        mirrored = replace(self, things=(*self.things, *self.photographer), photographer=())
+        radiance, end = self.without_panes(origins, directions, reflections)
+        mirrored = self.as_mirrored()
         distances = np.stack([pane.distances(origins, directions) for pane in self.panes])
         distances = np.where(distances < end, distances, np.inf)
         order = distances.argsort(axis=0)
@@ -274,7 +348,7 @@ class Place:
                 strength[hit], label[hit] = met.share, pane.label
                 transmission[hit] *= pane.tint
             radiance = (1 - strength[:, None]) * transmission + strength[:, None] * reflection
-        return Seen(radiance, transmission, reflection, strength, label)
+        return Seen(radiance, transmission, reflection, strength, label, self.silver_normals(origins, directions))
 
 
 def painted(points: Array, seed: int) -> Array:

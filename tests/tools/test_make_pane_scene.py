@@ -12,13 +12,14 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from glassplat.data.dataset import load_dataset
+from glassplat.evaluate.surface_truth import true_surface
 from glassplat.evaluate.truth import load_truth
 from glassplat.files.images import read_image
 from glassplat.kernels.blend_panes.reference import two_surfaces
 from glassplat.kernels.pane_hits.reference import pane_hits
 from glassplat.kernels.panes import Panes
 from tools.make_pane_scene import Arguments, main
-from tools.pane_tracer import Ball, Box, Carried, Pane, Place
+from tools.pane_tracer import Ball, Box, Carried, Pane, Place, Silver
 from tools.photographer_body import passer_by, photographer, upright_frame
 
 ROOM = Box((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), seed=1, room=True)
@@ -243,3 +244,67 @@ def test_nobody_walks_through_walls_or_the_camera() -> None:
 def test_a_scene_is_not_overwritten(tmp_path: Path) -> None:
     with pytest.raises(FileExistsError, match="expected a new folder"):
         main(Arguments(tmp_path))
+
+
+SILVER = Silver((0.0, 1.0, 0.0), (0.9, 0.5, 0.8))
+
+
+def test_silver_mirrors_the_room_as_its_normals_say() -> None:
+    place = Place((ROOM,), (), silver=(SILVER,))
+    origins, directions = towards_window()
+    normals = place.silver_normals(origins, directions)
+    hit = normals.any(axis=1)
+    assert 0.1 < hit.mean() < 0.9
+    radiance, distance = place.without_panes(origins, directions)
+    points = origins + distance[:, None] * directions
+    inside = ((points - SILVER.center) / SILVER.radii)[hit]
+    np.testing.assert_allclose((inside**2).sum(axis=1), 1)
+    # The normal halves the angle between both ways, which are in one plane with it.
+    onwards = directions[hit] - 2 * (directions[hit] * normals[hit]).sum(axis=1, keepdims=True) * normals[hit]
+    seen, _ = Place((ROOM,), ()).without_panes(points[hit], onwards)
+    np.testing.assert_allclose(radiance[hit], seen)
+    room, _ = Place((ROOM,), ()).without_panes(origins, directions)
+    np.testing.assert_array_equal(radiance[~hit], room[~hit])
+
+
+def test_normals_of_silver_are_those_of_its_depths() -> None:
+    eye = np.array([0.1, -1.0, 0.2])
+    ray = np.array([0.02, 1.0, -0.1])
+    steps = ray + 1e-5 * np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1]])
+    steps /= np.linalg.norm(steps, axis=1, keepdims=True)
+    points = eye + SILVER.distances(np.broadcast_to(eye, steps.shape), steps)[:, None] * steps
+    across = np.cross(points[1] - points[0], points[2] - points[0])
+    across /= np.linalg.norm(across)
+    (normal,) = SILVER.normals(points[:1])
+    assert normal @ ray < 0
+    np.testing.assert_allclose(abs(across @ normal), 1, atol=1e-6)
+
+
+def test_a_mirror_shows_silver_and_what_that_mirrors() -> None:
+    origins, directions = towards_window()
+    before = Silver((1.0, -0.6, 0.3), (0.3, 0.2, 0.4))
+    mirror = replace(WINDOW, refraction=None)
+    seen = Place((ROOM,), (mirror,), silver=(before,)).seen(origins, directions)
+    hit = (seen.label == 1) & ~seen.normal.any(axis=1)
+    # The place on the other side of the mirror's plane is the same but for the mirror, in which the silver is seen.
+    image, _ = Place((ROOM,), (mirror,), silver=(before,)).without_panes(
+        origins[hit] * [1, -1, 1], directions[hit] * [1, -1, 1], reflections=2
+    )
+    shows = Place((ROOM,), (), silver=(before,)).silver_normals(origins[hit] * [1, -1, 1], directions[hit] * [1, -1, 1])
+    assert shows.any(axis=1).mean() > 0.05
+    np.testing.assert_allclose(seen.radiance[hit], image, atol=1e-9)
+
+
+def test_the_case_ships_the_surface_of_its_silver(tmp_path: Path) -> None:
+    main(Arguments(tmp_path / "case", width=28, views=9, masks=2, points=200, case=True))
+    dataset = load_dataset(tmp_path / "case")
+    assert dataset.planes is not None and dataset.planes.labels == (1, 2) and dataset.planes.mirrors == (2,)
+    surface = true_surface(dataset.test[0])
+    assert surface is not None and surface.normals is not None and surface.strength is not None
+    silver = surface.covered
+    assert 0.02 < float(silver.float().mean()) < 0.5
+    # It faces the camera that sees it, and reflects where it is.
+    away = (surface.normals * dataset.test[0].camera.ray_directions()).sum(-1)
+    assert float(away[silver].max()) < 0.1
+    assert float(surface.strength[silver].min()) >= 0.5
+    assert float(surface.strength[~silver].max()) <= 0.5
