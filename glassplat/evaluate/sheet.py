@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from glassplat.evaluate.colormap import ERROR_SCALE, depth_colors, error_colors, label_colors, normal_colors
+from glassplat.evaluate.colormap import (
+    ERROR_SCALE,
+    depth_colors,
+    error_colors,
+    label_colors,
+    normal_colors,
+    tint_colors,
+)
 from glassplat.evaluate.metrics import quantized
 from glassplat.evaluate.surface_truth import NOTHING_KNOWN, TrueSurface
 from glassplat.evaluate.truth import TrueView
@@ -23,7 +30,7 @@ CAPTION_SIZE, TITLE_SIZE = 15, 19
 BACKGROUND, TEXT, QUIET_TEXT = (22, 24, 28), (236, 236, 236), (160, 166, 174)
 SMALLEST_STRENGTH_SCALE = 0.05
 COLORED = ("transmission", "base", "reflection", "curved_reflection", "environment")
-COLUMNS = (*COLORED, "strength", "curved_strength", "normal", "mask")
+COLUMNS = (*COLORED, "strength", "curved_strength", "tint", "normal", "mask")
 """Layers in the order in which they are shown."""
 
 
@@ -118,6 +125,8 @@ def _rendered_panels(frame: Frame, scale: float) -> dict[str, Panel]:
         panels["strength"] = _strength_panel("strength", layers["strength"], scale)
     if "curved_strength" in layers:
         panels["curved_strength"] = Panel("curved strength", _grey(layers["curved_strength"]))
+    if "tint" in layers:
+        panels["tint"] = Panel("tint", tint_colors(layers["tint"]))
     if "normal" in layers:
         panels["normal"] = Panel("normals", normal_colors(layers["normal"]))
     if "mask" in layers:

@@ -14,6 +14,7 @@ Layer = Literal[
     "without_panes",
     "reflection",
     "strength",
+    "tint",
     "mask",
     "depth",
     "alpha",
@@ -30,8 +31,8 @@ Layer = Literal[
 LAYERS: dict[str, tuple[Layer, ...]] = {
     "splat": ("rgb", "depth", "alpha"),
     "planar": ("rgb", "transmission", "without_panes", "reflection", "strength", "mask", "depth", "alpha"),
-    "deferred": ("rgb", "base", "reflection", "strength", "normal", "environment", "depth", "alpha"),
-    "traced": ("rgb", "base", "reflection", "strength", "normal", "surroundings", "depth", "alpha"),
+    "deferred": ("rgb", "base", "reflection", "strength", "tint", "normal", "environment", "depth", "alpha"),
+    "traced": ("rgb", "base", "reflection", "strength", "tint", "normal", "surroundings", "depth", "alpha"),
 }
 """What each method renders that is worth looking at; its frames hold more for the losses."""
 

@@ -17,10 +17,12 @@ PHOTOGRAPHED: Final = "photographed"
 
 def renderer_with(renderer: Renderer, layers: Sequence[str]) -> Renderer:
     """The renderer, also of those of the layers that it renders only when asked."""
-    if isinstance(renderer, Deferred) and "environment" in layers:
-        return replace(renderer, environment=True)
-    if isinstance(renderer, Traced) and "surroundings" in layers:
-        return replace(renderer, surroundings=True)
+    if isinstance(renderer, Deferred):
+        environment = renderer.environment or "environment" in layers
+        return replace(renderer, environment=environment, tint="tint" in layers)
+    if isinstance(renderer, Traced):
+        surroundings = renderer.surroundings or "surroundings" in layers
+        return replace(renderer, surroundings=surroundings, tint="tint" in layers)
     if isinstance(renderer, Planar) and renderer.curved is not None and "surroundings" in layers:
         renderer = replace(renderer, curved=replace(renderer.curved, surroundings=True))
     return with_photographer(renderer, "beside") if PHOTOGRAPHED in layers else renderer

@@ -26,6 +26,7 @@ from glassplat.render.rasterize import (
     screen_pass,
     shown,
 )
+from glassplat.render.tint import further_channels, tint_layer
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
@@ -42,6 +43,7 @@ class Surface:
         depth: [H, W] mean camera z, 0 where nothing is.
         alpha: [H, W] coverage.
         direct: [N] bool, which Gaussians reach a pixel.
+        excess: [H, W, 3] by how much red, green and blue reflect more strongly; None where reflections are white.
         screen: the record of the pass, if it was probed.
         extra: further layers, of discs those that say how thin the surface is.
     """
@@ -52,13 +54,16 @@ class Surface:
     depth: Tensor
     alpha: Tensor
     direct: Tensor
+    excess: Tensor | None = None
     screen: tuple[ScreenPass, ...] = ()
     extra: Mapping[str, Tensor] = field(default_factory=dict)
 
     def layers(self) -> dict[str, Tensor]:
         """The layers of a frame."""
+        tint = {} if self.excess is None else {"tint": tint_layer(self.strength, self.excess)}
         return {
             **self.extra,
+            **tint,
             "base": self.base,
             "normal": self.normal,
             "strength": self.strength,
@@ -107,7 +112,7 @@ def ellipsoid_channels(gaussians: Gaussians, projected: Projected, eyes: Tensor)
                 gaussians.means,
                 gaussians.channels["logit_strength"],
                 eye,
-                projected.depths[view, :, None],
+                further_channels(gaussians, projected.depths[view, :, None]),
             )
             for view, eye in enumerate(eyes)
         ]
@@ -137,6 +142,7 @@ def blended_surface(
         depth=mean_depth(image[..., SURFACE_CHANNELS], alpha),
         alpha=alpha,
         direct=direct,
+        excess=_excess(image, SURFACE_CHANNELS + 1),
         screen=screen,
     )
 
@@ -148,7 +154,9 @@ def _seen_discs(
     projected = projected_discs(scene.primary, camera, near=near)
     screen = (screen_pass("primary", projected),) if probed else ()
     strengths = torch.sigmoid(scene.primary.channels["logit_strength"])[None, :, None]
-    channels = torch.cat([projected.colors, projected.normals, strengths], dim=-1)
+    further = further_channels(scene.primary, None)
+    parts = [projected.colors, projected.normals, strengths, *([] if further is None else [further[None]])]
+    channels = torch.cat(parts, dim=-1)
     blended = blended_discs(projected, channels, camera, near=near, screen=screen)
     image, extra = blended.image[0], disc_layers(blended, scene.extent)
     alpha, depth = extra.pop("alpha"), extra.pop("depth")
@@ -159,9 +167,15 @@ def _seen_discs(
         depth=depth,
         alpha=alpha,
         direct=shown(projected),
+        excess=_excess(image, SURFACE_CHANNELS),
         screen=screen,
         extra=extra,
     )
+
+
+def _excess(image: Tensor, start: int) -> Tensor | None:
+    """What was blended [H, W, D] from a channel on, where there is any."""
+    return image[..., start:] if image.shape[-1] > start else None
 
 
 def reflected_rays(surface: Surface, camera: Camera, chosen: Tensor) -> tuple[Tensor, Tensor]:

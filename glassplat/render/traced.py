@@ -22,6 +22,7 @@ from glassplat.render.rasterize import (
     over_background,
 )
 from glassplat.render.surface import Surface, reflected_rays, seen_surface, view_directions
+from glassplat.render.tint import tint_layer
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import SH_ZERO, Gaussians
 from glassplat.scene.scene import Scene
@@ -42,11 +43,13 @@ class Traced:
     The scene's Gaussians are discs, as in the paper, or ellipsoids, whose n_i is the shortest axis, turned to the
     camera. c_ref is what the ray from x along d_ref meets of the scene's `surroundings`, a set of Gaussians of their
     own, and behind these the `environment` where the scene has one (not in the paper), else the background. Without
-    surroundings it is the environment alone. Colours are sRGB, as in the paper.
+    surroundings it is the environment alone. Colours are sRGB, as in the paper. Where the Gaussians have a tint
+    (`scene/tint.py`, not in the paper), red, green and blue have a strength each in place of beta.
 
     Layers: `base`, `reflection` [H, W, 3]; `normal` [H, W, 3] in world axes, blended and not normalised; `strength`,
     `depth`, `alpha` [H, W], of discs also `median_depth` and `distortion`; `surroundings` [H, W, 3], with the
-    environment those behind each pixel, if asked for.
+    environment those behind each pixel, if asked for; `tint` [H, W, 3], the strengths of red, green and blue as
+    multiples of beta, if there are such or if asked for.
 
     Attributes:
         background: colour behind everything, also behind surroundings without an environment, sRGB.
@@ -56,6 +59,7 @@ class Traced:
             reflect.
         joint: False keeps the reflection's gradient from the surfaces (Table 4, ablation).
         surroundings: also render the layer `surroundings`.
+        tint: also render the layer `tint` of reflections without colour, which are white.
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -63,6 +67,7 @@ class Traced:
     faintest: float = INVISIBLE
     joint: bool = True
     surroundings: bool = False
+    tint: bool = False
 
     def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are.
@@ -75,6 +80,8 @@ class Traced:
         surface = seen_surface(scene, camera, background=self.background, probed=probed)
         ((rgb, reflection),), places = self.shaded(scene, [camera], [surface])
         layers = surface.layers() | {"reflection": reflection}
+        if self.tint:
+            layers.setdefault("tint", tint_layer(surface.strength, None))
         if self.surroundings:
             layers["surroundings"] = self.behind(scene, camera)
         return Frame(
@@ -122,7 +129,8 @@ class Traced:
         """Eq. 5 of one view, of whose chosen pixels the rays have met these colours [R, 3]; and the mirrored image."""
         reflection, mirrors = self._elsewhere(scene, camera, surface, chosen)
         reflection = reflection.index_put(torch.where(chosen), colors)
-        share = torch.where(mirrors, surface.strength, torch.zeros_like(surface.strength))[..., None]
+        strength = surface.strength[..., None]
+        share = torch.where(mirrors[..., None], strength if surface.excess is None else strength + surface.excess, 0)
         return (1 - share) * surface.base + share * reflection, reflection
 
     def check(self, scene: Scene) -> None:

@@ -29,13 +29,14 @@ from glassplat.densify.mcmc import McmcDensify
 from glassplat.densify.mirrors import MirrorSearch
 from glassplat.densify.propagate import NormalPropagation
 from glassplat.losses.geometry import normal_consistency
-from glassplat.losses.reflectors import mean_strength, strength_outside
+from glassplat.losses.reflectors import mean_strength, mean_tint, strength_outside
 from glassplat.losses.term import LossTerm, weighted
 from glassplat.render.deferred import INVISIBLE, Deferred, Shading
 from glassplat.render.splat import Splat
 from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import SH_ZERO
 from glassplat.scene.scene import Scene
+from glassplat.scene.tint import TINT
 from glassplat.train.actions import Densify, GrowSh, ResetOpacity
 from glassplat.train.background import BLACK
 from glassplat.train.environment_entry import AddEnvironment, StayMatte
@@ -65,14 +66,17 @@ class ReflectionRates:
     Attributes:
         strength: logit of the reflection strength.
         environment: raw texels of the environment.
+        tint: logits of what red, green and blue reflect more or less strongly.
     """
 
     strength: LearningRate = 2e-2
     environment: LearningRate = 5e-2
+    tint: LearningRate = 2e-2
 
     def of(self) -> dict[str, Rate]:
         """The rates by dotted parameter name."""
-        return {"primary.logit_strength": Rate(self.strength), "environment.raw": Rate(self.environment)}
+        tints = {f"primary.{name}": Rate(self.tint) for name in TINT}
+        return {"primary.logit_strength": Rate(self.strength), "environment.raw": Rate(self.environment), **tints}
 
 
 @dataclass(frozen=True)
@@ -100,6 +104,8 @@ class DeferredRecipe:
         outside_weight: weight of the mean strength outside of the region in the objective.
         strength_weight: of the mean strength of all Gaussians in the objective, which the paper does not have: a matte
             thing would learn to reflect a little.
+        tint: reflections may have a colour, as those of gold and copper do, which the paper does not have.
+        tint_weight: of the mean square of what gives them one in the objective.
         consistency_weight: weight of the difference between normals and the slope of the depths, while normals spread.
         propagation: how normals spread and colours are sabotaged.
         schedule: when they do.
@@ -134,6 +140,8 @@ class DeferredRecipe:
     find_region: bool = True
     outside_weight: NotNegative = 0.4
     strength_weight: NotNegative = 0.005
+    tint: Annotated[bool, ESSENTIAL] = False
+    tint_weight: NotNegative = 0.005
     consistency_weight: NotNegative = 0.3
     propagation: NormalPropagation = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
@@ -213,6 +221,7 @@ class DeferredRecipe:
         guidance = weighted(
             LossTerm("outside", self.outside_weight, strength_outside),
             LossTerm("strength", self.strength_weight, mean_strength),
+            LossTerm("tint", self.tint_weight if self.tint else 0.0, mean_tint),
             LossTerm("consistency", self.consistency_weight, normal_consistency),
         )
         reflection = Stage(
@@ -272,7 +281,7 @@ class DeferredRecipe:
     def entry(self) -> BeginReflections:
         """How things begin to reflect."""
         seen_by = Splat(self.background or BLACK, depth=False)
-        return BeginReflections(self._environment(), None, self.search, seen_by)
+        return BeginReflections(self._environment(), None, self.search, seen_by, self.tint)
 
     def _environment(self) -> AddEnvironment:
         """What is mirrored."""

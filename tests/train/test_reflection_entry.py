@@ -11,6 +11,7 @@ from torch import Tensor
 from glassplat.densify.mirrors import MirrorSearch
 from glassplat.render.splat import Splat
 from glassplat.scene.activations import logit
+from glassplat.scene.tint import TINT
 from glassplat.train.actions import GrowSh, ResetOpacity
 from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.environment_entry import AddEnvironment
@@ -31,13 +32,13 @@ class Every3rd(MirrorSearch):
         return torch.ones_like(rows, dtype=torch.bool), rows % 3 == 0
 
 
-def begun(search: MirrorSearch, *, near: bool = True) -> tuple[TrainState, list[str]]:
+def begun(search: MirrorSearch, *, near: bool = True, tint: bool = False) -> tuple[TrainState, list[str]]:
     """A state in which reflections have begun, and what was told on the way."""
     state = TrainState(TracedRecipe(sh_degree=1).initialise(tiny_capture()), seed=0)
     ones = {name: torch.ones_like(tensor) for name, tensor in state.scene.primary.tensors().items()}
     state.optimizer.moments = {f"primary.{name}": (tensor, tensor.clone()) for name, tensor in ones.items()}
     around = AddSurroundings(SurroundingsStart("scene"), 1) if near else None
-    entry = BeginReflections(AddEnvironment(2), around, search, Splat())
+    entry = BeginReflections(AddEnvironment(2), around, search, Splat(), tint)
     messages, _ = followed(entry(state, tiny_capture()))
     return state, [message.what for message in messages]
 
@@ -82,3 +83,25 @@ def test_before_mirrors_are_searched_for_a_scene_is_learned_as_by_splat(recipe: 
 def test_only_traced_searches_by_itself() -> None:
     assert TracedRecipe().search.begin_found and not DeferredRecipe().search.begin_found
     assert not TracedRecipe.paper().search.begin_found
+
+
+def test_reflections_begin_white_and_may_learn_a_color_where_that_is_asked_for() -> None:
+    search = MirrorSearch(begin_found=False)
+    white, tinted = (begun(search, tint=tint)[0].scene for tint in (False, True))
+    assert not set(TINT) & set(white.primary.channels)
+    assert set(TINT) <= set(tinted.primary.channels)
+    assert not any(bool(tinted.primary.channels[name].any()) for name in TINT)
+    # What is mirrored is not copied with it.
+    assert not tinted.surroundings.channels
+
+
+@pytest.mark.parametrize(
+    "recipe", [DeferredRecipe(tint=True, least_iterations=1), TracedRecipe(tint=True, least_iterations=1)]
+)
+def test_a_tint_is_learned_at_a_price_from_when_things_reflect(recipe: DeferredRecipe | TracedRecipe) -> None:
+    bootstrap, *reflecting = recipe.stages(0, 7000)
+    names = {f"primary.{name}" for name in TINT}
+    assert not names & bootstrap.rates.keys()
+    for stage in reflecting:
+        assert names <= stage.rates.keys() and "tint" in {term.name for term in stage.losses}
+    assert "tint" not in {term.name for term in replace(recipe, tint=False).stages(0, 7000)[1].losses}
