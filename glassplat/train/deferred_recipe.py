@@ -41,6 +41,8 @@ from glassplat.train.actions import Densify, GrowSh, ResetOpacity
 from glassplat.train.background import BLACK
 from glassplat.train.environment_entry import AddEnvironment, StayMatte
 from glassplat.train.optimizer import PUBLISHED_ITERATIONS, Rate
+from glassplat.train.photo_exposure import PhotoExposure
+from glassplat.train.pose_refinement import PoseRefinement
 from glassplat.train.propagation import (
     DensifyWhilePropagating,
     GrowShAfterPropagation,
@@ -121,6 +123,8 @@ class DeferredRecipe:
         strategy: what decides how many Gaussians there are and where; `densify` or `mcmc` holds its options.
         densify: when and how Gaussians are added and pruned under `default`.
         mcmc: when and how Gaussians are relocated and added under `mcmc`.
+        exposure: whether the exposure of each photograph is learned.
+        poses: whether the camera of each photograph is corrected.
     """
 
     method: ClassVar[str] = "deferred"
@@ -154,6 +158,8 @@ class DeferredRecipe:
     strategy: Annotated[Strategy, ESSENTIAL] = "default"
     densify: DefaultDensify = field(default_factory=DefaultDensify)
     mcmc: McmcDensify = field(default_factory=McmcDensify)
+    exposure: PhotoExposure = field(default_factory=PhotoExposure)
+    poses: PoseRefinement = field(default_factory=PoseRefinement)
 
     @classmethod
     def paper(cls) -> DeferredRecipe:
@@ -194,7 +200,8 @@ class DeferredRecipe:
         primary = self._population().initial(dataset.points, self.sh_degree)
         strengths = torch.full((len(primary),), logit(self.first_strength))
         primary = replace(primary, channels={"logit_strength": strengths})
-        return Scene(primary, dataset.extent)
+        scene = Scene(primary, dataset.extent)
+        return self.poses.begun(self.exposure.begun(scene, dataset), dataset)
 
     def renderer(self) -> Deferred:
         """The renderer of the finished scene, with all its layers."""
@@ -202,8 +209,12 @@ class DeferredRecipe:
 
     def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
         """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has one stage."""
-        if iterations < self.least_iterations:
-            return self._matte_stages(seed, iterations)
+        short = iterations < self.least_iterations
+        stages = self._matte_stages(seed, iterations) if short else self._reflecting_stages()
+        return self.poses.learnt_in(self.exposure.learnt_in(stages))
+
+    def _reflecting_stages(self) -> tuple[Stage, ...]:
+        """Those of a run that is long enough for normals to spread."""
         population = self._population()
         image = image_terms(self.ssim_weight, self.view_dependence_weight)
         bootstrap = Stage(
