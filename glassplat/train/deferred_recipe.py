@@ -309,9 +309,7 @@ class DeferredRecipe:
 
     def _doublings(self) -> tuple[float, ...]:
         """The shares of the run at which the environment's edge length doubles."""
-        count = max(math.ceil(math.log2(self.texels / self.first_texels)), 0)
-        first, last = self.refinements
-        return tuple(first + (last - first) * number / max(count - 1, 1) for number in range(count))
+        return doublings(self.first_texels, self.texels, self.refinements)
 
     def _edits(self, population: Population) -> tuple[Action, ...]:
         """What changes the number of Gaussians once they reflect."""
@@ -345,3 +343,10 @@ class DeferredRecipe:
         return population_of(
             self.strategy, default=self.densify, mcmc=self.mcmc, rhythm=self.rhythm, means_rate=means_rate
         )
+
+
+def doublings(first_texels: int, texels: int, refinements: tuple[float, float]) -> tuple[float, ...]:
+    """The shares of the run, evenly from a first to a last one, at which an edge length doubles until it is reached."""
+    count = max(math.ceil(math.log2(texels / first_texels)), 0)
+    first, last = refinements
+    return tuple(first + (last - first) * number / max(count - 1, 1) for number in range(count))
