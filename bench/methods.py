@@ -17,7 +17,8 @@ from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
 from glassplat.render.deferred import INVISIBLE, Deferred
 from glassplat.render.frame import Renderer
-from glassplat.render.planar import Planar, half_spaces_of
+from glassplat.render.mirror_images import half_spaces_of
+from glassplat.render.planar import Planar
 from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, project_gaussians
 from glassplat.render.seen_panes import nearest_hits, panes_in_camera
 from glassplat.render.splat import Splat

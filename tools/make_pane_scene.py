@@ -75,6 +75,8 @@ class Arguments:
     """Share of the training views in which somebody stands somewhere in the room, in each elsewhere."""
     photographer: bool = False
     """Somebody stands behind the camera with a phone before the face, and is seen in panes and mirrors."""
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Share of red, green and blue light that panes of glass let through of what they do not reflect."""
 
 
 def make_place() -> Place:
@@ -231,6 +233,7 @@ def write_planes(path: Path, place: Place) -> None:
             "half_v": (pane.half_sizes[1] * pane.bitangent).tolist(),
             "mirror": pane.refraction is None,
             "base_reflectance": pane.base_reflectance,
+            "tint": list(pane.tint),
         }
         for pane in place.panes
     ]
@@ -320,6 +323,11 @@ def chosen_place(arguments: Arguments) -> DrawnPlace:
     return DrawnPlace(make_place(), camera_poses(arguments.views, arguments.seed))
 
 
+def tinted(place: Place, tint: tuple[float, float, float]) -> Place:
+    """The place with such panes of glass; mirrors stay as they are."""
+    return replace(place, panes=tuple(replace(p, tint=tint) if p.refraction else p for p in place.panes))
+
+
 def main(arguments: Arguments) -> None:
     """Makes the scene."""
     folder = arguments.output
@@ -328,7 +336,7 @@ def main(arguments: Arguments) -> None:
     for part in ("images", "masks", "sparse/0", "gt/strength"):
         (folder / part).mkdir(parents=True)
     drawn = chosen_place(arguments)
-    place, poses = drawn.place, drawn.poses
+    place, poses = tinted(drawn.place, arguments.tint), drawn.poses
     write_model(folder / "sparse/0", arguments, poses, place)
     write_planes(folder / "gt/planes.json", place)
     if arguments.case:

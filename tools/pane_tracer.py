@@ -169,6 +169,7 @@ class Pane:
         tangent: unit, along the first side.
         half_sizes: half the lengths of the sides.
         refraction: refractive index; None for a mirror.
+        tint: share of red, green and blue light that gets through of what is not reflected.
     """
 
     label: int
@@ -177,6 +178,7 @@ class Pane:
     tangent: Array
     half_sizes: tuple[float, float]
     refraction: float | None = 1.5
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     @property
     def bitangent(self) -> Array:
@@ -222,7 +224,7 @@ class Seen(NamedTuple):
 
     Attributes:
         radiance: [N, 3] linear, with all panes: (1 - strength) transmission + strength reflection.
-        transmission: [N, 3] what comes through the first pane, with what panes behind it reflect.
+        transmission: [N, 3] what comes through the first pane in its tint, with what panes behind it reflect.
         reflection: [N, 3] what the first pane would show as a perfect mirror; 0 without a pane.
         strength: [N] reflectance of the first pane.
         label: [N] the first pane's label, 0 where there is none.
@@ -337,13 +339,14 @@ class Place:
         order = distances.argsort(axis=0)
         # From the last pane on the way to the first one.
         for place in reversed(range(len(self.panes))):
-            transmission, reflection = radiance, np.zeros_like(radiance)
+            transmission, reflection = radiance.copy(), np.zeros_like(radiance)
             strength, label = np.zeros(len(end)), np.zeros(len(end), dtype=np.uint8)
             for number, pane in enumerate(self.panes):
                 hit = (order[place] == number) & (distances[number] < np.inf)
                 met = pane.meeting(origins[hit], directions[hit], distances[number, hit])
                 reflection[hit] = mirrored.radiance(met.points, met.mirrored, reflections - 1)
                 strength[hit], label[hit] = met.share, pane.label
+                transmission[hit] *= pane.tint
             radiance = (1 - strength[:, None]) * transmission + strength[:, None] * reflection
         return Seen(radiance, transmission, reflection, strength, label, self.silver_normals(origins, directions))
 

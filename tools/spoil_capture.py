@@ -6,6 +6,7 @@ python -m tools.spoil_capture CAPTURE --output COPY [--exposure STOPS] [--white-
 Photographs are brightened and tinted in linear radiance, as a camera's automatic exposure and white balance do, each by
 factors of its own, and clipped at white. Cameras of a COLMAP model in text are turned about each of their axes, and
 shifted by as much as the turn moves what is one radius of the cameras away; `true_images.txt` keeps the true poses.
+Captures with `transforms_train.json`, such as those of `tools/make_scenes.py`, will do for these three flaws too.
 Passers-by stand before everything in some photographs, but in no eighth one, which is a test view; `gt/passers_by/` has
 masks of them.
 """
@@ -13,9 +14,11 @@ masks of them.
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,6 +32,7 @@ from glassplat.kernels.color_space import linear_from_srgb, srgb_from_linear
 FIGURES = (0.4, 0.9)
 """Heights of passers-by, as shares of the photograph's."""
 IMAGES, MODEL, TRUE_MODEL = "images", "sparse/0/images.txt", "true_images.txt"
+SPLITS, TRANSFORMS = ("train", "test"), "transforms_{}.json"
 
 
 def main() -> None:
@@ -42,17 +46,22 @@ def main() -> None:
     parser.add_argument("--passers-by", type=float, default=0.0, help="share of the photographs that show somebody")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-    if not (given.capture / IMAGES).is_dir():
-        parser.error(f"{given.capture} has no folder {IMAGES}")
+    by_transforms = (given.capture / TRANSFORMS.format(SPLITS[0])).is_file()
+    if not by_transforms and not (given.capture / IMAGES).is_dir():
+        parser.error(f"{given.capture} has neither {IMAGES}/ nor {TRANSFORMS.format(SPLITS[0])}")
+    if by_transforms and given.passers_by:
+        parser.error(f"--passers-by takes a capture with {IMAGES}/")
     if given.output.exists():
         parser.error(f"{given.output} exists already; choose another --output")
-    if given.pose_noise and not (given.capture / MODEL).is_file():
-        parser.error(f"{given.capture} has no {MODEL}; --pose-noise takes a COLMAP model in text")
+    if given.pose_noise and not by_transforms and not (given.capture / MODEL).is_file():
+        parser.error(f"{given.capture} has no {MODEL}; --pose-noise takes a COLMAP model in text, or transforms")
     random = np.random.default_rng(given.seed)
     spoil(given.capture, given.output, given.exposure, given.white_balance, random)
     if given.passers_by:
         add_passers_by(given.output, given.passers_by, random)
-    if given.pose_noise:
+    if given.pose_noise and by_transforms:
+        disturb_transforms(given.output, math.radians(given.pose_noise), random)
+    elif given.pose_noise:
         disturb_poses(given.output / MODEL, math.radians(given.pose_noise), random)
 
 
@@ -75,11 +84,49 @@ def spoil(
     factors: dict[str, NDArray[np.float64]] = {}
     if not exposure and not white_balance:
         return factors
-    for path in sorted(path for path in (output / IMAGES).rglob("*") if path.is_file()):
+    for name, path in photographs(output):
         stops = exposure * random.standard_normal() + white_balance * random.standard_normal(3)
-        factors[path.relative_to(output / IMAGES).as_posix()] = 2.0**stops
+        factors[name] = 2.0**stops
         write_image(path, exposed(read_image(path), 2.0**stops))
     return factors
+
+
+def photographs(capture: Path) -> list[tuple[str, Path]]:
+    """Names and paths of a capture's photographs: those in `images/`, or those that its transforms name."""
+    if (capture / IMAGES).is_dir():
+        paths = sorted(path for path in (capture / IMAGES).rglob("*") if path.is_file())
+        return [(path.relative_to(capture / IMAGES).as_posix(), path) for path in paths]
+    names = [Path(frame["file_path"]).as_posix() + ".png" for split in SPLITS for frame in frames_of(capture, split)]
+    return [(name, capture / name) for name in names]
+
+
+def frames_of(capture: Path, split: str) -> list[dict[str, Any]]:
+    """The frames of a capture's `transforms_train.json` or `transforms_test.json`."""
+    frames: list[dict[str, Any]] = json.loads((capture / TRANSFORMS.format(split)).read_text())["frames"]
+    return frames
+
+
+def disturb_transforms(capture: Path, noise: float, random: np.random.Generator) -> None:
+    """Moves every camera of a capture with transforms a little, each by itself; as `disturb_poses`.
+
+    Args:
+        capture: its folder; `true_transforms_train.json` and `..._test.json` are kept beside the new ones.
+        noise: standard deviation of the turns about each axis, radians, and of the shifts, in radii of the cameras.
+        random: where they come from.
+    """
+    for split in SPLITS:
+        path = capture / TRANSFORMS.format(split)
+        shutil.copyfile(path, path.with_name("true_" + path.name))
+        record = json.loads(path.read_text())
+        poses = np.array([frame["transform_matrix"] for frame in record["frames"]])
+        centers = poses[:, :3, 3]
+        radius = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+        wobbles = np.broadcast_to(np.eye(4), poses.shape).copy()
+        wobbles[:, :3, :3] = Rotation.from_rotvec(noise * random.standard_normal((len(poses), 3))).as_matrix()
+        wobbles[:, :3, 3] = noise * radius * random.standard_normal((len(poses), 3))
+        for frame, pose in zip(record["frames"], poses @ wobbles, strict=True):
+            frame["transform_matrix"] = pose.tolist()
+        path.write_text(json.dumps(record, indent=1) + "\n")
 
 
 def disturb_poses(path: Path, noise: float, random: np.random.Generator) -> None:
@@ -140,10 +187,11 @@ def figure(height: int, width: int, random: np.random.Generator) -> NDArray[np.b
 
 
 def exposed(photo: NDArray[np.uint8], factors: NDArray[np.float64]) -> torch.Tensor:
-    """A photograph [H, W, 3] whose linear channels are multiplied by factors [3], clipped at white."""
+    """A photograph [H, W, 3 or 4] whose linear channels are multiplied by factors [3], clipped at white."""
     linear = linear_from_srgb(torch.from_numpy(photo[..., :3].astype(np.float32)) / 255)
     brighter = (linear * torch.from_numpy(factors).float()).clamp(0, 1)
-    return torch.round(255 * srgb_from_linear(brighter)).to(torch.uint8)
+    colors = torch.round(255 * srgb_from_linear(brighter)).to(torch.uint8)
+    return torch.cat([colors, torch.from_numpy(photo[..., 3:].copy())], dim=-1)
 
 
 if __name__ == "__main__":

@@ -42,26 +42,40 @@ class NormalPropagation:
     sabotaged: InnerShare = 0.05
 
     @torch.no_grad()
-    def propagate(self, gaussians: Gaussians, moments: Moments) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
-        """Raised opacities and strengths, and reflective Gaussians grown; what changed forgets its moments."""
+    def propagate(
+        self, gaussians: Gaussians, moments: Moments, where: Tensor | None = None
+    ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
+        """Raised opacities and strengths, and reflective Gaussians grown; what changed forgets its moments.
+
+        `where` [N] bool leaves the others as they are; None leaves none.
+        """
         if not self.propagates:
             return gaussians, dict(moments)
+        where = torch.ones_like(gaussians.logit_opacities, dtype=torch.bool) if where is None else where
         opacities = gaussians.logit_opacities.clamp(min=logit(self.least_opacity))
         strengths = gaussians.channels["logit_strength"].clamp(min=logit(self.least_strength))
-        grows = strengths >= logit(self.reflective)
+        grows = where & (strengths >= logit(self.reflective))
         log_scales = gaussians.log_scales + math.log(self.growth) * (grows[:, None] & _within_surface(gaussians))
-        changed = {"logit_opacities": opacities, "logit_strength": strengths, "log_scales": log_scales}
-        return gaussians.with_tensors(changed), forget(moments, [f"primary.{name}" for name in changed])
+        changed = {
+            "logit_opacities": torch.where(where, opacities, gaussians.logit_opacities),
+            "logit_strength": torch.where(where, strengths, gaussians.channels["logit_strength"]),
+            "log_scales": log_scales,
+        }
+        return gaussians.with_tensors(changed), forget(moments, [f"primary.{name}" for name in changed], where)
 
     @torch.no_grad()
     def disturb(
-        self, gaussians: Gaussians, moments: Moments, generator: torch.Generator
+        self, gaussians: Gaussians, moments: Moments, generator: torch.Generator, where: Tensor | None = None
     ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
-        """Noise on the constant colour of what does not reflect yet, which hinders it from explaining reflections."""
+        """Noise on the constant colour of what does not reflect yet, which hinders it from explaining reflections.
+
+        `where` [N] bool leaves the others as they are; None leaves none.
+        """
         if self.sabotage == 0:
             return gaussians, dict(moments)
         unit = torch.rand(gaussians.sh[:, 0].shape, generator=generator, device=gaussians.sh.device)
         dull = gaussians.channels["logit_strength"] <= logit(self.sabotaged)
+        dull = dull if where is None else dull & where
         sh = gaussians.sh.clone()
         sh[:, 0] += torch.where(dull[:, None], self.sabotage * (2 * unit - 1) / SH_ZERO, 0)
         return gaussians.with_tensors({"sh": sh}), forget(moments, ["primary.sh"], dull)

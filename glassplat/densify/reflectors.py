@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from glassplat.data.view import View
-from glassplat.render.contribution import contributions
-from glassplat.render.frame import Renderer
+from glassplat.render.contribution import contributions, gathered
+from glassplat.render.frame import Frame, Renderer
 from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import SH_ZERO
 from glassplat.scene.scene import Scene
@@ -82,13 +82,26 @@ def residual_spreads(scene: Scene, views: Sequence[View], renderer: Renderer) ->
     shown, squares = torch.zeros(2, count, device=device)
     sums = torch.zeros(count, 3, device=device)
     for view in views:
-        weights, residuals = contributions(scene, view.camera), residual_sums(scene, view, renderer)
+        weights, residuals = shown_and_residual(scene, view, renderer)
         shown += weights
         sums += residuals
         squares += residuals.square().sum(dim=1) / weights.clamp(min=1e-6)
     shown_or_one = shown.clamp(min=1e-6)
     variance = squares / shown_or_one - (sums / shown_or_one[:, None]).square().sum(dim=1)
     return shown, (variance.clamp(min=0) / 3).sqrt()
+
+
+def shown_and_residual(scene: Scene, view: View, renderer: Renderer) -> tuple[Tensor, Tensor]:
+    """[N] what a view shows of each primary Gaussian, in pixels, and [N, 3] photograph minus render over these.
+
+    What is seen through a pane counts by what the pane lets through; mirror images do not count.
+    """
+    if not len(scene.planes):
+        return contributions(scene, view.camera), residual_sums(scene, view, renderer)
+    frame = renderer(scene, view.camera)
+    direct = 1 - frame.layers["share"][..., None]
+    sums = gathered(scene, view.camera, torch.cat([direct, direct * residual(frame, view, scene)], dim=-1))
+    return sums[:, 0], sums[:, 1:]
 
 
 def residual_sums(scene: Scene, view: View, renderer: Renderer) -> Tensor:
@@ -99,9 +112,16 @@ def residual_sums(scene: Scene, view: View, renderer: Renderer) -> Tensor:
     with torch.enable_grad():
         sh = scene.primary.sh.detach().requires_grad_()
         frame = renderer(scene.with_parameters({"primary.sh": sh}), view.camera)
-        image = scene.exposures.applied(frame.rgb.detach(), view.name)
-        residual = view.photo.to(image) / 255 - image
-        if view.ignored is not None:
-            residual = residual.masked_fill(view.ignored.to(image.device)[..., None], 0)
-        (gradient,) = torch.autograd.grad((residual * frame.layers.get("base", frame.rgb)).sum(), sh)
+        (gradient,) = torch.autograd.grad(
+            (residual(frame, view, scene) * frame.layers.get("base", frame.rgb)).sum(), sh
+        )
     return gradient[:, 0] / SH_ZERO
+
+
+def residual(frame: Frame, view: View, scene: Scene) -> Tensor:
+    """[H, W, 3] photograph minus render, sRGB, 0 where the view is ignored."""
+    image = scene.exposures.applied(frame.rgb.detach(), view.name)
+    difference = view.photo.to(image) / 255 - image
+    if view.ignored is not None:
+        difference = difference.masked_fill(view.ignored.to(image.device)[..., None], 0)
+    return difference

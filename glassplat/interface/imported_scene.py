@@ -40,7 +40,8 @@ def imported_scene(file: Path, planes_file: Path | None = None, up: Up = "-y") -
 
     Args:
         file: the splats.
-        planes_file: the panes, in place of those beside the file; glass is then spread evenly over each.
+        planes_file: the panes, in place of those beside the file; glass is then spread evenly over each. The one
+            beside the file is no other.
         up: which way is up, for cameras that nobody gives.
 
     Raises:
@@ -50,7 +51,9 @@ def imported_scene(file: Path, planes_file: Path | None = None, up: Up = "-y") -
     if not len(gaussians):
         raise InputError(f"{file} holds no Gaussians; expected a trained splat")
     planes = _planes(file, planes_file)
-    glass = _glass(file, planes, own=planes_file is None)
+    glass = _glass(
+        file, planes, own=planes_file is None or planes_file.resolve() == file.with_name("planes.json").resolve()
+    )
     cameras = _cameras(file, gaussians, up)
     scene = Scene(with_intensity(gaussians), extent_of(gaussians, cameras), glass=glass, planes=planes)
     return ImportedScene(scene, cameras, lost)

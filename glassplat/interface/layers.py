@@ -24,6 +24,8 @@ Layer = Literal[
     "surroundings",
     "median_depth",
     "photographed",
+    "curved_reflection",
+    "curved_strength",
 ]
 
 LAYERS: dict[str, tuple[Layer, ...]] = {
@@ -34,13 +36,17 @@ LAYERS: dict[str, tuple[Layer, ...]] = {
 }
 """What each method renders that is worth looking at; its frames hold more for the losses."""
 
+CURVED_LAYERS: tuple[Layer, ...] = ("base", "curved_reflection", "curved_strength", "normal", "surroundings")
+"""What `planar` renders beside its own layers with `--curved.learn`."""
+
 DISC_LAYERS: tuple[Layer, ...] = ("rgb", "normal", "depth", "median_depth", "alpha")
 """What `splat` renders of discs."""
 
 
 def layers_of(recipe: Any) -> tuple[Layer, ...]:
     """What a run of a recipe renders that is worth looking at."""
-    return DISC_LAYERS if getattr(recipe, "primitive", None) == "disc" else LAYERS[recipe.method]
+    known = DISC_LAYERS if getattr(recipe, "primitive", None) == "disc" else LAYERS[recipe.method]
+    return (*known, *CURVED_LAYERS) if recipe.method == "planar" and recipe.curved.learn else known
 
 
 def check_layers(layers: Sequence[str], recipe: Any) -> None:

@@ -11,7 +11,8 @@ from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
 from glassplat.kernels.splats import Projected
 from glassplat.render.discs import blended_discs, projected_discs
-from glassplat.render.planar import detached, project_mirrored
+from glassplat.render.mirror_images import project_mirrored
+from glassplat.render.planar import detached
 from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, project_gaussians
 from glassplat.render.seen_panes import nearest_hits, panes_in_camera, seen_panes
 from glassplat.scene.camera import Camera

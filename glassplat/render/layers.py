@@ -8,7 +8,7 @@ from typing import Final
 
 from glassplat.render.deferred import Deferred
 from glassplat.render.frame import Renderer
-from glassplat.render.planar import with_photographer
+from glassplat.render.planar import Planar, with_photographer
 from glassplat.render.traced import Traced
 
 PHOTOGRAPHED: Final = "photographed"
@@ -23,4 +23,6 @@ def renderer_with(renderer: Renderer, layers: Sequence[str]) -> Renderer:
     if isinstance(renderer, Traced):
         surroundings = renderer.surroundings or "surroundings" in layers
         return replace(renderer, surroundings=surroundings, tint="tint" in layers)
+    if isinstance(renderer, Planar) and renderer.curved is not None and "surroundings" in layers:
+        renderer = replace(renderer, curved=replace(renderer.curved, surroundings=True))
     return with_photographer(renderer, "beside") if PHOTOGRAPHED in layers else renderer

@@ -13,9 +13,20 @@ from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
 from glassplat.kernels.layer_slopes import layer_slopes
 from glassplat.kernels.panes import Fresnel, PaneHits, Panes
+from glassplat.kernels.shade_environment.shaded import SURFACE_CHANNELS
 from glassplat.kernels.splats import Deviation, Projected, Splats
-from glassplat.render.frame import Frame, Renderer, ScreenPass
+from glassplat.render.curved import (
+    Shades,
+    curved_layers,
+    mirrored_cameras,
+    mirrors_anything,
+    shades_of,
+    with_matte_layers,
+    within_panes,
+)
+from glassplat.render.frame import Frame, Renderer, ScreenPass, SpacePass
 from glassplat.render.glazing import Blend, Glazed, glazed, own_masks, visibilities
+from glassplat.render.mirror_images import project_mirrored, project_photographer
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
     check_colored,
@@ -36,11 +47,10 @@ from glassplat.render.seen_panes import (
     panes_in_camera,
     seen_panes,
 )
+from glassplat.render.surface import blended_surface, ellipsoid_channels
+from glassplat.render.traced import Traced, space_pass
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.photographer import world_from_photographer
-from glassplat.scene.plane import Planes
-from glassplat.scene.pose import mirror_matrices
 from glassplat.scene.scene import Scene
 
 Shown = Literal["absent", "present", "beside"]
@@ -59,6 +69,7 @@ class FirstPass(NamedTuple):
     marks: Tensor
     direct: Tensor
     screen: tuple[ScreenPass, ...]
+    curved: Shades | None
 
 
 class SecondPass(NamedTuple):
@@ -67,6 +78,7 @@ class SecondPass(NamedTuple):
     reflections: Tensor
     mirrored: Tensor
     screen: tuple[ScreenPass, ...]
+    curved: Shades | None
 
 
 @dataclass(frozen=True)
@@ -89,7 +101,12 @@ class Planar:
     Layers: `transmission`, `reflection` [H, W, 3]; `strength`, `mask`, `depth`, `alpha` [H, W]; `hit` [H, W], 1 in
     the panes' rectangles, and `inner` [H, W], without the rim of what reflects; `without_panes` [H, W, 3], the image
     were there no panes, and `share` [H, W], how much of what is seen the panes add, all of them together;
-    `deviation` [H, W] (Eq. 14) if asked for.
+    `deviation` [H, W] (Eq. 14) if asked for. With `curved` those of `traced`, of what is seen straight through the
+    panes: `base`, `curved_reflection`, `normal` [H, W, 3], `curved_strength` [H, W], and `surroundings` if asked for.
+
+    Curved things may mirror, too: with `curved`, pixels of both passes that show such things are shaded as `traced`
+    does, by rays from the place of each that meet the scene's surroundings. So a pane shows what a curved thing
+    mirrors; light meets one of each at most.
 
     A photograph also shows who took it, in the panes: `Scene.photographer`, Gaussians in a frame that goes along with
     the camera. They are drawn among those that a pane mirrors, through the camera mirrored about it, and nowhere else.
@@ -109,6 +126,8 @@ class Planar:
             the image without.
         tells_mirrored: whether the records of a probed frame tell mirror images from what is seen directly, and how
             much is left of either; if not, all of them count alike.
+        curved: how things that are not flat mirror; its background has to be the same. None if nothing does, as in a
+            scene in which no such thing has been looked for yet.
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -121,13 +140,18 @@ class Planar:
     nearest_only: bool = False
     photographer: Shown = "absent"
     tells_mirrored: bool = True
+    curved: Traced | None = None
 
     def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are."""
+        if self.curved is not None and not mirrors_anything(scene):
+            return with_matte_layers(replace(self, curved=None)(scene, camera, probed=probed))
         camera = camera.to(scene.primary.means.device)
         rectangles = panes_in_camera(scene.planes, camera)
         first = self._first_pass(scene, camera, rectangles, probed)
         layers = {"without_panes": first.image, "depth": first.depth, "alpha": first.alpha, "mask": first.mask}
+        if first.curved is not None:
+            layers |= curved_layers(first.curved) | self._behind(scene, camera)
         hits = nearest_hits(rectangles, camera, first.mask)
         hit = (hits.pane >= 0).to(first.mask.dtype)
         layers["hit"] = hit
@@ -138,7 +162,7 @@ class Planar:
             nothing = torch.zeros_like(hit)
             layers |= {"transmission": first.image, "reflection": torch.zeros_like(first.image)}
             layers |= {"strength": nothing, "share": nothing, "inner": nothing}
-            return Frame(first.image, layers, direct=first.direct, screen=first.screen)
+            return Frame(first.image, layers, first.direct, None, first.screen, self._space(scene, probed, first))
         second = self._second_pass(scene, camera, seen, probed)
         masks = self._visibilities(scene, camera, seen, first)
         result = self._glazed(first, seen, masks, second, camera)
@@ -148,7 +172,8 @@ class Planar:
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
         layers["inner"] = amid_one_pane(hits.pane, result.strength)
         screen = self._screen(first, second, hits, result) if probed else ()
-        return Frame(result.rgb, layers, first.direct, second.mirrored, screen)
+        space = self._space(scene, probed, first, second)
+        return Frame(result.rgb, layers, first.direct, second.mirrored, screen, space)
 
     def check(self, scene: Scene) -> None:
         """Raises ValueError where a scene lacks colours, or its panes what they need; there may be no panes."""
@@ -168,13 +193,13 @@ class Planar:
         glass = project_gaussians(scene.glass, camera, near=near)
         splats = joined_splats(primary, glass)
         bins = bin_tiles(splats, camera.width, camera.height)
-        colors = torch.cat([primary.colors, primary.depths[..., None]], dim=-1)
-        channels = torch.nn.functional.pad(colors, (0, 0, 0, len(scene.glass)))
+        looks = self._looks(scene.primary, primary, camera)
+        channels = torch.nn.functional.pad(looks, (0, 0, 0, len(scene.glass)))
         marks = torch.sigmoid(scene.glass.channels["logit_mark"])[None]
         deviation = None
         if self.deviation:
             hit = nearest_hits(rectangles, camera).pane >= 0
-            deviation = Deviation(3, hit.to(colors.dtype)[None], self.deviation_depth_gradient)
+            deviation = Deviation(self._depth_at, hit.to(looks.dtype)[None], self.deviation_depth_gradient)
         screen = (screen_pass("primary", primary), screen_pass("glass", glass)) if probed else ()
         result = composite(
             splats,
@@ -186,30 +211,57 @@ class Planar:
             probe=joined_probe(screen),
         )
         alpha = result.alpha.squeeze(0)
-        color, depth = result.image.squeeze(0).split((3, 1), dim=-1)
+        shades = None
+        if self.curved is not None:
+            surface = blended_surface(result.image[0], alpha, shown(primary), self.background)
+            shades = shades_of(self.curved, scene, [camera], [surface])
+        color = result.image[0, ..., :3]
         return FirstPass(
-            image=over_background(color, alpha, self.background),
+            image=over_background(color, alpha, self.background) if shades is None else shades.images[0],
             alpha=alpha,
-            depth=mean_depth(depth.squeeze(-1), alpha),
+            depth=mean_depth(result.image[0, ..., self._depth_at], alpha),
             mask=result.mask.squeeze(0),
             deviation=result.deviation.squeeze(0) if deviation else None,
             splats=splats,
             marks=marks,
             direct=shown(primary),
             screen=screen,
+            curved=shades,
         )
+
+    def _behind(self, scene: Scene, camera: Camera) -> dict[str, Tensor]:
+        """The layer of what curved things mirror, if asked for."""
+        if self.curved is None or not self.curved.surroundings:
+            return {}
+        return {"surroundings": self.curved.behind(scene, camera)}
+
+    @property
+    def _depth_at(self) -> int:
+        """Which channel of the first pass is the depth."""
+        return 3 if self.curved is None else SURFACE_CHANNELS
+
+    def _looks(self, gaussians: Gaussians, projected: Projected, camera: Camera) -> Tensor:
+        """[1, N, D] channels of the first pass: colours first, and the depth at `_depth_at`."""
+        if self.curved is None:
+            return torch.cat([projected.colors, projected.depths[..., None]], dim=-1)
+        return ellipsoid_channels(gaussians, projected, camera.center[None])
 
     def _second_pass(self, scene: Scene, camera: Camera, seen: SeenPanes, probed: bool) -> SecondPass:
         primary = scene.primary if self.reflection_gradient == "all" else detached(scene.primary)
         projected = project_mirrored(primary, camera, seen, near=NEAR_PER_EXTENT * scene.extent)
         intensity = torch.exp(primary.channels["log_intensity"]).expand(len(seen.planes), -1)
-        channels = torch.cat([projected.colors, intensity[..., None]], dim=-1)
+        cameras = mirrored_cameras(camera, seen.planes)
+        looks = projected.colors
+        if self.curved is not None:
+            looks = ellipsoid_channels(primary, projected, torch.stack([each.center for each in cameras]))
+        channels = torch.cat([looks, intensity[..., None]], dim=-1)
         mirrored = [projected]
         screen: tuple[ScreenPass, ...] = (screen_pass("primary", projected, direct=False),) if probed else ()
         if self.photographer == "present" and len(scene.photographer):
             body = project_photographer(scene, camera, seen, near=NEAR_PER_EXTENT * scene.extent)
-            # A body is as bright as it is: an intensity of its own would be a second factor on its colours.
-            channels = torch.cat([channels, torch.nn.functional.pad(body.colors, (0, 1), value=1.0)], dim=1)
+            # A body is as bright as it is, and matte: an intensity of its own would be a second factor on its colours.
+            plain = torch.nn.functional.pad(body.colors, (0, looks.shape[-1] - 3))
+            channels = torch.cat([channels, torch.nn.functional.pad(plain, (0, 1), value=1.0)], dim=1)
             mirrored.append(body)
             # No view shows it directly, so that mirror images are what it is densified by.
             screen += (screen_pass("photographer", body),) if probed else ()
@@ -217,8 +269,24 @@ class Planar:
         bins = bin_tiles(splats, camera.width, camera.height, seen.tiles)
         result = composite(splats, channels, bins, probe=joined_probe(screen))
         # The background, too, is as bright in a pane as it is: with no intensity of its own it would be black there.
-        reflections = over_background(result.image, result.alpha, (*self.background, 1.0))
-        return SecondPass(reflections, shown(projected), screen)
+        if self.curved is None:
+            reflections, shades = over_background(result.image, result.alpha, (*self.background, 1.0)), None
+        else:
+            surfaces = [
+                blended_surface(image[..., :-1], alpha, shown(projected), self.background)
+                for image, alpha in zip(result.image, result.alpha, strict=True)
+            ]
+            shades = shades_of(self.curved, scene, cameras, within_panes(surfaces, seen))
+            brightness = over_background(result.image[..., -1:], result.alpha, (1.0,))
+            reflections = torch.cat([torch.stack(shades.images), brightness], dim=-1)
+        return SecondPass(reflections, shown(projected), screen, shades)
+
+    def _space(self, scene: Scene, probed: bool, *passes: FirstPass | SecondPass) -> tuple[SpacePass, ...]:
+        """What densification reads of the surroundings that curved things mirror."""
+        shades = [each.curved for each in passes if each.curved is not None]
+        if not probed or not shades or not len(scene.surroundings):
+            return ()
+        return (space_pass(scene, torch.cat([each.places for each in shades])),)
 
     def _glazed(
         self, first: FirstPass, seen: SeenPanes, masks: Sequence[Tensor], second: SecondPass, camera: Camera
@@ -277,59 +345,6 @@ def detached(gaussians: Gaussians) -> Gaussians:
     return gaussians.with_tensors({name: tensor.detach() for name, tensor in gaussians.tensors().items()})
 
 
-def project_mirrored(gaussians: Gaussians, camera: Camera, seen: SeenPanes, *, near: float) -> Projected:
-    """Projects the Gaussians of the camera's side into the camera mirrored about each plane (Eqs. 8-12).
-
-    Args:
-        gaussians: the set to project.
-        camera: whose mirror images are wanted.
-        seen: the planes that it sees, and where; what lies outside of a plane's window is culled.
-        near: depth below which a Gaussian is culled, world units.
-    """
-    return project_gaussians(
-        gaussians,
-        camera,
-        near=near,
-        poses=camera.cam_from_world @ mirror_matrices(seen.planes.centers, seen.planes.normals),
-        clip_planes=half_spaces_of(seen.planes, camera),
-        windows=seen.windows,
-    )
-
-
 def with_photographer(renderer: Renderer, photographer: Shown) -> Renderer:
     """A renderer whose frames tell what photographs show, as far as it knows of anybody; see `Planar.photographer`."""
     return replace(renderer, photographer=photographer) if isinstance(renderer, Planar) else renderer
-
-
-def project_photographer(scene: Scene, camera: Camera, seen: SeenPanes, *, near: float) -> Projected:
-    """Projects the photographer's mirror images: what `project_mirrored` does, of Gaussians that the camera carries.
-
-    Mirrored about plane k, the camera sees them at `cam_from_world @ M_k @ world_from_photographer`; all else, also
-    the depths by which they are sorted into the room, follows from that pose.
-
-    Args:
-        scene: with a photographer.
-        camera: that the photographer holds.
-        seen: the planes that it sees, and where.
-        near: depth below which a Gaussian is culled, world units.
-    """
-    frame = world_from_photographer(camera, scene.up)
-    half_spaces = half_spaces_of(seen.planes, camera)
-    return project_gaussians(
-        scene.photographer,
-        camera,
-        near=near,
-        poses=camera.cam_from_world @ mirror_matrices(seen.planes.centers, seen.planes.normals) @ frame,
-        # A plane n . x + d = 0 is (n, d) as a row vector, so that frames change it from the right.
-        clip_planes=half_spaces @ frame.detach(),
-        windows=seen.windows,
-    )
-
-
-def half_spaces_of(planes: Planes, camera: Camera) -> Tensor:
-    """Clip planes [K, 4] that keep each plane's side on which the camera stands; no gradient."""
-    with torch.no_grad():
-        normals = planes.normals
-        side = torch.sign(((camera.center - planes.centers) * normals).sum(-1, keepdim=True))
-        facing = normals * side
-        return torch.cat([facing, -(facing * planes.centers).sum(-1, keepdim=True)], dim=1)

@@ -12,6 +12,7 @@ from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
 from glassplat.kernels.pane_hits.reference import ray_grid
 from glassplat.kernels.shade_environment.shaded import NORMAL_AT, NORMAL_MIN, STRENGTH_AT, SURFACE_CHANNELS
+from glassplat.kernels.splats import Projected
 from glassplat.kernels.surface_channels import surface_channels
 from glassplat.render.discs import blended_discs, disc_layers, projected_discs
 from glassplat.render.frame import ScreenPass
@@ -27,6 +28,7 @@ from glassplat.render.rasterize import (
 )
 from glassplat.render.tint import further_channels, tint_layer
 from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
 
@@ -83,30 +85,63 @@ def _seen_ellipsoids(
     scene: Scene, camera: Camera, near: float, background: tuple[float, float, float], probed: bool
 ) -> Surface:
     """Depths are those of the centres."""
-    gaussians = scene.primary
-    projected = project_gaussians(gaussians, camera, near=near)
+    projected = project_gaussians(scene.primary, camera, near=near)
     screen = (screen_pass("primary", projected),) if probed else ()
-    channels = surface_channels(
-        projected.colors[0],
-        projected.radii[0],
-        gaussians.quats,
-        gaussians.log_scales,
-        gaussians.means,
-        gaussians.channels["logit_strength"],
-        camera.center,
-        further_channels(gaussians, projected.depths[0, :, None]),
-    )
+    channels = ellipsoid_channels(scene.primary, projected, camera.center[None])
     splats = joined_splats(projected)
     bins = bin_tiles(splats, camera.width, camera.height)
-    result = composite(splats, channels[None], bins, probe=joined_probe(screen))
-    image, alpha = result.image[0], result.alpha[0]
+    result = composite(splats, channels, bins, probe=joined_probe(screen))
+    return blended_surface(result.image[0], result.alpha[0], shown(projected), background, screen)
+
+
+def ellipsoid_channels(gaussians: Gaussians, projected: Projected, eyes: Tensor) -> Tensor:
+    """[C, N, D] what each ellipsoid adds to the images that `blended_surface` reads.
+
+    Args:
+        gaussians: with a `logit_strength`.
+        projected: the same, into C cameras.
+        eyes: [C, 3] the cameras' centres, to which normals are turned.
+    """
+    return torch.stack(
+        [
+            surface_channels(
+                projected.colors[view],
+                projected.radii[view],
+                gaussians.quats,
+                gaussians.log_scales,
+                gaussians.means,
+                gaussians.channels["logit_strength"],
+                eye,
+                further_channels(gaussians, projected.depths[view, :, None]),
+            )
+            for view, eye in enumerate(eyes)
+        ]
+    )
+
+
+def blended_surface(
+    image: Tensor,
+    alpha: Tensor,
+    direct: Tensor,
+    background: tuple[float, float, float],
+    screen: tuple[ScreenPass, ...] = (),
+) -> Surface:
+    """The surface of one view from the blended `ellipsoid_channels`.
+
+    Args:
+        image: [H, W, D] of these channels.
+        alpha: [H, W] coverage.
+        direct: [N] bool, which Gaussians reach a pixel.
+        background: colour behind everything, sRGB.
+        screen: the record of the pass, if it was probed.
+    """
     return Surface(
         base=over_background(image[..., :NORMAL_AT], alpha, background),
         normal=image[..., NORMAL_AT:STRENGTH_AT],
         strength=image[..., STRENGTH_AT],
         depth=mean_depth(image[..., SURFACE_CHANNELS], alpha),
         alpha=alpha,
-        direct=shown(projected),
+        direct=direct,
         excess=_excess(image, SURFACE_CHANNELS + 1),
         screen=screen,
     )

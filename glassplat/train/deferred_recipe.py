@@ -41,6 +41,8 @@ from glassplat.train.actions import Densify, GrowSh, ResetOpacity
 from glassplat.train.background import BLACK
 from glassplat.train.environment_entry import AddEnvironment, StayMatte
 from glassplat.train.optimizer import PUBLISHED_ITERATIONS, Rate
+from glassplat.train.photo_exposure import PhotoExposure
+from glassplat.train.pose_refinement import PoseRefinement
 from glassplat.train.propagation import (
     DensifyWhilePropagating,
     GrowShAfterPropagation,
@@ -123,6 +125,8 @@ class DeferredRecipe:
         strategy: what decides how many Gaussians there are and where; `densify` or `mcmc` holds its options.
         densify: when and how Gaussians are added and pruned under `default`.
         mcmc: when and how Gaussians are relocated and added under `mcmc`.
+        exposure: whether the exposure of each photograph is learned.
+        poses: whether the camera of each photograph is corrected.
     """
 
     method: ClassVar[str] = "deferred"
@@ -157,6 +161,8 @@ class DeferredRecipe:
     strategy: Annotated[Strategy, ESSENTIAL] = "default"
     densify: DefaultDensify = field(default_factory=DefaultDensify)
     mcmc: McmcDensify = field(default_factory=McmcDensify)
+    exposure: PhotoExposure = field(default_factory=PhotoExposure)
+    poses: PoseRefinement = field(default_factory=PoseRefinement)
 
     @classmethod
     def paper(cls) -> DeferredRecipe:
@@ -197,7 +203,8 @@ class DeferredRecipe:
         primary = self._population().initial(dataset.points, self.sh_degree)
         strengths = torch.full((len(primary),), logit(self.first_strength))
         primary = replace(primary, channels={"logit_strength": strengths})
-        return Scene(primary, dataset.extent)
+        scene = Scene(primary, dataset.extent)
+        return self.poses.begun(self.exposure.begun(scene, dataset), dataset)
 
     def renderer(self) -> Deferred:
         """The renderer of the finished scene, with all its layers."""
@@ -205,8 +212,12 @@ class DeferredRecipe:
 
     def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
         """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has one stage."""
-        if iterations < self.least_iterations:
-            return self._matte_stages(seed, iterations)
+        short = iterations < self.least_iterations
+        stages = self._matte_stages(seed, iterations) if short else self._reflecting_stages()
+        return self.poses.learnt_in(self.exposure.learnt_in(stages))
+
+    def _reflecting_stages(self) -> tuple[Stage, ...]:
+        """Those of a run that is long enough for normals to spread."""
         population = self._population()
         image = image_terms(self.ssim_weight, self.view_dependence_weight)
         bootstrap = Stage(
@@ -301,9 +312,7 @@ class DeferredRecipe:
 
     def _doublings(self) -> tuple[float, ...]:
         """The shares of the run at which the environment's edge length doubles."""
-        count = max(math.ceil(math.log2(self.texels / self.first_texels)), 0)
-        first, last = self.refinements
-        return tuple(first + (last - first) * number / max(count - 1, 1) for number in range(count))
+        return doublings(self.first_texels, self.texels, self.refinements)
 
     def _edits(self, population: Population) -> tuple[Action, ...]:
         """What changes the number of Gaussians once they reflect."""
@@ -347,3 +356,10 @@ class DeferredRecipe:
         return population_of(
             self.strategy, default=self.densify, mcmc=self.mcmc, rhythm=self.rhythm, means_rate=means_rate
         )
+
+
+def doublings(first_texels: int, texels: int, refinements: tuple[float, float]) -> tuple[float, ...]:
+    """The shares of the run, evenly from a first to a last one, at which an edge length doubles until it is reached."""
+    count = max(math.ceil(math.log2(texels / first_texels)), 0)
+    first, last = refinements
+    return tuple(first + (last - first) * number / max(count - 1, 1) for number in range(count))

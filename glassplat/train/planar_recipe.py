@@ -31,6 +31,7 @@ from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, GrowSh, PerturbOpacity, ResetOpacity
 from glassplat.train.background import BLACK
+from glassplat.train.curved_mirrors import CurvedMirrors
 from glassplat.train.optimizer import PUBLISHED_ITERATIONS, Rate
 from glassplat.train.photo_exposure import PhotoExposure
 from glassplat.train.photographer_entry import Photographer
@@ -157,6 +158,7 @@ class PlanarRecipe:
         exposure: whether the exposure of each photograph is learned.
         poses: whether the camera of each photograph is corrected.
         photographer: whether panes show who took the photographs.
+        curved: whether things that are not flat mirror as well.
     """
 
     method: ClassVar[str] = "planar"
@@ -191,6 +193,7 @@ class PlanarRecipe:
     exposure: PhotoExposure = field(default_factory=PhotoExposure)
     poses: PoseRefinement = field(default_factory=PoseRefinement)
     photographer: Photographer = field(default_factory=Photographer)
+    curved: CurvedMirrors = field(default_factory=CurvedMirrors)
 
     @classmethod
     def paper(cls) -> PlanarRecipe:
@@ -238,8 +241,16 @@ class PlanarRecipe:
         count = sum(view.is_annotated for view in (*dataset.train, *dataset.test))
         return f"none of the {count} masks of {dataset.root} names a pane" if count else f"{dataset.root} has no masks"
 
+    def contradiction(self) -> str | None:
+        """What is wrong with the options together, if anything."""
+        return self.curved.contradiction()
+
     def renderer(self) -> Planar:
         """The renderer of the finished scene, with all its layers."""
+        return self.curved.renderer(self._of_panes())
+
+    def _of_panes(self) -> Planar:
+        """The renderer of panes, without curved mirrors."""
         return Planar(
             self.background or BLACK,
             fresnel=self.fresnel,
@@ -275,6 +286,7 @@ class PlanarRecipe:
         else:
             stages = (initialisation, self._adjustment(second, entry), self._joint(third))
         stages = self.photographer.learnt_in(stages, self.densify, seed)
+        stages = self.curved.learnt_in(stages, self.rhythm.sh)
         return self.poses.learnt_in(self.exposure.learnt_in(stages))
 
     def _adjustment(self, share: float, entry: PlaneEntry) -> Stage:
@@ -351,7 +363,7 @@ class PlanarRecipe:
 
     def _training_renderer(self, gradient: str) -> Planar:
         return replace(
-            self.renderer(),
+            self._of_panes(),
             reflection_gradient="all" if gradient == "all" else "planes",
             deviation=self.weights.depth != 0,
             deviation_depth_gradient=self.moving_mean,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from glassplat.data.dataset import Dataset
 from glassplat.densify.edit import forget
 from glassplat.densify.mirrors import MirrorSearch
-from glassplat.render.splat import Splat
+from glassplat.render.frame import Renderer
 from glassplat.scene.tint import with_tint
 from glassplat.train.environment_entry import AddEnvironment
 from glassplat.train.messages import Working
@@ -31,7 +31,7 @@ class BeginReflections:
     environment: AddEnvironment | None
     surroundings: AddSurroundings | None
     mirrors: MirrorSearch
-    renderer: Splat
+    renderer: Renderer
     tint: bool = False
 
     def __call__(self, state: TrainState, dataset: Dataset) -> Generator[Working, None, bool]:

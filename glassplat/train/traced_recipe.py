@@ -34,6 +34,8 @@ from glassplat.train.actions import Densify, GrowSh, PruneIdle, ResetOpacity
 from glassplat.train.background import BLACK
 from glassplat.train.deferred_recipe import DeferredRecipe, ReflectionRates, Texels
 from glassplat.train.optimizer import PUBLISHED_ITERATIONS
+from glassplat.train.photo_exposure import PhotoExposure
+from glassplat.train.pose_refinement import PoseRefinement
 from glassplat.train.propagation import Propagate, PropagationSchedule, RefineEnvironment
 from glassplat.train.splat_recipe import GaussianRates, Primitive
 from glassplat.train.stage import Action, Every, Stage
@@ -115,6 +117,8 @@ class TracedRecipe:
         strategy: what decides how many Gaussians the scene has and where; `densify` or `mcmc` holds its options.
         densify: when and how Gaussians are added and pruned under `default`.
         mcmc: when and how Gaussians are relocated and added under `mcmc`.
+        exposure: whether the exposure of each photograph is learned.
+        poses: whether the camera of each photograph is corrected.
     """
 
     method: ClassVar[str] = "traced"
@@ -155,6 +159,8 @@ class TracedRecipe:
     strategy: Annotated[Strategy, ESSENTIAL] = "default"
     densify: DefaultDensify = field(default_factory=DefaultDensify)
     mcmc: McmcDensify = field(default_factory=McmcDensify)
+    exposure: PhotoExposure = field(default_factory=PhotoExposure)
+    poses: PoseRefinement = field(default_factory=PoseRefinement)
 
     @classmethod
     def paper(cls) -> TracedRecipe:

@@ -24,6 +24,8 @@ LARGEST_HEIGHT = 1080
 SHARP_QUALITY, COARSE_QUALITY = 90, 60
 LEAST_AHEAD = 0.1
 """Of the extent: how far before the camera the point is, at least, that the mouse turns it about."""
+WAITING = ("Drawing", "The first picture may take a minute or two: kernels are compiled once for each machine.")
+"""Title and text of what stands there until there is a picture."""
 
 
 class Host(Protocol):
@@ -50,6 +52,7 @@ class Client:
         self._layer: Any = None
         self._panes: PaneControls | None = None
         self.keyframes = KeyframeControls(handle, viewer.shown.scene.extent, self.camera)
+        self._waiting: Any = handle.add_notification(*WAITING, loading=True, with_close_button=False)
         self.lay_out()
         self.stand_at(viewer.first)
         handle.camera.on_update(lambda _: self.ask())
@@ -58,6 +61,9 @@ class Client:
         """Puts a picture on the screen, and with a sharp one the photograph that is nearest to it."""
         quality = SHARP_QUALITY if is_sharp else COARSE_QUALITY
         self._handle.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
+        if self._waiting is not None:
+            self._waiting.remove()
+            self._waiting = None
         if is_sharp:
             self._photographs.show_nearest(self._nearest)
 

@@ -58,3 +58,19 @@ def test_cameras_that_look_all_over_the_place_have_none() -> None:
 def test_parallel_cameras_have_none() -> None:
     eyes = [torch.tensor([float(x), 0.0, 0.0]) for x in range(5)]
     assert reflective_region([looking_at(eye, eye + torch.tensor([0.0, 1.0, 0.0])) for eye in eyes]) is None
+
+
+def test_a_third_of_the_cameras_may_look_elsewhere() -> None:
+    center = torch.tensor([3.0, -1.0, 2.0])
+    around = ring(center, 2.0)
+    away = [looking_at(camera.center, 3 * camera.center - 2 * center) for camera in around[::2]]
+    region = reflective_region([*around, *away])
+    assert region is not None
+    assert region[:3] == pytest.approx(center.tolist(), abs=1e-3)
+    assert region[3] == pytest.approx(reflective_region(around)[3], rel=1e-3)  # type: ignore[index]
+
+
+def test_more_than_the_smaller_part_may_not() -> None:
+    around = ring(torch.zeros(3), 2.0)
+    away = ring(torch.zeros(3), 2.0, turned=True)
+    assert reflective_region([*around[:8], *away]) is None

@@ -14,7 +14,7 @@ from glassplat.kernels.shade_environment import shade_environment
 from glassplat.kernels.shade_environment.reference import shade_environment as twin
 from glassplat.kernels.shade_environment.shaded import NORMAL_MIN, Shaded
 
-INPUTS = ("blended", "alpha", "texels")
+INPUTS = ("blended", "alpha", "texels", "world_from_cam")
 WIDTH, HEIGHT = 29, 23
 NORMAL, STRENGTH = slice(3, 6), 6
 BACKGROUND = (0.5, 1.0, 0.25)
@@ -117,7 +117,7 @@ def test_without_normal_or_strength_the_image_is_the_base_bit_for_bit() -> None:
     case["blended"][3, 20, NORMAL] = torch.tensor([NORMAL_MIN / 2, 0, 0])
     bare = case["blended"][..., NORMAL].norm(dim=-1) <= NORMAL_MIN
     unlit = case["blended"][..., STRENGTH] == 0
-    rgb, base, reflection, v_blended, _, _ = with_gradients(case, shade_environment)
+    rgb, base, reflection, v_blended, *_ = with_gradients(case, shade_environment)
     v_strength = v_blended[..., STRENGTH]
     assert bool(bare.any()) and bool((unlit & ~bare).any())
     assert torch.equal(rgb[bare | unlit], base[bare | unlit])
@@ -136,9 +136,9 @@ def test_pixels_that_reflect_too_little_are_the_base_and_the_others_stay_as_they
     dull = case["blended"][..., STRENGTH] < 0.5
     assert bool(dull.any()) and not bool(dull.all())
     every, some = (with_gradients(case, shade_environment, least) for least in (0.0, 0.5))
-    for tensor, other in zip(some[:-1], every[:-1], strict=True):
+    for tensor, other in zip(some[:-2], every[:-2], strict=True):
         assert torch.equal(tensor[~dull], other[~dull])
-    rgb, base, reflection, v_blended, _, _ = some
+    rgb, base, reflection, v_blended, *_ = some
     assert torch.equal(rgb[dull], base[dull])
     assert all(float(tensor[dull].abs().max()) == 0 for tensor in (reflection, v_blended[..., 3:]))
 

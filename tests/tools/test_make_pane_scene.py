@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -58,6 +59,22 @@ def test_one_pane_adds_its_reflection_to_what_is_behind_it() -> None:
     np.testing.assert_allclose(seen.radiance, (1 - share) * seen.transmission + share * seen.reflection)
     assert (seen.strength[~hit] == 0).all()
     assert (np.abs(seen.reflection - seen.transmission)[hit] > 0.05).any(axis=1).mean() > 0.3
+
+
+def test_tinted_glass_dims_what_comes_through_and_not_what_comes_back() -> None:
+    plain, tint = Place((ROOM,), (WINDOW,)).seen(*towards_window()), (0.5, 0.8, 0.6)
+    seen = Place((ROOM,), (replace(WINDOW, tint=tint),)).seen(*towards_window())
+    hit, share = plain.label == 1, plain.strength[:, None]
+    np.testing.assert_allclose(seen.transmission[hit], plain.transmission[hit] * tint)
+    np.testing.assert_array_equal(seen.transmission[~hit], plain.transmission[~hit])
+    np.testing.assert_array_equal(seen.reflection, plain.reflection)
+    np.testing.assert_allclose(seen.radiance, (1 - share) * seen.transmission + share * seen.reflection)
+
+
+def test_mirrors_have_no_tint(tmp_path: Path) -> None:
+    main(Arguments(tmp_path / "scene", width=16, views=8, masks=1, points=10, tint=(0.5, 0.8, 0.6)))
+    planes = json.loads((tmp_path / "scene/gt/planes.json").read_text())
+    assert [plane["tint"] for plane in planes] == [[0.5, 0.8, 0.6], [0.5, 0.8, 0.6], [1.0, 1.0, 1.0]]
 
 
 def test_a_mirror_shows_what_a_mirrored_camera_sees() -> None:

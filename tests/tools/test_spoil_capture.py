@@ -7,8 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from glassplat.files.images import read_image
 from glassplat.kernels.color_space import linear_from_srgb
+from tests.train.object_capture import write_object_capture
 from tests.train.tiny_capture import write_tiny_capture
-from tools.spoil_capture import add_passers_by, disturb_poses, spoil
+from tools.spoil_capture import add_passers_by, disturb_poses, disturb_transforms, frames_of, spoil
 
 
 def test_photographs_differ_by_their_factors_and_nothing_else_does(tmp_path: Path) -> None:
@@ -57,3 +58,25 @@ def test_passers_by_are_where_their_masks_say_and_in_no_test_view(tmp_path: Path
         assert 0.02 < there.mean() < 0.5
         assert (before[~there] == after[~there]).all() and (before[there] != after[there]).any(axis=1).mean() > 0.9
     assert (capture / "images/0.png").read_bytes() == (tmp_path / "copy/images/0.png").read_bytes()
+
+
+def test_a_capture_with_transforms_is_exposed_and_shaken_too(tmp_path: Path) -> None:
+    capture = write_object_capture(tmp_path / "capture")
+    factors = spoil(capture, tmp_path / "copy", 0.5, 0.1, np.random.default_rng(3))
+    assert len(factors) == sum(len(frames_of(capture, split)) for split in ("train", "test"))
+    for name in factors:
+        before, after = (read_image(folder / name) for folder in (capture, tmp_path / "copy"))
+        assert (before[..., 3] == after[..., 3]).all() and (before[..., :3] != after[..., :3]).any()
+    disturb_transforms(tmp_path / "copy", 0.01, np.random.default_rng(4))
+    for split in ("train", "test"):
+        name = f"transforms_{split}.json"
+        assert (tmp_path / "copy" / f"true_{name}").read_bytes() == (capture / name).read_bytes()
+        true, moved = (
+            np.array([frame["transform_matrix"] for frame in frames_of(folder, split)])
+            for folder in (capture, tmp_path / "copy")
+        )
+        wobbles = np.linalg.inv(true) @ moved
+        squares = wobbles[:, :3, :3] @ wobbles[:, :3, :3].transpose(0, 2, 1)
+        np.testing.assert_allclose(squares, np.broadcast_to(np.eye(3), squares.shape), atol=1e-9)
+        turns = Rotation.from_matrix(wobbles[:, :3, :3]).as_rotvec()
+        assert 0.003 < turns.std() < 0.03 and wobbles[:, :3, 3].std() > 0

@@ -13,7 +13,7 @@ from glassplat.data.view import View
 from glassplat.files.scene_folder import read_scene, write_scene
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.photo_exposure import PhotoExposure
-from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.recipe import RECIPES
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.state import TrainState
 from glassplat.train.trainer import train
@@ -54,16 +54,21 @@ def test_dark_photographs_are_told_from_bright_ones() -> None:
     assert float(affine.mean(dim=0).abs().max()) < 0.3
 
 
-@pytest.mark.parametrize("recipe", [SplatRecipe(exposure=LEARNED), PlanarRecipe(exposure=LEARNED)])
-def test_every_stage_learns_them(recipe: SplatRecipe | PlanarRecipe) -> None:
-    assert all("exposures.affine" in stage.rates for stage in recipe.stages(0))
-    assert all("exposure" in {term.name for term in stage.losses} for stage in recipe.stages(0))
+@pytest.mark.parametrize("method", RECIPES)
+@pytest.mark.parametrize("iterations", [3000, 30_000])
+def test_every_stage_of_every_method_learns_them(method: str, iterations: int) -> None:
+    recipe = RECIPES[method](exposure=LEARNED)
+    stages = recipe.stages(0, iterations)
+    assert all("exposures.affine" in stage.rates for stage in stages)
+    assert all([term.name for term in stage.losses].count("exposure") == 1 for stage in stages)
     assert recipe.initialise(CAPTURE).exposures.names == tuple(v.name for v in CAPTURE.train)
 
 
-@pytest.mark.parametrize("recipe", [SplatRecipe(exposure=OFF), PlanarRecipe(exposure=OFF)])
-def test_switched_off_nothing_knows_of_them(recipe: SplatRecipe | PlanarRecipe) -> None:
-    assert not any("exposures.affine" in stage.rates for stage in recipe.stages(0))
+@pytest.mark.parametrize("method", RECIPES)
+@pytest.mark.parametrize("iterations", [3000, 30_000])
+def test_switched_off_nothing_knows_of_them(method: str, iterations: int) -> None:
+    recipe = RECIPES[method](exposure=OFF)
+    assert not any("exposures.affine" in stage.rates for stage in recipe.stages(0, iterations))
     assert len(recipe.initialise(CAPTURE).exposures) == 0
 
 

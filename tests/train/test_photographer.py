@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import torch
 
 from glassplat.data.dataset import Dataset
@@ -13,7 +14,9 @@ from glassplat.densify.default import ScreenStatistics
 from glassplat.files.scene_folder import read_scene, write_scene
 from glassplat.init.photographer import distance_to_panes, first_photographer
 from glassplat.render.planar import Planar
+from glassplat.render.seen_panes import nearest_hits, panes_in_camera
 from glassplat.render.splat import Splat
+from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
@@ -25,16 +28,31 @@ from glassplat.train.stage import Clock, Stage, carried_out
 from glassplat.train.state import TrainState
 from glassplat.train.trainer import train
 from tests.render.test_photographer import body
-from tests.render.tiny_scene import in_single_precision, pane
+from tests.render.tiny_scene import in_single_precision, joined, pane
 from tests.train.tiny_capture import tiny_capture, true_scene
 
 LEARNED = Photographer(learn=True, count=60)
 UP = (0.0, -1.0, 0.0)
 
 
-def peopled_capture() -> Dataset:
+MIRROR = pane(2.0, half=2.5, base_reflectance=0.9)
+
+
+def half_of_corner(side: int) -> Planes:
+    """A mirror left or right of the z axis, turned towards it."""
+    return replace(
+        pane(2.0, half=1.0, label=1 if side < 0 else 2, base_reflectance=0.9),
+        centers=torch.tensor([[side * 1.0, 0.0, 2.0]], dtype=torch.float64),
+        raw_normals=torch.tensor([[-side * 0.2, 0.05, -1.0]], dtype=torch.float64),
+    )
+
+
+CORNER = joined(half_of_corner(-1), half_of_corner(1))
+
+
+def peopled_capture(planes: Planes = MIRROR) -> Dataset:
     """The capture photographed by somebody."""
-    scene, views = peopled_scene(), []
+    scene, views = peopled_scene(planes), []
     for view in tiny_capture().train:
         with torch.no_grad():
             image = Planar(photographer="present")(scene, view.camera).rgb
@@ -43,9 +61,8 @@ def peopled_capture() -> Dataset:
     return replace(tiny_capture(), train=tuple(views))
 
 
-def peopled_scene() -> Scene:
-    mirror = pane(2.0, half=2.5, base_reflectance=0.9)
-    return in_single_precision(replace(true_scene(), planes=mirror, photographer=body(), up=UP))
+def peopled_scene(planes: Planes = MIRROR) -> Scene:
+    return in_single_precision(replace(true_scene(), planes=planes, photographer=body(), up=UP))
 
 
 def begun(options: Photographer = LEARNED, scene: Scene | None = None) -> TrainState:
@@ -86,9 +103,20 @@ def test_switched_off_nothing_knows_of_anybody() -> None:
         assert not isinstance(stage.renderer, Planar) or stage.renderer.photographer == "absent"
 
 
-def test_somebody_is_found_in_the_photographs() -> None:
+def test_each_mirror_of_a_corner_shows_the_photographer() -> None:
+    scene, shown = peopled_scene(CORNER), torch.zeros(2)
+    for view in tiny_capture().train:
+        present, absent = (Planar(photographer=mode)(scene, view.camera) for mode in ("present", "absent"))  # type: ignore[arg-type]
+        differs = (present.rgb - absent.rgb).abs().amax(dim=-1) > 0.02
+        pane_of_pixel = nearest_hits(panes_in_camera(scene.planes, view.camera), view.camera).pane
+        shown += torch.stack([(differs & (pane_of_pixel == pane)).sum() for pane in range(2)])
+    assert float(shown.min()) > 30
+
+
+@pytest.mark.parametrize("planes", [MIRROR, CORNER])
+def test_somebody_is_found_in_the_photographs(planes: Planes) -> None:
     """With the true room and panes held, the cloud takes the form of who stands there."""
-    dataset, state = peopled_capture(), begun(scene=peopled_scene())
+    dataset, state = peopled_capture(planes), begun(scene=peopled_scene(planes))
     frozen = [
         replace(
             stage,

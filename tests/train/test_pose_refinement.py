@@ -16,19 +16,25 @@ from glassplat.evaluate.alignment import aligned_camera, with_aligned_test_views
 from glassplat.files.cameras_json import read_cameras
 from glassplat.files.colmap_text import write_colmap
 from glassplat.files.scene_folder import read_scene, write_scene
+from glassplat.init.points import as_discs
+from glassplat.render.deferred import Deferred
+from glassplat.render.frame import Renderer
 from glassplat.render.planar import Planar
+from glassplat.render.traced import Traced
 from glassplat.scene.camera import Camera
 from glassplat.scene.pose_correction import PoseCorrections, moved_camera
 from glassplat.scene.scene import Scene
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
-from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.pose_refinement import PoseRefinement
+from glassplat.train.recipe import RECIPES
 from glassplat.train.run import run_training
 from glassplat.train.run_directory import RunDirectory, RunSettings
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.state import TrainState
 from glassplat.train.trainer import train
+from tests.render.test_deferred import glossy as deferred_scene
 from tests.render.test_planar import CAMERA
+from tests.render.test_traced import glossy as traced_scene
 from tests.render.tiny_scene import showcase
 from tests.train.tiny_capture import tiny_capture, true_scene, write_tiny_capture
 
@@ -67,13 +73,29 @@ def test_a_twist_is_a_rigid_motion_in_the_cameras_frame() -> None:
     assert misplacement(moved_camera(camera, torch.zeros(6), 2.0), camera) == 0
 
 
+def discs() -> Scene:
+    scene = traced_scene()
+    return replace(scene, primary=as_discs(scene.primary), surroundings=as_discs(scene.surroundings))
+
+
+RENDERED = [
+    (Planar(), showcase()),
+    (Deferred(), deferred_scene()),
+    (Deferred(shading="forward"), deferred_scene()),
+    (Traced(), replace(traced_scene(), environment=deferred_scene().environment)),
+    (Traced(), discs()),
+]
+
+
 @pytest.mark.parametrize("twist", [torch.zeros(6).double(), TWIST.double()])
-def test_pose_gradients_match_finite_differences_through_the_whole_renderer(twist: Tensor) -> None:
-    scene = showcase()
+@pytest.mark.parametrize(("renderer", "scene"), RENDERED)
+def test_pose_gradients_match_finite_differences_through_the_whole_renderer(
+    renderer: Renderer, scene: Scene, twist: Tensor
+) -> None:
     weights = torch.randn(28, 40, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
 
     def objective(values: Tensor) -> Tensor:
-        return (Planar()(scene, moved_camera(CAMERA, values, scene.extent)).rgb * weights).sum()
+        return (renderer(scene, moved_camera(CAMERA, values, scene.extent)).rgb * weights).sum()
 
     values = twist.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(objective(values), values)
@@ -127,13 +149,15 @@ def test_where_nothing_is_in_sight_the_camera_stays() -> None:
     assert misplacement(aligned_camera(true_scene(), Planar(), away), away.camera) < 1e-6
 
 
-@pytest.mark.parametrize("recipe", [SplatRecipe(poses=REFINED), PlanarRecipe(poses=REFINED)])
-def test_every_stage_refines(recipe: SplatRecipe | PlanarRecipe) -> None:
-    assert all("poses.twists" in stage.rates for stage in recipe.stages(0))
+@pytest.mark.parametrize("method", RECIPES)
+@pytest.mark.parametrize("iterations", [3000, 30_000])
+def test_every_stage_of_every_method_refines(method: str, iterations: int) -> None:
+    recipe = RECIPES[method](poses=REFINED)
+    assert all("poses.twists" in stage.rates for stage in recipe.stages(0, iterations))
     capture = replace(tiny_capture(), measured_points=False)
     assert recipe.initialise(capture).poses.names == tuple(view.name for view in capture.train[1:])
     off = replace(recipe, poses=PoseRefinement(rate=0.0))
-    assert not any("poses.twists" in stage.rates for stage in off.stages(0))
+    assert not any("poses.twists" in stage.rates for stage in off.stages(0, iterations))
     assert len(off.initialise(capture).poses) == 0
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from glassplat.cli import main
 from glassplat.render.planar import Planar
+from glassplat.viewer.client import WAITING
 from glassplat.viewer.server import Viewer
 from glassplat.viewer.shown import Shown
 from tests.browser_needed import needs_browser
@@ -48,6 +49,7 @@ def test_a_browser_is_shown_sharp_pictures_and_may_leave() -> None:
     try:
         with Browser(f"http://127.0.0.1:{viewer.port}/", 400, 300) as browser:
             eventually(lambda: any(shown))
+            eventually(lambda: WAITING[1] not in browser.evaluate("document.body.innerText"))
             (client,) = viewer._clients.values()
             shown.clear()
             client.stand_at(2)
@@ -69,3 +71,13 @@ def test_a_port_in_use_gets_a_message(tmp_path: Path, capsys: pytest.CaptureFixt
         taken.listen()
         assert main(["view", str(run), "--port", str(taken.getsockname()[1])]) == 2
     assert "choose another --port" in " ".join(capsys.readouterr().err.split())
+
+
+@needs_browser
+def test_who_waits_for_the_first_picture_is_told_so() -> None:
+    viewer = Viewer(SHOWN, "127.0.0.1", free_port())  # Nobody draws before it starts.
+    try:
+        with Browser(f"http://127.0.0.1:{viewer.port}/", 400, 300) as browser:
+            eventually(lambda: WAITING[1] in browser.evaluate("document.body.innerText"))
+    finally:
+        viewer.stop()

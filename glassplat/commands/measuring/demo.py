@@ -8,12 +8,14 @@ from pathlib import Path
 from rich.console import Console
 
 from glassplat.commands.console.messages import say
+from glassplat.commands.measuring.beside import beside
 from glassplat.commands.measuring.evaluate import evaluate_run, print_results
 from glassplat.commands.runs.stored_run import open_run
 from glassplat.commands.training.train import Train
 from glassplat.data.ranges import Seed, Several
 from glassplat.kernels.devices import DeviceName
 from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.recipe import Recipe
 from glassplat.train.run_directory import RunDirectory
 from glassplat.train.splat_recipe import SplatRecipe
 
@@ -37,16 +39,29 @@ class Demo:
     device: DeviceName = "auto"
 
     def run(self, console: Console) -> None:
-        """Trains both methods, evaluates them and says where the pictures are."""
-        results = []
-        for recipe in (PlanarRecipe(), SplatRecipe()):
-            folder = self.output / recipe.method
-            begun = RunDirectory(folder).checkpoint.is_file()
-            run = Train(recipe, SCENE, folder, self.iterations, seed=self.seed, device=self.device, resume=begun)
-            run.run(console)
-            results.append(evaluate_run(open_run(folder, self.device)))
-        print_results(console, *results)
+        """Trains both methods, each in a process of its own, evaluates them and says where the pictures are."""
+        log = self.output / "splat.log"
+        with beside(self._arguments(SplatRecipe.method), log) as splat:
+            say(console, f"planar is trained here, and splat beside it: {log}")
+            self._train(PlanarRecipe()).run(console)
+            with console.status("waiting for splat"):
+                splat.wait()
+        folders = [self.output / method for method in (PlanarRecipe.method, SplatRecipe.method)]
+        print_results(console, *(evaluate_run(open_run(folder, self.device)) for folder in folders))
         say(console, f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
+
+    def _train(self, recipe: Recipe) -> Train:
+        """The command that trains one method, or goes on where it was interrupted."""
+        folder = self.output / recipe.method
+        begun = RunDirectory(folder).checkpoint.is_file()
+        return Train(recipe, SCENE, folder, self.iterations, seed=self.seed, device=self.device, resume=begun)
+
+    def _arguments(self, method: str) -> list[str]:
+        """The same for the command line."""
+        folder = self.output / method
+        run = ["train", method, "--data", str(SCENE), "--output", str(folder), "--iterations", str(self.iterations)]
+        begun = RunDirectory(folder).checkpoint.is_file()
+        return [*run, "--seed", str(self.seed), "--device", self.device, *(["--resume"] if begun else [])]
 
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""

@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from glassplat.kernels.cube_lookup import check_cube
+from glassplat.kernels.cube_lookup import check_cube, cube_lookup
 from glassplat.kernels.devices import kernels_for
-from glassplat.kernels.shade_environment.shaded import SURFACE_CHANNELS, Shaded
+from glassplat.kernels.pane_hits.reference import ray_grid
+from glassplat.kernels.shade_environment.shaded import NORMAL_AT, NORMAL_MIN, STRENGTH_AT, SURFACE_CHANNELS, Shaded
 from glassplat.kernels.tensor_checks import check_tensors
 
 
@@ -35,7 +36,7 @@ def shade_environment(
     base C, bit for bit, the reflection is 0, and nothing but the base gets a gradient. Where else the strength is 0 the
     image is the base, bit for bit, too, but the strength has its gradient. A normal that is not finite gives NaN.
 
-    Differentiable in `blended`, `alpha` and `texels`.
+    Differentiable in `blended`, `alpha`, `texels` and `world_from_cam`.
 
     Args:
         blended: [H, W, D] with D >= 7: color, sRGB; normal N, world axes, of any length, whose sign does not matter;
@@ -87,4 +88,24 @@ class _ShadeEnvironment(torch.autograd.Function):
         cotangents = [gradient.contiguous() for gradient in gradients]
         kernels = kernels_for("shade_environment", reflection.device)
         found = kernels.shade_environment_gradients(inputs, ctx.least_strength, (base, reflection), cotangents)
-        return (None, *found, None, None, None)
+        turn = _gradient_of_turn(inputs, ctx.least_strength, cotangents) if ctx.needs_input_grad[5] else None
+        return (None, *found, None, turn, None)
+
+
+def _gradient_of_turn(inputs: list[Tensor], least_strength: float, cotangents: list[Tensor]) -> Tensor:
+    """[3, 3] gradient of the camera's rotation, which turns the rays that are mirrored.
+
+    Only cameras that are refined ask for it, so that it has no kernel of its own.
+    """
+    blended, alpha, texels, intrinsics, world_from_cam, _ = inputs
+    normals, strength = blended[..., NORMAL_AT:STRENGTH_AT], blended[..., STRENGTH_AT]
+    shines = (normals.square().sum(-1) > NORMAL_MIN**2) & (strength.abs() >= least_strength)
+    v_rgb, _, v_reflection = (cotangent[shines] for cotangent in cotangents)
+    n, height, width = normals[shines], *alpha.shape
+    with torch.enable_grad():
+        turn = world_from_cam.detach().requires_grad_()
+        rays = ray_grid(intrinsics, width, height)[shines] @ turn.T
+        mirrored = n.square().sum(-1, keepdim=True) * rays - 2 * (rays * n).sum(-1, keepdim=True) * n
+        seen = torch.sigmoid(cube_lookup(texels, mirrored))
+    (found,) = torch.autograd.grad(seen, turn, v_reflection + strength[shines][:, None] * v_rgb)
+    return found

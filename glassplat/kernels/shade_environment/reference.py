@@ -24,7 +24,7 @@ def shade_environment(
     height, width = alpha.shape
     normals, strength = blended[..., NORMAL_AT:STRENGTH_AT], blended[..., STRENGTH_AT]
     base = blended[..., :NORMAL_AT] + (1 - alpha)[..., None] * blended.new_tensor(background)
-    rays = ray_grid(intrinsics.detach(), width, height) @ world_from_cam.detach().T
+    rays = ray_grid(intrinsics.detach(), width, height) @ world_from_cam.T
     bare = (normals.square().sum(-1, keepdim=True) <= NORMAL_MIN**2) | (strength.abs() < least_strength)[..., None]
     # Where there is no normal, a harmless one stands in: a NaN masked afterwards would still reach the gradients.
     safe = torch.where(bare, rays, normals)

@@ -387,11 +387,11 @@ def test_shade_environment(dtype: torch.dtype) -> None:
     intrinsics = torch.tensor([0.9 * width, 0.8 * width, width / 2 + 0.3, height / 2 - 0.4], dtype=dtype)
     blended = torch.cat([base, normals, strength[..., None], draw(height, width, 1, seed=6)], dim=-1)
     alpha = draw(height, width, seed=7).sigmoid()
-    leaves = [tensor.to(dtype).detach().requires_grad_() for tensor in (blended, alpha, texels)]
+    leaves = [tensor.to(dtype).detach().requires_grad_() for tensor in (blended, alpha, texels, rotation)]
     own = [on_device(leaf) for leaf in leaves]
     options = {"background": (0.5, 1.0, 0.25), "least_strength": 0.2}
-    found = shade_operation.shade_environment(*own, intrinsics.to(DEVICE), rotation.to(DEVICE), **options)
-    expected = shade_twin.shade_environment(*leaves, intrinsics, rotation, **options)
+    found = shade_operation.shade_environment(*own[:3], intrinsics.to(DEVICE), own[3], **options)
+    expected = shade_twin.shade_environment(*leaves[:3], intrinsics, leaves[3], **options)
     for value, want in zip(found, expected, strict=True):
         close(value, want)
     check_gradients(found, expected, own, leaves)
