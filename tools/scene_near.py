@@ -14,8 +14,8 @@ from tools.scene_environment import NAMED, Color
 from tools.scene_surfaces import Triangles, placed, star_shaped
 
 Array = NDArray[np.floating]
-NearScene = Literal["table", "sheet", "car"]
-NEAR_SCENES: tuple[NearScene, ...] = ("table", "sheet", "car")
+NearScene = Literal["table", "gold", "sheet", "car"]
+NEAR_SCENES: tuple[NearScene, ...] = ("table", "gold", "sheet", "car")
 
 BALL_RADIUS = 0.5
 """Of the mirror ball on the table."""
@@ -38,6 +38,7 @@ def near_scene(name: NearScene) -> DrawnScene:
     """The scene of a name: what mirrors comes first among the bodies."""
     makers: dict[str, Callable[[], tuple[tuple[Body, ...], Stand]]] = {
         "table": _table,
+        "gold": _gold,
         "sheet": _sheet,
         "car": _car,
     }
@@ -51,6 +52,12 @@ def _table() -> tuple[tuple[Body, ...], Stand]:
     ball = star_shaped(lambda d: BALL_RADIUS * np.ones(d.shape[:-1]))
     around = tuple(_standing(number, 0.92, 60.0 * number + 11.0, stand.z) for number in range(6))
     return (_body("ball", ball, "mirror", number=0), *around), stand
+
+
+def _gold() -> tuple[tuple[Body, ...], Stand]:
+    """The table with a ball of gold in place of the mirror."""
+    (mirror, *around), stand = _table()
+    return (_body("ball", mirror.triangles, "metal", number=2), *around), stand
 
 
 def _sheet() -> tuple[tuple[Body, ...], Stand]:

@@ -115,6 +115,8 @@ class DeferredRecipe:
             have learnt what the reflections leave to them; it trains like one of `splat`.
         hurry_matte: raise the learning rates to those of `splat` for the rest of a run in which nothing was found that
             reflects, and for all of one that is too short to look for it.
+        hurry_found: so that `hurry_matte` counts after propagation where something reflects, too; before, high rates
+            would spoil its normals.
         propagation_interval: steps between densifications while normals spread; None keeps `densify.interval`.
         rates: learning rates of the Gaussians; they do not rise in short runs, which costs a mirror ball its normals
             (docs/experiments.md).
@@ -151,6 +153,7 @@ class DeferredRecipe:
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
     least_iterations: Several = 6000
     hurry_matte: bool = True
+    hurry_found: bool = False
     propagation_interval: Several | None = None
     rates: GaussianRates = field(default_factory=partial(GaussianRates, short_run_power=0.0))
     reflection_rates: ReflectionRates = field(default_factory=ReflectionRates)
@@ -244,7 +247,7 @@ class DeferredRecipe:
             actions=(
                 *self._edits(population),
                 # Before the resets: it looks at what is seen, also at the beats that it leaves to them.
-                Propagate(beat, self.propagation, self.schedule, renderer, matte_rates=self._matte_rates()),
+                self._propagate(beat, renderer),
                 GrowShAfterPropagation(Every(self.rhythm.sh)),
                 *self._resets(population),
                 RefineEnvironment(self._doublings(), self.texels),
@@ -326,6 +329,16 @@ class DeferredRecipe:
         if not self.schedule.last_reset:
             return population.resets
         return tuple(ResetRaised.instead_of(reset) for reset in population.resets)
+
+    def _propagate(self, beat: Every, renderer: Deferred) -> Propagate:
+        return Propagate(
+            beat,
+            self.propagation,
+            self.schedule,
+            renderer,
+            matte_rates=self._matte_rates(),
+            hurries_found=self.hurry_found,
+        )
 
     def _matte_rates(self) -> dict[str, Rate]:
         """What brings the learning rates to those of `splat`, where nothing reflects that higher ones would spoil."""

@@ -16,6 +16,7 @@ from glassplat.init.planes import PlaneFit, fit_planes, with_mirrors
 from glassplat.init.points import gaussians_from_points
 from glassplat.init.virtual_scene import virtual_points
 from glassplat.scene.camera import Camera
+from glassplat.scene.coplanar import coplanar_groups
 from glassplat.scene.mirrored import mirrored_gaussians
 from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
@@ -62,12 +63,11 @@ class PlaneEntry:
             planes = replace(planes, mirrors=())
         state.scene = replace(scene, planes=planes)
         state.statistics.clear()
-        for row, label in enumerate(planes.labels):
-            if label in planes.mirrors:
-                yield Working(f"moving what was built behind mirror {label}", 0, 1)
-                turn_virtual_scene_round(state, dataset, planes.select([row]))
-            elif self.seed_reflections:
-                yield from seed_reflection(state, dataset, planes.select([row]))
+        for mirrors in surfaces(planes, mirrors=True):
+            yield Working(f"moving what was built behind {named(mirrors, 'mirror')}", 0, 1)
+            turn_virtual_scene_round(state, dataset, mirrors)
+        for panes in surfaces(planes, mirrors=False) if self.seed_reflections else ():
+            yield from seed_reflection(state, dataset, panes)
         return True
 
     def _with_mirrors_found(self, scene: Scene, dataset: Dataset) -> Generator[Working, None, Planes]:
@@ -128,31 +128,46 @@ def mirrors_found(scene: Scene, dataset: Dataset) -> Generator[Working, None, tu
     return mirrors_among(scene.planes.labels, pairs)
 
 
-def reflects_little(scene: Scene, pane: Planes, cameras: Sequence[Camera]) -> Work:
-    """Whether Gaussians cover hardly anything of what a pane could mirror; False where no view shows the pane."""
+def surfaces(planes: Planes, *, mirrors: bool) -> list[Planes]:
+    """The mirrors, or the panes that are none, those in one plane together.
+
+    Behind one pane of a glass front lies what is mirrored in it and its neighbours: most views show it through these.
+    """
+    rows = [row for row, label in enumerate(planes.labels) if (label in planes.mirrors) == mirrors]
+    return [planes.select(group) for group in coplanar_groups(planes, rows)]
+
+
+def named(panes: Planes, kind: str) -> str:
+    """What messages call panes: "pane 2", "panes 2, 3"."""
+    labels = ", ".join(map(str, sorted(panes.labels)))
+    return f"{kind}s {labels}" if len(panes) > 1 else f"{kind} {labels}"
+
+
+def reflects_little(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Work:
+    """Whether Gaussians cover hardly anything of what panes could mirror; False where no view shows any."""
     covered, whole = 0.0, 0
     for done, camera in enumerate(cameras):
-        yield Working(f"looking for what pane {pane.labels[0]} reflects", done, len(cameras))
-        of_view, pixels = mirrored_coverage(scene, pane, camera)
+        yield Working(f"looking for what {named(panes, 'pane')} can mirror", done, len(cameras))
+        of_view, pixels = mirrored_coverage(scene, panes, camera)
         covered, whole = covered + of_view, whole + pixels
     return covered < LEAST_COVERAGE * whole
 
 
-def turn_virtual_scene_round(state: TrainState, dataset: Dataset, mirror: Planes) -> None:
-    """Moves what the first stage built behind a mirror to where it really is, in front of it."""
+def turn_virtual_scene_round(state: TrainState, dataset: Dataset, mirrors: Planes) -> None:
+    """Moves what the first stage built behind a mirror, or several in one plane, to where it really is, in front."""
     primary, moments = state.scene.primary, state.optimizer.moments
-    virtual = virtual_points(primary.means, mirror, [view.camera for view in dataset.train])
+    virtual = virtual_points(primary.means, mirrors, [view.camera for view in dataset.train])
     if not bool(virtual.any()):
         return
-    turned = mirrored_gaussians(primary.select(virtual), mirror.centers[0], mirror.normals[0])
+    turned = mirrored_gaussians(primary.select(virtual), mirrors.centers[0], mirrors.normals[0])
     primary, moments = apply_edit(primary, moments, keep(~virtual))
     primary, state.optimizer.moments = append(primary, moments, turned)
     state.scene = replace(state.scene, primary=primary)
-    log.info("%d Gaussians behind mirror %d moved to its front", int(virtual.sum()), mirror.labels[0])
+    log.info("%d Gaussians behind %s moved to the front", int(virtual.sum()), named(mirrors, "mirror"))
 
 
-def seed_reflection(state: TrainState, dataset: Dataset, pane: Planes) -> Work:
-    """Adds the mirror images of the measured points behind a pane, if the pane has hardly anything to reflect.
+def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
+    """Adds the mirror images of the measured points behind panes in one plane, if these hardly have a thing to mirror.
 
     Structure from motion places points on reflected things where they seem to be, behind the pane. In a capture from
     the front these are the only trace of what is reflected; the true points behind the pane, mirrored along, are
@@ -160,19 +175,19 @@ def seed_reflection(state: TrainState, dataset: Dataset, pane: Planes) -> Work:
     """
     cameras = [view.camera for view in dataset.train]
     # The coverage is rendered over all views, so it comes last.
-    if not dataset.measured_points or not (yield from reflects_little(state.scene, pane, cameras)):
+    if not dataset.measured_points or not (yield from reflects_little(state.scene, panes, cameras)):
         return False
     points = dataset.points
-    device = pane.centers.device
-    virtual = virtual_points(points.positions.to(device), pane, cameras).cpu()
+    device = panes.centers.device
+    virtual = virtual_points(points.positions.to(device), panes, cameras).cpu()
     if not bool(virtual.any()):
         return False
     behind = replace(points, positions=points.positions[virtual], colors=points.colors[virtual])
     primary = state.scene.primary
     seeds = gaussians_from_points(behind, sh_degree=primary.max_sh_degree).to(device)
     seeds = replace(seeds, active_sh_degree=primary.active_sh_degree)
-    seeds = mirrored_gaussians(seeds, pane.centers[0], pane.normals[0])
+    seeds = mirrored_gaussians(seeds, panes.centers[0], panes.normals[0])
     primary, state.optimizer.moments = append(primary, state.optimizer.moments, seeds)
     state.scene = replace(state.scene, primary=primary)
-    log.info("pane %d reflects what no photograph shows: %d points behind it mirrored", pane.labels[0], len(seeds))
+    log.info("no photograph shows what is mirrored by %s: %d points behind mirrored", named(panes, "pane"), len(seeds))
     return True

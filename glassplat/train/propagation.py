@@ -81,10 +81,10 @@ class Propagate:
         propagation: what it does.
         schedule: when it ends.
         renderer: that of the stage; its frames have a layer `base`.
-        matte_rates: factors on learning rates before the first beat at which normals may be propagated, and after the
-            last one where nothing reflective was found, by dotted parameter name; of them the value for a run of this
-            length is taken.
+        matte_rates: factors on learning rates after the end where nothing reflective was found, by dotted parameter
+            name; of them the value for a run of this length is taken.
         search: what tells how much reflects.
+        hurries_found: they count after the end where something was found, too.
     """
 
     when: Every
@@ -93,6 +93,7 @@ class Propagate:
     renderer: Renderer
     matte_rates: Mapping[str, Rate] = field(default_factory=dict)
     search: Search = field(default_factory=Search)
+    hurries_found: bool = False
     name: str = "propagate normals"
 
     def due(self, clock: Clock) -> bool:
@@ -164,12 +165,13 @@ class Propagate:
         """Notes the end and says what was found."""
         state.records[ENDED] = clock.step
         share = max(self.search.reflective(state.scene, dataset.train), state.records.get(MOST, 0.0))
+        if share < FOUND or self.hurries_found:
+            self._hurry(state, clock)
         if share >= FOUND:
             log.info(
                 "step %d: normal propagation has ended, %.0f %% of what is seen is reflection", clock.step, 100 * share
             )
             return
-        self._hurry(state, clock)
         turns = state.records.get(TURNS)
         if turns is None:
             turns = self.search.turning(state.scene, dataset.train, self.renderer)

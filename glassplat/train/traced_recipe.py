@@ -108,6 +108,8 @@ class TracedRecipe:
         schedule: when they do.
         hurry_matte: raise the learning rates to those of `splat` for the rest of a run in which nothing was found that
             reflects.
+        hurry_found: so that `hurry_matte` counts after propagation where something reflects, too; before, high rates
+            would spoil its normals.
         propagation_interval: steps between densifications while normals spread; None keeps `densify.interval`.
         rates: learning rates of the Gaussians.
         reflection_rates: learning rates of strength and environment.
@@ -149,6 +151,7 @@ class TracedRecipe:
     propagation: NormalPropagation = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
     hurry_matte: bool = True
+    hurry_found: bool = True
     propagation_interval: Several | None = None
     rates: GaussianRates = field(default_factory=partial(GaussianRates, short_run_power=0.0))
     reflection_rates: ReflectionRates = field(default_factory=ReflectionRates)
@@ -194,6 +197,7 @@ class TracedRecipe:
             propagation=NormalPropagation(sabotage=0.4 * SH_ZERO),
             schedule=PropagationSchedule(end="fixed", stop=18_000 / CODE_ITERATIONS, pause=200, last_reset=False),
             hurry_matte=False,
+            hurry_found=False,
             rates=plain,
             reflection_rates=ReflectionRates(strength=1e-2),
             rhythm=Rhythm(

@@ -37,6 +37,7 @@ from glassplat.train.splat_recipe import GaussianRates, SplatRecipe
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
 from glassplat.train.strategy import Rhythm, Strategy
+from glassplat.train.traced_recipe import TracedRecipe
 from glassplat.train.trainer import train
 from tests.train.progress_of import finished
 from tests.train.tiny_capture import tiny_capture
@@ -192,11 +193,15 @@ class Told(Search):
         return self.turns
 
 
-def propagated(search: Search, schedule: PropagationSchedule, beats: int = 10) -> tuple[TrainState, list[int]]:
+def propagated(
+    search: Search, schedule: PropagationSchedule, beats: int = 10, *, hurries_found: bool = False
+) -> tuple[TrainState, list[int]]:
     """A state after so many beats of ten steps, of a run of a hundred, and when normals were propagated."""
     state, done = fresh_state(), []
     when = Every(0.1, stop=schedule.stop, skip_multiples_of=3)
-    action = Propagate(when, NormalPropagation(), schedule, Deferred(), {"primary.sh": Rate(3.0)}, search)
+    action = Propagate(
+        when, NormalPropagation(), schedule, Deferred(), {"primary.sh": Rate(3.0)}, search, hurries_found
+    )
     for beat in range(1, beats + 1):
         clock = Clock(10 * beat, 100, 5)
         if action.due(clock) and action.apply(state, tiny_capture(), clock):
@@ -261,6 +266,16 @@ def test_where_nothing_reflects_the_run_hurries_on_and_says_so(
         assert re.search(rf"nothing reflective was found.*{said}", warnings[0])
     else:
         assert "40 % of what is seen is reflection" in caplog.messages[-1]
+
+
+@pytest.mark.parametrize("recipe", [DeferredRecipe(), TracedRecipe(), TracedRecipe(hurry_found=False)])
+def test_where_something_reflects_the_rest_of_the_run_hurries_if_that_is_asked_for(
+    recipe: DeferredRecipe | TracedRecipe,
+) -> None:
+    (action,) = (action for action in recipe.stages(seed=0)[1].actions if isinstance(action, Propagate))
+    state, _ = propagated(Told(reflects=(0.4,)), PropagationSchedule(patience=2), hurries_found=action.hurries_found)
+    assert state.optimizer.hurried == ({"primary.sh": 3.0} if recipe.hurry_found else {})
+    assert state.records[ENDED] > 10
 
 
 def test_where_nothing_reflects_the_rates_are_those_of_splat() -> None:

@@ -7,9 +7,11 @@ from dataclasses import replace
 import torch
 
 from glassplat.init.planes import with_mirrors
+from glassplat.init.virtual_scene import virtual_points
+from glassplat.scene.plane import Planes
 from glassplat.scene.pose import mirror_matrices
 from glassplat.scene.scene import Scene
-from glassplat.train.plane_entry import seed_reflection, turn_virtual_scene_round
+from glassplat.train.plane_entry import seed_reflection, surfaces, turn_virtual_scene_round
 from glassplat.train.state import TrainState
 from tests.render.tiny_scene import in_single_precision, joined, pane, showcase
 from tests.train.progress_of import finished
@@ -64,6 +66,47 @@ def test_a_capture_from_the_front_gets_the_mirrored_points() -> None:
     assert bool((added[:, 2] < 2.0).all())
     points = mirrored(tiny_capture().points.positions)
     assert bool(torch.isclose(added[:, None], points, atol=1e-5).all(dim=-1).any(dim=1).all())
+
+
+def split_in_two(whole: Planes) -> Planes:
+    """The pane as two, side by side."""
+    tangent, quarter = whole.axes()[0], 0.5 * whole.half_sizes[:, :1]
+    halves = [
+        replace(
+            whole,
+            centers=whole.centers + side * quarter * tangent,
+            half_sizes=whole.half_sizes * torch.tensor([[0.5, 1.0]]),
+            labels=(label,),
+        )
+        for side, label in ((-1, 1), (1, 2))
+    ]
+    return joined(*halves)
+
+
+def test_panes_side_by_side_get_the_points_of_one() -> None:
+    scene = true_scene()
+    case = replace(scene, primary=scene.primary.select(scene.primary.means[:, 2] > 1.5))
+    halves = split_in_two(PANE)
+    (front,) = surfaces(halves, mirrors=False)
+    assert surfaces(halves, mirrors=True) == []
+    whole, both = state_of(case), state_of(replace(case, planes=halves))
+    assert finished(seed_reflection(whole, tiny_capture(), PANE)) and finished(
+        seed_reflection(both, tiny_capture(), front)
+    )
+    torch.testing.assert_close(both.scene.primary.means, whole.scene.primary.means)
+    # Each by itself would get fewer: the neighbour shows what lies behind it from elsewhere.
+    cameras = [view.camera for view in tiny_capture().train]
+    points = tiny_capture().points.positions
+    alone = [int(virtual_points(points, halves.select([row]), cameras).sum()) for row in (0, 1)]
+    assert sum(alone) < int(virtual_points(points, PANE, cameras).sum())
+
+
+def test_mirrors_and_glass_in_one_plane_are_apart() -> None:
+    doors = with_mirrors(split_in_two(PANE), (2,), 0.99)
+    assert [panes.labels for panes in surfaces(doors, mirrors=True)] == [(2,)]
+    assert [panes.labels for panes in surfaces(doors, mirrors=False)] == [(1,)]
+    mirrors = with_mirrors(split_in_two(PANE), (1, 2), 0.99)
+    assert [panes.labels for panes in surfaces(mirrors, mirrors=True)] == [(1, 2)]
 
 
 def test_mirrors_are_named_and_start_at_their_reflectance() -> None:

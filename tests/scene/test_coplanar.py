@@ -1,0 +1,44 @@
+"""Panes of one glass front are known to lie in one plane."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from glassplat.scene.coplanar import coplanar_groups
+from glassplat.scene.plane import Planes
+
+
+def at(x: float, offset: float = 0.0, turn_deg: float = 0.0, half: float = 0.5, label: int = 1) -> Planes:
+    """A pane in the plane z = 0, or off by an offset and a turn about the vertical axis."""
+    turn = math.radians(turn_deg)
+    return Planes.rectangle((x, 0.0, offset), (math.sin(turn), 0.0, math.cos(turn)), (half, 1.0), label=label)
+
+
+def front(*panes: Planes) -> Planes:
+    tensors = {name: torch.cat([pane.tensors()[name] for pane in panes]) for name in panes[0].tensors()}
+    return Planes(**tensors, labels=tuple(range(1, len(panes) + 1)))
+
+
+def test_panes_between_posts_are_one_group_the_largest_first() -> None:
+    planes = front(at(0.0), at(1.1, half=0.6), at(0.0, offset=0.5), at(2.3))
+    assert coplanar_groups(planes, range(4)) == [[1, 0, 3], [2]]
+    assert coplanar_groups(planes, [0, 2]) == [[0], [2]]
+    assert coplanar_groups(planes, []) == []
+
+
+def test_turned_panes_and_those_before_one_another_are_apart() -> None:
+    assert coplanar_groups(front(at(0.0), at(1.0, turn_deg=3)), range(2)) == [[0], [1]]
+    assert coplanar_groups(front(at(0.0), at(0.0, offset=0.05)), range(2)) == [[0], [1]]
+    assert coplanar_groups(front(at(0.0), at(1.0, turn_deg=0.5)), range(2)) == [[0, 1]]
+
+
+def test_the_side_from_which_a_pane_was_marked_does_not_matter() -> None:
+    assert coplanar_groups(front(at(0.0), at(1.0, turn_deg=180)), range(2)) == [[0, 1]]
+
+
+def test_a_third_pane_joins_two_that_are_too_far_apart_for_their_angle() -> None:
+    planes = front(at(0.0), at(2.0, offset=0.03, turn_deg=0.0), at(1.0, offset=0.015))
+    assert coplanar_groups(planes, [0, 1]) == [[0], [1]]
+    assert coplanar_groups(planes, range(3)) == [[0, 1, 2]]
