@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Annotated
 
 import torch
 
 from glassplat.data.dataset import Dataset
 from glassplat.data.ranges import ESSENTIAL, Ascending, Finite, InnerShare, NotNegative, Positive, PositiveShare, Share
+from glassplat.densify.edit import append, apply_edit, keep
 from glassplat.densify.mirrors import MirrorSearch, neighbours
+from glassplat.densify.outlines import fitted_ellipsoid, mirrored_by, outlines_of, refined_ellipsoid, surface_gaussians
 from glassplat.densify.propagate import NormalPropagation
 from glassplat.losses.geometry import normal_consistency
 from glassplat.losses.reflectors import mean_strength, strength_outside
@@ -20,9 +24,11 @@ from glassplat.render.planar import Planar
 from glassplat.render.traced import Traced
 from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import Gaussians
-from glassplat.train.actions import Densify, GrowSh, PruneIdle
+from glassplat.train.actions import Densify, GrowSh, PruneIdle, ResetOpacity
 from glassplat.train.deferred_recipe import ReflectionRates, Texels, doublings
 from glassplat.train.environment_entry import AddEnvironment
+from glassplat.train.messages import Working
+from glassplat.train.optimizer import Rate
 from glassplat.train.propagation import RefineEnvironment
 from glassplat.train.reflection_entry import BeginReflections
 from glassplat.train.stage import Clock, Every, Stage, Work, carried_out
@@ -32,6 +38,14 @@ from glassplat.train.traced_recipe import SurroundingsOptions
 
 log = logging.getLogger("glassplat.train")
 
+LEAST_ON_SURFACE = 1500
+"""Gaussians that an ellipsoid begins with."""
+WITHIN = 0.95
+"""Share of its radii within which everything is a part of the picture in the mirror."""
+TURNING = 0.05
+"""Factor on the learning rate of rotations."""
+RESHAPED = "mirrors reshaped"
+"""Name in `TrainState.records`: the step at which that happened."""
 NEIGHBOURS = 16
 """Gaussians, itself among them, of which one has to be a mirror for normals to spread to another."""
 
@@ -49,6 +63,8 @@ class CurvedMirrors:
         least_strength: rays are traced where the strength is larger.
         first_strength: of what was not taken for a mirror.
         search: what is taken for a mirror at once.
+        least_overlap: how well the outlines of what was found have to be those of an ellipsoid, pixels in both as a
+            share of those in either, for it to begin as that; 1 never lets it.
         surroundings: how the Gaussians learn that reflections show.
         texels: edge length of a face of the environment behind them in the end.
         first_texels: edge length at the start.
@@ -68,7 +84,8 @@ class CurvedMirrors:
     beat: PositiveShare = 0.0214
     least_strength: Share = 0.02
     first_strength: InnerShare = 1e-3
-    search: MirrorSearch = field(default_factory=MirrorSearch)
+    search: MirrorSearch = field(default_factory=partial(MirrorSearch, views=200))
+    least_overlap: Share = 0.6
     surroundings: SurroundingsOptions = field(default_factory=SurroundingsOptions)
     texels: Texels = 64
     first_texels: Texels = 16
@@ -127,14 +144,15 @@ class CurvedMirrors:
             LossTerm("strength", self.strength_weight, mean_strength),
         )
         around = self.surroundings.densify
+        kept = [action for action in stage.actions if not isinstance(action, ResetOpacity)]
         moments = doublings(self.first_texels, self.texels, self.refinements)
         return replace(
             stage,
             renderer=replace(stage.renderer, curved=traced),
             losses=(*stage.losses, *guidance),
-            rates={**stage.rates, **self.rates.of(), **self.surroundings.rates.of("surroundings")},
+            rates={**slowly_turning(stage.rates), **self.rates.of(), **self.surroundings.rates.of("surroundings")},
             actions=(
-                *stage.actions,
+                *kept,
                 Densify(around, "surroundings"),
                 PruneIdle(around, "surroundings", curved_contributions),
                 GrowSh(Every(sh), "surroundings"),
@@ -154,7 +172,14 @@ class CurvedMirrors:
         """How things begin to reflect."""
         environment = AddEnvironment(min(self.first_texels, self.texels), self.region, self.find_region)
         around = AddSurroundings(self.surroundings.start, self.surroundings.sh_degree)
-        return BeginCurved(self.first_strength, BeginReflections(environment, around, self.search, stage.renderer))
+        begin = BeginReflections(environment, around, self.search, stage.renderer)
+        return BeginCurved(self.first_strength, begin, self.least_overlap)
+
+
+def slowly_turning(rates: Mapping[str, Rate]) -> dict[str, Rate]:
+    """The rates of a scene in which things reflect: at the usual ones single normals lose their way at once."""
+    turning = rates["primary.quats"]
+    return {**rates, "primary.quats": replace(turning, start=TURNING * turning.start)}
 
 
 @dataclass(frozen=True)
@@ -164,10 +189,12 @@ class BeginCurved:
     Attributes:
         strength: of reflections, at first.
         begin: adds what is mirrored, and finds mirrors.
+        least_overlap: see `CurvedMirrors`.
     """
 
     strength: float
     begin: BeginReflections
+    least_overlap: float = 1.0
 
     def __call__(self, state: TrainState, dataset: Dataset) -> Work:
         """Edits `state`, and tells how far it is."""
@@ -178,7 +205,35 @@ class BeginCurved:
         yield from carried_out(self.begin(state, dataset))
         found = int((state.scene.primary.channels["logit_strength"] > logit(0.5)).sum())
         log.info("%d of %d Gaussians look like curved mirrors", found, len(primary))
+        if found and self.least_overlap < 1:
+            yield Working("looking for the outlines of mirrors", 0, 1)
+            self._reshape(state, dataset)
         return True
+
+    @torch.no_grad()
+    def _reshape(self, state: TrainState, dataset: Dataset) -> None:
+        """Puts what was found onto the ellipsoid that its outlines describe, if they describe one."""
+        scene = state.scene
+        chosen = scene.primary.channels["logit_strength"] > logit(0.5)
+        outlines = outlines_of(scene, dataset.train, chosen)
+        if not len(outlines.inside):
+            return
+        like = scene.primary.select(chosen)
+        ellipsoid = fitted_ellipsoid(outlines, like.means, state.generator("outlines"))
+        overlap = ellipsoid.overlap(outlines)
+        log.info("its outlines are those of an ellipsoid to %.0f %%", 100 * overlap)
+        if overlap < self.least_overlap:
+            return
+        mirrored = mirrored_by(scene, dataset.train, chosen, self.begin.renderer)
+        ellipsoid = refined_ellipsoid(ellipsoid, outlines, mirrored, scene, state.generator("reflections"))
+        log.info("mirrored, they make it %.3f x %.3f x %.3f world units", *torch.exp(ellipsoid.log_radii).tolist())
+        count = max(int(chosen.sum()), LEAST_ON_SURFACE)
+        inside = ellipsoid.in_units(scene.primary.means - ellipsoid.center).norm(dim=1) < WITHIN
+        primary, moments = apply_edit(scene.primary, state.optimizer.moments, keep(~(chosen | inside)))
+        primary, state.optimizer.moments = append(primary, moments, surface_gaussians(like, ellipsoid, count))
+        state.scene = replace(scene, primary=primary)
+        state.statistics.pop("primary", None)
+        state.records[RESHAPED] = state.step
 
 
 @dataclass(frozen=True)
@@ -206,7 +261,8 @@ class SpreadMirrors:
         """Edits `state`, if there is a mirror."""
         primary, moments = state.scene.primary, state.optimizer.moments
         near = beside_mirrors(primary, self.propagation.reflective)
-        if not bool(near.any()):
+        # What has got the right shape needs no normals from its neighbours.
+        if RESHAPED in state.records or not bool(near.any()):
             return False
         primary, moments = self.propagation.propagate(primary, moments, near)
         primary, moments = self.propagation.disturb(primary, moments, state.generator(self.name), near)

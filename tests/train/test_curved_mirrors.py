@@ -18,8 +18,9 @@ from glassplat.densify.propagate import NormalPropagation
 from glassplat.densify.reflectors import residual_spreads
 from glassplat.files.scene_folder import read_scene, write_scene
 from glassplat.render.planar import Planar
+from glassplat.scene.gaussians import Gaussians
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
-from glassplat.train.curved_mirrors import BeginCurved, CurvedMirrors, SpreadMirrors, beside_mirrors
+from glassplat.train.curved_mirrors import RESHAPED, BeginCurved, CurvedMirrors, SpreadMirrors, beside_mirrors
 from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
@@ -29,6 +30,7 @@ from glassplat.train.strategy import Rhythm
 from glassplat.train.surroundings_entry import SurroundingsStart
 from glassplat.train.traced_recipe import SurroundingsOptions
 from glassplat.train.trainer import train
+from tests.densify.test_outlines import TRUE, cameras, surrounded
 from tests.render.test_curved import CAMERA, glossy
 from tests.render.tiny_scene import in_single_precision
 from tests.train.tiny_capture import tiny_capture, true_scene
@@ -198,3 +200,37 @@ def test_what_is_seen_in_a_pane_does_not_look_like_a_mirror() -> None:
     assert float(shown[behind].sum()) < 0.9 * float(unshown[behind].sum())
     seen = shown > 1.0
     assert bool(seen.any()) and float(spreads[seen].median()) < 0.02
+
+
+def test_what_has_the_outlines_of_a_ball_becomes_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("glassplat.densify.outlines.REFINE_STEPS", 3)
+    around = surrounded()
+    offsets = 0.15 * torch.randn(41, 3, generator=torch.Generator().manual_seed(0))
+    offsets[0] = torch.tensor([0.0, 2.0, 0.0])
+    primary = Gaussians(
+        means=TRUE.center + offsets,
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(41, 1),
+        log_scales=torch.full((41, 3), -1.8),
+        logit_opacities=torch.full((41,), 4.0),
+        sh=torch.zeros(41, 1, 3),
+        channels={"logit_strength": torch.tensor([-5.0] + 40 * [2.0]), "log_intensity": torch.zeros(41)},
+    )
+    state = TrainState(replace(around, primary=primary), seed=0)
+    photo = torch.zeros(36, 48, 3, dtype=torch.uint8)
+    views = tuple(View.in_memory(f"{i}.png", camera, photo=photo) for i, camera in enumerate(cameras()))
+    dataset = replace(tiny_capture(), train=views)
+    begin = replace(PlanarRecipe(curved=CurvedMirrors(learn=True)).stages(0)[3].entry, least_overlap=0.5)
+    assert isinstance(begin, BeginCurved)
+    begin._reshape(state, dataset)
+    made = state.scene.primary
+    assert RESHAPED in state.records and len(made) == 1 + 1500
+    assert torch.equal(made.means[0], primary.means[0])
+    radii = (made.means[1:] - TRUE.center).norm(dim=1)
+    assert float(radii.min()) > 0.3 and float(radii.max()) < 1.0
+    assert bool((made.channels["logit_strength"][1:] == 2).all())
+    spread = SpreadMirrors(Every(0.1), NormalPropagation())
+    assert not spread.apply(state, dataset, Clock(4, 40, 6))
+    # What is no ellipsoid stays as it was found.
+    other = TrainState(replace(around, primary=primary), seed=0)
+    replace(begin, least_overlap=0.999)._reshape(other, dataset)
+    assert len(other.scene.primary) == 41 and RESHAPED not in other.records
