@@ -43,6 +43,7 @@ Switch = Literal[
     "monocular-normals",
     "normal-consistency",
     "culling",
+    "hurry-found",
     "tint",
 ]
 Ablated = Literal["planar", "deferred", "traced"]
@@ -126,7 +127,7 @@ DEFERRED: dict[Switch, Ablation] = {
     "sabotage": Ablation("w/o colour sabotage", _without_sabotage, -3.66),
     "deferred-shading": Ablation("forward shading", lambda r: replace(r, shading="forward"), -6.02),
     "coarse-to-fine": Ablation("w/o coarse-to-fine environment", lambda r: replace(r, first_texels=r.texels)),
-    "tint": Ablation("white reflections (the paper's)", lambda r: replace(r, tint=False)),
+    "tint": Ablation("with a strength for each of red, green and blue", lambda r: replace(r, tint=True)),
     "strength-price": Ablation("strength without a price (the paper's)", lambda r: replace(r, strength_weight=0.0)),
 }
 """The rows of 3DGS-DR's Table 5 and its forward variant (Table 1, `ball`), and what the paper does not have."""
@@ -141,7 +142,8 @@ TRACED: dict[Switch, Ablation] = {
     "copied-surroundings": Ablation("surroundings spread over the box (the paper's)", _spread_over_the_box),
     "found-mirrors": Ablation("strengths that grow from nothing (the paper's)", _without_search),
     "normal-consistency": Ablation("w/o normal consistency", lambda r: replace(r, consistency_weight=0.0)),
-    "tint": Ablation("white reflections (the paper's)", lambda r: replace(r, tint=False)),
+    "tint": Ablation("with a strength for each of red, green and blue", lambda r: replace(r, tint=True)),
+    "hurry-found": Ablation("published rates after propagation", lambda r: replace(r, hurry_found=False)),
     "culling": Ablation("rays wherever anything reflects", lambda r: replace(r, least_strength=0.0)),
 }
 """The first five are the rows of EnvGS's Table 4, but for its perceptual loss, which needs a network's weights; the

@@ -147,7 +147,7 @@ class DeferredRecipe:
     outside_weight: NotNegative = 0.4
     strength_weight: NotNegative = 0.005
     tint: Annotated[bool, ESSENTIAL] = False
-    tint_weight: NotNegative = 0.005
+    tint_weight: NotNegative = 2e-4
     consistency_weight: NotNegative = 0.3
     propagation: NormalPropagation = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)

@@ -144,7 +144,7 @@ class TracedRecipe:
     outside_weight: NotNegative = 0.4
     strength_weight: NotNegative = 0.005
     tint: Annotated[bool, ESSENTIAL] = False
-    tint_weight: NotNegative = 0.005
+    tint_weight: NotNegative = 2e-4
     consistency_weight: NotNegative = 0.3
     consistency_to_end: bool = False
     monocular_weight: NotNegative = 0.01
