@@ -109,7 +109,9 @@ class DefaultDensify:
         prune_radius_fraction: with `prune_large`, Gaussians that any view saw with a radius above
             this share of its longer side are removed; None keeps them. 3DGS states a limit of 20
             pixels but clears the radii before it looks at them, so its published results have none.
-        cap: largest number of Gaussians to grow to; None for no limit.
+        cap: largest number of Gaussians to grow to; None takes `per_pixel`.
+        per_pixel: largest number of Gaussians to grow to for each pixel of all training photographs, which is reached
+            where these contradict each other, by cars and leaves, and never stop asking for more; 0 for no limit.
         least_contribution: Gaussians that add less than so many pixels to every training view, directly and mirrored,
             are removed; 0 keeps them.
         contribution_moments: shares of the run at which they are: when the set has stopped growing, and in `planar`
@@ -130,6 +132,7 @@ class DefaultDensify:
     prune_scale_fraction: Positive = 0.1
     prune_radius_fraction: PositiveShare | None = None
     cap: Annotated[Count | None, ESSENTIAL] = None
+    per_pixel: NotNegative = 0.02
     least_contribution: NotNegative = 0.2
     contribution_moments: Annotated[tuple[Share, ...], Ascending()] = (0.5, 0.8)
 
@@ -141,6 +144,7 @@ class DefaultDensify:
             whole_passes=False,
             adapt_to_size=False,
             prune_large_start=3000 / 30_000,
+            per_pixel=0.0,
             least_contribution=0.0,
         )
 

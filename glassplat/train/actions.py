@@ -67,6 +67,13 @@ def threshold_factor(dataset: Dataset) -> float:
     return max(1.0, math.sqrt(MEGAPIXEL / (camera.width * camera.height)))
 
 
+def limit_of(densifier: DefaultDensify, dataset: Dataset) -> int | None:
+    """The largest number of Gaussians to grow to: the one that was asked for, or one that suits the photographs."""
+    if densifier.cap is not None or densifier.per_pixel == 0:
+        return densifier.cap
+    return round(densifier.per_pixel * sum(view.camera.width * view.camera.height for view in dataset.train))
+
+
 @dataclass(frozen=True)
 class Densify:
     """Clones, splits and prunes one set of Gaussians by its screen gradients."""
@@ -95,6 +102,7 @@ class Densify:
         factor = threshold_factor(dataset) if self.densifier.adapt_to_size else 1.0
         densifier = replace(
             self.densifier,
+            cap=limit_of(self.densifier, dataset),
             gradient_threshold=self.densifier.gradient_threshold * factor,
             pull_threshold=self.densifier.pull_threshold * factor,
         )

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 
-from glassplat.densify.default import DefaultDensify
+from glassplat.densify.default import DefaultDensify, ScreenStatistics
 from glassplat.scene.scene import Scene
-from glassplat.train.actions import PruneIdle
+from glassplat.train.actions import Densify, PruneIdle, limit_of
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Clock
 from glassplat.train.state import TrainState
@@ -42,3 +43,28 @@ def test_idle_gaussians_are_looked_for_at_the_moments_that_were_asked_for() -> N
 
     assert due(DefaultDensify(contribution_moments=(0.5, 0.8))) == [50, 80]
     assert due(DefaultDensify(least_contribution=0)) == []
+
+
+@pytest.mark.parametrize(
+    ("densifier", "limit"),
+    [
+        (DefaultDensify(per_pixel=0.01), 0.01),
+        (DefaultDensify(per_pixel=0.01, cap=5), None),
+        (DefaultDensify(per_pixel=0.0), None),
+        (DefaultDensify.published(), None),
+    ],
+)
+def test_photographs_limit_the_number_of_gaussians(densifier: DefaultDensify, limit: float | None) -> None:
+    capture = tiny_capture()
+    pixels = sum(view.camera.width * view.camera.height for view in capture.train)
+    assert limit_of(densifier, capture) == (densifier.cap if limit is None else round(limit * pixels))
+
+
+def test_a_set_grows_to_its_limit_and_no_further() -> None:
+    state, capture = TrainState(SplatRecipe(sh_degree=1).initialise(tiny_capture()), seed=0), tiny_capture()
+    count = len(state.scene.primary)
+    ones = torch.ones(2, count)
+    state.statistics["primary"] = ScreenStatistics(ones, ones, ones, torch.full((count,), 0.01))
+    share = (count + 2) / sum(view.camera.width * view.camera.height for view in capture.train)
+    Densify(DefaultDensify(per_pixel=share)).apply(state, capture, Clock(10, 100, 5))
+    assert len(state.scene.primary) == count + 2
