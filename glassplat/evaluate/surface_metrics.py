@@ -62,11 +62,13 @@ def _normal_errors(frame: Frame, truth: TrueSurface) -> Tensor | str:
 
 
 def _strength_errors(frame: Frame, truth: TrueSurface) -> Tensor | str:
+    if "strength" not in frame.layers:
+        return NO_STRENGTH
+    if truth.strength is None:
+        return NO_TRUE_STRENGTH
     # Where there are panes, `strength` is theirs.
     strength = frame.layers.get("curved_strength" if "mask" in frame.layers else "strength")
-    if strength is None:
-        return NO_STRENGTH
-    return NO_TRUE_STRENGTH if truth.strength is None else (strength - truth.strength).abs()
+    return NO_STRENGTH if strength is None else (strength - truth.strength).abs()
 
 
 def _reflective(truth: TrueSurface) -> Tensor | str:
