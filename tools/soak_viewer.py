@@ -14,7 +14,6 @@ import asyncio
 import contextlib
 import os
 import random
-import signal
 import sys
 import tempfile
 import time
@@ -221,7 +220,7 @@ async def soak(run: Path, clients: int, minutes: float, say: Any = print) -> Soa
             await asyncio.gather(*tasks, return_exceptions=True)
         finally:
             with contextlib.suppress(ProcessLookupError):
-                viewer.send_signal(signal.SIGINT)
+                viewer.terminate()
             await viewer.wait()
         log.seek(0)
         complaints = [line.strip() for line in log if any(word in line for word in COMPLAINTS)]

@@ -92,6 +92,8 @@ class PaneControls:
         gui = handle.gui
         self._changed = changed
         self._own = dict(zip(planes.labels, planes.base_reflectances.tolist(), strict=True))
+        # First, for a control may be used as soon as it is there.
+        self._gizmos = [PaneGizmo(handle.scene, planes, row, changed) for row in range(len(planes))]
         with gui.add_folder("Glass"):
             self._glass = self._told(gui.add_dropdown("Panes", ("as it is", "mirror", "none")))
             self._reflectances = {
@@ -102,7 +104,6 @@ class PaneControls:
             self._chosen = gui.add_dropdown("Move pane", (NO_PANE, *map(str, planes.labels)))
             self._chosen.on_update(lambda _: self._show_gizmo())
             gui.add_button("Put panes back").on_click(lambda _: self._put_back())
-        self._gizmos = [PaneGizmo(handle.scene, planes, row, changed) for row in range(len(planes))]
 
     def applied(self, wish: Wish) -> Wish:
         """The wish, with the panes as the controls say."""

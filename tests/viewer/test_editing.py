@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from glassplat.interface.keeping import KeptBeside
 from glassplat.interface.watching import shown_of
 from glassplat.scene.camera import Camera
 from glassplat.viewer.client import Client
-from glassplat.viewer.pane_controls import HANDLE_SHARE
+from glassplat.viewer.pane_controls import HANDLE_SHARE, PaneControls
 from glassplat.viewer.server import Viewer
 from tests.browser_needed import needs_browser
 from tests.interface.test_model import model
@@ -168,3 +169,14 @@ def error_is_shown(viewer: Viewer, client: Client, browser: Browser) -> None:
     assert client.wish().against == 3
     client._panes._glass.value = "mirror"
     eventually(lambda: pictures[-1][..., 0].max() > 100)
+
+
+def test_controls_may_be_used_as_soon_as_they_are_there() -> None:
+    handle, control = mock.MagicMock(), mock.MagicMock()
+    control.on_update.side_effect = control.on_click.side_effect = lambda act: act(None)
+    handle.gui.add_dropdown.return_value = handle.gui.add_slider.return_value = control
+    handle.gui.add_button.return_value = control
+    asked: list[None] = []
+    planes = true_scene().planes
+    PaneControls(handle, planes, lambda: asked.append(None))
+    assert len(asked) == 3 + len(planes)
