@@ -13,6 +13,8 @@ from glassplat.kernels.composite import composite
 from glassplat.kernels.devices import SIMULATED, cuda_problem
 from glassplat.kernels.project import project
 from glassplat.kernels.splats import CameraBatch, Deviation, RawGaussians, Splats, TileBins
+from glassplat.render.traced import traced_surroundings
+from glassplat.scene.gaussians import Gaussians
 from tests.kernels.gaussians_and_cameras import draw
 
 if SIMULATED or (problem := cuda_problem()) is not None:
@@ -117,3 +119,12 @@ def check_bins(bins: TileBins) -> None:
     assert torch.equal(bins.pair_slots.sort().values, torch.arange(pairs, dtype=torch.int32, device=DEVICE))
     owners = torch.arange(len(bins.splat_offsets) - 1, device=DEVICE).repeat_interleave(bins.splat_offsets.diff())
     assert torch.equal(bins.pair_splats[bins.pair_slots.long()].long(), owners)
+
+
+def test_rays_of_a_gpu_are_traced_on_the_cpu() -> None:
+    part = Gaussians(*(tensor.float() for tensor in gaussians(2000, size=0.05)), active_sh_degree=3)
+    origins, directions = torch.zeros(100, 3), torch.tensor([0.0, 0.0, 1.0]) + 0.3 * draw(100, 3, seed=9).float()
+    on_cpu = traced_surroundings(part, origins, directions, 0.0)
+    on_gpu = traced_surroundings(part.to(DEVICE), origins.to(DEVICE), directions.to(DEVICE), 0.0)
+    assert on_gpu.colors.device.type == DEVICE.type
+    assert torch.equal(on_gpu.colors.cpu(), on_cpu.colors)
