@@ -31,9 +31,8 @@ class McmcDensify:
     """When and how Gaussians are relocated, added and moved (Kheradmand et al. 2024).
 
     Attributes:
-        cap: largest number of Gaussians to grow to. None takes half as many as a photograph has pixels: what detail
-            can be told apart follows the pixels, and default densification ends near that number too. A capture of
-            200x150 pixels grows to 15,000 Gaussians, one of a megapixel to 500,000.
+        cap: largest number of Gaussians to grow to; None takes half as many as a photograph has pixels, for what
+            detail can be told apart follows the pixels.
         interval: steps between relocations.
         start: share of the run after which relocation begins.
         stop: share of the run after which relocation and growth end; the noise goes on.

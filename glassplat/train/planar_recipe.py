@@ -144,12 +144,10 @@ class PlanarRecipe:
         plane_rates: learning rates of planes and glass.
         plane_fit: how planes are found from masks.
         rhythm: when opacities are reset and the SH degree grows.
-        strategy: what decides how many primary Gaussians there are and where. With `mcmc` its relocation takes the
-            place of densification and its regularisers join the loss (Eq. 20). The set grows in the joint stage only,
-            before which opacities are reset once: many Gaussians would build the reflected room behind the panes in
-            the first stage, and no pruning removes it later. The perturbation keeps its beats. The glass is densified
-            by `densify` either way.
+        strategy: what decides how many primary Gaussians there are and where: densification, or MCMC (Eq. 20), under
+            which the set grows in the joint stage only, and opacities are reset once before it.
         early_growth: under `mcmc`, let the set grow from the first stage on, and reset no opacities, as in the paper.
+            Many Gaussians then build the reflected room behind the panes, and no pruning removes it later.
         early_resets: reset opacities in the first two stages too, at the beats of the third, as in the paper.
         densify_by: the views by which primary Gaussians are densified: those that show them directly, or their mirror
             images where none does, each counting by what panes leave of it; or all views and mirror images alike.

@@ -137,7 +137,8 @@ class Client:
         if self._panes is not None:
             self._panes.remove()
         self._panes = PaneControls(self._handle, panes, self.ask) if len(panes) else None
-        self._photographs = PhotographControls(gui, shown, self._nearest, self.stand_at)
+        self._photographs = PhotographControls(gui, shown, self._nearest)
+        self._photographs.listen(self.stand_at)  # Which needs them: a control may be used as soon as it is there.
         self.keyframes.lay_out(self.go, None if shown.keeper is None else self.keep_keyframes)
         if shown.keeper is not None:
             self._add_saving(f"{shown.title}-edited")

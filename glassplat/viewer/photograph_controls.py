@@ -15,27 +15,30 @@ PHOTO_WIDTH = 360
 class PhotographControls:
     """A folder of controls: a list of photographs to stand at, and the picture of the nearest one."""
 
-    def __init__(self, gui: Any, shown: Shown, at: int, stand_at: Callable[[int], None]) -> None:
-        """Lays them out.
+    def __init__(self, gui: Any, shown: Shown, at: int) -> None:
+        """Lays them out; they do nothing yet.
 
         Args:
             gui: of the client.
             shown: what is looked at.
             at: the photograph to begin with.
-            stand_at: moves the camera to where a photograph was taken.
         """
         self._shown, self._at, self._on_screen = shown, at, -1
-        names = tuple(name for name, _ in shown.cameras)
+        self._names = tuple(name for name, _ in shown.cameras)
         with gui.add_folder("Photographs"):
-            self._name = gui.add_dropdown("Stand at", names, initial_value=names[at])
-            self._name.on_update(
-                lambda event: stand_at(names.index(self._name.value)) if event.client is not None else None
-            )
-            steps = gui.add_button_group("Step", ("previous", "next"))
-            steps.on_click(lambda _: stand_at((self._at + (1 if steps.value == "next" else -1)) % len(names)))
+            self._name = gui.add_dropdown("Stand at", self._names, initial_value=self._names[at])
+            self._steps = gui.add_button_group("Step", ("previous", "next"))
             self._photo = None
             if shown.photographs:
                 self._photo = gui.add_image(np.zeros((2, 3, 3), dtype=np.uint8), label="Nearest photograph")
+
+    def listen(self, stand_at: Callable[[int], None]) -> None:
+        """From now on they move the camera to where a photograph was taken, with `stand_at`."""
+        names, steps = self._names, self._steps
+        self._name.on_update(
+            lambda event: stand_at(names.index(self._name.value)) if event.client is not None else None
+        )
+        steps.on_click(lambda _: stand_at((self._at + (1 if steps.value == "next" else -1)) % len(names)))
 
     def stands_at(self, index: int) -> None:
         """The camera is where a photograph was taken."""

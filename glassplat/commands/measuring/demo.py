@@ -13,6 +13,7 @@ from glassplat.commands.measuring.evaluate import evaluate_run, print_results
 from glassplat.commands.runs.stored_run import open_run
 from glassplat.commands.training.train import Train
 from glassplat.data.ranges import Seed, Several
+from glassplat.files.folders import check_folder
 from glassplat.kernels.devices import DeviceName
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.recipe import Recipe
@@ -40,6 +41,7 @@ class Demo:
 
     def run(self, console: Console) -> None:
         """Trains both methods, each in a process of its own, evaluates them and says where the pictures are."""
+        check_folder(self.output)
         log = self.output / "splat.log"
         with beside(self._arguments(SplatRecipe.method), log) as splat:
             say(console, f"planar is trained here, and splat beside it: {log}")
