@@ -250,7 +250,7 @@ class Planar:
         primary = scene.primary if self.reflection_gradient == "all" else detached(scene.primary)
         projected = project_mirrored(primary, camera, seen, near=NEAR_PER_EXTENT * scene.extent)
         intensity = torch.exp(primary.channels["log_intensity"]).expand(len(seen.planes), -1)
-        cameras = mirrored_cameras(camera, seen.planes)
+        cameras = [] if self.curved is None else mirrored_cameras(camera, seen.planes)
         looks = projected.colors
         if self.curved is not None:
             looks = ellipsoid_channels(primary, projected, torch.stack([each.center for each in cameras]))

@@ -16,7 +16,6 @@ from glassplat.data.ranges import Seed, Several
 from glassplat.files.folders import check_folder
 from glassplat.kernels.devices import DeviceName
 from glassplat.train.planar_recipe import PlanarRecipe
-from glassplat.train.recipe import Recipe
 from glassplat.train.run_directory import RunDirectory
 from glassplat.train.splat_recipe import SplatRecipe
 
@@ -42,29 +41,28 @@ class Demo:
     def run(self, console: Console) -> None:
         """Trains both methods, each in a process of its own, evaluates them and says where the pictures are."""
         check_folder(self.output)
+        folders = [self.output / method for method in (PlanarRecipe.method, SplatRecipe.method)]
         log = self.output / "splat.log"
         with beside(self._arguments(SplatRecipe.method), log) as splat:
             say(console, f"planar is trained here, and splat beside it: {log}")
-            self._train(PlanarRecipe()).run(console)
+            here = Train(PlanarRecipe(), SCENE, folders[0], self.iterations, seed=self.seed, device=self.device)
+            here.resuming(begun(folders[0])).run(console)
             with console.status("waiting for splat"):
                 splat.wait()
-        folders = [self.output / method for method in (PlanarRecipe.method, SplatRecipe.method)]
         print_results(console, *(evaluate_run(open_run(folder, self.device)) for folder in folders))
         say(console, f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
 
-    def _train(self, recipe: Recipe) -> Train:
-        """The command that trains one method, or goes on where it was interrupted."""
-        folder = self.output / recipe.method
-        begun = RunDirectory(folder).checkpoint.is_file()
-        return Train(recipe, SCENE, folder, self.iterations, seed=self.seed, device=self.device, resume=begun)
-
     def _arguments(self, method: str) -> list[str]:
-        """The same for the command line."""
+        """Of the command line that trains one method, or goes on where it was interrupted."""
         folder = self.output / method
         run = ["train", method, "--data", str(SCENE), "--output", str(folder), "--iterations", str(self.iterations)]
-        begun = RunDirectory(folder).checkpoint.is_file()
-        return [*run, "--seed", str(self.seed), "--device", self.device, *(["--resume"] if begun else [])]
+        return [*run, "--seed", str(self.seed), "--device", self.device, *(["--resume"] if begun(folder) else [])]
 
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""
         return f"what is finished stays in {self.output}: repeat the command to go on"
+
+
+def begun(folder: Path) -> bool:
+    """Whether there is a run to go on with."""
+    return RunDirectory(folder).checkpoint.is_file()
