@@ -26,6 +26,7 @@ from bench.timing import Work
 from bench.twin import compiled_library
 from glassplat.files.markdown_table import Table
 from glassplat.kernels.build_bvh import build_bvh
+from glassplat.kernels.morton import morton_codes
 from glassplat.kernels.splats import RawGaussians
 from glassplat.kernels.trace import Bvh, Rays, cpu, trace
 from glassplat.kernels.trace.records import Shapes
@@ -51,6 +52,8 @@ def surrounding_discs(count: int) -> RawGaussians:
     generator = torch.Generator().manual_seed(SEED)
     means = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
     means = means * (1 + 2 * torch.rand(count, 1, generator=generator))
+    # Along a Morton curve, as training keeps them.
+    means = means[morton_codes(means).argsort()]
     size = math.log(0.035 * math.sqrt(10_000 / count))
     return RawGaussians(
         means,

@@ -19,7 +19,7 @@ from glassplat.kernels.maths.blending import TRANSMITTANCE_MIN
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.tensor_checks import REAL_OF
 from glassplat.kernels.trace.cpu_backward import trace_gradients
-from glassplat.kernels.trace.cpu_traversal import arrays_of, traversal
+from glassplat.kernels.trace.cpu_traversal import arrays_of, packed_leaves, traversal
 from glassplat.kernels.trace.steps import CHUNK, STACK, WIDTH
 
 __all__ = ["trace", "trace_gradients"]
@@ -41,7 +41,8 @@ def trace(
         torch.empty(count, dtype=torch.int32),
     )
     trace_forward(real, flat)(
-        *(tensor.numpy() for tensor in (*shapes, *rays)),
+        packed_leaves(shapes, bvh[0]),
+        *(tensor.numpy() for tensor in (shapes[3], *rays)),
         *arrays_of(bvh),
         degree,
         real(near),
@@ -59,7 +60,7 @@ def trace_forward(real: type, flat: bool) -> Kernel:
 
     @kernel("trace_forward_discs" if flat else "trace_forward_ellipsoids", real)
     def forward(
-        means, frames, opacities, sh, origins, directions, order, boxes, offsets, degree, near,
+        leaves, sh, origins, directions, order, boxes, offsets, degree, near,
         colors, alphas, depths, hits,
     ):  # fmt: skip
         count = origins.shape[0]
@@ -68,7 +69,8 @@ def trace_forward(real: type, flat: bool) -> Kernel:
         for task in prange(num_blocks):
             block = task * stride % num_blocks
             ts, found, ids = np.empty((CHUNK,), real), np.empty((CHUNK,), real), np.empty((CHUNK,), np.int32)
-            entries, stack, waiting = np.empty((WIDTH,), real), np.empty((STACK,), np.int64), np.empty((STACK,), real)
+            entries, squares = np.empty((WIDTH,), real), np.empty((WIDTH,), real)
+            stack, waiting = np.empty((STACK,), np.int64), np.empty((STACK,), real)
             for r in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
                 o, d, inverse, length, usable = ray(origins, directions, r)
                 red = green = blue = depth = zero
@@ -76,8 +78,8 @@ def trace_forward(real: type, flat: bool) -> Kernel:
                 first, first_id, known = near, 2147483647, CHUNK
                 while usable and known == CHUNK:
                     known = next_hits(
-                        o, d, inverse, means, frames, opacities, order, boxes, offsets, first, first_id,
-                        ts, ids, found, entries, stack, waiting,
+                        o, d, inverse, leaves, order, boxes, offsets, first, first_id,
+                        ts, ids, found, entries, squares, stack, waiting,
                     )  # fmt: skip
                     for k in range(known):
                         after = left * (one - found[k])

@@ -23,7 +23,7 @@ from glassplat.kernels.maths.blending import ALPHA_MAX, Scalar, blend_maths
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.maths.ray_hit import ray_hit_maths
 from glassplat.kernels.tensor_checks import REAL_OF
-from glassplat.kernels.trace.cpu_traversal import arrays_of, traversal
+from glassplat.kernels.trace.cpu_traversal import arrays_of, packed_leaves, traversal
 from glassplat.kernels.trace.steps import CHUNK, STACK, WIDTH, coverage_maths, shape_reader
 
 BLOCK = 256
@@ -48,8 +48,8 @@ def trace_gradients(
     places = np.full((numba.get_num_threads(), 2, count), -1, np.int32)
     inputs = tuple(tensor.numpy() for tensor in (*shapes[:3], *rays))
     trace_collect(real, flat)(
-        *inputs, *arrays_of(bvh), real(near), hit_offsets.numpy(), places, met.numpy(),
-        distinct.numpy(),
+        packed_leaves(shapes, bvh[0]), *inputs[3:], *arrays_of(bvh), real(near), hit_offsets.numpy(), places,
+        met.numpy(), distinct.numpy(),
     )  # fmt: skip
     row_offsets = torch.cat([distinct.new_zeros(1), distinct.cumsum(0)])
     num_rows = int(row_offsets[-1])
@@ -81,24 +81,23 @@ def trace_collect(real: type, flat: bool) -> Kernel:
     next_hits, ray = traversal(real, flat)
 
     @kernel("trace_collect_discs" if flat else "trace_collect_ellipsoids", real)
-    def collect(
-        means, frames, opacities, origins, directions, order, boxes, offsets, near, hit_offsets, places, met, distinct
-    ):
+    def collect(leaves, origins, directions, order, boxes, offsets, near, hit_offsets, places, met, distinct):
         count, num_blocks = origins.shape[0], distinct.size
         stride = even_stride(num_blocks)
         for task in prange(num_blocks):
             block = task * stride % num_blocks
             seen = places[numba.get_thread_id(), 0]
             ts, alphas, ids = np.empty((CHUNK,), real), np.empty((CHUNK,), real), np.empty((CHUNK,), np.int32)
-            entries, stack, waiting = np.empty((WIDTH,), real), np.empty((STACK,), np.int64), np.empty((STACK,), real)
+            entries, squares = np.empty((WIDTH,), real), np.empty((WIDTH,), real)
+            stack, waiting = np.empty((STACK,), np.int64), np.empty((STACK,), real)
             different = 0
             for r in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
                 o, d, inverse, _, _ = ray(origins, directions, r)
                 first, first_id, place = near, 2147483647, hit_offsets[r]
                 while place < hit_offsets[r + 1]:
                     known = next_hits(
-                        o, d, inverse, means, frames, opacities, order, boxes, offsets, first, first_id,
-                        ts, ids, alphas, entries, stack, waiting,
+                        o, d, inverse, leaves, order, boxes, offsets, first, first_id,
+                        ts, ids, alphas, entries, squares, stack, waiting,
                     )  # fmt: skip
                     for k in range(min(known, hit_offsets[r + 1] - place)):
                         g = ids[k]

@@ -7,15 +7,18 @@ boxes that begin behind the farthest of those found so far (Knoll et al. 2019; E
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
+from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
 from glassplat.kernels.cpu.vector import bits_of, lowest_bit, maximum, minimum, store, vector_kind
 from glassplat.kernels.maths.blending import Scalar, blend_maths
-from glassplat.kernels.maths.ray_hit import ray_hit_maths
+from glassplat.kernels.maths.ray_hit import EDGE_ON, MOST_DEVIATIONS
+from glassplat.kernels.tensor_checks import REAL_OF
 from glassplat.kernels.trace.steps import (
     CHUNK,
     NODE,
@@ -24,8 +27,10 @@ from glassplat.kernels.trace.steps import (
     coverage_maths,
     nearest_maths,
     ray_reader,
-    shape_reader,
 )
+
+LEAF = 13 * WIDTH
+"""Numbers of what a node of the lowest level holds: means, rows of frames and opacities, each for all its places."""
 
 
 def arrays_of(bvh: Sequence[Tensor]) -> tuple[NDArray[Any], ...]:
@@ -77,15 +82,99 @@ def _entry(real: type) -> Scalar:
     return enter
 
 
+def _lanes(real: type, flat: bool) -> Scalar:
+    """Puts down (t, squared |q|) of a ray and eight Gaussians; returns which of them it may meet, as bits.
+
+    What `maths/ray_hit.py` does with one of them.
+    """
+    load, edge_on, farthest = vector_kind(real, WIDTH).load, real(EDGE_ON**2), real(MOST_DEVIATIONS**2)
+    zero = real(0.0)
+
+    @inlined
+    def row(leaves, at, x, y, z, d):  # type: ignore[no-untyped-def]
+        """One row of the frames times offsets, and times the direction."""
+        a, b, c = load(leaves, at), load(leaves, at + WIDTH), load(leaves, at + 2 * WIDTH)
+        return a * x + b * y + c * z, a * d[0] + b * d[1] + c * d[2]
+
+    @inlined
+    def offsets_of(leaves, at, o):  # type: ignore[no-untyped-def]
+        return load(leaves, at) - o[0], load(leaves, at + WIDTH) - o[1], load(leaves, at + 2 * WIDTH) - o[2]
+
+    @inlined
+    def meet_discs(leaves, leaf, o, d, first, last, ts, squares):  # type: ignore[no-untyped-def]
+        at = leaf * LEAF
+        x, y, z = offsets_of(leaves, at, o)
+        distance, slope = row(leaves, at + 9 * WIDTH, x, y, z, d)
+        t = distance / slope
+        offset_u, along_u = row(leaves, at + 3 * WIDTH, x, y, z, d)
+        offset_v, along_v = row(leaves, at + 6 * WIDTH, x, y, z, d)
+        u, v = t * along_u - offset_u, t * along_v - offset_v
+        squared = u * u + v * v
+        store(ts, 0, t)
+        store(squares, 0, squared)
+        facing = slope * slope > edge_on * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+        return bits_of(facing & (t >= first) & (t <= last) & (squared <= farthest))
+
+    @inlined
+    def meet_ellipsoids(leaves, leaf, o, d, first, last, ts, squares):  # type: ignore[no-untyped-def]
+        at = leaf * LEAF
+        x, y, z = offsets_of(leaves, at, o)
+        e0, f0 = row(leaves, at + 3 * WIDTH, x, y, z, d)
+        e1, f1 = row(leaves, at + 6 * WIDTH, x, y, z, d)
+        e2, f2 = row(leaves, at + 9 * WIDTH, x, y, z, d)
+        length = f0 * f0 + f1 * f1 + f2 * f2
+        t = (e0 * f0 + e1 * f1 + e2 * f2) / length
+        u, v, w = t * f0 - e0, t * f1 - e1, t * f2 - e2
+        squared = u * u + v * v + w * w
+        store(ts, 0, t)
+        store(squares, 0, squared)
+        return bits_of((length > zero) & (t >= first) & (t <= last) & (squared <= farthest))
+
+    return meet_discs if flat else meet_ellipsoids
+
+
+@cache
+def pack_leaves(real: type) -> Kernel:
+    """Fills what the lowest nodes hold, in their order; what stands behind the last Gaussian is met nowhere."""
+    zero = real(0.0)
+
+    @kernel("trace_pack_leaves", real)
+    def pack(means, frames, opacities, order, leaves):
+        for leaf in prange(leaves.shape[0]):
+            for k in range(WIDTH):
+                place = leaf * WIDTH + k
+                if place >= order.size:
+                    for j in range(13):
+                        leaves[leaf, j, k] = zero
+                    continue
+                g = order[place]
+                for j in range(3):
+                    leaves[leaf, j, k] = means[g, j]
+                    for i in range(3):
+                        leaves[leaf, 3 + 3 * i + j, k] = frames[g, i, j]
+                leaves[leaf, 12, k] = opacities[g]
+
+    return pack
+
+
+def packed_leaves(shapes: Sequence[Tensor], order: Tensor) -> NDArray[Any]:
+    """What the lowest nodes of a hierarchy hold, in one dimension."""
+    means, frames, opacities = shapes[:3]
+    leaves = means.new_empty(-(-order.shape[0] // WIDTH), 13, WIDTH)
+    inputs = (tensor.numpy() for tensor in (means, frames, opacities, order, leaves))
+    pack_leaves(REAL_OF[means.dtype])(*inputs)
+    return leaves.numpy().reshape(-1)
+
+
 def _next_hits(real: type, flat: bool) -> Scalar:
-    meet, insert = ray_hit_maths(real, flat).meet, nearest_maths()
-    shape, coverage, enter = shape_reader(real), coverage_maths(real, blend_maths(real).exp2), _entry(real)
+    insert, enter, meet = nearest_maths(), _entry(real), _lanes(real, flat)
+    coverage = coverage_maths(real, blend_maths(real).exp2)
     zero, nowhere, sooner = real(0.0), real("inf"), real(1.0 - SLACK)
 
     @inlined
     def next_hits(  # type: ignore[no-untyped-def]
-        o, d, inverse, means, frames, opacities, order, boxes, offsets, first, first_id, ts, ids, alphas,
-        entries, stack, waiting,
+        o, d, inverse, leaves, order, boxes, offsets, first, first_id, ts, ids, alphas,
+        entries, squares, stack, waiting,
     ):  # fmt: skip
         count, top = 0, 0
         farthest, farthest_id = nowhere, 2147483647
@@ -100,11 +189,9 @@ def _next_hits(real: type, flat: bool) -> Scalar:
             level = 0
             while offsets[level + 1] <= node:
                 level += 1
-            met = enter(boxes, node, o, inverse, first, farthest, entries)
-            child = (node - offsets[level]) * WIDTH
             if level > 0:
-                child += offsets[level - 1]
-                begin = top
+                met = enter(boxes, node, o, inverse, first, farthest, entries)
+                child, begin = (node - offsets[level]) * WIDTH + offsets[level - 1], top
                 while met != 0:
                     k = lowest_bit(met)
                     met &= met - 1
@@ -116,16 +203,17 @@ def _next_hits(real: type, flat: bool) -> Scalar:
                     stack[place], waiting[place] = child + k, at
                     top += 1
                 continue
+            # Eight Gaussians take hardly longer than the boxes around them would.
+            met = meet(leaves, node, o, d, first, farthest, entries, squares)
             while met != 0:
-                g = order[child + lowest_bit(met)]
+                k = lowest_bit(met)
                 met &= met - 1
-                offset, frame = shape(means, frames, g, o)
-                t, _, squared = meet(offset, d, frame)
-                if not (t > first or (t == first and g > first_id)):
+                t, g = entries[k], order[node * WIDTH + k]
+                if not (t > first or g > first_id):
                     continue
                 if not (t < farthest or (t == farthest and g < farthest_id)):
                     continue
-                _, alpha = coverage(opacities[g], squared)
+                _, alpha = coverage(leaves[node * LEAF + 12 * WIDTH + k], squares[k])
                 if alpha > zero:
                     count = insert(ts, ids, alphas, count, t, g, alpha)
                     if count == CHUNK:
