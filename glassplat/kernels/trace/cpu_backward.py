@@ -161,7 +161,7 @@ def trace_backward(real: type, flat: bool) -> Kernel:
     """Fills each block's rows and their owners, and the gradients of the rays, which are zero beforehand."""
     shape, coverage, pull = shape_reader(real), coverage_maths(real, blend_maths(real).exp2), _pull(real, flat)
     meet, shade = ray_hit_maths(real, flat).meet, _shade(real)
-    zero, half, one = real(0.0), real(0.5), real(1.0)
+    zero, half, one, nowhere = real(0.0), real(0.5), real(1.0), real("inf")
 
     @kernel("trace_backward_discs" if flat else "trace_backward_ellipsoids", real)
     def backward(
@@ -193,6 +193,9 @@ def trace_backward(real: type, flat: bool) -> Kernel:
                     row = own[g]
                     offset, frame = shape(means, frames, g, o)
                     t, q, squared = meet(offset, d, frame)
+                    # On a threshold, what the search has met may be missed by other roundings.
+                    if not t < nowhere:
+                        continue
                     covered, alpha = coverage(opacities[g], squared)
                     weight = alpha * left
                     value = shade(sh[g : g + 1], degree, unit, v_colors[r], weight, sh_rows[row : row + 1], v_unit)

@@ -21,6 +21,7 @@ from glassplat.kernels.maths.ray_hit import EDGE_ON, MOST_DEVIATIONS
 from glassplat.kernels.tensor_checks import REAL_OF
 from glassplat.kernels.trace.steps import (
     CHUNK,
+    LEVEL_BITS,
     NODE,
     SLACK,
     WIDTH,
@@ -179,16 +180,13 @@ def _next_hits(real: type, flat: bool) -> Scalar:
         count, top = 0, 0
         farthest, farthest_id = nowhere, 2147483647
         if boxes.size > 0:
-            stack[0], waiting[0] = boxes.size // NODE - 1, zero
+            stack[0], waiting[0] = ((boxes.size // NODE - 1) << LEVEL_BITS) | (offsets.size - 2), zero
             top = 1
         while top > 0:
             top -= 1
-            node = stack[top]
             if waiting[top] * sooner > farthest:
                 continue
-            level = 0
-            while offsets[level + 1] <= node:
-                level += 1
+            level, node = stack[top] & ((1 << LEVEL_BITS) - 1), stack[top] >> LEVEL_BITS
             if level > 0:
                 met = enter(boxes, node, o, inverse, first, farthest, entries)
                 child, begin = (node - offsets[level]) * WIDTH + offsets[level - 1], top
@@ -200,7 +198,7 @@ def _next_hits(real: type, flat: bool) -> Scalar:
                     while place > begin and waiting[place - 1] < at:
                         stack[place], waiting[place] = stack[place - 1], waiting[place - 1]
                         place -= 1
-                    stack[place], waiting[place] = child + k, at
+                    stack[place], waiting[place] = ((child + k) << LEVEL_BITS) | (level - 1), at
                     top += 1
                 continue
             # Eight Gaussians take hardly longer than the boxes around them would.

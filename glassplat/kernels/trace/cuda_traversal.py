@@ -6,10 +6,16 @@ from glassplat.kernels.cpu.jit import inlined
 from glassplat.kernels.cuda.fast_maths import exp2_maths
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.ray_hit import ray_hit_maths
-from glassplat.kernels.trace.steps import CHUNK, NODE, SLACK, WIDTH, coverage_maths, nearest_maths, shape_reader
-
-LEVEL_BITS = 4
-"""Of what stands on the stack: a node's number lies above its level."""
+from glassplat.kernels.trace.steps import (
+    CHUNK,
+    LEVEL_BITS,
+    NODE,
+    SLACK,
+    WIDTH,
+    coverage_maths,
+    nearest_maths,
+    shape_reader,
+)
 
 
 def _entry(real: type) -> Scalar:

@@ -16,6 +16,8 @@ NODE = 6 * WIDTH
 """Numbers of a node: the lowest x, y, z and the highest x, y, z of its children."""
 STACK = 80
 """Nodes that wait at most: seven siblings on each of the eleven levels that 32-bit places can have, and the nearest."""
+LEVEL_BITS = 4
+"""Of what stands on the stack: a node's number lies above its level."""
 SLACK = 1e-5
 """Share by which boxes begin earlier and end later, so that rounding loses no hit."""
 LARGEST_INVERSE = 1e18
