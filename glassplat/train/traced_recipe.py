@@ -245,7 +245,8 @@ class TracedRecipe:
         entry = self._distant().entry()
         around = AddSurroundings(self.surroundings.start, self.surroundings.sh_degree)
         environment = None if self.mirrors == "surroundings" else entry.environment
-        near = replace(self._tracing(distant), entry=replace(entry, environment=environment, surroundings=around))
+        entry = replace(entry, environment=environment, surroundings=around, harmonics_wait=False)
+        near = replace(self._tracing(distant), entry=entry)
         return bootstrap, near, self._tracing(refinement)
 
     def contradiction(self) -> str | None:
