@@ -245,8 +245,7 @@ class TracedRecipe:
         entry = self._distant().entry()
         around = AddSurroundings(self.surroundings.start, self.surroundings.sh_degree)
         environment = None if self.mirrors == "surroundings" else entry.environment
-        entry = replace(entry, environment=environment, surroundings=around, harmonics_wait=False)
-        near = replace(self._tracing(distant), entry=entry)
+        near = replace(self._tracing(distant), entry=replace(entry, environment=environment, surroundings=around))
         return bootstrap, near, self._tracing(refinement)
 
     def contradiction(self) -> str | None:

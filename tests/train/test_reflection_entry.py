@@ -15,6 +15,7 @@ from glassplat.scene.tint import TINT
 from glassplat.train.actions import GrowSh, ResetOpacity
 from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.environment_entry import AddEnvironment
+from glassplat.train.propagation import GrowShAfterPropagation
 from glassplat.train.reflection_entry import BeginReflections
 from glassplat.train.state import TrainState
 from glassplat.train.surroundings_entry import AddSurroundings, SurroundingsStart
@@ -104,10 +105,11 @@ def test_what_colors_have_learnt_of_mirrors_is_left_out_if_there_are_any(search:
     assert begun(search)[0].scene.primary.active_sh_degree == 1
 
 
-def test_only_deferred_lets_colors_wait() -> None:
-    for recipe, waits in ((DeferredRecipe(), True), (TracedRecipe(), False)):
-        entry = recipe.stages(0, 7000)[1].entry
-        assert isinstance(entry, BeginReflections) and entry.harmonics_wait == waits
+@pytest.mark.parametrize("recipe", [DeferredRecipe(), TracedRecipe()])
+def test_colors_wait_until_normals_have_spread(recipe: DeferredRecipe | TracedRecipe) -> None:
+    stage = recipe.stages(0, 7000)[1]
+    assert isinstance(stage.entry, BeginReflections) and stage.entry.harmonics_wait
+    assert any(isinstance(action, GrowShAfterPropagation) for action in stage.actions)
 
 
 def test_reflections_begin_white_and_may_learn_a_color_where_that_is_asked_for() -> None:
