@@ -32,7 +32,7 @@ from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, GrowSh, PerturbOpacity, ResetOpacity
 from glassplat.train.background import BLACK
 from glassplat.train.curved_mirrors import CurvedMirrors
-from glassplat.train.optimizer import FASTEST_ITERATIONS, PUBLISHED_ITERATIONS, Rate
+from glassplat.train.optimizer import PUBLISHED_ITERATIONS, Rate
 from glassplat.train.photo_exposure import PhotoExposure
 from glassplat.train.photographer_entry import Photographer
 from glassplat.train.plane_entry import PlaneEntry, fitted_planes
@@ -45,10 +45,6 @@ from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
 @dataclass(frozen=True)
 class PlaneRates:
     """Learning rates of planes and glass, which the paper leaves out; see docs/experiments.md.
-
-    Those of planes hold for runs of up to 3000 iterations and are lower in longer ones, so that a plane may go as far
-    in all: Adam follows at its full rate the little that photographs say of some turns, as of a plane that mirrors what
-    is seen nowhere else.
 
     Attributes:
         center: plane position in stage 2, per scene extent.
@@ -66,10 +62,9 @@ class PlaneRates:
 
     def of(self, factor: float) -> dict[str, Rate]:
         """The rates by dotted parameter name."""
-        of_planes = factor * FASTEST_ITERATIONS / PUBLISHED_ITERATIONS
         return {
-            "planes.centers": Rate(self.center * of_planes, per_extent=True, short_run_power=1.0),
-            "planes.raw_normals": Rate(self.normal * of_planes, short_run_power=1.0),
+            "planes.centers": Rate(self.center * factor, per_extent=True),
+            "planes.raw_normals": Rate(self.normal * factor),
             "planes.logit_reflectances": Rate(self.reflectance),
             "glass.logit_mark": Rate(self.mark),
         }
