@@ -16,6 +16,7 @@ from glassplat.kernels.join_channels import join_channels
 from glassplat.kernels.layer_slopes import layer_slopes, slopes_at
 from glassplat.kernels.pane_layers import pane_layers
 from glassplat.kernels.panes import Fresnel, PaneHits, Panes
+from glassplat.kernels.project import GradientSum
 from glassplat.kernels.shade_environment.shaded import SURFACE_CHANNELS
 from glassplat.kernels.splats import Deviation, Projected, Splats
 from glassplat.render.curved import (
@@ -71,6 +72,7 @@ class FirstPass(NamedTuple):
     direct: Tensor
     screen: tuple[ScreenPass, ...]
     curved: Shades | None
+    total: GradientSum
 
 
 class SecondPass(NamedTuple):
@@ -163,11 +165,11 @@ class Planar:
             layers |= {"transmission": first.image, "reflection": torch.zeros_like(first.image)}
             layers |= {"strength": nothing, "share": nothing, "inner": nothing}
             return Frame(first.image, layers, first.direct, None, first.screen, self._space(scene, probed, first))
-        second = self._second_pass(scene, camera, seen, probed)
+        second = self._second_pass(scene, camera, seen, probed, first.total)
         masks = self._visibilities(scene, camera, seen, first)
         result = self._glazed(first, seen, masks, second, camera)
         if self.photographer == "beside" and len(scene.photographer):
-            with_body = replace(self, photographer="present")._second_pass(scene, camera, seen, False)
+            with_body = replace(self, photographer="present")._second_pass(scene, camera, seen, False, first.total)
             layers["photographed"] = self._glazed(first, seen, masks, with_body, camera).rgb
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
         layers["hit"], layers["inner"] = pane_layers(hits.pane, result.strength)
@@ -188,8 +190,8 @@ class Planar:
             raise ValueError(f"the glass has the channels {sorted(scene.glass.channels)}; expected logit_mark")
 
     def _first_pass(self, scene: Scene, camera: Camera, rectangles: Panes, probed: bool) -> FirstPass:
-        near = NEAR_PER_EXTENT * scene.extent
-        primary = project_gaussians(scene.primary, camera, near=near)
+        near, total = NEAR_PER_EXTENT * scene.extent, GradientSum()
+        primary = project_gaussians(scene.primary, camera, near=near, total=total)
         glass = project_gaussians(scene.glass, camera, near=near)
         splats = joined_splats(primary, glass)
         bins = bin_tiles(splats, camera.width, camera.height)
@@ -229,6 +231,7 @@ class Planar:
             direct=shown(primary),
             screen=screen,
             curved=shades,
+            total=total,
         )
 
     def _behind(self, scene: Scene, camera: Camera) -> dict[str, Tensor]:
@@ -249,9 +252,13 @@ class Planar:
         looks = ellipsoid_channels(scene.primary, projected, camera.center[None])
         return torch.nn.functional.pad(looks, (0, 0, 0, len(scene.glass)))
 
-    def _second_pass(self, scene: Scene, camera: Camera, seen: SeenPanes, probed: bool) -> SecondPass:
-        primary = scene.primary if self.reflection_gradient == "all" else detached(scene.primary)
-        projected = project_mirrored(primary, camera, seen, near=NEAR_PER_EXTENT * scene.extent)
+    def _second_pass(
+        self, scene: Scene, camera: Camera, seen: SeenPanes, probed: bool, total: GradientSum
+    ) -> SecondPass:
+        primary = scene.primary
+        if self.reflection_gradient == "planes":
+            primary, total = detached(scene.primary), GradientSum()
+        projected = project_mirrored(primary, camera, seen, near=NEAR_PER_EXTENT * scene.extent, total=total)
         # By how much it departs from 1: what is behind all Gaussians has 0 then, and needs no blending.
         gain = torch.expm1(primary.channels["log_intensity"])[None].expand(len(seen.planes), -1)
         cameras = [] if self.curved is None else mirrored_cameras(camera, seen.planes)
