@@ -60,6 +60,9 @@ def slopes_at_kernel(real: type) -> Kernel:
         for task in prange(cameras * chunks):
             c, chunk = task // chunks, task % chunks
             for n in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
+                if not depths[c, n] > zero:  # As where a splat is not seen; no surface is that near.
+                    found[c, n] = one
+                    continue
                 x, y = means2d[c, n, 0], means2d[c, n, 1]
                 # Clamped before the conversion, so that infinities are well defined; NaN is the first pixel.
                 column = np.int64(min(x, right)) if x > zero else 0
