@@ -18,7 +18,7 @@ from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians
 
 @dataclass
 class GradientSum:
-    """Where several projections of the same Gaussians add up their gradients, instead of each filling tensors of its own.
+    """Where projections of the same Gaussians add up their gradients, instead of each filling tensors of its own.
 
     Most of a gradient is zeros, of what a camera does not see; filling and adding them costs more than the rest. Each
     projection hands the next one a token, so that autograd asks for their gradients from the last to the first, which
