@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numba import prange
+from numpy.typing import NDArray
 
 from glassplat.kernels.cpu.jit import Kernel, kernel
 
@@ -17,19 +19,20 @@ COLORS = 3
 @cache
 def energy_forward(real: type) -> Kernel:
     """Fills the sum of each chunk of Gaussians."""
-    zero = real(0.0)
 
     @kernel("harmonic_energy_forward", real)
     def forward(sh, sums):
         count, floats = sh.shape[0], sh.shape[1] * COLORS
         rows = sh.reshape(count, floats)
         for chunk in prange(sums.size):
-            total = 0.0
+            # A sum for each column, so that a row is a few vectors.
+            squares: NDArray[Any] = np.zeros(floats, real)
             for n in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-                row, energy = rows[n], zero
-                for j in range(COLORS, floats):
-                    energy += row[j] * row[j]
-                total += np.float64(energy)
+                for j in range(floats):
+                    squares[j] += rows[n, j] * rows[n, j]
+            total = 0.0
+            for j in range(COLORS, floats):
+                total += np.float64(squares[j])
             sums[chunk] = total
 
     return forward
