@@ -62,9 +62,10 @@ class KeptBeside:
             raise FileExistsError(f"{path} is already there; nothing was written. Choose another name")
         make_folder(self._folder)
         write_cameras(path, [(f"keyframe {index}", camera) for index, camera in enumerate(cameras, start=1)])
-        source = "RUN" if self._model.path is None else self._model.path
+        source = "RUN" if self._model.path is None else quote(str(self._model.path))
         return (
-            f"{path}: film them with `glassplat video {source} --path keyframes --keyframes {path} --output film.mp4`"
+            f"{path}: film them with `glassplat video {source} --path keyframes --keyframes {quote(str(path))} "
+            "--output film.mp4`"
         )
 
     def _path(self, name: str) -> Path:

@@ -29,24 +29,25 @@ Layer = Literal[
 ]
 
 LAYERS: dict[str, tuple[Layer, ...]] = {
-    "splat": ("rgb", "depth", "alpha"),
-    "planar": ("rgb", "transmission", "without_panes", "reflection", "strength", "mask", "depth", "alpha"),
+    "splat": ("rgb", "normal", "depth", "alpha"),
+    "planar": ("rgb", "transmission", "without_panes", "reflection", "strength", "mask", "normal", "depth", "alpha"),
     "deferred": ("rgb", "base", "reflection", "strength", "tint", "normal", "environment", "depth", "alpha"),
     "traced": ("rgb", "base", "reflection", "strength", "tint", "normal", "surroundings", "depth", "alpha"),
 }
 """What each method renders that is worth looking at; its frames hold more for the losses."""
 
-CURVED_LAYERS: tuple[Layer, ...] = ("base", "curved_reflection", "curved_strength", "normal", "surroundings")
+CURVED_LAYERS: tuple[Layer, ...] = ("base", "curved_reflection", "curved_strength", "surroundings")
 """What `planar` renders beside its own layers with `--curved.learn`."""
 
-DISC_LAYERS: tuple[Layer, ...] = ("rgb", "normal", "depth", "median_depth", "alpha")
-"""What `splat` renders of discs."""
+DISC_LAYERS: tuple[Layer, ...] = ("median_depth",)
+"""What any method renders of discs beside its own layers."""
 
 
 def layers_of(recipe: Any) -> tuple[Layer, ...]:
     """What a run of a recipe renders that is worth looking at."""
-    known = DISC_LAYERS if getattr(recipe, "primitive", None) == "disc" else LAYERS[recipe.method]
-    return (*known, *CURVED_LAYERS) if recipe.method == "planar" and recipe.curved.learn else known
+    curved = CURVED_LAYERS if recipe.method == "planar" and recipe.curved.learn else ()
+    discs = DISC_LAYERS if getattr(recipe, "primitive", None) == "disc" else ()
+    return (*LAYERS[recipe.method], *curved, *discs)
 
 
 def check_layers(layers: Sequence[str], recipe: Any) -> None:

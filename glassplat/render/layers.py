@@ -9,6 +9,8 @@ from typing import Final
 from glassplat.render.deferred import Deferred
 from glassplat.render.frame import Renderer
 from glassplat.render.planar import Planar, with_photographer
+from glassplat.render.shortest_axes import WithNormals
+from glassplat.render.splat import Splat
 from glassplat.render.traced import Traced
 
 PHOTOGRAPHED: Final = "photographed"
@@ -25,4 +27,5 @@ def renderer_with(renderer: Renderer, layers: Sequence[str]) -> Renderer:
         return replace(renderer, surroundings=surroundings, tint="tint" in layers)
     if isinstance(renderer, Planar) and renderer.curved is not None and "surroundings" in layers:
         renderer = replace(renderer, curved=replace(renderer.curved, surroundings=True))
-    return with_photographer(renderer, "beside") if PHOTOGRAPHED in layers else renderer
+    renderer = with_photographer(renderer, "beside") if PHOTOGRAPHED in layers else renderer
+    return WithNormals(renderer) if "normal" in layers and isinstance(renderer, Planar | Splat) else renderer

@@ -136,9 +136,12 @@ class Client:
         panes = shown.scene.planes
         if self._panes is not None:
             self._panes.remove()
-        self._panes = PaneControls(self._handle, panes, self.ask) if len(panes) else None
+        self._panes = PaneControls(self._handle, panes) if len(panes) else None
         self._photographs = PhotographControls(gui, shown, self._nearest)
-        self._photographs.listen(self.stand_at)  # Which needs them: a control may be used as soon as it is there.
+        # Now that all are there: a control may be used as soon as it listens.
+        if self._panes is not None:
+            self._panes.listen(self.ask)
+        self._photographs.listen(self.stand_at)
         self.keyframes.lay_out(self.go, None if shown.keeper is None else self.keep_keyframes)
         if shown.keeper is not None:
             self._add_saving(f"{shown.title}-edited")

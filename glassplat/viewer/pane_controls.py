@@ -23,14 +23,13 @@ OUTLINE_PIXELS = 2.0
 class PaneGizmo:
     """Arrows and arcs on one pane that move and turn it, with its outline; hidden until it is shown."""
 
-    def __init__(self, scene: Any, planes: Planes, row: int, changed: Callable[[], None]) -> None:
+    def __init__(self, scene: Any, planes: Planes, row: int) -> None:
         """Puts it where the pane is.
 
         Args:
             scene: a client's.
             planes: of the scene that is looked at.
             row: which of them.
-            changed: called whenever it is moved.
         """
         self.label, self._name = planes.labels[row], f"/panes/{planes.labels[row]}"
         axes = torch.stack([*(axis[row] for axis in planes.axes()), planes.normals[row]], dim=1)
@@ -53,6 +52,9 @@ class PaneGizmo:
             thickness=OUTLINE_PIXELS,
             thickness_units="screen",
         )
+
+    def listen(self, changed: Callable[[], None]) -> None:
+        """From now on `changed` is called whenever it is moved."""
         self._handle.on_update(lambda _: changed())
 
     def show(self, visible: bool) -> None:
@@ -81,29 +83,34 @@ class PaneGizmo:
 class PaneControls:
     """A folder of controls of the glass; to be made only for scenes that have panes."""
 
-    def __init__(self, handle: Any, planes: Planes, changed: Callable[[], None]) -> None:
-        """Lays them out.
+    def __init__(self, handle: Any, planes: Planes) -> None:
+        """Lays them out; they do nothing yet.
 
         Args:
             handle: of the client.
             planes: of the scene that is looked at; at least one.
-            changed: called whenever something else is wished for.
         """
         gui = handle.gui
-        self._changed = changed
         self._own = dict(zip(planes.labels, planes.base_reflectances.tolist(), strict=True))
-        # First, for a control may be used as soon as it is there.
-        self._gizmos = [PaneGizmo(handle.scene, planes, row, changed) for row in range(len(planes))]
+        self._gizmos = [PaneGizmo(handle.scene, planes, row) for row in range(len(planes))]
         with gui.add_folder("Glass"):
-            self._glass = self._told(gui.add_dropdown("Panes", ("as it is", "mirror", "none")))
+            self._glass = gui.add_dropdown("Panes", ("as it is", "mirror", "none"))
             self._reflectances = {
-                label: self._told(gui.add_slider(f"R0 of pane {label}", 0.0, 1.0, 0.005, round(value, 3)))
+                label: gui.add_slider(f"R0 of pane {label}", 0.0, 1.0, 0.005, round(value, 3))
                 for label, value in self._own.items()
             }
-            self._gain = self._told(gui.add_slider("Gain", LEAST_GAIN, MOST_GAIN, 0.05, 1.0))
+            self._gain = gui.add_slider("Gain", LEAST_GAIN, MOST_GAIN, 0.05, 1.0)
             self._chosen = gui.add_dropdown("Move pane", (NO_PANE, *map(str, planes.labels)))
-            self._chosen.on_update(lambda _: self._show_gizmo())
-            gui.add_button("Put panes back").on_click(lambda _: self._put_back())
+            self._back = gui.add_button("Put panes back")
+
+    def listen(self, changed: Callable[[], None]) -> None:
+        """From now on `changed` is called whenever something else is wished for, and arrows show as they are chosen."""
+        for control in (self._glass, *self._reflectances.values(), self._gain):
+            control.on_update(lambda _: changed())
+        for gizmo in self._gizmos:
+            gizmo.listen(changed)
+        self._chosen.on_update(lambda _: self._show_gizmo())
+        self._back.on_click(lambda _: self._put_back(changed))
 
     def applied(self, wish: Wish) -> Wish:
         """The wish, with the panes as the controls say."""
@@ -123,15 +130,11 @@ class PaneControls:
         for gizmo in self._gizmos:
             gizmo.remove()
 
-    def _told(self, control: Any) -> Any:
-        control.on_update(lambda _: self._changed())
-        return control
-
     def _show_gizmo(self) -> None:
         for gizmo in self._gizmos:
             gizmo.show(str(gizmo.label) == self._chosen.value)
 
-    def _put_back(self) -> None:
+    def _put_back(self, changed: Callable[[], None]) -> None:
         for gizmo in self._gizmos:
             gizmo.put_back()
-        self._changed()
+        changed()

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+
+from glassplat.scene.pose import rotation_from_quat
 
 
 def matrix_of(wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
     """[3, 3] of a quaternion [4] of any length."""
-    from scipy.spatial.transform import Rotation
-
-    w, x, y, z = wxyz
-    matrix: NDArray[np.float64] = Rotation.from_quat([x, y, z, w]).as_matrix()
+    matrix: NDArray[np.float64] = rotation_from_quat(torch.from_numpy(np.asarray(wxyz, dtype=np.float64))).numpy()
     return matrix
 
 

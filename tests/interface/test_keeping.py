@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import pytest
@@ -69,9 +70,9 @@ def test_keyframes_are_what_a_film_is_made_of(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     keeper = KeptBeside(glassplat.load(run, device="cpu"), tmp_path)
     with pytest.raises(InputError, match="at least two"):
-        keeper.keep_keyframes(CAMERAS[:1], "path")
-    said = keeper.keep_keyframes(CAMERAS[:3], "path")
-    keyframes = said.split("--keyframes ")[1].split()[0]
+        keeper.keep_keyframes(CAMERAS[:1], "my path")
+    said = shlex.split(keeper.keep_keyframes(CAMERAS[:3], "my path").split("`")[1])
+    assert said[:3] == ["glassplat", "video", str(run)] and said[-2:] == ["--output", "film.mp4"]
     film = ["--output", str(tmp_path / "film.webp"), "--seconds", "0.3", "--fps", "10", "--width", "64"]
-    assert main(["video", str(run), *film, "--path", "keyframes", "--keyframes", keyframes]) == 0
+    assert main([*said[1:-2], *film]) == 0
     assert (tmp_path / "film.webp").is_file()

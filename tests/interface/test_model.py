@@ -54,8 +54,8 @@ def test_every_layer_is_an_image(tmp_path: Path) -> None:
         image = whole.image("2.png", layer)
         assert image.shape == (28, 40, 3) and not image.requires_grad
         assert 0 <= float(image.min()) <= float(image.max()) <= 1
-    with pytest.raises(InputError, match=r"planar renders no layer normal; expected .*reflection"):
-        whole.image("2.png", "normal")
+    with pytest.raises(InputError, match=r"planar renders no layer base; expected .*reflection"):
+        whole.image("2.png", "base")
     with pytest.raises(KeyError, match="nobody"):
         whole.render("nobody.png")
 

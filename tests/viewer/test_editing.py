@@ -178,5 +178,7 @@ def test_controls_may_be_used_as_soon_as_they_are_there() -> None:
     handle.gui.add_button.return_value = control
     asked: list[None] = []
     planes = true_scene().planes
-    PaneControls(handle, planes, lambda: asked.append(None))
+    controls = PaneControls(handle, planes)
+    assert not control.on_update.called and not control.on_click.called
+    controls.listen(lambda: asked.append(None))
     assert len(asked) == 3 + len(planes)

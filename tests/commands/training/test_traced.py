@@ -40,6 +40,16 @@ def test_it_is_measured_and_every_layer_can_be_rendered(run: Path, capsys: pytes
     assert "traced renders no layer mask" in capsys.readouterr().err
 
 
+def test_discs_have_a_median_depth_beside_all_other_layers(tmp_path: Path) -> None:
+    capture, run, output = write_object_capture(tmp_path / "ball"), tmp_path / "run", tmp_path / "layers"
+    options = [*few_steps(capture, run), "--surroundings.start.cells", "3", "--primitive", "disc"]
+    assert main(["train", "traced", *options]) == 0
+    listed = layers.layers_of(open_run(run, "cpu").recipe)
+    assert set(listed) == {*LAYERS, "median_depth"}
+    assert main(["render", str(run), "--layers", *listed, "--output", str(output)]) == 0
+    assert all(len(list((output / layer).rglob("*.png"))) == 2 for layer in listed)
+
+
 def test_the_stored_scene_is_the_trained_one(run: Path) -> None:
     trained, stored = load_checkpoint(run / "checkpoint.safetensors").scene, open_run(run, "cpu").scene
     assert trained.parameters().keys() == stored.parameters().keys()
