@@ -12,17 +12,19 @@ import torch
 from torch import Tensor
 
 from bench.methods import frame_work, step_work, view_of
-from bench.scene import bench_camera, bench_scene
+from bench.scene import bench_camera, bench_scene, mirroring_scene
 from bench.timing import Work, interleaved_seconds, paired_ratio
 from glassplat.data.dataset import View
 from glassplat.files.markdown_table import Table
 from glassplat.kernels.photometric import photometric
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
+from glassplat.render.traced import Traced
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.splat_recipe import SplatRecipe
+from glassplat.train.traced_recipe import TracedRecipe
 
 WIDTH, HEIGHT, REPEATS = 960, 720, 15
 
@@ -31,6 +33,7 @@ def measured(count: int) -> Table:
     """Frames, gradients and steps of both methods, and gsplat's."""
     camera = bench_camera(WIDTH, HEIGHT).to("cuda")
     scene = bench_scene(count, 1, 0.5, camera.to("cpu")).to("cuda")
+    mirroring = mirroring_scene(count).to("cuda")
     view, recipe = view_of(camera), PlanarRecipe()
     works: dict[str, Work] = {
         "splat frame": frame_work(scene, Splat(depth=False), camera),
@@ -39,6 +42,8 @@ def measured(count: int) -> Table:
         "planar frame": frame_work(scene, Planar(), camera),
         "splat step": step_work(scene, SplatRecipe().stages(0)[0], view),
         "planar step": step_work(scene, recipe.stages(0)[2], view),
+        "traced frame": frame_work(mirroring, Traced(), camera),
+        "traced step": step_work(mirroring, TracedRecipe().stages(0)[-1], view),
     }
     theirs = gsplat_works(scene, view) if importlib.util.find_spec("gsplat") else {}
     partners = {
@@ -59,7 +64,8 @@ def measured(count: int) -> Table:
     note += "Ratios are medians of ratios taken round by round." if theirs else "gsplat is not installed."
     seconds = interleaved_seconds({name: timed(work) for name, work in (works | theirs).items()}, REPEATS)
     table = Table(
-        f"On a GPU: {count:,} primary Gaussians, SH 3, {WIDTH}x{HEIGHT}, one pane over half of the image",
+        f"On a GPU: {count:,} primary Gaussians, SH 3, {WIDTH}x{HEIGHT}, one pane over half of the image, or all "
+        "of it mirroring as many more",
         ("what", "ms", "gsplat, ms", "gsplat : ours", "memory, MiB", "gsplat memory, MiB"),
         note,
     )

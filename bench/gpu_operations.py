@@ -13,6 +13,7 @@ from bench.gpu_frames import HEIGHT, REPEATS, WIDTH, milliseconds, timed
 from bench.gpu_peaks import measured_peaks
 from bench.gpu_roofline import Peaks, backward_demand, counts_of, forward_demand
 from bench.kernels import backward, batch_of, raw_of, visited_pixels
+from bench.rays import operation_works
 from bench.scene import bench_camera, bench_scene
 from bench.timing import Work, interleaved_seconds
 from glassplat.files.markdown_table import Table
@@ -23,6 +24,9 @@ from glassplat.kernels.photometric import photometric
 from glassplat.kernels.project import project
 from glassplat.kernels.splats import Splats, TileBins
 from glassplat.render.rasterize import joined_splats
+
+RAYS_WIDTH = 1024
+"""Of the square image of a mirror ball that throws the rays, in pixels."""
 
 Bound = Callable[[Peaks], float]
 
@@ -50,7 +54,7 @@ def kernel_times(count: int) -> Table:
         "composite backward": backward([blended.image], [picture[None]], leaves),
         "photometric forward": lambda: photometric(picture, photo),
         "photometric backward": backward(means, [torch.ones_like(means[0])] * 2, [image]),
-    }
+    } | operation_works(count, RAYS_WIDTH, "cuda")
     evaluations = visited_pixels(type(splats)(*(t.cpu() for t in splats)), bins_on_cpu(bins))
     seconds = interleaved_seconds({name: timed(work) for name, work in works.items()}, REPEATS)
     peaks, least = measured_peaks(), least_seconds(splats, leaves[3].detach(), bins, evaluations)

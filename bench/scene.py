@@ -98,3 +98,9 @@ def glossy_scene(count: int) -> Scene:
     primary = room(count)
     environment = Environment.random(128, generator=torch.Generator().manual_seed(2))
     return Scene(replace(primary, channels={"logit_strength": torch.zeros(count)}), extent=3.0, environment=environment)
+
+
+def mirroring_scene(count: int) -> Scene:
+    """The same room, every Gaussian of which mirrors as many others, those of another room."""
+    primary, others = room(count), replace(room(count, seed=3), channels={})
+    return Scene(replace(primary, channels={"logit_strength": torch.zeros(count)}), extent=3.0, surroundings=others)

@@ -64,13 +64,13 @@ class Blending(NamedTuple):
     rows: Array
 
 
-def compiled_twin(folder: Path) -> ctypes.CDLL | None:
-    """The loops in C++, compiled into a folder; None where there is no compiler."""
+def compiled_library(source: Path, folder: Path) -> ctypes.CDLL | None:
+    """A file of C++, compiled into a folder; None where there is no compiler."""
     compiler = next(filter(None, map(shutil.which, (os.environ.get("CXX", ""), *COMPILERS))), None)
     if compiler is None:
         return None
-    library = folder / "twin.so"
-    subprocess.run([compiler, *FLAGS, "-o", str(library), str(SOURCE)], check=True)
+    library = folder / f"{source.stem}.so"
+    subprocess.run([compiler, *FLAGS, "-o", str(library), str(source)], check=True)
     return ctypes.CDLL(str(library))
 
 
@@ -168,7 +168,7 @@ def main() -> None:
         "Four channels, one thread, processor time; ratios are medians of ratios taken round by round.",
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
-        library = compiled_twin(Path(folder))
+        library = compiled_library(SOURCE, Path(folder))
         if library is None:
             sys.exit(f"skipped: no C++ compiler ({', '.join(COMPILERS)} or CXX); install one, such as g++, to measure")
         numba.set_num_threads(1)

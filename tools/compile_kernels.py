@@ -27,7 +27,7 @@ from tools.machine_loops import Loops, loops_of
 CAPABILITIES = ((8, 0), (9, 0), (12, 0))
 SUPPORTED = ((7, 5), (8, 0), (8, 6), (8, 9), (9, 0), (10, 0), (12, 0))
 PACKAGE = "glassplat.kernels"
-COSTS = ("shared bytes", "instructions of a turn", "float64 in loops")
+COSTS = ("shared bytes", "local bytes", "instructions of a turn", "float64 in loops")
 
 
 COUNTED = (9, 0)
@@ -35,11 +35,14 @@ COUNTED = (9, 0)
 
 
 class Resources(NamedTuple):
-    """What a thread or block of a kernel takes: registers, bytes spilled to memory and back, bytes shared."""
+    """What a thread or block of a kernel takes: registers, bytes spilled to memory and back, bytes shared, and bytes of
+    a thread's own memory, which is where its arrays are that do not fit into registers.
+    """
 
     registers: int
     spilled: int
     shared: int
+    local: int
 
 
 class Linked(NamedTuple):
@@ -62,8 +65,15 @@ def all_kernels(real: type = np.float32) -> list[Any]:
         and value.__module__ == module.__name__
         and first_parameter(value) in ("real", "key")
     }
-    made = (factory(real) if first_parameter(factory) == "real" else factory() for factory in factories)
+    made = (kernel for factory in factories for kernel in kernels_of(factory, real))
     return sorted(made, key=lambda kernel: str(kernel.name))
+
+
+def kernels_of(factory: Callable[..., Any], real: type) -> list[Any]:
+    """The kernels of a factory: of those for discs or ellipsoids, `flat` or not, both."""
+    if "flat" in inspect.signature(factory).parameters:
+        return [factory(real, flat) for flat in (True, False)]
+    return [factory(real) if first_parameter(factory) == "real" else factory()]
 
 
 def first_parameter(factory: Callable[..., Any]) -> str | None:
@@ -125,8 +135,9 @@ def read_report(report: str) -> Resources:
     def largest(pattern: str) -> int:
         return max((int(number) for number in re.findall(pattern, report)), default=0)
 
+    frame = r"(\d+) bytes stack frame"
     spilled = largest(r"(\d+) bytes spill stores") + largest(r"(\d+) bytes spill loads")
-    return Resources(largest(r"Used (\d+) registers"), spilled, largest(r"(\d+) bytes smem"))
+    return Resources(largest(r"Used (\d+) registers"), spilled, largest(r"(\d+) bytes smem"), largest(frame))
 
 
 def table(kernels: Sequence[Any]) -> list[str]:
@@ -137,7 +148,7 @@ def table(kernels: Sequence[Any]) -> list[str]:
         made = {cc: linked(ptx, cc) for ptx, cc in zip(ptx_of(kernel), CAPABILITIES, strict=True)}
         found = [one.resources for one in made.values()]
         cells = [f"{r.registers}" + (f" ({r.spilled} B spilled)" if r.spilled else "") for r in found]
-        cells += [str(found[-1].shared), *loop_cells(loops_of(made[COUNTED].cubin))]
+        cells += [str(found[-1].shared), str(found[-1].local), *loop_cells(loops_of(made[COUNTED].cubin))]
         lines.append("| " + " | ".join([kernel.name, *cells]) + " |")
     return lines
 

@@ -170,13 +170,10 @@ def traced_colors(
 
 
 def traced_surroundings(part: Gaussians, origins: Tensor, directions: Tensor, near: float) -> Found:
-    """What rays [R, 3] meet of a set of Gaussians; those of a GPU, which has no kernels for it, on the CPU."""
-    tensors = (part.means, part.quats, part.log_scales, part.logit_opacities, part.sh, origins, directions)
-    *gaussians, here, there = (tensor.cpu() for tensor in tensors)
-    raw = RawGaussians(*gaussians)
+    """What rays [R, 3] meet of a set of Gaussians."""
+    raw = RawGaussians(part.means, part.quats, part.log_scales, part.logit_opacities, part.sh)
     bvh = build_bvh(shapes_of(raw), flat=part.log_scales.shape[1] == FLAT)
-    found = trace(raw, Rays(here, there), bvh, sh_degree=part.active_sh_degree, near=near)
-    return Found(*(tensor.to(origins.device) for tensor in found))
+    return trace(raw, Rays(origins, directions), bvh, sh_degree=part.active_sh_degree, near=near)
 
 
 @torch.no_grad()

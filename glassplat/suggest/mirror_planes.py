@@ -85,16 +85,16 @@ def _without(one: MirrorPlane, free: NDArray[np.bool_], matches: MirrorMatches, 
 
 
 def judged(plane: Plane, matches: MirrorMatches, extent: float, reach: float = FINE) -> MirrorPlane:
-    """What speaks for and against a plane: matches that agree with it to within `reach` image diagonals."""
+    """What speaks for and against a plane: matches that agree with it to within `reach` image diagonals.
+
+    What is seen through the plane from both sides says nothing: a case of glass shows the room behind it as well.
+    """
     told = matches.predicted(plane, np.arange(len(matches)))
     agreeing = (told.away < reach * matches.seen.diagonal) & told.alike
-    right, wrong = agreeing & told.by_mirror, agreeing & told.impossible
-    both = np.flatnonzero(right & told.both)
-    if len(both):  # Beside the pane a camera may look past it; in the pane it would see the mirror image.
-        within = seen_within(plane, matches.seen, matches.virtual[right], matches.real[both])
-        wrong[both[within]], right[both[within]] = True, False
-    shown = np.flatnonzero(right)
-    return MirrorPlane(plane, _places(matches, shown, extent), _places(matches, np.flatnonzero(wrong), extent), shown)
+    mirrored, really_there = told.by_mirror & ~told.both, matches.seen_from_behind(plane)
+    shown = np.flatnonzero(agreeing & mirrored & ~really_there)
+    against = np.flatnonzero(agreeing & (told.impossible | mirrored & really_there))
+    return MirrorPlane(plane, _places(matches, shown, extent), _places(matches, against, extent), shown)
 
 
 def refined(plane: Plane, matches: MirrorMatches, extent: float) -> Plane:

@@ -8,12 +8,13 @@ import torch
 from numba import prange
 from torch import Tensor
 
+from glassplat.kernels.build_bvh.boxes import half_widths_maths, level_sizes
 from glassplat.kernels.build_bvh.hilbert import hilbert_codes
 from glassplat.kernels.cpu.jit import Kernel, kernel
 from glassplat.kernels.tensor_checks import REAL_OF
-from glassplat.kernels.trace.cpu_traversal import WIDTH
 from glassplat.kernels.trace.records import Bvh, Shapes
 from glassplat.kernels.trace.shapes import reach
+from glassplat.kernels.trace.steps import WIDTH
 
 
 def build_bvh(shapes: Shapes, *, flat: bool, order: Tensor | None) -> Bvh:
@@ -30,19 +31,10 @@ def build_bvh(shapes: Shapes, *, flat: bool, order: Tensor | None) -> Bvh:
     return Bvh(order, boxes, offsets)
 
 
-def level_sizes(count: int) -> list[int]:
-    """Nodes of each level over `count` Gaussians, the lowest first; none over none."""
-    sizes: list[int] = []
-    while count > 1 or (count == 1 and not sizes):
-        count = -(-count // WIDTH)
-        sizes.append(count)
-    return sizes
-
-
 @cache
 def fit_boxes(real: type, flat: bool) -> Kernel:
     """Fills the boxes of all nodes."""
-    zero, nowhere, axes = real(0.0), real("inf"), 2 if flat else 3
+    zero, nowhere, half_widths = real(0.0), real("inf"), half_widths_maths(real, flat)
 
     @kernel("fit_boxes_discs" if flat else "fit_boxes_ellipsoids", real)
     def fit(means, frames, extents, order, offsets, boxes):
@@ -67,17 +59,10 @@ def fit_boxes(real: type, flat: bool) -> Kernel:
                     g = order[member]
                     if not extents[g] > zero:
                         continue
-                    sums = (zero, zero, zero)
-                    for i in range(axes):
-                        x, y, z = frames[g, i, 0], frames[g, i, 1], frames[g, i, 2]
-                        # A row is an axis divided by its deviation; divided by its squared length it is their product.
-                        inverse = real(1.0) / (x * x + y * y + z * z)
-                        x, y, z = x * inverse, y * inverse, z * inverse
-                        sums = (sums[0] + x * x, sums[1] + y * y, sums[2] + z * z)
+                    half = half_widths(frames, g, extents[g])
                     for j in range(3):
-                        half = extents[g] * sums[j] ** real(0.5)
                         # NaN and infinity fail the comparison, which leaves the box empty.
-                        if abs(means[g, j]) + half < nowhere:
-                            boxes[node, j, k], boxes[node, 3 + j, k] = means[g, j] - half, means[g, j] + half
+                        if abs(means[g, j]) + half[j] < nowhere:
+                            boxes[node, j, k], boxes[node, 3 + j, k] = means[g, j] - half[j], means[g, j] + half[j]
 
     return fit

@@ -28,19 +28,25 @@ def hilbert_codes(points: Tensor) -> Tensor:
 
     What is not finite comes last.
     """
-    finite = points.isfinite().all(dim=1)
-    codes = torch.full((points.shape[0],), torch.iinfo(torch.int64).max)
-    if not bool(finite.any()):
-        return codes
-    known = points[finite]
-    lowest = known.amin(dim=0)
-    size = float((known.amax(dim=0) - lowest).amax())
-    scale = (2**BITS - 1) / size if size > 0 else 0.0
-    cells = ((known - lowest).double() * scale).long()
-    places = torch.empty(len(known), dtype=torch.int64)
+    cells, finite = curve_cells(points)
+    places = torch.empty(len(points), dtype=torch.int64)
     hilbert_places(REAL_OF[points.dtype])(cells.numpy(), places.numpy())
-    codes[finite] = places
-    return codes
+    return torch.where(finite, places, torch.iinfo(torch.int64).max)
+
+
+def curve_cells(points: Tensor) -> tuple[Tensor, Tensor]:
+    """[N, 3] int64 cells of a grid over the finite points' bounding cube, and [N] which ones are finite.
+
+    On any device, and without asking it for a number.
+    """
+    finite = points.isfinite().all(dim=1)
+    if not len(points):
+        return points.long(), finite
+    lowest = torch.where(finite[:, None], points, torch.inf).amin(dim=0)
+    size = (torch.where(finite[:, None], points, -torch.inf).amax(dim=0) - lowest).amax().double()
+    scale = torch.where(size > 0, (2**BITS - 1) / size, 0.0)
+    cells = ((points - lowest).double() * scale).nan_to_num(0.0, 0.0, 0.0).long()
+    return cells, finite
 
 
 @inlined
@@ -76,6 +82,17 @@ def unfolded(x, y, z):  # type: ignore[no-untyped-def]
     return x ^ turned, y ^ turned, z ^ turned
 
 
+@inlined
+def curve_place(x, y, z):  # type: ignore[no-untyped-def]
+    """The place of a cell along the curve."""
+    x, y, z = unfolded(x, y, z)
+    place = np.int64(0)
+    for j in range(BITS):
+        shift = BITS - 1 - j
+        place = (place << 3) | ((x >> shift & 1) << 2) | ((y >> shift & 1) << 1) | (z >> shift & 1)
+    return place
+
+
 @cache
 def hilbert_places(real: type) -> Kernel:
     """Fills the places of cells along the curve."""
@@ -85,11 +102,6 @@ def hilbert_places(real: type) -> Kernel:
         count = places.size
         for chunk in prange((count + CHUNK - 1) // CHUNK):
             for i in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-                x, y, z = unfolded(cells[i, 0], cells[i, 1], cells[i, 2])
-                place = np.int64(0)
-                for j in range(BITS):
-                    shift = BITS - 1 - j
-                    place = (place << 3) | ((x >> shift & 1) << 2) | ((y >> shift & 1) << 1) | (z >> shift & 1)
-                places[i] = place
+                places[i] = curve_place(cells[i, 0], cells[i, 1], cells[i, 2])
 
     return fill

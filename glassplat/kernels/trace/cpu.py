@@ -19,7 +19,8 @@ from glassplat.kernels.maths.blending import TRANSMITTANCE_MIN
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.tensor_checks import REAL_OF
 from glassplat.kernels.trace.cpu_backward import trace_gradients
-from glassplat.kernels.trace.cpu_traversal import CHUNK, STACK, WIDTH, arrays_of, traversal
+from glassplat.kernels.trace.cpu_traversal import arrays_of, traversal
+from glassplat.kernels.trace.steps import CHUNK, STACK, WIDTH
 
 __all__ = ["trace", "trace_gradients"]
 

@@ -19,19 +19,12 @@ from torch import Tensor
 
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
 from glassplat.kernels.cpu.schedule import even_stride
-from glassplat.kernels.maths.blending import ALPHA_MAX, Scalar
+from glassplat.kernels.maths.blending import ALPHA_MAX, Scalar, blend_maths
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.maths.ray_hit import ray_hit_maths
 from glassplat.kernels.tensor_checks import REAL_OF
-from glassplat.kernels.trace.cpu_traversal import (
-    CHUNK,
-    STACK,
-    WIDTH,
-    arrays_of,
-    coverage_maths,
-    shape_reader,
-    traversal,
-)
+from glassplat.kernels.trace.cpu_traversal import arrays_of, traversal
+from glassplat.kernels.trace.steps import CHUNK, STACK, WIDTH, coverage_maths, shape_reader
 
 BLOCK = 256
 """Rays per task, whose sums share rows."""
@@ -167,7 +160,7 @@ def _shade(real: type) -> Scalar:
 @cache
 def trace_backward(real: type, flat: bool) -> Kernel:
     """Fills each block's rows and their owners, and the gradients of the rays, which are zero beforehand."""
-    shape, coverage, pull = shape_reader(real), coverage_maths(real), _pull(real, flat)
+    shape, coverage, pull = shape_reader(real), coverage_maths(real, blend_maths(real).exp2), _pull(real, flat)
     meet, shade = ray_hit_maths(real, flat).meet, _shade(real)
     zero, half, one = real(0.0), real(0.5), real(1.0)
 

@@ -14,21 +14,18 @@ from torch import Tensor
 
 from glassplat.kernels.cpu.jit import inlined
 from glassplat.kernels.cpu.vector import bits_of, lowest_bit, maximum, minimum, store, vector_kind
-from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar, blend_maths
-from glassplat.kernels.maths.ray_hit import MOST_DEVIATIONS, ray_hit_maths
-
-CHUNK = 16
-"""Hits that a search returns at most."""
-WIDTH = 8
-"""Children of a node."""
-NODE = 6 * WIDTH
-"""Numbers of a node: the lowest x, y, z and the highest x, y, z of its children."""
-STACK = 128
-"""Nodes that wait at most: seven siblings on each of the levels that 32-bit places can have, and the nearest."""
-SLACK = 1e-5
-"""Share by which boxes begin earlier and end later, so that rounding loses no hit."""
-LARGEST_INVERSE = 1e18
-"""In place of 1 / 0 in the direction of a ray."""
+from glassplat.kernels.maths.blending import Scalar, blend_maths
+from glassplat.kernels.maths.ray_hit import ray_hit_maths
+from glassplat.kernels.trace.steps import (
+    CHUNK,
+    NODE,
+    SLACK,
+    WIDTH,
+    coverage_maths,
+    nearest_maths,
+    ray_reader,
+    shape_reader,
+)
 
 
 def arrays_of(bvh: Sequence[Tensor]) -> tuple[NDArray[Any], ...]:
@@ -51,59 +48,7 @@ class Traversal(NamedTuple):
 
 def traversal(real: type, flat: bool) -> Traversal:
     """Builds the functions for `real`, and for discs (`flat`) or ellipsoids."""
-    return Traversal(_next_hits(real, flat), _ray(real))
-
-
-def _ray(real: type) -> Scalar:
-    zero, one, largest, most = real(0.0), real(1.0), real(LARGEST_INVERSE), real("inf")
-
-    @inlined
-    def inverse(x):  # type: ignore[no-untyped-def]
-        if x > one / largest or x < -one / largest:
-            return one / x
-        return -largest if x < zero else largest
-
-    @inlined
-    def ray(origins, directions, r):  # type: ignore[no-untyped-def]
-        o = origins[r, 0], origins[r, 1], origins[r, 2]
-        d = directions[r, 0], directions[r, 1], directions[r, 2]
-        squared = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
-        # NaN and infinity fail one of the comparisons.
-        usable = squared > zero and squared < most and abs(o[0]) + abs(o[1]) + abs(o[2]) < most
-        return o, d, (inverse(d[0]), inverse(d[1]), inverse(d[2])), squared ** real(0.5), usable
-
-    return ray
-
-
-def shape_reader(real: type) -> Scalar:
-    """Offset from the origin, and frame, of one Gaussian."""
-
-    @inlined
-    def shape(means, frames, g, o):  # type: ignore[no-untyped-def]
-        offset = means[g, 0] - o[0], means[g, 1] - o[1], means[g, 2] - o[2]
-        first = frames[g, 0, 0], frames[g, 0, 1], frames[g, 0, 2]
-        second = frames[g, 1, 0], frames[g, 1, 1], frames[g, 1, 2]
-        third = frames[g, 2, 0], frames[g, 2, 1], frames[g, 2, 2]
-        return offset, (first, second, third)
-
-    return shape
-
-
-def coverage_maths(real: type) -> Scalar:
-    """(coverage before clamping, blended alpha) from the opacity and the squared distance; alpha is 0 beyond reach."""
-    half_bits, farthest = real(-0.5 / 0.6931471805599453), real(MOST_DEVIATIONS**2)
-    zero, least, most, exp2 = real(0.0), real(ALPHA_MIN), real(ALPHA_MAX), blend_maths(real).exp2
-
-    @inlined
-    def coverage(opacity, squared):  # type: ignore[no-untyped-def]
-        if not squared <= farthest:
-            return zero, zero
-        covered = opacity * exp2(half_bits * squared)
-        if not covered >= least:
-            return zero, zero
-        return covered, covered if covered < most else most
-
-    return coverage
+    return Traversal(_next_hits(real, flat), ray_reader(real))
 
 
 def _entry(real: type) -> Scalar:
@@ -133,19 +78,9 @@ def _entry(real: type) -> Scalar:
 
 
 def _next_hits(real: type, flat: bool) -> Scalar:
-    meet = ray_hit_maths(real, flat).meet
-    shape, coverage, enter = shape_reader(real), coverage_maths(real), _entry(real)
+    meet, insert = ray_hit_maths(real, flat).meet, nearest_maths()
+    shape, coverage, enter = shape_reader(real), coverage_maths(real, blend_maths(real).exp2), _entry(real)
     zero, nowhere, sooner = real(0.0), real("inf"), real(1.0 - SLACK)
-
-    @inlined
-    def insert(ts, ids, alphas, count, t, g, alpha):  # type: ignore[no-untyped-def]
-        """Puts a hit in its place among the nearest; returns how many there are."""
-        place = count if count < CHUNK else CHUNK - 1
-        while place > 0 and (ts[place - 1] > t or (ts[place - 1] == t and ids[place - 1] > g)):
-            ts[place], ids[place], alphas[place] = ts[place - 1], ids[place - 1], alphas[place - 1]
-            place -= 1
-        ts[place], ids[place], alphas[place] = t, g, alpha
-        return count + 1 if count < CHUNK else count
 
     @inlined
     def next_hits(  # type: ignore[no-untyped-def]

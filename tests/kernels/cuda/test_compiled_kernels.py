@@ -37,14 +37,16 @@ def test_the_kernel_compiles_and_fits(kernel) -> None:
 def test_every_operation_has_its_kernels() -> None:
     names = {kernel.name.rsplit("_", 1)[0] for kernel in KERNELS}
     both_ways = {"project", "composite", "blend_panes", "photometric", "cube_lookup"}
+    traced = {f"trace_{step}_{kind}" for step in ("forward", "pull") for kind in ("discs", "ellipsoids")}
     both_ways |= {"shade_environment", "surface_channels", "project_discs", "composite_discs"}
     expected = {f"{name}_{way}" for name in both_ways for way in ("forward", "backward")} | {"adam", "pane_hits"}
-    assert all(any(name.startswith(want) for name in names) for want in expected | {"count_tiles", "emit_tiles"})
+    expected |= traced | {"count_tiles", "emit_tiles", "hilbert_places", "fit_leaves", "fit_level"}
+    assert all(any(name.startswith(want) for name in names) for want in expected)
 
 
 def test_the_linkers_report_is_read() -> None:
     report = "4 bytes stack frame, 8 bytes spill stores, 12 bytes spill loads\nUsed 40 registers, 1024 bytes smem"
-    assert read_report(report) == (40, 20, 1024)
+    assert read_report(report) == (40, 20, 1024, 4)
 
 
 WITHOUT_DISASSEMBLER = pytest.mark.skipif(disassembler() is None, reason="nvdisasm is not installed")

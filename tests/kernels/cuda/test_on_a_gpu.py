@@ -121,10 +121,10 @@ def check_bins(bins: TileBins) -> None:
     assert torch.equal(bins.pair_splats[bins.pair_slots.long()].long(), owners)
 
 
-def test_rays_of_a_gpu_are_traced_on_the_cpu() -> None:
+def test_rays_of_a_gpu_meet_what_they_meet_on_the_cpu() -> None:
     part = Gaussians(*(tensor.float() for tensor in gaussians(2000, size=0.05)), active_sh_degree=3)
     origins, directions = torch.zeros(100, 3), torch.tensor([0.0, 0.0, 1.0]) + 0.3 * draw(100, 3, seed=9).float()
     on_cpu = traced_surroundings(part, origins, directions, 0.0)
     on_gpu = traced_surroundings(part.to(DEVICE), origins.to(DEVICE), directions.to(DEVICE), 0.0)
     assert on_gpu.colors.device.type == DEVICE.type
-    assert torch.equal(on_gpu.colors.cpu(), on_cpu.colors)
+    torch.testing.assert_close(on_gpu.colors.cpu(), on_cpu.colors, atol=1e-3, rtol=0)

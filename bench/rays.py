@@ -1,0 +1,232 @@
+"""`python -m bench.rays [--embree FOLDER]`: rays through discs, beside Embree's traversal of the same; one thread.
+
+Embree stands in `embreex`, of which the library alone is used: `pip install embreex==4.4.0.post1`, or unpack its wheel
+and name the folder. With it and a C++ compiler, `bench/trace_embree.cpp` gives it the tracer's own hit maths.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import math
+import statistics
+import sysconfig
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numba
+import torch
+from torch import Tensor
+
+from bench.kernels import backward
+from bench.timing import Work
+from bench.twin import compiled_library
+from glassplat.files.markdown_table import Table
+from glassplat.kernels.build_bvh import build_bvh
+from glassplat.kernels.splats import RawGaussians
+from glassplat.kernels.trace import Bvh, Rays, cpu, trace
+from glassplat.kernels.trace.records import Shapes
+from glassplat.kernels.trace.shapes import reach, shapes_of
+
+SOURCE = Path(__file__).with_name("trace_embree.cpp")
+COUNTS = (10_000, 100_000, 300_000, 1_000_000)
+WIDTH, ROUNDS, SEED = 160, 5, 0
+CLEARANCE = 0.3
+"""Radius of the mirror ball that throws the rays."""
+
+
+class Case(NamedTuple):
+    """Discs of an activated set, rays, and the hierarchy."""
+
+    shapes: Shapes
+    rays: Rays
+    bvh: Bvh
+
+
+def surrounding_discs(count: int) -> RawGaussians:
+    """Discs all around, between 1 and 3 from the origin; smaller where they are many, so that rays meet as many."""
+    generator = torch.Generator().manual_seed(SEED)
+    means = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    means = means * (1 + 2 * torch.rand(count, 1, generator=generator))
+    size = math.log(0.035 * math.sqrt(10_000 / count))
+    return RawGaussians(
+        means,
+        torch.randn(count, 4, generator=generator),
+        size + 0.6 * torch.randn(count, 2, generator=generator),
+        1.5 * torch.randn(count, generator=generator),
+        0.2 * torch.randn(count, 16, 3, generator=generator),
+    )
+
+
+def mirrored_rays(width: int) -> Rays:
+    """What a mirror ball at the origin throws back of a camera's rays, row by row of those that meet it."""
+    across = (torch.arange(width) + 0.5) / width * 2 - 1
+    y, x = torch.meshgrid(across, across, indexing="ij")
+    eye = torch.tensor([0.0, 0.0, -0.9])
+    through = torch.stack([0.36 * x, 0.36 * y, torch.ones_like(x)], dim=-1).reshape(-1, 3)
+    d = torch.nn.functional.normalize(through, dim=1)
+    along = -(d @ eye)
+    inside = along**2 - (eye.square().sum() - CLEARANCE**2)
+    d, t = d[inside > 0], (along - inside.clamp(min=0).sqrt())[inside > 0]
+    places = eye + t[:, None] * d
+    normals = places / CLEARANCE
+    return Rays(places, d - 2 * (d * normals).sum(1, keepdim=True) * normals)
+
+
+def processor_seconds(work: Work) -> float:
+    """Processor time of a piece of work."""
+    start = time.process_time()
+    work()
+    return time.process_time() - start
+
+
+def in_turn(works: Mapping[str, Work], rounds: int) -> dict[str, list[float]]:
+    """Processor time of each piece of work, round by round after one to warm up."""
+    taken = [{name: processor_seconds(work) for name, work in works.items()} for _ in range(rounds + 1)][1:]
+    return {name: [one[name] for one in taken] for name in works}
+
+
+def own_works(case: Case) -> dict[str, Work]:
+    """Both passes without colours and with those of degree 3, and the hierarchy built and fitted again."""
+    options: dict[str, Any] = {"flat": True, "near": 0.0}
+    colored = cpu.trace(case.shapes, case.rays, case.bvh, degree=3, **options)
+    cotangents = [torch.ones_like(output) for output in colored[:3]]
+    return {
+        "trace": lambda: cpu.trace(case.shapes, case.rays, case.bvh, degree=-1, **options),
+        "colored": lambda: cpu.trace(case.shapes, case.rays, case.bvh, degree=3, **options),
+        "backward": lambda: cpu.trace_gradients(
+            case.shapes, case.rays, case.bvh, colored, cotangents, degree=3, **options
+        ),
+        "build": lambda: build_bvh(case.shapes, flat=True),
+        "refit": lambda: build_bvh(case.shapes, flat=True, order=case.bvh.order),
+    }
+
+
+def operation_works(count: int, width: int, device: str) -> dict[str, Work]:
+    """The operations themselves on a device, both passes with colours of degree 3 and gradients to everything."""
+    discs = RawGaussians(*(tensor.to(device).requires_grad_() for tensor in surrounding_discs(count)))
+    rays = Rays(*(tensor.to(device).requires_grad_() for tensor in mirrored_rays(width)))
+    shapes = Shapes(*(tensor.detach() for tensor in shapes_of(discs)))
+    bvh = build_bvh(shapes, flat=True)
+    found = list(trace(discs, rays, bvh, sh_degree=3, near=0.0)[:3])
+    size = f"{len(rays.origins):,} rays"
+    return {
+        f"build_bvh, {count:,} discs": lambda: build_bvh(shapes, flat=True),
+        "build_bvh, order kept": lambda: build_bvh(shapes, flat=True, order=bvh.order),
+        f"trace forward, {size}": lambda: trace(discs, rays, bvh, sh_degree=3, near=0.0),
+        f"trace backward, {size}": backward(found, [torch.ones_like(x) for x in found], [*discs, *rays]),
+    }
+
+
+class Embree:
+    """Embree's library, and the callbacks that give it discs."""
+
+    def __init__(self, folder: Path, build: Path) -> None:
+        # Symbols of the first two are those that the third one lacks.
+        for pattern in ("libtbb*.so*", "libembree4*.so*"):
+            (found,) = (folder / "embreex.libs").glob(pattern)
+            ctypes.CDLL(str(found), mode=ctypes.RTLD_GLOBAL)
+        library = compiled_library(SOURCE, build)
+        if library is None:
+            raise OSError("no C++ compiler")
+        library.new_device.restype = library.new_scene.restype = ctypes.c_void_p
+        self.library = library
+        self.device = ctypes.c_void_p(library.new_device())
+        self.kept: list[Tensor] = []
+
+    def scene(self, shapes: Shapes, *, robust: bool) -> ctypes.c_void_p:
+        """Builds its hierarchy over discs; the one before is no longer to be traced."""
+        self.kept = [*shapes[:3], reach(shapes.opacities)]
+        count, flags = ctypes.c_long(len(shapes.means)), ctypes.c_int(robust)
+        return ctypes.c_void_p(self.library.new_scene(self.device, count, flags, *map(address, self.kept)))
+
+    def trace(self, scene: ctypes.c_void_p, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
+        """Alphas, depths and hits."""
+        count = len(rays.origins)
+        found = torch.empty(count), torch.empty(count), torch.empty(count, dtype=torch.int32)
+        self.library.trace(scene, ctypes.c_long(count), *map(address, rays), ctypes.c_float(0.0), *map(address, found))
+        return found
+
+    def build(self, shapes: Shapes) -> None:
+        """Builds a hierarchy and lets it go."""
+        self.library.release_scene(self.scene(shapes, robust=False))
+
+
+def address(tensor: Tensor) -> ctypes.c_void_p:
+    """An argument as C takes it."""
+    return ctypes.c_void_p(tensor.data_ptr())
+
+
+def case_of(count: int, width: int) -> Case:
+    """Discs, what the mirror ball throws among them, and the hierarchy."""
+    with torch.no_grad():
+        shapes = Shapes(*(tensor.contiguous() for tensor in shapes_of(surrounding_discs(count))))
+    rays = Rays(*(tensor.contiguous() for tensor in mirrored_rays(width)))
+    return Case(shapes, rays, build_bvh(shapes, flat=True))
+
+
+def add_case(tables: tuple[Table, Table], case: Case, embree: Embree | None, rounds: int) -> str:
+    """Adds a row to both tables; says how far the two agree."""
+    works, agreement = own_works(case), ""
+    found = cpu.trace(case.shapes, case.rays, case.bvh, flat=True, degree=-1, near=0.0)
+    if embree is not None:
+        scene = embree.scene(case.shapes, robust=False)
+        theirs = embree.trace(scene, case.rays)
+        same = (theirs[2] == found[3]).float().mean()
+        furthest = (theirs[0] - found[1]).abs().max()
+        agreement = f"{same:.2%} of the rays have as many hits, alphas differ by at most {furthest:.1e}"
+        # Its hierarchy is built last: the discs that it reads are those of the last one.
+        works |= {"embree": lambda: embree.trace(scene, case.rays), "embree build": lambda: embree.build(case.shapes)}
+    seconds = in_turn(works, rounds)
+    count, rays = f"{len(case.shapes.means):,}", len(found[1])
+    mean = {name: statistics.median(taken) for name, taken in seconds.items()}
+    beside = ("", "")
+    if embree is not None:
+        ratios = (a / b for a, b in zip(seconds["embree"], seconds["trace"], strict=True))
+        beside = (rays / mean["embree"] / 1e3, statistics.median(ratios))
+    tables[0].add(
+        count, float(found[3].float().mean()), rays / mean["trace"] / 1e3, *beside, rays / mean["colored"] / 1e3,
+        mean["backward"] / mean["colored"],
+    )  # fmt: skip
+    tables[1].add(count, *(1e3 * mean[name] if name in mean else "" for name in ("build", "refit", "embree build")))
+    return agreement
+
+
+def new_tables(rays: int) -> tuple[Table, Table]:
+    """Rays a second, and milliseconds of building."""
+    columns = ("discs", "hits a ray", "k rays/s", "Embree, k rays/s", "ours : Embree")
+    note = "Processor time. Without colours, but for the last two columns; ratios are medians of ratios round by round."
+    title, built = f"{rays:,} rays of a mirror ball through discs, one thread", ("build", "refit", "Embree's build")
+    return (
+        Table(title, (*columns, "k rays/s, SH 3", "backward : forward"), note),
+        Table("The hierarchy, milliseconds", ("discs", *built), "Processor time, one thread."),
+    )
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(prog="python -m bench.rays", description=__doc__)
+    parser.add_argument("--embree", type=Path, default=Path(sysconfig.get_path("purelib")), help="holds embreex.libs")
+    parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="discs")
+    parser.add_argument("--rounds", type=int, default=ROUNDS, help="of each piece of work, in turn")
+    parser.add_argument("--width", type=int, default=WIDTH, help="of the square image of the ball, in pixels")
+    arguments = parser.parse_args()
+    numba.set_num_threads(1)
+    torch.set_num_threads(1)
+    tables = new_tables(len(mirrored_rays(arguments.width).origins))
+    said = []
+    with tempfile.TemporaryDirectory() as folder:
+        embree = None
+        if (arguments.embree / "embreex.libs").is_dir():
+            embree = Embree(arguments.embree, Path(folder))
+        for count in arguments.counts:
+            said.append(add_case(tables, case_of(count, arguments.width), embree, arguments.rounds))
+    print("\n".join(table.markdown() for table in tables))
+    print("\n".join(said) if embree else "skipped Embree: `pip install embreex==4.4.0.post1`, or --embree FOLDER")
+
+
+if __name__ == "__main__":
+    main()
