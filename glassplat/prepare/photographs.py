@@ -22,6 +22,8 @@ from glassplat.prepare.messages import Listener, Progress
 
 UNREADABLE = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
 """Photographs that Pillow cannot read: those of telephones that nobody told otherwise, and raw ones."""
+HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif")
+"""In bytes 8 to 12 of such a file, whatever its name: telephones and chats call some of them `.jpg`."""
 LEAST_SIDE = 64
 """Pixels of the shorter side; a smaller picture holds too few places to recognise."""
 FEWEST = 3
@@ -75,6 +77,17 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
             "from places a step apart"
         )
     return list(found.values())
+
+
+def broken_photographs(paths: Sequence[Path]) -> list[str]:
+    """Names of those that `photographs_in` would refuse; each is decoded at a small size."""
+    broken = []
+    for path in paths:
+        try:
+            _examined(path, path.name, LEAST_SIDE)
+        except InputError:
+            broken.append(path.name)
+    return broken
 
 
 def capture_names(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
@@ -132,19 +145,34 @@ def _photograph_paths(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise InputError(f"no folder or video {folder}; expected a folder of photographs, or a video file")
     files = [path for path in folder.rglob("*") if path.is_file() and not _is_hidden(path, folder)]
-    unreadable = sorted(path.name for path in files if path.suffix.lower() in UNREADABLE)
+    unreadable = {path.name: kind for path in sorted(files) if (kind := _unreadable_kind(path))}
     if unreadable:
-        kinds = "/".join(sorted({Path(name).suffix[1:].upper() for name in unreadable}))
+        kinds = "/".join(sorted(set(unreadable.values())))
         raise InputError(
             f"{len(unreadable)} photographs in {folder} are {kinds} files, which cannot be read "
-            f"({first_names(unreadable)}); save them as JPEG and remove these (a telephone does so by itself with "
-            "'most compatible' in the camera's settings)"
+            f"({first_names(list(unreadable))}); save them as JPEG and remove these (a telephone does so by itself "
+            "with 'most compatible' in the camera's settings)"
         )
     paths = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
     if not paths:
         found = first_names(sorted(path.name for path in files)) or "nothing"
         raise InputError(f"no photograph in {folder}; expected {', '.join(IMAGE_SUFFIXES)} files, found {found}")
     return sorted(paths, key=lambda path: _numbers_as_such(path.relative_to(folder).as_posix()))
+
+
+def _unreadable_kind(path: Path) -> str | None:
+    """What a photograph is that Pillow cannot read, by its name or by its first bytes; None for all others."""
+    suffix = path.suffix.lower()
+    if suffix in UNREADABLE:
+        return suffix[1:].upper()
+    if suffix not in IMAGE_SUFFIXES:
+        return None
+    try:
+        with reading(path), path.open("rb") as file:
+            start = file.read(12)
+    except (ValueError, FileNotFoundError):
+        return None  # Which is said when it is decoded.
+    return "HEIC" if start[4:8] == b"ftyp" and start[8:] in HEIF_BRANDS else None
 
 
 def _is_hidden(path: Path, folder: Path) -> bool:

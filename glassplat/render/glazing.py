@@ -46,14 +46,14 @@ def glazed(
         image: [H, W, 3] without panes.
         seen: the K panes, and their order.
         masks: [H, W] for each of `seen.order`, visibility of that pane.
-        reflections: [K, H, W, 4] what each pane mirrors, and its intensity.
+        reflections: [K, H, W, 4] what each pane mirrors, and its intensity minus 1.
         camera: of the view.
         fresnel: as for `blend_panes`.
         intensity: as for `blend_panes`.
         blend: the space in which light adds up.
     """
     normals = seen.planes.normals @ camera.cam_from_world[:3, :3].T
-    share, laid = torch.zeros_like(masks[0]), []
+    laid = []
     for mask, pane in zip(reversed(masks), reversed(seen.order), strict=True):
         result = blend_panes(
             image,
@@ -68,14 +68,25 @@ def glazed(
             linear=blend == "linear",
         )
         laid.append((image, result))
-        image, share = result.rgb, result.strength + (1 - result.strength) * share
+        image = result.rgb
+    share = _all_of_them([result.strength for _, result in laid])
     behind, nearest = laid.pop()
     layers = (behind, nearest.reflection, nearest.strength)
+    if not laid:
+        return Glazed(image, *layers, share)
     faint = masks[0] < FAINT
     for mask, (behind, farther) in zip(masks[1:], reversed(laid), strict=True):
         layers = _joined_layers(layers, behind, farther, faint & (farther.strength > 0), blend)
         faint = faint & (mask < FAINT)
     return Glazed(image, *layers, share)
+
+
+def _all_of_them(strengths: Sequence[Tensor]) -> Tensor:
+    """[H, W] how much of what is seen panes of these strengths add, the farthest first."""
+    share, *nearer = strengths
+    for strength in nearer:
+        share = strength + (1 - strength) * share
+    return share
 
 
 def _joined_layers(

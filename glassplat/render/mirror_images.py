@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from glassplat.kernels.project import GradientSum
 from glassplat.kernels.splats import Projected
 from glassplat.render.rasterize import project_gaussians
 from glassplat.render.seen_panes import SeenPanes
@@ -16,7 +17,9 @@ from glassplat.scene.pose import mirror_matrices
 from glassplat.scene.scene import Scene
 
 
-def project_mirrored(gaussians: Gaussians, camera: Camera, seen: SeenPanes, *, near: float) -> Projected:
+def project_mirrored(
+    gaussians: Gaussians, camera: Camera, seen: SeenPanes, *, near: float, total: GradientSum | None = None
+) -> Projected:
     """Projects the Gaussians of the camera's side into the camera mirrored about each plane (Eqs. 8-12).
 
     Args:
@@ -24,6 +27,7 @@ def project_mirrored(gaussians: Gaussians, camera: Camera, seen: SeenPanes, *, n
         camera: whose mirror images are wanted.
         seen: the planes that it sees, and where; what lies outside of a plane's window is culled.
         near: depth below which a Gaussian is culled, world units.
+        total: as for `project_gaussians`.
     """
     return project_gaussians(
         gaussians,
@@ -32,6 +36,7 @@ def project_mirrored(gaussians: Gaussians, camera: Camera, seen: SeenPanes, *, n
         poses=camera.cam_from_world @ mirror_matrices(seen.planes.centers, seen.planes.normals),
         clip_planes=half_spaces_of(seen.planes, camera),
         windows=seen.windows,
+        total=total,
     )
 
 

@@ -10,9 +10,13 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.bin_tiles import bin_tiles
+from glassplat.kernels.color_and_depth import color_and_depth
 from glassplat.kernels.composite import composite
-from glassplat.kernels.layer_slopes import layer_slopes
+from glassplat.kernels.join_channels import join_channels
+from glassplat.kernels.layer_slopes import layer_slopes, slopes_at
+from glassplat.kernels.pane_layers import pane_layers
 from glassplat.kernels.panes import Fresnel, PaneHits, Panes
+from glassplat.kernels.project import GradientSum
 from glassplat.kernels.shade_environment.shaded import SURFACE_CHANNELS
 from glassplat.kernels.splats import Deviation, Projected, Splats
 from glassplat.render.curved import (
@@ -33,7 +37,6 @@ from glassplat.render.rasterize import (
     check_ellipsoids,
     joined_probe,
     joined_splats,
-    mean_depth,
     over_background,
     project_gaussians,
     screen_pass,
@@ -41,7 +44,6 @@ from glassplat.render.rasterize import (
 )
 from glassplat.render.seen_panes import (
     SeenPanes,
-    amid_one_pane,
     glass_owners,
     nearest_hits,
     panes_in_camera,
@@ -70,10 +72,11 @@ class FirstPass(NamedTuple):
     direct: Tensor
     screen: tuple[ScreenPass, ...]
     curved: Shades | None
+    total: GradientSum
 
 
 class SecondPass(NamedTuple):
-    """What the panes mirror: colours and intensity [K, H, W, 4] of each."""
+    """What the panes mirror: colours and intensity minus 1 [K, H, W, 4] of each."""
 
     reflections: Tensor
     mirrored: Tensor
@@ -153,24 +156,23 @@ class Planar:
         if first.curved is not None:
             layers |= curved_layers(first.curved) | self._behind(scene, camera)
         hits = nearest_hits(rectangles, camera, first.mask)
-        hit = (hits.pane >= 0).to(first.mask.dtype)
-        layers["hit"] = hit
         if first.deviation is not None:
             layers["deviation"] = first.deviation
         seen = seen_panes(scene.planes, camera, hits, first.mask, most=1 if self.nearest_only else None)
         if seen is None:
-            nothing = torch.zeros_like(hit)
+            nothing = torch.zeros_like(first.mask)
+            layers["hit"] = (hits.pane >= 0).to(nothing.dtype)
             layers |= {"transmission": first.image, "reflection": torch.zeros_like(first.image)}
             layers |= {"strength": nothing, "share": nothing, "inner": nothing}
             return Frame(first.image, layers, first.direct, None, first.screen, self._space(scene, probed, first))
-        second = self._second_pass(scene, camera, seen, probed)
+        second = self._second_pass(scene, camera, seen, probed, first.total)
         masks = self._visibilities(scene, camera, seen, first)
         result = self._glazed(first, seen, masks, second, camera)
         if self.photographer == "beside" and len(scene.photographer):
-            with_body = replace(self, photographer="present")._second_pass(scene, camera, seen, False)
+            with_body = replace(self, photographer="present")._second_pass(scene, camera, seen, False, first.total)
             layers["photographed"] = self._glazed(first, seen, masks, with_body, camera).rgb
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
-        layers["inner"] = amid_one_pane(hits.pane, result.strength)
+        layers["hit"], layers["inner"] = pane_layers(hits.pane, result.strength)
         screen = self._screen(first, second, hits, result) if probed else ()
         space = self._space(scene, probed, first, second)
         return Frame(result.rgb, layers, first.direct, second.mirrored, screen, space)
@@ -188,18 +190,17 @@ class Planar:
             raise ValueError(f"the glass has the channels {sorted(scene.glass.channels)}; expected logit_mark")
 
     def _first_pass(self, scene: Scene, camera: Camera, rectangles: Panes, probed: bool) -> FirstPass:
-        near = NEAR_PER_EXTENT * scene.extent
-        primary = project_gaussians(scene.primary, camera, near=near)
+        near, total = NEAR_PER_EXTENT * scene.extent, GradientSum()
+        primary = project_gaussians(scene.primary, camera, near=near, total=total)
         glass = project_gaussians(scene.glass, camera, near=near)
         splats = joined_splats(primary, glass)
         bins = bin_tiles(splats, camera.width, camera.height)
-        looks = self._looks(scene.primary, primary, camera)
-        channels = torch.nn.functional.pad(looks, (0, 0, 0, len(scene.glass)))
+        channels = self._channels(scene, primary, camera)
         marks = torch.sigmoid(scene.glass.channels["logit_mark"])[None]
         deviation = None
         if self.deviation:
             hit = nearest_hits(rectangles, camera).pane >= 0
-            deviation = Deviation(self._depth_at, hit.to(looks.dtype)[None], self.deviation_depth_gradient)
+            deviation = Deviation(self._depth_at, hit.to(channels.dtype)[None], self.deviation_depth_gradient)
         screen = (screen_pass("primary", primary), screen_pass("glass", glass)) if probed else ()
         result = composite(
             splats,
@@ -211,15 +212,18 @@ class Planar:
             probe=joined_probe(screen),
         )
         alpha = result.alpha.squeeze(0)
-        shades = None
-        if self.curved is not None:
-            surface = blended_surface(result.image[0], alpha, shown(primary), self.background)
+        # Squeezed, because the gradient of an indexed image is a whole one of zeros first.
+        blended, shades = result.image.squeeze(0), None
+        if self.curved is None:
+            image, depth = color_and_depth(blended, alpha, self.background)
+        else:
+            surface = blended_surface(blended, alpha, shown(primary), self.background)
             shades = shades_of(self.curved, scene, [camera], [surface])
-        color = result.image[0, ..., :3]
+            image, depth = shades.images[0], surface.depth
         return FirstPass(
-            image=over_background(color, alpha, self.background) if shades is None else shades.images[0],
+            image=image,
             alpha=alpha,
-            depth=mean_depth(result.image[0, ..., self._depth_at], alpha),
+            depth=depth,
             mask=result.mask.squeeze(0),
             deviation=result.deviation.squeeze(0) if deviation else None,
             splats=splats,
@@ -227,6 +231,7 @@ class Planar:
             direct=shown(primary),
             screen=screen,
             curved=shades,
+            total=total,
         )
 
     def _behind(self, scene: Scene, camera: Camera) -> dict[str, Tensor]:
@@ -240,45 +245,50 @@ class Planar:
         """Which channel of the first pass is the depth."""
         return 3 if self.curved is None else SURFACE_CHANNELS
 
-    def _looks(self, gaussians: Gaussians, projected: Projected, camera: Camera) -> Tensor:
-        """[1, N, D] channels of the first pass: colours first, and the depth at `_depth_at`."""
+    def _channels(self, scene: Scene, projected: Projected, camera: Camera) -> Tensor:
+        """[1, G, D] channels of the first pass, of glass too: colours first, and the depth at `_depth_at`."""
         if self.curved is None:
-            return torch.cat([projected.colors, projected.depths[..., None]], dim=-1)
-        return ellipsoid_channels(gaussians, projected, camera.center[None])
+            return join_channels(projected.colors, projected.depths, more=len(scene.glass))
+        looks = ellipsoid_channels(scene.primary, projected, camera.center[None])
+        return torch.nn.functional.pad(looks, (0, 0, 0, len(scene.glass)))
 
-    def _second_pass(self, scene: Scene, camera: Camera, seen: SeenPanes, probed: bool) -> SecondPass:
-        primary = scene.primary if self.reflection_gradient == "all" else detached(scene.primary)
-        projected = project_mirrored(primary, camera, seen, near=NEAR_PER_EXTENT * scene.extent)
-        intensity = torch.exp(primary.channels["log_intensity"]).expand(len(seen.planes), -1)
+    def _second_pass(
+        self, scene: Scene, camera: Camera, seen: SeenPanes, probed: bool, total: GradientSum
+    ) -> SecondPass:
+        primary = scene.primary
+        if self.reflection_gradient == "planes":
+            primary, total = detached(scene.primary), GradientSum()
+        projected = project_mirrored(primary, camera, seen, near=NEAR_PER_EXTENT * scene.extent, total=total)
+        # By how much it departs from 1: what is behind all Gaussians has 0 then, and needs no blending.
+        gain = torch.expm1(primary.channels["log_intensity"])[None].expand(len(seen.planes), -1)
         cameras = [] if self.curved is None else mirrored_cameras(camera, seen.planes)
-        looks = projected.colors
-        if self.curved is not None:
+        if self.curved is None:
+            channels = join_channels(projected.colors, gain)
+        else:
             looks = ellipsoid_channels(primary, projected, torch.stack([each.center for each in cameras]))
-        channels = torch.cat([looks, intensity[..., None]], dim=-1)
+            channels = torch.cat([looks, gain[..., None]], dim=-1)
         mirrored = [projected]
         screen: tuple[ScreenPass, ...] = (screen_pass("primary", projected, direct=False),) if probed else ()
         if self.photographer == "present" and len(scene.photographer):
             body = project_photographer(scene, camera, seen, near=NEAR_PER_EXTENT * scene.extent)
             # A body is as bright as it is, and matte: an intensity of its own would be a second factor on its colours.
-            plain = torch.nn.functional.pad(body.colors, (0, looks.shape[-1] - 3))
-            channels = torch.cat([channels, torch.nn.functional.pad(plain, (0, 1), value=1.0)], dim=1)
+            plain = torch.nn.functional.pad(body.colors, (0, channels.shape[-1] - 3))
+            channels = torch.cat([channels, plain], dim=1)
             mirrored.append(body)
             # No view shows it directly, so that mirror images are what it is densified by.
             screen += (screen_pass("photographer", body),) if probed else ()
         splats = joined_splats(*mirrored)
         bins = bin_tiles(splats, camera.width, camera.height, seen.tiles)
         result = composite(splats, channels, bins, probe=joined_probe(screen))
-        # The background, too, is as bright in a pane as it is: with no intensity of its own it would be black there.
         if self.curved is None:
-            reflections, shades = over_background(result.image, result.alpha, (*self.background, 1.0)), None
+            reflections, shades = over_background(result.image, result.alpha, (*self.background, 0.0)), None
         else:
             surfaces = [
                 blended_surface(image[..., :-1], alpha, shown(projected), self.background)
                 for image, alpha in zip(result.image, result.alpha, strict=True)
             ]
             shades = shades_of(self.curved, scene, cameras, within_panes(surfaces, seen))
-            brightness = over_background(result.image[..., -1:], result.alpha, (1.0,))
-            reflections = torch.cat([torch.stack(shades.images), brightness], dim=-1)
+            reflections = torch.cat([torch.stack(shades.images), result.image[..., -1:]], dim=-1)
         return SecondPass(reflections, shown(projected), screen, shades)
 
     def _space(self, scene: Scene, probed: bool, *passes: FirstPass | SecondPass) -> tuple[SpacePass, ...]:
@@ -331,11 +341,8 @@ def weighted_screen(
     layers = result.strength, result.transmission, result.reflection
     through, mirrored = layer_slopes(*layers, hit, linear=blend == "linear")
     primary, glass = first.screen
-    height, width = hit.shape
-    columns, rows = primary.means2d.nan_to_num().floor().long().unbind(-1)
-    pixels = rows.clamp(0, height - 1), columns.clamp(0, width - 1)
-    behind = first.splats.depths[:, : primary.means2d.shape[1]] > hits.depth[pixels]
-    primary = replace(primary, weight=torch.where(behind, through[pixels], 1.0))
+    depths = first.splats.depths[:, : primary.means2d.shape[1]]
+    primary = replace(primary, weight=slopes_at(through, hits.depth, primary.means2d, depths))
     weight = mirrored.sum() / hit.sum().clamp(min=1)
     return (primary, glass, *(replace(record, weight=weight) for record in second.screen))
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.discs import ProjectedDiscs
-from glassplat.kernels.project import project
+from glassplat.kernels.project import GradientSum, project
 from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians, Splats
 from glassplat.render.frame import ScreenPass
 from glassplat.scene.camera import Camera
@@ -29,6 +29,7 @@ def project_gaussians(
     poses: Tensor | None = None,
     clip_planes: Tensor | None = None,
     windows: Tensor | None = None,
+    total: GradientSum | None = None,
 ) -> Projected:
     """Projects a set of Gaussians into one camera, or into several that share its intrinsics.
 
@@ -39,9 +40,10 @@ def project_gaussians(
         poses: [C, 4, 4] `cam_from_world` of the cameras; may be left-handed.
         clip_planes: [C, 4] world planes (n, d); a Gaussian whose centre has n . x + d <= 0 is culled.
         windows: [C, 4] left, top, right and bottom edge of the part of each image that is wanted, pixels.
+        total: the same for all projections of one set whose gradients are to be added up; see `project`.
     """
     cameras = camera_batch(camera, poses)._replace(clip_planes=clip_planes, windows=windows)
-    return project(raw_gaussians(gaussians), cameras, sh_degree=gaussians.active_sh_degree, near=near)
+    return project(raw_gaussians(gaussians), cameras, sh_degree=gaussians.active_sh_degree, near=near, total=total)
 
 
 def raw_gaussians(gaussians: Gaussians) -> RawGaussians:

@@ -102,25 +102,6 @@ def _joined_windows(hits: list[PaneHits]) -> Tensor:
 
 
 @torch.no_grad()
-def amid_one_pane(pane: Tensor, strength: Tensor) -> Tensor:
-    """[H, W] 1 where a pixel and its eight neighbours show the same pane, and it reflects; 0 elsewhere.
-
-    Args:
-        pane: [H, W] which pane is nearest, -1 for none.
-        strength: [H, W] of the reflection; 0 where a pane is hit and no glass is there.
-    """
-    shown = torch.where(strength > 0, pane, -1)
-    above, along = shown[1:] == shown[:-1], shown[:, 1:] == shown[:, :-1]
-    # Three rows that are each the same throughout, and the same as their neighbours.
-    row = torch.nn.functional.pad(along, (0, 1), value=True) & torch.nn.functional.pad(along, (1, 0), value=True)
-    pair = row[1:] & row[:-1] & above
-    inner = torch.nn.functional.pad(pair, (0, 0, 0, 1), value=True) & torch.nn.functional.pad(
-        pair, (0, 0, 1, 0), value=True
-    )
-    return (inner & row & (shown >= 0)).to(strength.dtype)
-
-
-@torch.no_grad()
 def glass_owners(glass: Gaussians, planes: Planes) -> Tensor:
     """[M] the plane whose rectangle is nearest to each glass Gaussian, position in `planes`."""
     offsets = glass.means[:, None] - planes.centers

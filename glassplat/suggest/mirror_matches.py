@@ -47,7 +47,7 @@ class Prediction:
         alike: [N] whether feature sizes and directions agree as well.
         by_mirror: [N] the camera that sees the mirror image is on the side of the thing itself, as mirrors have it.
         impossible: [N] neither of both is seen through the plane, which no mirror does, but whatever else is symmetric.
-        both: [N] the thing itself is seen through the plane as well, which may be beside the pane.
+        both: [N] the thing itself is seen through the plane as well: beside the pane, or through it.
     """
 
     away: Array
@@ -70,6 +70,7 @@ class MirrorMatches:
         tips: [N, 3] a point beside it, as far as the feature's size, along its direction.
         virtual_points: [N, 3] the point that `virtual` shows, in space; NaN where it was not triangulated.
         virtual_track: [N] number of that, or -1.
+        tracks: all points.
     """
 
     seen: Observations
@@ -80,6 +81,7 @@ class MirrorMatches:
     tips: Array
     virtual_points: Array
     virtual_track: Numbers
+    tracks: Tracks
 
     @staticmethod
     def of(seen: Observations, tracks: Tracks, pairs: Pairs) -> MirrorMatches:
@@ -98,10 +100,20 @@ class MirrorMatches:
             tips=_tips(seen, points, real),
             virtual_points=others[tracks.track[virtual]],
             virtual_track=tracks.track[virtual],
+            tracks=tracks,
         )
 
     def __len__(self) -> int:
         return len(self.virtual)
+
+    def seen_from_behind(self, plane: Plane) -> NDArray[np.bool_]:
+        """[N] whether some camera behind a plane sees what would be a mirror image, which is there then."""
+        shown = np.flatnonzero(self.tracks.track >= 0)
+        track = self.tracks.track[shown]
+        itself = plane.heights(self.tracks.points)[track] * plane.heights(self.seen.centers_of(shown)) > 0
+        real = np.zeros(len(self.tracks.points) + 1, dtype=bool)  # The last one, -1, is none.
+        real[track[itself]] = True
+        return np.asarray(real[self.virtual_track])
 
     def predicted(self, planes: Plane, numbers: Numbers) -> Prediction:
         """What one plane says of some matches."""

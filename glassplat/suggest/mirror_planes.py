@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.spatial import cKDTree
 
 from glassplat.suggest.mirror_matches import MirrorMatches, Plane
 from glassplat.suggest.pane_extent import seen_within
@@ -87,16 +85,16 @@ def _without(one: MirrorPlane, free: NDArray[np.bool_], matches: MirrorMatches, 
 
 
 def judged(plane: Plane, matches: MirrorMatches, extent: float, reach: float = FINE) -> MirrorPlane:
-    """What speaks for and against a plane: matches that agree with it to within `reach` image diagonals."""
+    """What speaks for and against a plane: matches that agree with it to within `reach` image diagonals.
+
+    What is seen through the plane from both sides says nothing: a case of glass shows the room behind it as well.
+    """
     told = matches.predicted(plane, np.arange(len(matches)))
     agreeing = (told.away < reach * matches.seen.diagonal) & told.alike
-    right, wrong = agreeing & told.by_mirror, agreeing & told.impossible
-    both = np.flatnonzero(right & told.both)
-    if len(both):  # Beside the pane a camera may look past it; in the pane it would see the mirror image.
-        within = seen_within(plane, matches.seen, matches.virtual[right], matches.real[both])
-        wrong[both[within]], right[both[within]] = True, False
-    shown = np.flatnonzero(right)
-    return MirrorPlane(plane, _places(matches, shown, extent), _places(matches, np.flatnonzero(wrong), extent), shown)
+    mirrored, really_there = told.by_mirror & ~told.both, matches.seen_from_behind(plane)
+    shown = np.flatnonzero(agreeing & mirrored & ~really_there)
+    against = np.flatnonzero(agreeing & (told.impossible | mirrored & really_there))
+    return MirrorPlane(plane, _places(matches, shown, extent), _places(matches, against, extent), shown)
 
 
 def refined(plane: Plane, matches: MirrorMatches, extent: float) -> Plane:
@@ -113,6 +111,8 @@ def refined(plane: Plane, matches: MirrorMatches, extent: float) -> Plane:
 
 def _fitted(plane: Plane, matches: MirrorMatches, chosen: Numbers, extent: float) -> Plane:
     """Least squares over some matches, every point with the same weight however often it is matched."""
+    from scipy.optimize import least_squares  # Slow to import, and `annotate` needs it with --suggest alone.
+
     points, virtual = matches.points[chosen], matches.virtual[chosen]
     _, track = np.unique(matches.track[chosen], return_inverse=True)
     weight = 1 / np.sqrt(np.bincount(track)[track])[:, None]
@@ -150,6 +150,8 @@ def _hypotheses(matches: MirrorMatches, extent: float) -> tuple[Array, Array]:
 
 def _voted(normals: Array, offsets: Array, *, matches: MirrorMatches, extent: float) -> Iterator[Plane]:
     """Different planes among many, those with most others close to them first."""
+    from scipy.spatial import cKDTree
+
     if not len(offsets):
         return
     images = np.stack([_images(n, d, matches, extent) for n, d in zip(normals, offsets, strict=True)])

@@ -136,12 +136,12 @@ class DeferredRecipe:
     view_dependence_weight: NotNegative = 0.0
     background: Annotated[Color | None, ESSENTIAL] = None
     shading: Shading = "deferred"
-    bootstrap: Share = 0.043
+    bootstrap: Share = 0.25
     texels: Annotated[Texels, ESSENTIAL] = 64
     first_texels: Texels = 16
     refinements: Annotated[tuple[Share, Share], Ascending()] = (0.45, 0.65)
     first_strength: InnerShare = 1e-3
-    search: MirrorSearch = field(default_factory=partial(MirrorSearch, begin_found=False))
+    search: MirrorSearch = field(default_factory=MirrorSearch)
     region: Annotated[tuple[Finite, Finite, Finite, Positive] | None, ESSENTIAL] = None
     find_region: bool = True
     outside_weight: NotNegative = 0.4
@@ -153,7 +153,7 @@ class DeferredRecipe:
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
     least_iterations: Several = 6000
     hurry_matte: bool = True
-    hurry_found: bool = False
+    hurry_found: bool = True
     propagation_interval: Several | None = None
     rates: GaussianRates = field(default_factory=partial(GaussianRates, short_run_power=0.0))
     reflection_rates: ReflectionRates = field(default_factory=ReflectionRates)
@@ -170,6 +170,7 @@ class DeferredRecipe:
         published = DefaultDensify.published()
         return cls(
             bootstrap=3000 / CODE_ITERATIONS,
+            search=MirrorSearch(begin_found=False),
             texels=128,
             first_texels=128,
             find_region=False,
@@ -179,6 +180,7 @@ class DeferredRecipe:
             schedule=PropagationSchedule(end="fixed", stop=24_000 / CODE_ITERATIONS, pause=200, last_reset=False),
             least_iterations=1,
             hurry_matte=False,
+            hurry_found=False,
             propagation_interval=500,
             rates=GaussianRates(decay=30_000 / CODE_ITERATIONS, short_run_power=0.0),
             reflection_rates=ReflectionRates(strength=6e-3),
@@ -295,7 +297,7 @@ class DeferredRecipe:
     def entry(self) -> BeginReflections:
         """How things begin to reflect."""
         seen_by = Splat(self.background or BLACK, depth=False)
-        return BeginReflections(self._environment(), None, self.search, seen_by, self.tint)
+        return BeginReflections(self._environment(), None, self.search, seen_by, self.tint, harmonics_wait=True)
 
     def _environment(self) -> AddEnvironment:
         """What is mirrored."""

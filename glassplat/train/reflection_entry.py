@@ -26,6 +26,8 @@ class BeginReflections:
         mirrors: what looks like a mirror.
         renderer: that of the stage before.
         tint: reflections may learn a colour; at first they are white.
+        harmonics_wait: where mirrors were found, colours are again the same from all sides, until harmonics rise anew:
+            what they had learnt by then is what those mirrors show.
     """
 
     environment: AddEnvironment | None
@@ -33,6 +35,7 @@ class BeginReflections:
     mirrors: MirrorSearch
     renderer: Renderer
     tint: bool = False
+    harmonics_wait: bool = False
 
     def __call__(self, state: TrainState, dataset: Dataset) -> Generator[Working, None, bool]:
         """Edits `state`."""
@@ -48,6 +51,8 @@ class BeginReflections:
             self.surroundings(state, dataset, seen & ~mirrors)
         if self.mirrors.begin_found:
             primary = self.mirrors.as_mirrors(state.scene, dataset.train, mirrors)
+            if self.harmonics_wait and bool(mirrors.any()):
+                primary = replace(primary, active_sh_degree=0)
             state.scene = replace(state.scene, primary=primary)
             names = [f"primary.{name}" for name in primary.tensors()]
             state.optimizer.moments = forget(state.optimizer.moments, names, mirrors)

@@ -106,7 +106,7 @@ def test_what_stands_before_the_pane_is_found_within_a_rough_outline(room: Path)
         page.show(0)
         inside, beside = (x - 8, y), (x + 17, y)
         covered = page.color_at(inside)
-        page.window.keys("6")
+        page.window.keys("5")
         for place in page.on_screen([(x - 37, y - 30), (x + 22, y - 30), (x + 22, y + 30), (x - 37, y + 30)]):
             page.window.click(*place)
         page.window.keys("Enter")
@@ -163,7 +163,7 @@ def test_keys_choose_photographs_panes_and_brushes(page: Page) -> None:
     page.saved()
     assert not is_blue(page.color_at(tuple(middle)))
     assert page.document()["strokes"]["1.png"][0]["kind"] == "brush"
-    page.window.keys("5")
+    page.window.keys("6")
     page.window.drag([(x - 30, y), (x, y), (x + 30, y)])
     page.saved()
     assert is_blue(page.color_at(tuple(middle)))

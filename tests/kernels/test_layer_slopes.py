@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.color_space import linear_from_srgb, srgb_from_linear
-from glassplat.kernels.layer_slopes import layer_slopes
+from glassplat.kernels.layer_slopes import layer_slopes, slopes_at
 from glassplat.kernels.layer_slopes.reference import layer_slopes as reference_layer_slopes
+from glassplat.kernels.layer_slopes.reference import slopes_at as reference_slopes_at
 
 
 def grey_layers(height: int = 5, width: int = 7) -> tuple[Tensor, Tensor, Tensor]:
@@ -95,3 +96,18 @@ def test_bad_input_is_refused(change: dict[str, Tensor], error: type[Exception],
     arguments |= {name: torch.zeros(4, 6, 3) for name in ("transmission", "reflection")}
     with pytest.raises(error, match=message):
         layer_slopes(**(arguments | change), linear=True)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_slopes_at_centres_agree_with_the_twin(dtype: torch.dtype) -> None:
+    generator, count = torch.Generator().manual_seed(4), 6000
+    slopes, near = torch.rand(2, 9, 14, generator=generator, dtype=torch.float64).to(dtype)
+    near[near > 0.8] = torch.inf
+    means = (24 * torch.rand(2, count, 2, generator=generator, dtype=torch.float64) - 5).to(dtype)
+    broken = [(torch.nan, 3.0), (3.0, torch.nan), (torch.inf, 2.0), (-torch.inf, 2.0), (1e30, -1e30)]
+    means[0, : len(broken)] = torch.tensor(broken, dtype=dtype)
+    depths = torch.rand(2, count, generator=generator, dtype=torch.float64).to(dtype)
+    depths[:, ::7] = 0
+    found, expected = slopes_at(slopes, near, means, depths), reference_slopes_at(slopes, near, means, depths)
+    assert 0.2 < float((found < 1).double().mean()) < 0.8
+    assert torch.equal(found, expected)

@@ -103,7 +103,7 @@ def blend_case(dtype: torch.dtype, count: int = 3) -> dict[str, Tensor]:
     return {
         "transmission": 1.2 * draw(HEIGHT, WIDTH, 3) ** 3,
         "mask": torch.where(mask < 0.1, 0, mask),
-        "reflections": 1.2 * draw(count, HEIGHT, WIDTH, 4) ** 3,
+        "reflections": 1.2 * draw(count, HEIGHT, WIDTH, 4) ** 3 - intrinsics.new_tensor([0, 0, 0, 1]),
         "pane": pane_hits(panes, intrinsics, WIDTH, HEIGHT).pane,
         "normals": panes.normals,
         "base_reflectances": 0.9 * draw(count),

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import gc
 import math
+import weakref
 
 import numba
 import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.project import project
+from glassplat.kernels.project import GradientSum, project
 from glassplat.kernels.project.reference import project as reference_project
 from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians
 from tests.kernels.gaussians_and_cameras import HEIGHT, WIDTH, draw, random_cameras, random_gaussians
@@ -252,3 +254,39 @@ def test_bad_cameras_and_options_are_refused() -> None:
         project(gaussians, cameras, sh_degree=4, near=NEAR)
     with pytest.raises(ValueError, match=r"near is -1\.0"):
         project(gaussians, cameras, sh_degree=0, near=-1.0)
+
+
+@pytest.mark.parametrize("asked", [(0, 1, 2), (0, 2), (1, 2), (0, 1), (0,), (1,), (2,)])
+def test_gradients_of_several_projections_add_up_where_they_are_made(asked: tuple[int, ...]) -> None:
+    gaussians, batches = random_gaussians(700), [random_cameras(n, clip=n > 1) for n in (1, 2, 1)]
+
+    def slopes(total: GradientSum | None) -> tuple[Tensor, ...]:
+        found = [project(gaussians, batch, sh_degree=3, near=NEAR, total=total) for batch in batches]
+        loss = sum((1 + i) * field.sin().sum() for i in asked for field in found[i][:5])
+        inputs = [*gaussians, *(batch.cam_from_world for batch in batches)]
+        once = torch.autograd.grad(loss, inputs, retain_graph=True, allow_unused=True, materialize_grads=True)
+        # What a pass has left behind must not enter the next one, nor what only asks for poses.
+        torch.autograd.grad(loss, batches[asked[-1]].cam_from_world, retain_graph=True)
+        again = torch.autograd.grad(loss, inputs, allow_unused=True, materialize_grads=True)
+        assert all(torch.equal(a, b) for a, b in zip(once, again, strict=True))
+        return once
+
+    for name, together, apart in zip(
+        [*RawGaussians._fields, "pose 0", "pose 1", "pose 2"], slopes(GradientSum()), slopes(None), strict=True
+    ):
+        assert_parallel(together, apart, 1e-12, name)
+
+
+def test_a_sum_of_gradients_frees_its_graph() -> None:
+    gaussians, total = random_gaussians(5), GradientSum()
+    first = project(gaussians, random_cameras(1), sh_degree=3, near=NEAR, total=total)
+    second = project(gaussians, random_cameras(1), sh_degree=3, near=NEAR, total=total)
+    torch.autograd.grad(first.means2d.sum() + second.means2d.sum(), gaussians.means)
+    assert total.found == []
+    node = weakref.ref(first.means2d.grad_fn)
+    gc.disable()
+    try:
+        del first, second, total
+        assert node() is None
+    finally:
+        gc.enable()

@@ -7,10 +7,10 @@ from typing import Any
 
 import torch
 
+from glassplat.kernels.pane_layers import pane_layers
 from glassplat.losses.geometry import depth_deviation_loss
 from glassplat.losses.reflection import gradient_conflict, intensity_departure, mask_loss
 from glassplat.render.frame import Frame
-from glassplat.render.seen_panes import amid_one_pane
 
 
 def frame_with(**layers: torch.Tensor) -> Any:
@@ -18,7 +18,7 @@ def frame_with(**layers: torch.Tensor) -> Any:
 
 
 def conflict(transmission: torch.Tensor, reflection: torch.Tensor, pane: torch.Tensor, strength: torch.Tensor) -> float:
-    layers = {"without_panes": transmission, "reflection": reflection, "inner": amid_one_pane(pane, strength)}
+    layers = {"without_panes": transmission, "reflection": reflection, "inner": pane_layers(pane, strength)[1]}
     return float(gradient_conflict(frame_with(**layers), SimpleNamespace(), SimpleNamespace()))
 
 

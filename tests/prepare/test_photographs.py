@@ -152,6 +152,10 @@ def heic(folder: Path) -> None:
     (folder / "IMG_1.HEIC").write_bytes(b"....ftypheic")
 
 
+def heic_by_another_name(folder: Path) -> None:
+    (folder / "IMG_2.jpg").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic")
+
+
 def too_few(folder: Path) -> None:
     (folder / "1.png").unlink()
 
@@ -174,6 +178,7 @@ def nothing(folder: Path) -> None:
         (no_picture, r"cannot read .*1\.png as an image"),
         (tiny, r"thumbnail\.png is 30x20 pixels large; expected a photograph, 64"),
         (heic, r"1 photographs in .* are HEIC files.*IMG_1\.HEIC.*save them as JPEG"),
+        (heic_by_another_name, r"1 photographs in .* are HEIC files.*IMG_2\.jpg.*save them as JPEG"),
         (too_few, r"holds 2 photographs; expected at least 3"),
         (only_twins, r"holds 1 photographs, and 1\.png \(as 0\.png\), 2\.png \(as 0\.png\) the same again"),
         (nothing, r"no photograph in .*found notes\.txt"),

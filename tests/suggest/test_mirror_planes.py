@@ -63,6 +63,31 @@ def test_a_symmetric_thing_that_is_seen_from_both_sides_is_no_pane() -> None:
     assert mirror_planes(matches, EXTENT) == []
 
 
+def test_a_thing_that_is_seen_from_behind_is_no_mirror_image() -> None:
+    place, rng = room(6, side=0)
+    place.add_symmetric(WALL, *things(rng, 150))
+    before = [eye.center[1] > 0 for eye in place.eyes]
+    place.mirrored = [pair for pair in place.mirrored if all(before[place.rows[one][0]] for one in pair)]
+    matches = place.matches()
+    agreeing = matches.predicted(WALL, np.arange(len(matches)))
+    assert not agreeing.impossible.any(), "match by match it could be a mirror"
+    told = judged(WALL, matches, EXTENT)
+    assert told.places < 5 and told.impossible > 15
+    assert mirror_planes(matches, EXTENT) == []
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_pane_is_found_that_photographs_look_through_from_behind(seed: int) -> None:
+    place, rng = room(seed, side=0)
+    place.add_mirrored([WALL], *things(rng, 150))
+    place.add_outliers(len(place.mirrored))
+    matches = place.matches()
+    assert matches.predicted(WALL, np.arange(len(matches))).both.sum() > 100
+    (found,) = mirror_planes(matches, EXTENT)
+    assert degrees_between(found.plane.normal, WALL.normal) < 0.3
+    assert found.impossible <= 2
+
+
 def test_without_matches_there_is_nothing() -> None:
     place, rng = room(7)
     place.add_mirrored([], *things(rng, 20))

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from glassplat.data.view import View
+from glassplat.densify.mirrors import MirrorSearch
 from glassplat.densify.propagate import NormalPropagation
 from glassplat.densify.reflectors import Search
 from glassplat.render.deferred import Deferred
@@ -48,6 +49,7 @@ RECIPE = DeferredRecipe(
     texels=4,
     first_texels=2,
     refinements=(0.4, 0.6),
+    search=MirrorSearch(begin_found=False),
     region=(0.0, 0.0, 3.5, 1.0),
     rhythm=Rhythm(beat=0.1, least=2, sh=0.1),
     schedule=PropagationSchedule(end="fixed", stop=0.7, pause=2),

@@ -15,6 +15,7 @@ from glassplat.scene.tint import TINT
 from glassplat.train.actions import GrowSh, ResetOpacity
 from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.environment_entry import AddEnvironment
+from glassplat.train.propagation import GrowShAfterPropagation
 from glassplat.train.reflection_entry import BeginReflections
 from glassplat.train.state import TrainState
 from glassplat.train.surroundings_entry import AddSurroundings, SurroundingsStart
@@ -32,13 +33,25 @@ class Every3rd(MirrorSearch):
         return torch.ones_like(rows, dtype=torch.bool), rows % 3 == 0
 
 
-def begun(search: MirrorSearch, *, near: bool = True, tint: bool = False) -> tuple[TrainState, list[str]]:
+@dataclass(frozen=True)
+class Nothing(MirrorSearch):
+    """Finds no mirror."""
+
+    def looks(self, scene, views, renderer) -> tuple[Tensor, Tensor]:  # type: ignore[no-untyped-def]
+        seen = torch.ones(len(scene.primary), dtype=torch.bool)
+        return seen, torch.zeros_like(seen)
+
+
+def begun(
+    search: MirrorSearch, *, near: bool = True, tint: bool = False, harmonics_wait: bool = False
+) -> tuple[TrainState, list[str]]:
     """A state in which reflections have begun, and what was told on the way."""
     state = TrainState(TracedRecipe(sh_degree=1).initialise(tiny_capture()), seed=0)
+    state.scene = replace(state.scene, primary=replace(state.scene.primary, active_sh_degree=1))
     ones = {name: torch.ones_like(tensor) for name, tensor in state.scene.primary.tensors().items()}
     state.optimizer.moments = {f"primary.{name}": (tensor, tensor.clone()) for name, tensor in ones.items()}
     around = AddSurroundings(SurroundingsStart("scene"), 1) if near else None
-    entry = BeginReflections(AddEnvironment(2), around, search, Splat(), tint)
+    entry = BeginReflections(AddEnvironment(2), around, search, Splat(), tint, harmonics_wait)
     messages, _ = followed(entry(state, tiny_capture()))
     return state, [message.what for message in messages]
 
@@ -80,9 +93,23 @@ def test_before_mirrors_are_searched_for_a_scene_is_learned_as_by_splat(recipe: 
         assert hurried == (search.begin_found and recipe.hurry_matte)
 
 
-def test_only_traced_searches_by_itself() -> None:
-    assert TracedRecipe().search.begin_found and not DeferredRecipe().search.begin_found
-    assert not TracedRecipe.paper().search.begin_found
+@pytest.mark.parametrize("kind", [DeferredRecipe, TracedRecipe])
+def test_mirrors_are_searched_for_but_not_in_the_papers(kind: type[DeferredRecipe | TracedRecipe]) -> None:
+    assert kind().search.begin_found and not kind.paper().search.begin_found
+
+
+@pytest.mark.parametrize(("search", "degree"), [(Every3rd(), 0), (Nothing(), 1), (Every3rd(begin_found=False), 1)])
+def test_what_colors_have_learnt_of_mirrors_is_left_out_if_there_are_any(search: MirrorSearch, degree: int) -> None:
+    state, _ = begun(search, harmonics_wait=True)
+    assert state.scene.primary.active_sh_degree == degree
+    assert begun(search)[0].scene.primary.active_sh_degree == 1
+
+
+@pytest.mark.parametrize("recipe", [DeferredRecipe(), TracedRecipe()])
+def test_colors_wait_until_normals_have_spread(recipe: DeferredRecipe | TracedRecipe) -> None:
+    stage = recipe.stages(0, 7000)[1]
+    assert isinstance(stage.entry, BeginReflections) and stage.entry.harmonics_wait
+    assert any(isinstance(action, GrowShAfterPropagation) for action in stage.actions)
 
 
 def test_reflections_begin_white_and_may_learn_a_color_where_that_is_asked_for() -> None:

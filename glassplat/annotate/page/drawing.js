@@ -15,6 +15,7 @@ export class Drawing {
     this.view = null;
     this.scale = 1;
     this.shift = [0, 0];
+    this.upcoming = null; // The corner that the next click marks: where it may lie is drawn stronger.
     this.layer = document.createElement("canvas");
   }
 
@@ -144,8 +145,9 @@ export class Drawing {
   }
 
   #guide(line, corner, color) {
-    this.context.globalAlpha = 0.9;
-    this.context.lineWidth = 1;
+    const isNext = corner === this.upcoming;
+    this.context.globalAlpha = isNext ? 1 : 0.5;
+    this.context.lineWidth = isNext ? 2 : 1;
     this.#line(line, color, [6, 4]);
     this.context.globalAlpha = 1;
   }

@@ -102,6 +102,7 @@ function unskip() { skipped = { corner: new Set(), edge: new Set() }; }
 const view = () => capture.views[current];
 
 function draw() {
+  drawing.upcoming = tool === "corner" && marking.pane ? upcoming() : null;
   drawing.draw(marking.document.panes, answers, marking.active, pending, capture.suggestions);
 }
 
@@ -323,8 +324,8 @@ const KEYS = {
   2: () => choose("edge"),
   3: () => choose("polygon"),
   4: () => choose("brush"),
-  5: () => choose("restore"),
-  6: () => choose("grab"),
+  5: () => choose("grab"),
+  6: () => choose("restore"),
   "[": () => { radius = Math.max(2, radius / 1.25); tell(`brush of ${Math.round(radius)} pixels`); },
   "]": () => { radius = Math.min(300, radius * 1.25); tell(`brush of ${Math.round(radius)} pixels`); },
   Enter: closePolygon,

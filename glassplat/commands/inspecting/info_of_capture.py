@@ -6,11 +6,12 @@ from pathlib import Path
 
 from glassplat.commands.inspecting.finding import Finding
 from glassplat.data.dataset import Dataset, load_dataset
-from glassplat.data.errors import InputError
+from glassplat.data.errors import InputError, first_names
 from glassplat.files.images import IMAGE_SUFFIXES
 from glassplat.files.json_text import read_json
 from glassplat.init.planes import PlaneFit, PlaneFitError
 from glassplat.init.virtual_scene import virtual_points
+from glassplat.prepare.photographs import broken_photographs
 from glassplat.prepare.report_page import PAGE, write_page
 from glassplat.prepare.workplace import RECORD
 from glassplat.train.plane_entry import fitted_planes
@@ -58,10 +59,17 @@ def write_capture_page(path: Path, target: Path) -> None:
 
 def photographs_finding(path: Path) -> Finding | None:
     """A folder of photographs without poses; None where there are none."""
-    found = [one for one in path.rglob("*") if one.suffix.lower() in IMAGE_SUFFIXES and one.is_file()]
+    found = sorted(one for one in path.rglob("*") if one.suffix.lower() in IMAGE_SUFFIXES and one.is_file())
     if not found:
         return None
     finding = Finding("photographs without poses", {"photographs": len(found)})
+    if broken := broken_photographs(found):
+        finding.problems.append(
+            f"{len(broken)} are broken, tiny or of a kind that cannot be read ({first_names(broken)}); replace or "
+            "remove them"
+        )
+    if len(found) - len(broken) < FEW_VIEWS:
+        finding.problems.append(f"{len(found) - len(broken)} photographs are few; 30 and more do better")
     finding.next.append(f"glassplat prepare {path} --output CAPTURE    finds out where they were taken")
     return finding
 

@@ -76,7 +76,7 @@ def _load(real: type) -> Scalar:
             column = first + min(i, count - 1)
             shown = (pane[row, column] == k) & (i < count)
             run[MASK + i] = mask[row, column] if shown else zero
-            run[GAIN + i] = reflections[k, row, column, 3] if intensity else one
+            run[GAIN + i] = one + reflections[k, row, column, 3] if intensity else one
             for d in range(3):
                 run[BEHIND + d * RUN + i] = transmission[row, column, d]
                 run[MIRRORED + d * RUN + i] = reflections[k, row, column, d]

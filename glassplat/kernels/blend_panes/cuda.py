@@ -83,7 +83,7 @@ def blend_panes_forward(real: type) -> Kernel:
         if shown:
             raw, _, _, _, _ = shine(row, column, k, normals, bases, intrinsics, law)
             share = raw * marked
-            gain = reflections[k, row, column, 3] if intensity else one
+            gain = one + reflections[k, row, column, 3] if intensity else one
         strength[row, column] = share
         for d in range(3):
             behind, bright, mixed = transmission[row, column, d], zero, transmission[row, column, d]
@@ -127,7 +127,7 @@ def blend_panes_backward(real: type) -> Kernel:
             return
         raw, x, y, along, length = shine(row, column, k, normals, bases, intrinsics, law)
         share, v_share, v_gain = raw * marked, v_strength[row, column], zero
-        gain = reflections[k, row, column, 3] if intensity else one
+        gain = one + reflections[k, row, column, 3] if intensity else one
         for d in range(3):
             behind, mirrored = transmission[row, column, d], reflections[k, row, column, d]
             v_behind, v_bright = v_rgb[row, column, d], v_reflection[row, column, d]

@@ -46,7 +46,8 @@ def blend_panes(
     Args:
         transmission: [H, W, 3] C_t, sRGB.
         mask: [H, W] M, visibility of the panes.
-        reflections: [K, H, W, 4] what each pane mirrors, C_raw in sRGB and the intensity A.
+        reflections: [K, H, W, 4] what each pane mirrors, C_raw in sRGB and A - 1, by how much the intensity departs
+            from 1: 0 where nothing was blended.
         pane: [H, W] int32 position of each pixel's pane, -1 for none, as `pane_hits` gives it.
         normals: [K, 3] unit normals in the camera frame; the sign does not matter.
         base_reflectances: [K] R0 in [0, 1].

@@ -43,7 +43,7 @@ def blend_panes(
         cosine = (rays @ normals[k]).abs().clamp(max=1)
         base = base_reflectances[k]
         strength = torch.where(shown, REFLECTANCE[fresnel](base, cosine) * mask, strength)
-        gain = reflections[k, ..., 3:] if intensity else torch.ones_like(mask)[..., None]
+        gain = 1 + reflections[k, ..., 3:] if intensity else torch.ones_like(mask)[..., None]
         color = reflections[k, ..., :3]
         bright = srgb_from_linear(linear_from_srgb(color) * gain) if linear else color * gain
         reflection = torch.where(shown[..., None], bright, reflection)

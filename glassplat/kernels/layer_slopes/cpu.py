@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from glassplat.kernels.cpu.jit import Kernel, kernel
 from glassplat.kernels.maths.color_space import color_space_maths
 
+CHUNK = 4096
+"""Splats per task."""
+
 
 @functools.cache
 def layer_slopes_kernel(real: type) -> Kernel:
@@ -42,3 +45,28 @@ def layer_slopes_kernel(real: type) -> Kernel:
                 out_mirrored[x] = by_mirror_image if shown[x] else zero
 
     return slopes
+
+
+@functools.cache
+def slopes_at_kernel(real: type) -> Kernel:
+    """Fills what is found at the centres [C, N]."""
+    zero, one = real(0.0), real(1.0)
+
+    @kernel("slopes_at", real)
+    def slopes_at(slopes, near, means2d, depths, found):
+        (height, width), (cameras, count) = slopes.shape, depths.shape
+        right, bottom = real(width - 1), real(height - 1)
+        chunks = (count + CHUNK - 1) // CHUNK
+        for task in prange(cameras * chunks):
+            c, chunk = task // chunks, task % chunks
+            for n in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
+                if not depths[c, n] > zero:  # As where a splat is not seen; no surface is that near.
+                    found[c, n] = one
+                    continue
+                x, y = means2d[c, n, 0], means2d[c, n, 1]
+                # Clamped before the conversion, so that infinities are well defined; NaN is the first pixel.
+                column = np.int64(min(x, right)) if x > zero else 0
+                row = np.int64(min(y, bottom)) if y > zero else 0
+                found[c, n] = slopes[row, column] if depths[c, n] > near[row, column] else one
+
+    return slopes_at

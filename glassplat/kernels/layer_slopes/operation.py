@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.layer_slopes import reference as reference
-from glassplat.kernels.layer_slopes.cpu import layer_slopes_kernel
+from glassplat.kernels.layer_slopes.cpu import layer_slopes_kernel, slopes_at_kernel
 from glassplat.kernels.tensor_checks import REAL_OF, check_device, check_tensors
 
 
@@ -48,3 +48,32 @@ def layer_slopes(
     layers = (tensor.detach().contiguous().numpy() for tensor in (strength, transmission, reflection, where))
     layer_slopes_kernel(REAL_OF[strength.dtype])(*layers, linear, through.numpy(), mirrored.numpy())
     return through, mirrored
+
+
+@torch.no_grad()
+def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
+    """What an image of slopes holds at the centres of splats, 1 where they lie before a surface. Not differentiable.
+
+    Args:
+        slopes: [H, W], by the transmission.
+        near: [H, W] depth of the surface, infinite where there is none.
+        means2d: [C, N, 2] centres in pixels; those beyond the image, and NaN, count as at its border.
+        depths: [C, N] of the centres.
+
+    Returns:
+        [C, N].
+
+    Raises:
+        ValueError: shapes disagree.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
+    """
+    size, leading = tuple(slopes.shape), tuple(depths.shape)
+    expected = {"slopes": (slopes, size), "near": (near, size), "means2d": (means2d, (*leading, 2))}
+    check_tensors({**expected, "depths": (depths, leading)})
+    if slopes.device.type != "cpu":
+        # On a GPU these few operations on the splats are no bottleneck, so that there they stay PyTorch's.
+        return reference.slopes_at(slopes, near, means2d, depths)
+    found = torch.empty_like(depths)
+    tensors = (tensor.detach().contiguous().numpy() for tensor in (slopes, near, means2d, depths))
+    slopes_at_kernel(REAL_OF[slopes.dtype])(*tensors, found.numpy())
+    return found

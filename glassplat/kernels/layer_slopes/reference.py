@@ -26,3 +26,11 @@ def layer_slopes(
             image = (1 - share) * behind + share * mirror_image
         through, mirrored = torch.autograd.grad(image.sum(), (behind, mirror_image))
     return torch.where(where, through, 1), torch.where(where, mirrored, 0)
+
+
+def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
+    """See `glassplat.kernels.layer_slopes.slopes_at`."""
+    height, width = slopes.shape
+    columns, rows = means2d.nan_to_num().floor().long().unbind(-1)
+    pixels = rows.clamp(0, height - 1), columns.clamp(0, width - 1)
+    return torch.where(depths > near[pixels], slopes[pixels], 1.0)

@@ -40,14 +40,18 @@ def project(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, n
 def project_gradients(
     inputs: Sequence[Tensor], width: int, height: int, degree: int,
     *, seen: tuple[Tensor, Tensor], cotangents: Sequence[Tensor], needs_camera: bool,
+    known: list[Tensor] | None = None,
 ) -> tuple[list[Tensor], Tensor]:  # fmt: skip
-    """Gradients of raw Gaussians and of each camera [C, 12]; `seen` are the radii and conics of the forward pass."""
+    """Gradients of raw Gaussians and of each camera [C, 12]; `seen` are the radii and conics of the forward pass.
+
+    Those of the Gaussians are added to what is `known`, in place.
+    """
     real = REAL_OF[inputs[0].dtype]
-    found = [torch.empty_like(tensor) for tensor in inputs[:5]]
+    found = [torch.empty_like(tensor) for tensor in inputs[:5]] if known is None else known
     cameras = torch.zeros(inputs[5].shape[0], 12, dtype=torch.float64)
     project_backward(real)(
         *(tensor.numpy() for tensor in inputs), real(width), real(height), degree,
-        *(tensor.numpy() for tensor in (*seen, *cotangents)), needs_camera,
+        *(tensor.numpy() for tensor in (*seen, *cotangents)), needs_camera, known is None,
         *(tensor.numpy() for tensor in (*found, cameras)),
     )  # fmt: skip
     return found, cameras

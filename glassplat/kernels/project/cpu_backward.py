@@ -115,24 +115,34 @@ def shape_gradients(real: type) -> Callable[..., Any]:
     zero, one = real(0.0), real(1.0)
 
     @inlined
-    def store_shape_gradient(
+    def add_shape_gradient(
         n, opacity, quat, inverse_norm, axes, g_opacity, g_axes, g_quats, g_log_scales, g_logit_opacities
     ):
         x, y, z = rotation(quat)
-        g_logit_opacities[n] = g_opacity * opacity * (one - opacity)
-        g_log_scales[n, 0] = dot(axes[0], g_axes[0])
-        g_log_scales[n, 1] = dot(axes[1], g_axes[1])
-        g_log_scales[n, 2] = dot(axes[2], g_axes[2])
+        g_logit_opacities[n] += g_opacity * opacity * (one - opacity)
+        g_log_scales[n, 0] += dot(axes[0], g_axes[0])
+        g_log_scales[n, 1] += dot(axes[1], g_axes[1])
+        g_log_scales[n, 2] += dot(axes[2], g_axes[2])
         g_x, g_y, g_z = (
             blend(dot(axes[0], x), g_axes[0], zero, x),
             blend(dot(axes[1], y), g_axes[1], zero, y),
             blend(dot(axes[2], z), g_axes[2], zero, z),
         )
-        g_quats[n, 0], g_quats[n, 1], g_quats[n, 2], g_quats[n, 3] = unit_quat_gradient(
-            quat, inverse_norm, g_x, g_y, g_z
-        )
+        g_w, g_i, g_j, g_k = unit_quat_gradient(quat, inverse_norm, g_x, g_y, g_z)
+        g_quats[n, 0] += g_w
+        g_quats[n, 1] += g_i
+        g_quats[n, 2] += g_j
+        g_quats[n, 3] += g_k
 
-    return store_shape_gradient
+    return add_shape_gradient
+
+
+@inlined
+def add_mean(g_means, n, g_mean):
+    """Adds to row n of the gradient of the means."""
+    g_means[n, 0] += g_mean[0]
+    g_means[n, 1] += g_mean[1]
+    g_means[n, 2] += g_mean[2]
 
 
 def _color_backward(real: type) -> Callable[..., Any]:
@@ -143,21 +153,21 @@ def _color_backward(real: type) -> Callable[..., Any]:
 
     @inlined
     def color_backward(n, means, sh, cam_from_world, lens, degree, radii, g_colors, needs_camera, total, g_means, g_sh):
-        """Fills g_sh[n] and sets g_means[n] to what comes through the direction of view."""
-        for k in range(sh.shape[1]):
-            g_sh[n, k, 0] = g_sh[n, k, 1] = g_sh[n, k, 2] = zero
-        mean, g_mean = vec3(means, n), (zero, zero, zero)
+        """Adds to g_sh[n], and to g_means[n] what comes through the direction of view."""
+        mean, g_mean, touched = vec3(means, n), (zero, zero, zero), False
         for c in range(cam_from_world.shape[0] if degree >= 0 else 0):
             g_color = vec3(g_colors[c], n)
             # A Gaussian that no pixel saw, as behind others, has nothing to pass on.
             idle = g_color[0] == zero and g_color[1] == zero and g_color[2] == zero
             if idle or not radii[c, n, 0] > zero:
                 continue
+            touched = True
             g_view = view_gradient(sh, n, degree, mean, lens, c, g_color, g_sh)
             g_mean = blend(one, g_mean, one, g_view)
             if needs_camera:
                 add_view(total[c], cam_from_world, c, g_view)
-        g_means[n, 0], g_means[n, 1], g_means[n, 2] = g_mean
+        if touched:
+            add_mean(g_means, n, g_mean)
 
     return color_backward
 
@@ -165,7 +175,7 @@ def _color_backward(real: type) -> Callable[..., Any]:
 def _place_backward(real: type) -> Callable[..., Any]:
     vec3, pose, shape, view, *_ = view_steps(real)
     dot, blend, scaled_sum = vector_maths().dot, vector_maths().blend, vector_maths().scaled_sum
-    place_gradient, store_shape_gradient, add_place = (
+    place_gradient, add_shape_gradient, add_place = (
         place_gradients(real),
         shape_gradients(real),
         camera_sums(real)[0],
@@ -178,14 +188,18 @@ def _place_backward(real: type) -> Callable[..., Any]:
         g_means2d, g_conics, g_depths, g_opacities, needs_camera, total,
         g_means, g_quats, g_log_scales, g_logit_opacities,
     ):  # fmt: skip
-        """Adds to g_means[n] and fills the other gradients."""
-        mean, g_mean, touched = vec3(means, n), vec3(g_means, n), False
+        """Adds to all gradients but that of the colour."""
+        touched = False
+        for c in range(cam_from_world.shape[0]):
+            touched |= radii[c, n, 0] > zero
+        if not touched:
+            return
+        mean, g_mean = vec3(means, n), (zero, zero, zero)
         _, opacity, quat, inverse_norm, axes = shape(means, quats, log_scales, logit_opacities, n)
         g_opacity, ga_x, ga_y, ga_z = zero, (zero, zero, zero), (zero, zero, zero), (zero, zero, zero)
         for c in range(cam_from_world.shape[0]):
             if not radii[c, n, 0] > zero:
                 continue
-            touched = True
             row_x, row_y, row_z, offset = pose(cam_from_world, c)
             rows = (row_x, row_y, row_z)
             position = dot(row_x, mean) + offset[0], dot(row_y, mean) + offset[1], dot(row_z, mean) + offset[2]
@@ -200,30 +214,29 @@ def _place_backward(real: type) -> Callable[..., Any]:
             g_opacity += g_opacities[c, n]
             if needs_camera:
                 add_place(total[c], g_rows, g_position, mean)
-        if touched:
-            g_means[n, 0], g_means[n, 1], g_means[n, 2] = g_mean
-            store_shape_gradient(
-                n, opacity, quat, inverse_norm, axes, g_opacity, (ga_x, ga_y, ga_z),
-                g_quats, g_log_scales, g_logit_opacities,
-            )  # fmt: skip
-        else:
-            g_logit_opacities[n] = g_quats[n, 0] = g_quats[n, 1] = g_quats[n, 2] = g_quats[n, 3] = zero
-            g_log_scales[n, 0] = g_log_scales[n, 1] = g_log_scales[n, 2] = zero
+        add_mean(g_means, n, g_mean)
+        add_shape_gradient(
+            n, opacity, quat, inverse_norm, axes, g_opacity, (ga_x, ga_y, ga_z),
+            g_quats, g_log_scales, g_logit_opacities,
+        )  # fmt: skip
 
     return place_backward
 
 
 @cache
 def project_backward(real: type) -> Kernel:
-    """Fills the gradients of the Gaussians; adds those of the cameras to [C, 12], rows of (3x3 block, translation)."""
+    """Adds to the gradients of the Gaussians, or fills them where they are `fresh`, and adds to those of the cameras.
+
+    These are [C, 12], rows of (3x3 block, translation).
+    """
     fill_lenses = view_steps(real).fill_lenses
     color_backward, place_backward = _color_backward(real), _place_backward(real)
-    chunk_size = CHUNK
+    chunk_size, zero = CHUNK, real(0.0)
 
     @kernel("project_backward", real)
     def backward(
         means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, width, height, degree, radii, conics,
-        g_means2d, g_conics, g_depths, g_opacities, g_colors, needs_camera,
+        g_means2d, g_conics, g_depths, g_opacities, g_colors, needs_camera, fresh,
         g_means, g_quats, g_log_scales, g_logit_opacities, g_sh, g_cameras,
     ):  # fmt: skip
         count, num_cameras = means.shape[0], cam_from_world.shape[0]
@@ -235,6 +248,9 @@ def project_backward(real: type) -> Kernel:
         for task in prange(num_chunks):
             chunk = task * stride % num_chunks
             begin, end = chunk * chunk_size, min(count, (chunk + 1) * chunk_size)
+            if fresh:
+                g_means[begin:end], g_quats[begin:end], g_log_scales[begin:end] = zero, zero, zero
+                g_logit_opacities[begin:end], g_sh[begin:end] = zero, zero
             for n in range(begin, end):
                 color_backward(
                     n, means, sh, cam_from_world, lens, degree, radii, g_colors, needs_camera, totals[chunk],

@@ -14,7 +14,13 @@ from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.maths.projection import shape_maths, vector_maths
 from glassplat.kernels.project.cpu import culling, placing
-from glassplat.kernels.project.cpu_backward import camera_sums, place_gradients, shape_gradients, view_gradients
+from glassplat.kernels.project.cpu_backward import (
+    add_mean,
+    camera_sums,
+    place_gradients,
+    shape_gradients,
+    view_gradients,
+)
 from glassplat.kernels.project.cpu_view import LENS_VALUES, view_steps
 from glassplat.kernels.tensor_checks import REAL_OF
 
@@ -36,13 +42,14 @@ def project(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, n
 def project_gradients(
     inputs: Sequence[Tensor], width: int, height: int, degree: int,
     *, seen: tuple[Tensor, Tensor], cotangents: Sequence[Tensor], needs_camera: bool,
+    known: list[Tensor] | None = None,
 ) -> tuple[list[Tensor], Tensor]:  # fmt: skip
     """As `glassplat.kernels.project.cpu.project_gradients`."""
     means, cam_from_world = inputs[0], inputs[5]
     real, num_cameras = REAL_OF[means.dtype], cam_from_world.shape[0]
     blocks = blocks_for(means.shape[0], THREADS)
-    # Harmonics are added to, and to clear them all at once is faster than one Gaussian at a time.
-    found = [*(torch.empty_like(tensor) for tensor in inputs[:4]), torch.zeros_like(inputs[4])]
+    # Added to, and to clear them all at once is faster than one Gaussian at a time.
+    found = [torch.zeros_like(tensor) for tensor in inputs[:5]] if known is None else known
     shape = (blocks, num_cameras, POSE) if needs_camera else (0, 0, 0)
     partial = torch.zeros(shape, dtype=torch.float64, device=means.device)
     lens = _lenses(cam_from_world, inputs[6], width, height)
@@ -121,12 +128,12 @@ def project_forward(real: type) -> Kernel:
 
 @cache
 def project_backward(real: type) -> Kernel:
-    """Fills the gradients of the Gaussians, and of each camera the sum over each block [blocks, C, 12]."""
+    """Adds to the gradients of the Gaussians, and fills of each camera the sum over each block [blocks, C, 12]."""
     vec3, pose, shape, view, *_ = view_steps(real)
     maths = vector_maths()
     dot, blend, scaled_sum = maths.dot, maths.blend, maths.scaled_sum
     place_gradient, view_gradient = place_gradients(real), view_gradients(real)
-    store_shape_gradient = shape_gradients(real)
+    add_shape_gradient = shape_gradients(real)
     add_place, add_view = camera_sums(real)
     zero, one = real(0.0), real(1.0)
 
@@ -186,16 +193,11 @@ def project_backward(real: type) -> Kernel:
                         block_sum += sums[j, t]
                     partial[cuda.blockIdx.x, c, t] = block_sum
                 cuda.syncthreads()
-        if not inside:
-            return
-        g_means[n, 0], g_means[n, 1], g_means[n, 2] = g_mean
         if touched:
-            store_shape_gradient(
+            add_mean(g_means, n, g_mean)
+            add_shape_gradient(
                 n, opacity, quat, inverse_norm, axes, g_opacity, (ga_x, ga_y, ga_z),
                 g_quats, g_log_scales, g_logit_opacities,
             )  # fmt: skip
-        else:
-            g_logit_opacities[n] = g_quats[n, 0] = g_quats[n, 1] = g_quats[n, 2] = g_quats[n, 3] = zero
-            g_log_scales[n, 0] = g_log_scales[n, 1] = g_log_scales[n, 2] = zero
 
     return backward

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -14,7 +16,27 @@ from glassplat.kernels.projection_inputs import projection_inputs
 from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians
 
 
-def project(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, near: float) -> Projected:
+@dataclass
+class GradientSum:
+    """Where projections of the same Gaussians add up their gradients, instead of each filling tensors of its own.
+
+    Most of a gradient is zeros, of what a camera does not see; filling and adding them costs more than the rest. Each
+    projection hands the next one a token, so that autograd asks for their gradients from the last to the first, which
+    alone returns the sum.
+
+    Attributes:
+        token: of the projection before.
+        found: what the projections after it have found, where they have been asked; empty otherwise. Nodes of the graph
+            hold this list and not the record, whose token holds them.
+    """
+
+    token: Tensor | None = None
+    found: list[Tensor] = field(default_factory=list)
+
+
+def project(
+    gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, near: float, total: GradientSum | None = None
+) -> Projected:
     """Projects Gaussians into cameras: activation, EWA splatting, bounds, culling and view-dependent colour.
 
     A Gaussian is culled in a camera when its depth is at most `near`, its centre is not on the kept side of
@@ -34,13 +56,18 @@ def project(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, ne
         sh_degree: highest degree of the spherical harmonics to evaluate; `gaussians.sh` may hold more, or
             none at all, which makes all colours zero.
         near: smallest depth (camera z, world units), at least 0.
+        total: the same for all projections of these very tensors whose gradients are to be added up.
 
     Raises:
         ValueError: a shape, the degree or `near` is out of range.
         TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
     inputs = projection_inputs(gaussians, cameras, scales=SOLID, sh_degree=sh_degree, near=near)
-    return Projected(*_Project.apply(*inputs, cameras.width, cameras.height, sh_degree, near))
+    total = GradientSum() if total is None else total
+    *fields, total.token = _Project.apply(
+        *inputs, total.token, total.found, cameras.width, cameras.height, sh_degree, near
+    )  # fmt: skip
+    return Projected(*fields)
 
 
 class _Project(torch.autograd.Function):
@@ -50,7 +77,7 @@ class _Project(torch.autograd.Function):
     def forward(
         ctx: Any, means: Tensor, quats: Tensor, log_scales: Tensor, logit_opacities: Tensor, sh: Tensor,
         cam_from_world: Tensor, intrinsics: Tensor, clip_planes: Tensor, windows: Tensor,
-        width: int, height: int, sh_degree: int, near: float,
+        token: Tensor | None, shared: list[Tensor], width: int, height: int, sh_degree: int, near: float,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         inputs = (means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, clip_planes, windows)
         tensors = [tensor.detach().contiguous() for tensor in inputs]
@@ -60,20 +87,38 @@ class _Project(torch.autograd.Function):
         conics, radii = outputs[1], outputs[5]
         ctx.save_for_backward(*tensors[:7], radii, conics)
         ctx.size_and_degree = (width, height, degree)
+        ctx.shared = shared
         ctx.mark_non_differentiable(radii)
-        return outputs
+        ctx.set_materialize_grads(False)
+        return *outputs, means.new_empty(0)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         *inputs, radii, conics = ctx.saved_tensors
-        cotangents = [gradient.contiguous() for gradient in gradients[:5]]
-        cam_from_world, needs_camera = inputs[5], bool(ctx.needs_input_grad[5])
+        seen = (radii, conics)
+        # Only a projection that was asked in this very pass has handed back its token.
+        known = None if gradients[6] is None else list(ctx.shared)
+        ctx.shared.clear()
         found, cameras = kernels_for("project", radii.device).project_gradients(
-            inputs, *ctx.size_and_degree, seen=(radii, conics), cotangents=cotangents, needs_camera=needs_camera
-        )
-        pose_gradient = None
-        if needs_camera:
-            pose_gradient = torch.zeros_like(cam_from_world)
+            inputs, *ctx.size_and_degree,
+            seen=seen, cotangents=_cotangents(gradients, seen), needs_camera=bool(ctx.needs_input_grad[5]), known=known,
+        )  # fmt: skip
+        pose_gradient, v_token = None, None
+        if ctx.needs_input_grad[5]:
+            pose_gradient = torch.zeros_like(inputs[5])
             pose_gradient[:, :3] = cameras.reshape(-1, 3, 4)
-        return (*found, pose_gradient, None, None, None, None, None, None, None)
+        if ctx.needs_input_grad[9]:
+            ctx.shared.extend(found)
+            found, v_token = [None] * 5, radii.new_empty(0)
+        return *found, pose_gradient, None, None, None, v_token, None, None, None, None, None
+
+
+def _cotangents(gradients: Sequence[Tensor | None], seen: tuple[Tensor, Tensor]) -> list[Tensor]:
+    """Gradients of means2d, conics, depths, opacities and colors; zeros for those that nothing comes from."""
+    radii, conics = seen
+    like = (radii, conics, radii[..., 0], radii[..., 0], conics)
+    return [
+        torch.zeros(fits.shape, dtype=fits.dtype, device=fits.device) if gradient is None else gradient.contiguous()
+        for gradient, fits in zip(gradients[:5], like, strict=True)
+    ]

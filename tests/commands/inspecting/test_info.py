@@ -51,6 +51,26 @@ def test_photographs_are_to_be_prepared(tmp_path: Path, capsys: pytest.CaptureFi
     assert any("glassplat prepare" in line for line in found["next"])
 
 
+def test_photographs_that_prepare_would_refuse_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for path in sorted((SCENE / "images").iterdir())[:25]:
+        shutil.copy(path, folder)
+    assert told(folder, capsys)["healthy"]
+    first, second, *_ = sorted(folder.iterdir())
+    first.write_bytes(first.read_bytes()[:900])
+    second.write_bytes(b"\0\0\0\x18ftypheic")
+    found = told(folder, capsys)
+    assert not found["healthy"]
+    assert f"2 are broken, tiny or of a kind that cannot be read ({first.name}, {second.name})" in found["problems"][0]
+
+
+def test_a_folder_of_few_photographs_is_said_to_be_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "few").mkdir()
+    shutil.copy(SCENE / "images" / "0000.jpg", tmp_path / "few")
+    assert told(tmp_path / "few", capsys)["problems"] == ["1 photographs are few; 30 and more do better"]
+
+
 def test_what_was_interrupted_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "c.partial").mkdir()
     (tmp_path / "c.partial" / "settings.json").write_text('{"input": "photographs"}')
