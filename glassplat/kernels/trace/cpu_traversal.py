@@ -140,7 +140,7 @@ def pack_leaves(real: type) -> Kernel:
     zero = real(0.0)
 
     @kernel("trace_pack_leaves", real)
-    def pack(means, frames, opacities, order, leaves):
+    def pack(means, frames, opacities, order, leaves):  # type: ignore[no-untyped-def]
         for leaf in prange(leaves.shape[0]):
             for k in range(WIDTH):
                 place = leaf * WIDTH + k
