@@ -85,12 +85,17 @@ def edge_matches(planes: PlaneEquations, views: Sequence[PaneView], *, edges_per
 
 
 def _turns(planes: PlaneEquations, outward: Array) -> Array:
-    """[H, P] sine of twice the angle between directions in the plane and the nearest side of the pane."""
+    """[H, P] sine of twice the angle between directions in the plane and the nearest side of the pane.
+
+    Its sign is that against the side across which most edges lie, whatever axes the plane has: with another sign after
+    a small move there would be no slope to follow.
+    """
     first, second = in_plane_axes(planes)
     along, across = np.einsum("hpd,hd->hp", outward, first), np.einsum("hpd,hd->hp", outward, second)
-    fourfold = (along + 1j * across) ** 4
-    sides = np.exp(-0.5j * np.angle(fourfold.mean(axis=1)))
-    turned: Array = ((along + 1j * across) ** 2 * sides[:, None]).imag
+    twofold = (along + 1j * across) ** 2
+    sides = np.exp(-0.5j * np.angle((twofold**2).mean(axis=1)))
+    sides *= np.where((twofold.mean(axis=1) * sides).real < 0, -1, 1)
+    turned: Array = (twofold * sides[:, None]).imag
     return turned
 
 

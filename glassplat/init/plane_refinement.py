@@ -71,19 +71,35 @@ def _quadratic(
     planes: FramedPlanes, objective: Objective, tolerance: float, anchors: Array, scales: Array
 ) -> tuple[Array, Array, Array]:
     """The cost [H] of planes, and its Gauss-Newton matrix [H, 4, 4] and gradient [H, 4] (halved)."""
+    here, moved_residuals = _nearby(planes, objective, tolerance, anchors, scales)
+    jacobian = (moved_residuals - here.residuals) / STEP
+    weighted = jacobian * _pull(here)
+    return here.cost, _products(weighted, jacobian), np.einsum("ahm,hm->ha", weighted, here.residuals)
+
+
+def _nearby(
+    planes: FramedPlanes, objective: Objective, tolerance: float, anchors: Array, scales: Array
+) -> tuple[Terms, Array]:
+    """The terms of planes, and the residuals [4, H, M] after a small step along each axis."""
     count = len(planes)
     nearby = [planes]
     for axis in range(4):
         nearby.append(_stepped(planes, anchors, STEP * np.eye(4)[axis] * scales))
     terms = objective.terms(joined(nearby), tolerance)
     residuals = terms.residuals.reshape(5, count, -1)
-    jacobian = (residuals[1:] - residuals[0]) / STEP
-    here = Terms(residuals[0], terms.weights[:count], terms.rest[:count])
-    pull = here.weights / (1 + here.residuals**2) ** 2
-    weighted = jacobian * pull
-    hessian = np.einsum("ahm,bhm->hab", weighted, jacobian)
-    gradient = np.einsum("ahm,hm->ha", weighted, here.residuals)
-    return here.cost, hessian, gradient
+    return Terms(residuals[0], terms.weights[:count], terms.rest[:count]), residuals[1:]
+
+
+def _pull(terms: Terms) -> Array:
+    """[H, M] weights with which least squares have the slope of the Geman-McClure loss."""
+    weights: Array = terms.weights / (1 + terms.residuals**2) ** 2
+    return weights
+
+
+def _products(first: Array, second: Array) -> Array:
+    """[H, 4, 4] sums of products of slopes [4, H, M]."""
+    found: Array = np.einsum("ahm,bhm->hab", first, second)
+    return found
 
 
 def _stepped(planes: FramedPlanes, anchors: Array, steps: Array) -> FramedPlanes:
@@ -104,7 +120,10 @@ def doubt(planes: FramedPlanes, objective: Objective, tolerance: float) -> Array
     The plane is free to shift and the frame to grow meanwhile. The Gauss-Newton matrix at the plane tells.
     """
     anchors, scales = objective.anchors(planes.planes), _scales(planes, objective)
-    hessian = _quadratic(planes, objective, tolerance, anchors, scales)[1]
+    here, residuals = _nearby(planes, objective, tolerance, anchors, scales)
+    # Where an edge comes into an image, or leaves it, a residual jumps from zero or to it, which is no slope.
+    jacobian = np.where((residuals == 0) == (here.residuals == 0), residuals - here.residuals, 0) / STEP
+    hessian = _products(jacobian * _pull(here), jacobian)
     turns = np.linalg.inv(hessian + SMALLEST_CURVATURE * np.eye(4))[:, :2, :2]
     widest: Array = np.sqrt(NOTICEABLE * np.linalg.eigvalsh(turns)[:, -1])
     return widest

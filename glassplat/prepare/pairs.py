@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2, vq
 
 Pairs = list[tuple[int, int]]
 
@@ -58,6 +57,8 @@ def chosen_pairs(descriptors: Sequence[NDArray[np.uint8]]) -> Pairs:
 
 def _signatures(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
     """[P, WORDS * 128] unit vectors; zeros where a photograph has no features."""
+    from scipy.cluster.vq import kmeans2  # Slow to import, and only many photographs need it.
+
     everything = np.concatenate(descriptors)
     rng = np.random.default_rng(SEED)
     sample = everything[rng.permutation(len(everything))[:SAMPLED]]
@@ -66,6 +67,8 @@ def _signatures(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float3
 
 
 def _signature(features: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:
+    from scipy.cluster.vq import vq
+
     sums = np.zeros_like(words)
     if len(features):
         nearest, _ = vq(features, words)

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.spatial import cKDTree
 
 from glassplat.suggest.mirror_matches import MirrorMatches, Plane
 from glassplat.suggest.pane_extent import seen_within
@@ -113,6 +111,8 @@ def refined(plane: Plane, matches: MirrorMatches, extent: float) -> Plane:
 
 def _fitted(plane: Plane, matches: MirrorMatches, chosen: Numbers, extent: float) -> Plane:
     """Least squares over some matches, every point with the same weight however often it is matched."""
+    from scipy.optimize import least_squares  # Slow to import, and `annotate` needs it with --suggest alone.
+
     points, virtual = matches.points[chosen], matches.virtual[chosen]
     _, track = np.unique(matches.track[chosen], return_inverse=True)
     weight = 1 / np.sqrt(np.bincount(track)[track])[:, None]
@@ -150,6 +150,8 @@ def _hypotheses(matches: MirrorMatches, extent: float) -> tuple[Array, Array]:
 
 def _voted(normals: Array, offsets: Array, *, matches: MirrorMatches, extent: float) -> Iterator[Plane]:
     """Different planes among many, those with most others close to them first."""
+    from scipy.spatial import cKDTree
+
     if not len(offsets):
         return
     images = np.stack([_images(n, d, matches, extent) for n, d in zip(normals, offsets, strict=True)])

@@ -4,7 +4,7 @@ const SLOW = 1 / 22, QUICK = 1 / 45, LEAST_SCALE = 0.35, REST = 0.18;
 
 async function start() {
   const scene = await loadedScene(), canvas = element('view');
-  const renderer = makeRenderer(canvas, scene), sort = makeSorter(scene.positions);
+  const renderer = makeRenderer(canvas, scene), sort = makeSorter(scene);
   let stale = true, last = 0, quiet = 0, drawn = 0, frame = REST, moving = renderer.isSoftware ? 0.6 : 1, sorting = false;
   const changed = () => { stale = true; };
   const navigation = makeNavigation(scene, changed), panel = makePanel(scene, navigation, changed);
@@ -21,8 +21,12 @@ async function start() {
     return { pose: navigation.pose(), intrinsics: intrinsics(canvas.width, canvas.height), scale, ...panel.wanted() };
   }
 
-  async function sorted(pose) {
-    const orders = await sort(camerasToSort(pose, scene));
+  const lensOf = (width, height) => ({ intrinsics: intrinsics(width, height), size: [width, height] });
+
+  const ordersOf = (pose, lens) => sort(camerasToSort(pose, lens, scene));
+
+  async function sorted(pose, lens = lensOf(canvas.width, canvas.height)) {
+    const orders = await ordersOf(pose, lens);
     orders?.forEach((order, k) => renderer.setOrder(k, order));
   }
 
@@ -51,7 +55,7 @@ async function start() {
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
     renderer.resize(Math.max(1, Math.round(canvas.clientWidth * ratio)), Math.max(1, Math.round(canvas.clientHeight * ratio)));
     const moved = navigation.pose() !== seen;
-    if (moved) { seen = navigation.pose(); follow(); }
+    if (moved || canvas.width !== tick.width || canvas.height !== tick.height) { seen = navigation.pose(); follow(); }
     if (moved || active) { adapt(seconds); quiet = 0; } else { quiet += seconds; }
     const scale = quiet < REST ? moving : 1;
     if (!stale && !(scale === 1 && drawn < 1) && canvas.width === tick.width && canvas.height === tick.height) return;
@@ -66,9 +70,10 @@ async function start() {
     const pose = poseAt(rotation, position);
     await settled();
     sorting = true;
-    await sorted(pose);
+    const lens = { intrinsics: [fx, fy, cx, cy], size: [width, height] };
+    await sorted(pose, lens);
     renderer.resize(width, height);
-    renderer.draw({ ...viewOf(1), pose, intrinsics: [fx, fy, cx, cy], divider: 2, ...wanted });
+    renderer.draw({ ...viewOf(1), pose, intrinsics: lens.intrinsics, divider: 2, ...wanted });
     const rows = renderer.pixels();
     sorting = false;
     tick.width = 0;
@@ -102,7 +107,7 @@ async function start() {
   document.body.classList.add('ready');
   if (!matchMedia('(prefers-reduced-motion: reduce)').matches && !location.hash.includes('still')) navigation.sway();
   requestAnimationFrame(tick);
-  return { picture, measured, panel, navigation, scene, isSoftware: renderer.isSoftware };
+  return { picture, measured, ordersOf, panel, navigation, scene, isSoftware: renderer.isSoftware };
 }
 
 window.glassplat = start();

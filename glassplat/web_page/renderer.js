@@ -280,11 +280,20 @@ function boundsOf(pane, pose, [fx, fy, cx, cy], [width, height], near) {
   return bounds[0] < bounds[2] && bounds[1] < bounds[3] ? bounds : null;
 }
 
-// What the sorter has to know of a view: the camera itself, and one camera per pane.
-function camerasToSort(pose, scene) {
-  const camera = (one, clip, last) => ({ row: row(one.rotation, 2), offset: one.offset[2], near: scene.near, clip, last });
+// What the sorter has to know of a view: the camera itself, and one camera per pane, which shows what the pane covers.
+// A view has moved on before its order is there, so that windows, in tangents, are wider than the picture.
+const SPARE = 0.3;
+
+function camerasToSort(pose, { intrinsics, size }, scene) {
+  const window = (bounds) => bounds.map((edge, k) => {
+    const spare = (k < 2 ? -SPARE : SPARE) * size[k % 2];
+    return (edge + spare - intrinsics[2 + (k % 2)]) / intrinsics[k % 2];
+  });
+  const camera = ({ rotation, offset }, clip, last, bounds) =>
+    ({ rows: rotation, offset, near: scene.near, clip, last, window: window(bounds || [0, 0, ...size]) });
   return [
-    camera(pose, null, scene.total),
-    ...scene.panes.map((pane) => camera(mirroredPose(pose, pane), sideOf(pane, pose), scene.firstGlass)),
+    camera(pose, null, scene.total, null),
+    ...scene.panes.map((pane) => camera(mirroredPose(pose, pane), sideOf(pane, pose), scene.firstGlass,
+      boundsOf(pane, pose, intrinsics, size, scene.near))),
   ];
 }

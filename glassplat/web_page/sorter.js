@@ -1,15 +1,21 @@
-// Orders splats back to front, one order per camera; runs as a worker.
-function sorterOf(positions) {
+// Orders the splats that may be in the picture back to front, one order per camera; runs as a worker.
+function sorterOf(positions, reaches) {
   const count = positions.length / 3, keys = new Int32Array(count), chosen = new Uint32Array(count);
   const bits = new Int32Array(1), depth = new Float32Array(bits.buffer), counts = new Uint32Array(65537);
 
   // The bits of a positive float grow with it, and their upper ones resolve near depths more finely than far ones.
-  function kept({ row, offset, near, clip, last }) {
+  function kept({ rows, offset, near, clip, last, window: [left, top, right, bottom] }) {
+    const across = Math.hypot(1, Math.max(-left, right)), down = Math.hypot(1, Math.max(-top, bottom));
     let found = 0, lowest = 0x7fffffff, highest = 0;
     for (let i = 0; i < last; i++) {
       const x = positions[3 * i], y = positions[3 * i + 1], z = positions[3 * i + 2];
-      depth[0] = row[0] * x + row[1] * y + row[2] * z + offset;
-      if (!(depth[0] > near) || (clip && clip[0] * x + clip[1] * y + clip[2] * z + clip[3] <= 0)) continue;
+      const far = rows[6] * x + rows[7] * y + rows[8] * z + offset[2];
+      if (!(far > near) || (clip && clip[0] * x + clip[1] * y + clip[2] * z + clip[3] <= 0)) continue;
+      const u = rows[0] * x + rows[1] * y + rows[2] * z + offset[0], wide = across * reaches[i];
+      if (u < left * far - wide || u > right * far + wide) continue;
+      const v = rows[3] * x + rows[4] * y + rows[5] * z + offset[1], high = down * reaches[i];
+      if (v < top * far - high || v > bottom * far + high) continue;
+      depth[0] = far;
       const key = bits[0];
       if (key < lowest) lowest = key;
       if (key > highest) highest = key;
@@ -35,29 +41,29 @@ function sorterOf(positions) {
 function sortingWorker() {
   let order = null;
   self.onmessage = ({ data }) => {
-    if (data.positions) { order = sorterOf(data.positions); return; }
+    if (data.positions) { order = sorterOf(data.positions, data.reaches); return; }
     const orders = data.cameras.map(order);
     self.postMessage({ ticket: data.ticket, orders }, orders.map((sorted) => sorted.buffer));
   };
 }
 
 // Asks the worker, or sorts here where a browser allows none; only the newest request waits while one is under way.
-function makeSorter(positions) {
+function makeSorter({ positions, reaches }) {
   let worker = null, here = null, ticket = 0, busy = false, waiting = null;
   const answers = new Map();
   try {
     const source = `${sorterOf}\n(${sortingWorker})()`;
     worker = new Worker(URL.createObjectURL(new Blob([source], { type: 'text/javascript' })));
-    worker.onerror = () => { worker = null; here = sorterOf(positions); busy = false; pump(); };
+    worker.onerror = () => { worker = null; here = sorterOf(positions, reaches); busy = false; pump(); };
     worker.onmessage = ({ data }) => {
       busy = false;
       answers.get(data.ticket)?.(data.orders);
       answers.delete(data.ticket);
       pump();
     };
-    worker.postMessage({ positions });
+    worker.postMessage({ positions, reaches });
   } catch {
-    here = sorterOf(positions);
+    here = sorterOf(positions, reaches);
   }
 
   function pump() {

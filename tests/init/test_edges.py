@@ -7,10 +7,11 @@ import pytest
 
 from glassplat.init.annotation import PaneView, pane_views
 from glassplat.init.edges import edge_matches
+from glassplat.init.plane_moves import moved
 from glassplat.init.plane_objective import Objective
 from glassplat.init.plane_refinement import doubt, refined
 from glassplat.init.ransac import FramedPlanes, PlaneEquations
-from tests.init.pane_scene import FRONT, framed_scene_of, scene_of
+from tests.init.pane_scene import EYES, FRONT, framed_scene_of, scene_of
 
 TRUTH = PlaneEquations(FRONT.normal[None], np.array([FRONT.normal @ FRONT.center]))
 BEYOND = ((2.6, 0.0, 0.3), (-1.9, 0.4, 0.6), (0.2, 0.2, -1.2))
@@ -61,3 +62,20 @@ def test_doubt_is_small_where_all_sides_are_seen_and_large_where_one_is() -> Non
         replace(view, edge=view.edge[sides], outward=view.outward[sides]) for view in views for sides in [upper(view)]
     ]
     assert doubt(planes, Objective(level, *nothing), 0.004)[0] > np.radians(10)
+
+
+def test_edges_that_enter_an_image_or_leave_it_make_no_plane_surer() -> None:
+    views = pane_views(scene_of([FRONT], [*EYES, (0.9, -0.5, 0.9), (-0.5, 0.4, 1.0)]), 1)
+    steps = 1e-3 * np.random.default_rng(0).standard_normal((40, 3))
+    around = moved(TRUTH.select(np.zeros(40, dtype=np.int64)), np.tile(FRONT.center, (40, 1)), steps)
+    doubts = doubt(FramedPlanes(around, np.zeros(40)), Objective(views, np.zeros((0, 3)), 2.0, 0.02), 0.004)
+    assert doubts.max() < 1.1 * doubts.min()
+
+
+def test_the_sign_of_turned_edges_does_not_hang_on_the_axes_of_the_plane() -> None:
+    views = pane_views(scene_of([FRONT]), 1)
+    # The axes of a plane turn by a right angle where its normal is nearest to another axis of the world.
+    tilts = 1e-3 * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
+    around = moved(TRUTH.select(np.zeros(5, dtype=np.int64)), np.tile(FRONT.center, (5, 1)), tilts)
+    turns = edge_matches(around, views, edges_per_view=100).turns
+    assert np.abs(turns - turns[0]).max() < 0.05 < np.abs(turns[0]).max()

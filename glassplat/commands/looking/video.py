@@ -93,7 +93,7 @@ class Video:
             with atomic_write(self.output) as temporary:
                 count = write_film(temporary, pictures, self.fps)
         kept.remove()
-        say(console, f"{count} pictures, {self.output.stat().st_size / 1e6:.1f} MB -> {self.output}")
+        say(console, f"{count} pictures, {self.output.stat().st_size / 1e6:.2f} MB -> {self.output}")
 
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""

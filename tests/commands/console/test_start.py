@@ -52,9 +52,10 @@ def test_the_list_of_commands_needs_none_of_the_libraries(arguments: list[str], 
     assert all(name in done.stdout + done.stderr for name in COMMANDS) or arguments == ["--version"]
 
 
-@pytest.mark.parametrize("name", ["train", "eval", "export", "view", "video", "import", "info"])
+@pytest.mark.parametrize("name", ["prepare", "annotate", "train", "eval", "export", "view", "video", "import", "info"])
 def test_a_command_does_not_wait_for_what_it_may_never_need(name: str) -> None:
-    late = ["scipy.spatial", "scipy.ndimage", "scipy.interpolate", "pycolmap", "viser", "cv2", "OpenEXR"]
+    late = ["scipy.spatial", "scipy.ndimage", "scipy.interpolate", "scipy.optimize", "viser", "cv2", "OpenEXR"]
+    late += [] if name in ("prepare", "annotate") else ["pycolmap"]
     late += ["glassplat.evaluate.evaluate", "zstandard"] if name == "train" else []
     done = subprocess.run(
         [sys.executable, "-c", IMPORTS.format(arguments=[name, "--help"], slow=late)],
