@@ -37,7 +37,7 @@ class _HarmonicEnergy(torch.autograd.Function):
         ctx.save_for_backward(sh)
         if sh.device.type != "cpu":
             return reference.harmonic_energy(sh)
-        sums = torch.empty(-(-sh.shape[0] // CHUNK), dtype=torch.float64)
+        sums = torch.empty(-(-sh.shape[0] // CHUNK), dtype=torch.float64, device=sh.device)
         energy_forward(REAL_OF[sh.dtype])(sh.numpy(), sums.numpy())
         return sums.sum().to(sh.dtype)
 

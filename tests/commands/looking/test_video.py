@@ -134,7 +134,7 @@ def test_a_damaged_picture_is_named(
         ("--output there.webp", "pass --force"),
         ("--output film.webp --layout wipe", "two --layers"),
         ("--output film.webp --path keyframes", "belong together"),
-        ("--output film.webp --layers normal", "renders no layer normal"),
+        ("--output film.webp --layers base", "renders no layer base"),
         ("--output film.webp --seconds 0", "--seconds"),
     ],
 )

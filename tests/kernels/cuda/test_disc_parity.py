@@ -14,10 +14,12 @@ from glassplat.kernels.devices import SIMULATED
 from glassplat.kernels.project_discs import project_discs
 from glassplat.kernels.project_discs.reference import project_discs as project_twin
 from glassplat.kernels.splats import CameraBatch
-from tests.kernels.cuda.test_parity import DTYPES, check_gradients, close, many, on_device
+from tests.kernels.cuda.agreement import DTYPES, check_gradients, close, many, on_a_device_or_skipped, on_device
 from tests.kernels.gaussians_and_cameras import random_cameras
 from tests.kernels.test_composite_discs import NEAR, Case, cameras_of, case_of, scattered, with_gradients
 from tests.kernels.test_project_discs import SMOOTH, random_discs
+
+on_a_device_or_skipped()
 
 pytestmark = [pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 

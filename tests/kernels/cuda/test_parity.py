@@ -5,9 +5,8 @@
 
 from __future__ import annotations
 
-import os
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,7 @@ from glassplat.kernels.bin_tiles import reference as bin_twin
 from glassplat.kernels.blend_panes import reference as blend_twin
 from glassplat.kernels.composite import reference as composite_twin
 from glassplat.kernels.cube_lookup import reference as lookup_twin
-from glassplat.kernels.devices import SIMULATED, cuda_problem, kernels_for
+from glassplat.kernels.devices import SIMULATED, kernels_for
 from glassplat.kernels.pane_hits import reference as hits_twin
 from glassplat.kernels.panes import Fresnel, Panes
 from glassplat.kernels.photometric import reference as photometric_twin
@@ -38,62 +37,25 @@ from glassplat.kernels.project import reference as project_twin
 from glassplat.kernels.shade_environment import reference as shade_twin
 from glassplat.kernels.splats import CameraBatch, Deviation, RawGaussians, Splats
 from glassplat.kernels.surface_channels import reference as surface_twin
+from tests.kernels.cuda.agreement import (
+    DEVICE,
+    DTYPES,
+    check_gradients,
+    close,
+    many,
+    on_a_device_or_skipped,
+    on_device,
+)
 from tests.kernels.gaussians_and_cameras import draw, random_cameras, random_gaussians
 
-if SIMULATED and hasattr(os, "sched_setaffinity"):
-    # The simulator has a Python thread for each of CUDA's; on several cores they fight over the interpreter.
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-if not SIMULATED and (problem := cuda_problem()) is not None:
-    pytest.skip(f"no GPU to run the CUDA kernels on: {problem}", allow_module_level=True)
+on_a_device_or_skipped()
 
 pytestmark = [
     # The simulator computes with NumPy's scalars, which warn where a GPU gives infinity, and in threads.
     pytest.mark.filterwarnings("ignore::RuntimeWarning"),
 ]
 
-DEVICE = torch.device("cpu" if SIMULATED else "cuda")
 WIDTH, HEIGHT = (20, 17) if SIMULATED else (203, 117)
-DTYPES = [torch.float64, torch.float32]
-TOLERANCE = {torch.float64: 1e-9, torch.float32: 2e-4}
-
-
-def many(few: int, number: int) -> int:
-    """A size for the simulator, and one for a GPU."""
-    return few if SIMULATED else number
-
-
-def on_device(value: Any) -> Any:
-    """Tensors, and records of tensors, on the device under test, as new leaves."""
-    if isinstance(value, Tensor):
-        return value.detach().to(DEVICE).requires_grad_(value.requires_grad)
-    if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return type(value)(*map(on_device, value))
-    return value
-
-
-def close(found: Tensor, expected: Tensor, factor: float = 1.0) -> None:
-    """Agreement relative to the largest entry, because gradients of one tensor differ by orders of magnitude."""
-    assert found.shape == expected.shape
-    if expected.numel() == 0:
-        return
-    if not expected.is_floating_point():
-        assert torch.equal(found.cpu(), expected)
-        return
-    scale = max(float(expected.detach().abs().max()), 1e-12)
-    tolerance = factor * TOLERANCE[expected.dtype] * scale
-    torch.testing.assert_close(found.detach().cpu(), expected.detach(), rtol=0, atol=tolerance)
-
-
-def check_gradients(
-    found: Sequence[Tensor], expected: Sequence[Tensor], inputs: Sequence[Tensor], expected_inputs: Sequence[Tensor]
-) -> None:
-    """Gradients of random sums of the outputs agree."""
-    cotangents = [draw(*tensor.shape, seed=90 + i).to(tensor.dtype) for i, tensor in enumerate(expected)]
-    gradients = torch.autograd.grad(found, inputs, [c.to(DEVICE) for c in cotangents], allow_unused=True)
-    wanted = torch.autograd.grad(expected, expected_inputs, cotangents, allow_unused=True)
-    for gradient, want, leaf in zip(gradients, wanted, expected_inputs, strict=True):
-        zeros = torch.zeros_like(leaf)
-        close(zeros if gradient is None else gradient, zeros if want is None else want, 10)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

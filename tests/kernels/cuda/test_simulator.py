@@ -17,9 +17,9 @@ ROOT = Path(__file__).parents[3]
 
 
 @pytest.mark.skipif(SIMULATED, reason="this process is the simulator")
-def test_every_kernel_agrees_with_its_twin_in_the_simulator() -> None:
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/kernels/cuda/test_parity.py"]
-    command += [f"tests/kernels/cuda/test_{kind}_parity.py" for kind in ("disc", "trace")]
+@pytest.mark.parametrize("tests", ["test_parity.py", "test_disc_parity.py", "test_trace_parity.py"])
+def test_every_kernel_agrees_with_its_twin_in_the_simulator(tests: str) -> None:
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"tests/kernels/cuda/{tests}"]
     environment = os.environ | {"NUMBA_ENABLE_CUDASIM": "1", "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-8000:] + done.stderr[-2000:]

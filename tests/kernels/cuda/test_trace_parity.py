@@ -18,8 +18,10 @@ from glassplat.kernels.splats import RawGaussians
 from glassplat.kernels.trace import Rays, trace
 from glassplat.kernels.trace.reference import trace as twin
 from glassplat.kernels.trace.shapes import shapes_of
-from tests.kernels.cuda.test_parity import DEVICE, DTYPES, close, many, on_device
+from tests.kernels.cuda.agreement import DEVICE, DTYPES, close, many, on_a_device_or_skipped, on_device
 from tests.kernels.test_trace import DISCS, ELLIPSOIDS, bvh_of, cloud, one_disc, ray, rays_around, with_gradients
+
+on_a_device_or_skipped()
 
 pytestmark = [pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 
