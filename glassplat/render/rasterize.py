@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.discs import ProjectedDiscs
 from glassplat.kernels.project import GradientSum, project
-from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians, Splats
+from glassplat.kernels.splats import LEAST_ALPHA, CameraBatch, Projected, RawGaussians, Splats
 from glassplat.render.frame import ScreenPass
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
@@ -110,7 +110,7 @@ class _OverBackground(torch.autograd.Function):
 
 def mean_depth(depth_sum: Tensor, alpha: Tensor) -> Tensor:
     """Blended depth (TR-Gaussians, Eq. 4): weighted depth sum over total weight; 0 where nothing is."""
-    return torch.where(alpha > 1e-6, depth_sum / alpha.clamp(min=1e-6), 0)
+    return torch.where(alpha > LEAST_ALPHA, depth_sum / alpha.clamp(min=LEAST_ALPHA), 0)
 
 
 def check_ellipsoids(gaussians: Gaussians) -> None:

@@ -9,13 +9,13 @@ from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.trace.steps import WIDTH
 
 
-def level_sizes(count: int) -> list[int]:
-    """Nodes of each level over `count` Gaussians, the lowest first; none over none."""
-    sizes: list[int] = []
-    while count > 1 or (count == 1 and not sizes):
+def level_offsets(count: int) -> list[int]:
+    """Where the nodes of each level over `count` Gaussians begin, the lowest first, and where the last one ends."""
+    offsets = [0]
+    while count > 1 or (count == 1 and len(offsets) == 1):
         count = -(-count // WIDTH)
-        sizes.append(count)
-    return sizes
+        offsets.append(offsets[-1] + count)
+    return offsets
 
 
 def half_widths_maths(real: type, flat: bool) -> Scalar:

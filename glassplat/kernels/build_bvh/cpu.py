@@ -8,7 +8,7 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from glassplat.kernels.build_bvh.boxes import half_widths_maths, level_sizes
+from glassplat.kernels.build_bvh.boxes import half_widths_maths, level_offsets
 from glassplat.kernels.build_bvh.hilbert import hilbert_codes
 from glassplat.kernels.cpu.jit import Kernel, kernel
 from glassplat.kernels.tensor_checks import REAL_OF
@@ -22,8 +22,7 @@ def build_bvh(shapes: Shapes, *, flat: bool, order: Tensor | None) -> Bvh:
     count, real = shapes.means.shape[0], REAL_OF[shapes.means.dtype]
     if order is None:
         order = torch.argsort(hilbert_codes(shapes.means.detach()), stable=True).to(torch.int32)
-    sizes = level_sizes(count)
-    offsets = torch.tensor([0, *sizes]).cumsum(0)
+    offsets = torch.tensor(level_offsets(count))
     boxes = shapes.means.new_empty(int(offsets[-1]), 6, WIDTH)
     extents = reach(shapes.opacities)
     inputs = (tensor.detach().contiguous().numpy() for tensor in (shapes.means, shapes.frames, extents, order, offsets))

@@ -10,7 +10,7 @@ import torch
 from numba import cuda
 from torch import Tensor
 
-from glassplat.kernels.build_bvh.boxes import half_widths_maths, level_sizes
+from glassplat.kernels.build_bvh.boxes import half_widths_maths, level_offsets
 from glassplat.kernels.build_bvh.hilbert import curve_cells, curve_place
 from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
 from glassplat.kernels.tensor_checks import REAL_OF
@@ -27,9 +27,7 @@ def build_bvh(shapes: Shapes, *, flat: bool, order: Tensor | None) -> Bvh:
     count, real = means.shape[0], REAL_OF[means.dtype]
     if order is None:
         order = torch.argsort(hilbert_codes(means), stable=True).to(torch.int32)
-    offsets = [0]
-    for size in level_sizes(count):
-        offsets.append(offsets[-1] + size)
+    offsets = level_offsets(count)
     boxes = means.new_empty(offsets[-1], 6, WIDTH)
     extents = reach(shapes.opacities.detach())
     leaves = offsets[1] if count else 0
