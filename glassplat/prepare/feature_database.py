@@ -5,12 +5,11 @@ Photographs go by numbers in it, whatever they are called. What is in it stays: 
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Callable, Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +21,7 @@ from glassplat.prepare.messages import Listener, Progress
 from glassplat.prepare.native_call import interruptible
 from glassplat.prepare.photographs import Photograph, read_photograph
 
+Item = TypeVar("Item")
 Lens = Literal["simple_pinhole", "simple_radial", "radial", "opencv", "opencv_fisheye"]
 """COLMAP's camera models, the simplest first: two fish-eyes aside, each next one bends lines in more ways."""
 
@@ -103,8 +103,9 @@ class FeatureDatabase:
                 cancellation_token=token,
             )
 
-        counted = self._counted("looking for features", "keypoints", len(self.photographs), listen)
-        interruptible(work, counted)
+        with closing(pycolmap.Database.open(self.path)) as database:
+            watched = _Watched("looking for features", _image_ids(database), database.exists_keypoints, listen)
+            interruptible(work, watched.look)
 
     def match(self, pairs: Sequence[tuple[int, int]], features: Features, listen: Listener, threads: int) -> None:
         """Matches pairs of photographs, by number, that are not matched yet."""
@@ -126,21 +127,23 @@ class FeatureDatabase:
                 cancellation_token=token,
             )
 
-        interruptible(work, self._counted("matching photographs", "two_view_geometries", len(pairs), listen))
+        with closing(pycolmap.Database.open(self.path)) as database:
+            ids = _image_ids(database)
+            items = [(ids[one], ids[other]) for one, other in pairs]
+            watched = _Watched(
+                "matching photographs", items, lambda two: database.exists_two_view_geometry(*two), listen
+            )
+            interruptible(work, watched.look)
 
     def feature_counts(self) -> NDArray[np.int64]:
         """[P] features of each photograph."""
         with closing(pycolmap.Database.open(self.path)) as database:
-            ids = {image.name: image.image_id for image in database.read_all_images()}
-            names = map(self.picture_name, range(len(self.photographs)))
-            return np.array([database.num_keypoints_for_image(ids[name]) for name in names], dtype=np.int64)
+            return np.array([database.num_keypoints_for_image(one) for one in _image_ids(database)], dtype=np.int64)
 
     def descriptors(self) -> list[NDArray[np.uint8]]:
         """[F, 128] of each photograph, the order of the features as found."""
         with closing(pycolmap.Database.open(self.path)) as database:
-            ids = {image.name: image.image_id for image in database.read_all_images()}
-            names = map(self.picture_name, range(len(self.photographs)))
-            return [np.asarray(database.read_descriptors(ids[name]).data) for name in names]
+            return [np.asarray(database.read_descriptors(one).data) for one in _image_ids(database)]
 
     def inliers(self) -> dict[tuple[int, int], int]:
         """How many matches of each pair of photographs, by number, agree on how the camera moved; pairs with any."""
@@ -159,16 +162,27 @@ class FeatureDatabase:
         told = [one.focal for one in self.photographs if _camera_key(one) == key and one.focal is not None]
         return float(np.median(told)) if told else None
 
-    def _counted(self, what: str, table: str, total: int, listen: Listener) -> Callable[[], None]:
-        """Tells how many rows a table has while COLMAP writes it."""
 
-        def look() -> None:
-            # COLMAP may hold the file, or not have made it yet: then the next look tells.
-            with suppress(sqlite3.Error), closing(sqlite3.connect(self.path, timeout=0.05)) as connection:
-                (rows,) = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()
-                listen(Progress(what, min(int(rows), total), total))
+class _Watched(Generic[Item]):
+    """Tells of how many items a database has what COLMAP finds, while COLMAP is at it.
 
-        return look
+    It is read by COLMAP's SQLite. Python's is another copy in this process: closing a file in one drops the locks of
+    the other, which then dies of a bus error (sqlite.org/howtocorrupt.html, 2.2.1).
+    """
+
+    def __init__(self, what: str, items: Sequence[Item], exists: Callable[[Item], bool], listen: Listener) -> None:
+        self._what, self._total = what, len(items)
+        self._missing, self._exists, self._listen = items, exists, listen
+
+    def look(self) -> None:
+        """Looks for what was missing the last time, and tells."""
+        self._missing = [item for item in self._missing if not self._exists(item)]
+        self._listen(Progress(self._what, self._total - len(self._missing), self._total))
+
+
+def _image_ids(database: Any) -> list[int]:
+    """The database's ids of the photographs, in their order."""
+    return [image.image_id for image in sorted(database.read_all_images(), key=lambda image: str(image.name))]
 
 
 def _camera_key(photograph: Photograph) -> tuple[str, int, int]:
