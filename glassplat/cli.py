@@ -1,7 +1,8 @@
 """The command line: `glassplat prepare | annotate | train | eval | render | dereflect | export | info | demo | bench`.
 
 A command's module is imported when the command is chosen, and nothing before that which takes long: the list of
-commands appears at once, and Ctrl-C works from the beginning.
+commands appears at once, and Ctrl-C works from the beginning. What does a command's work, and PyTorch with it, is
+imported when the command has understood its options and refused what can be refused without: its method `ready`.
 """
 
 from __future__ import annotations
@@ -113,6 +114,8 @@ def guarded(arguments: list[str], *, is_program: bool) -> int:
         try:
             with immediate_end() if is_program else nullcontext():
                 command = parsed(arguments)
+                if hasattr(command, "ready"):
+                    command.ready()
             run(command)
         except KeyboardInterrupt as stop:
             return interrupted(stop, command)
@@ -164,6 +167,11 @@ def parsed(arguments: list[str]) -> Any:
 def command_line(name: str, options: list[str]) -> tuple[Any, list[str]]:
     """What tyro should make of a command's options, and how it should see them; that of `train` depends on them."""
     if name == "train":
+        from glassplat.commands.console.loading import load
+        from glassplat.commands.training.first_look import check_places
+
+        check_places(options)
+        load("glassplat.commands.training.train_options")
         from glassplat.commands.training.train_options import train_command
 
         return train_command(options)

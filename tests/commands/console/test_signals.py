@@ -15,7 +15,7 @@ import pytest
 from glassplat.cli import main
 from glassplat.commands.looking.render import Render
 from glassplat.commands.measuring.bench import Bench, BenchScenes
-from glassplat.commands.measuring.demo import Demo
+from glassplat.commands.measuring.demo import SCENE, Demo
 from glassplat.commands.measuring.evaluate import Evaluate
 from glassplat.commands.publishing.dereflect import Dereflect
 from glassplat.commands.training.train import Train
@@ -33,7 +33,7 @@ class Sender(importlib.abc.MetaPathFinder):
         return None
 
 sys.meta_path.insert(0, Sender())
-sys.argv = ["glassplat", "train", "splat", "--data", "none", "--output", "none"]
+sys.argv = ["glassplat", "train", "splat", "--data", {data!r}, "--output", "none"]
 from glassplat.cli import main
 sys.exit(main())
 """
@@ -65,7 +65,7 @@ def ended(script: str) -> tuple[int, str, str]:
     ],
 )
 def test_a_signal_among_the_imports_is_one_line(name: str, number: str) -> None:
-    code, _, said = ended(SIGNALLED_WHILE_IMPORTING.format(name=name, signal=number))
+    code, _, said = ended(SIGNALLED_WHILE_IMPORTING.format(name=name, signal=number, data=str(SCENE)))
     assert (code, said) == (CODES[number], f"{WORDS[number]}\n")
 
 
