@@ -131,7 +131,13 @@ def fit_planes(
     panes = []
     for label in labels:
         views = pane_views(annotations, label, most=options.most_views, names=names)
-        panes.append(_fit_pane(label, clouds, views, extent=extent, options=options))
+        try:
+            panes.append(_fit_pane(label, clouds, views, extent=extent, options=options))
+        except PlaneFitError as error:
+            if len(labels) == 1:
+                raise
+            without = f"Or do without it: with label {label} erased from the masks, it is learned like all else"
+            raise PlaneFitError(f"{error}. {without}") from error
     return _planes(panes, labels, options).to(centers.device)
 
 

@@ -125,6 +125,17 @@ def test_one_view_is_too_few() -> None:
         fit_planes(frame_and_clutter([FRONT]), scene_of([FRONT])[:1], extent=EXTENT, options=QUICK)
 
 
+def test_among_several_panes_one_may_be_done_without() -> None:
+    annotations = scene_of([FRONT])
+    camera, image = annotations[0]
+    annotations[0] = camera, torch.where(image == 1, 2, image)
+    with pytest.raises(PlaneFitError, match=r"pane 2 is annotated in 1 view.* with label 2 erased from the masks"):
+        fit_planes(frame_and_clutter([FRONT]), annotations, extent=EXTENT, options=QUICK)
+    with pytest.raises(PlaneFitError, match="pane 1 is annotated in 1 view") as one:
+        fit_planes(frame_and_clutter([FRONT]), scene_of([FRONT])[:1], extent=EXTENT, options=QUICK)
+    assert "erased" not in str(one.value)
+
+
 def test_two_views_are_enough_but_not_without_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     planes = fit_planes(frame_and_clutter([FRONT]), scene_of([FRONT])[:2], extent=EXTENT, options=QUICK)
     assert normal_error(planes, 0, FRONT) < 2

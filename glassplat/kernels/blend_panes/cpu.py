@@ -17,14 +17,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
+from glassplat.kernels.cpu.pixel_rows import interleaved, sorted_apart
 from glassplat.kernels.cpu.schedule import even_stride
+from glassplat.kernels.cpu.vector import bits_of, store, vector_kind
+from glassplat.kernels.cpu.vector_rows import store_all, thirds, triples
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.color_space import color_space_maths
 from glassplat.kernels.maths.pane import pane_maths
 from glassplat.kernels.tensor_checks import REAL_OF
 
-RUN = 64
-"""Pixels of a run."""
+LANES = 16
+RUN = 32
+"""Pixels of a run, whole vectors."""
+
+ALL = (1 << LANES) - 1
+"""Bits of a whole vector."""
 
 # Planes of a run. MASK is 0 where the run's pane is not shown; GAIN is the intensity.
 MASK, GAIN, RAW, SHARE, ALONG, LENGTH = (plane * RUN for plane in range(6))
@@ -67,21 +74,67 @@ def _span(pane, row, k):
 
 
 def _load(real: type) -> Scalar:
-    zero, one = real(0.0), real(1.0)
+    load_lanes, zero, one = vector_kind(real, LANES).load, real(0.0), real(1.0)
+    load_triples = _copies(real)[0]
 
     @inlined
     def load(run, transmission, mask, reflections, pane, intensity, row, k, first, count):
-        """Copies the pixels of a run; what lies beyond its end is not shown."""
-        for i in range(RUN):
-            column = first + min(i, count - 1)
-            shown = (pane[row, column] == k) & (i < count)
-            run[MASK + i] = mask[row, column] if shown else zero
-            run[GAIN + i] = one + reflections[k, row, column, 3] if intensity else one
-            for d in range(3):
-                run[BEHIND + d * RUN + i] = transmission[row, column, d]
-                run[MIRRORED + d * RUN + i] = reflections[k, row, column, d]
+        """Copies the pixels of a run; what lies beyond its end is not shown. Images of colours are flat."""
+        height, width = mask.shape
+        pixel = row * width + first
+        mirrored = k * height * width + pixel
+        if count == RUN:
+            for i in range(RUN):
+                run[MASK + i] = mask[row, first + i] if pane[row, first + i] == k else zero
+            for i in range(0, RUN, LANES):
+                load_triples(run, BEHIND + i, transmission, pixel + i)
+                at = 4 * (mirrored + i)
+                four = (
+                    load_lanes(reflections, at), load_lanes(reflections, at + LANES),
+                    load_lanes(reflections, at + 2 * LANES), load_lanes(reflections, at + 3 * LANES),
+                )  # fmt: skip
+                red, green, blue, gain = sorted_apart(four)
+                store(run, MIRRORED + i, red)
+                store(run, MIRRORED + RUN + i, green)
+                store(run, MIRRORED + 2 * RUN + i, blue)
+                store(run, GAIN + i, gain + one)
+        else:
+            for i in range(RUN):
+                x = min(i, count - 1)
+                shown = (pane[row, first + x] == k) & (i < count)
+                run[MASK + i] = mask[row, first + x] if shown else zero
+                run[GAIN + i] = one + reflections[4 * (mirrored + x) + 3]
+                for d in range(3):
+                    run[BEHIND + d * RUN + i] = transmission[3 * (pixel + x) + d]
+                    run[MIRRORED + d * RUN + i] = reflections[4 * (mirrored + x) + d]
+        if not intensity:
+            for i in range(RUN):
+                run[GAIN + i] = one
 
     return load
+
+
+def _copies(real: type) -> tuple[Scalar, Scalar]:
+    """Between colours of `LANES` pixels, which lie in a row in a flat image, and three planes of a run."""
+    load_lanes = vector_kind(real, LANES).load
+
+    @inlined
+    def load_triples(run, at, image, pixel):
+        rows = (
+            load_lanes(image, 3 * pixel), load_lanes(image, 3 * pixel + LANES),
+            load_lanes(image, 3 * pixel + 2 * LANES),
+        )  # fmt: skip
+        red, green, blue = thirds(rows[0], rows[1], rows[2])
+        store(run, at, red)
+        store(run, at + RUN, green)
+        store(run, at + 2 * RUN, blue)
+
+    @inlined
+    def store_triples(run, at, image, pixel):
+        rows = triples(load_lanes(run, at), load_lanes(run, at + RUN), load_lanes(run, at + 2 * RUN))
+        store_all(image, 3 * pixel, rows)
+
+    return load_triples, store_triples
 
 
 def _shine(real: type) -> Scalar:
@@ -133,15 +186,17 @@ def _mix(real: type) -> Scalar:
 @cache
 def blend_panes_forward(real: type) -> Kernel:
     """Fills rgb, reflection and strength."""
-    load, shine, mix = _load(real), _shine(real), _mix(real)
-    zero = real(0.0)
+    load, shine, mix, store_triples = _load(real), _shine(real), _mix(real), _copies(real)[1]
+    load_lanes, zero = vector_kind(real, LANES).load, real(0.0)
 
     @kernel("blend_panes_forward", real)
     def forward(
         transmission, mask, reflections, normals, bases, pane, intrinsics, law, intensity, linear,
         rgb, reflection, strength,
     ):  # fmt: skip
-        height = mask.shape[0]
+        height, width = mask.shape
+        behind, mirrored = transmission.reshape(transmission.size), reflections.reshape(reflections.size)
+        mixed, bright, shares = rgb.reshape(rgb.size), reflection.reshape(reflection.size), strength.reshape(mask.size)
         stride = even_stride(height)
         for task in prange(height):
             row = task * stride % height
@@ -151,19 +206,27 @@ def blend_panes_forward(real: type) -> Kernel:
                 begin, end = _span(pane, row, k)
                 for first in range(begin, end, RUN):
                     count = min(RUN, end - first)
-                    load(run, transmission, mask, reflections, pane, intensity, row, k, first, count)
+                    load(run, behind, mask, mirrored, pane, intensity, row, k, first, count)
                     shine(run, normals, bases, k, row, first, intrinsics, law)
                     for d in range(3):
                         mix(run, d, linear)
-                    for i in range(count):
-                        column = first + i
-                        if run[MASK + i] > zero:
-                            strength[row, column] = run[SHARE + i]
-                            for d in range(3):
-                                reflection[row, column, d] = run[BRIGHT + d * RUN + i]
-                        if run[SHARE + i] > zero:
-                            for d in range(3):
-                                rgb[row, column, d] = run[RGB + d * RUN + i]
+                    for start in range(0, count, LANES):
+                        share = load_lanes(run, SHARE + start)
+                        if bits_of(share > zero) == ALL:
+                            pixel = row * width + first + start
+                            store_triples(run, RGB + start, mixed, pixel)
+                            store_triples(run, BRIGHT + start, bright, pixel)
+                            store(shares, pixel, share)
+                            continue
+                        for i in range(start, min(count, start + LANES)):
+                            column = first + i
+                            if run[MASK + i] > zero:
+                                strength[row, column] = run[SHARE + i]
+                                for d in range(3):
+                                    reflection[row, column, d] = run[BRIGHT + d * RUN + i]
+                            if run[SHARE + i] > zero:
+                                for d in range(3):
+                                    rgb[row, column, d] = run[RGB + d * RUN + i]
 
     return forward
 
@@ -229,6 +292,7 @@ def _dim(real: type) -> Scalar:
 def blend_panes_backward(real: type) -> Kernel:
     """Fills the gradients of transmission, mask, reflections, normals and base reflectances; all start at zero."""
     load, shine, unmix, dim = _load(real), _shine(real), _unmix(real), _dim(real)
+    load_lanes, (load_triples, store_triples) = vector_kind(real, LANES).load, _copies(real)
     zero = real(0.0)
 
     @kernel("blend_panes_backward", real)
@@ -236,7 +300,11 @@ def blend_panes_backward(real: type) -> Kernel:
         transmission, mask, reflections, normals, bases, pane, intrinsics, law, intensity, linear,
         v_rgb, v_reflection, v_strength, v_transmission, v_mask, v_reflections, v_normals, v_bases,
     ):  # fmt: skip
-        height, panes = mask.shape[0], normals.shape[0]
+        (height, width), panes = mask.shape, normals.shape[0]
+        behind, mirrored = transmission.reshape(transmission.size), reflections.reshape(reflections.size)
+        v_mixed, v_bright = v_rgb.reshape(v_rgb.size), v_reflection.reshape(v_reflection.size)
+        v_behind, v_mirrored = v_transmission.reshape(v_rgb.size), v_reflections.reshape(v_reflections.size)
+        v_marked = v_mask.reshape(mask.size)
         sums: NDArray[Any] = np.zeros((height, panes, 4), real)
         stride = even_stride(height)
         for task in prange(height):
@@ -247,14 +315,20 @@ def blend_panes_backward(real: type) -> Kernel:
                 begin, end = _span(pane, row, k)
                 for first in range(begin, end, RUN):
                     count = min(RUN, end - first)
-                    load(run, transmission, mask, reflections, pane, intensity, row, k, first, count)
+                    load(run, behind, mask, mirrored, pane, intensity, row, k, first, count)
                     y = shine(run, normals, bases, k, row, first, intrinsics, law)
                     for i in range(RUN):
-                        column = first + min(i, count - 1)
-                        run[V_SHARE + i], run[V_GAIN + i] = v_strength[row, column], zero
-                        for d in range(3):
-                            run[V_RGB + d * RUN + i] = v_rgb[row, column, d]
-                            run[V_BRIGHT + d * RUN + i] = v_reflection[row, column, d]
+                        run[V_SHARE + i], run[V_GAIN + i] = v_strength[row, first + min(i, count - 1)], zero
+                    for start in range(0, count, LANES):
+                        if start + LANES <= count:
+                            load_triples(run, V_RGB + start, v_mixed, row * width + first + start)
+                            load_triples(run, V_BRIGHT + start, v_bright, row * width + first + start)
+                            continue
+                        for i in range(start, RUN):
+                            column = first + min(i, count - 1)
+                            for d in range(3):
+                                run[V_RGB + d * RUN + i] = v_rgb[row, column, d]
+                                run[V_BRIGHT + d * RUN + i] = v_reflection[row, column, d]
                     for d in range(3):
                         unmix(run, d, linear)
                     sum_x, sum_1, sum_base = dim(run, bases[k], first, intrinsics, law)
@@ -262,16 +336,32 @@ def blend_panes_backward(real: type) -> Kernel:
                     sums[row, k, 1] += sum_1 * y
                     sums[row, k, 2] += sum_1
                     sums[row, k, 3] += sum_base
-                    for i in range(count):
-                        column = first + i
-                        if not run[MASK + i] > zero:
+                    if not intensity:
+                        for i in range(RUN):
+                            run[V_GAIN + i] = zero
+                    for start in range(0, count, LANES):
+                        if bits_of(load_lanes(run, SHARE + start) > zero) == ALL:
+                            pixel = row * width + first + start
+                            store(v_marked, pixel, load_lanes(run, V_SHARE + start) * load_lanes(run, RAW + start))
+                            store_triples(run, V_RGB + start, v_behind, pixel)
+                            at = 4 * (k * height * width + pixel)
+                            v = V_BRIGHT + start
+                            four = (
+                                load_lanes(run, v), load_lanes(run, v + RUN), load_lanes(run, v + 2 * RUN),
+                                load_lanes(run, V_GAIN + start),
+                            )  # fmt: skip
+                            store_all(v_mirrored, at, interleaved(four))
                             continue
-                        v_mask[row, column] = run[V_SHARE + i] * run[RAW + i]
-                        v_reflections[k, row, column, 3] = run[V_GAIN + i] if intensity else zero
-                        for d in range(3):
-                            v_reflections[k, row, column, d] = run[V_BRIGHT + d * RUN + i]
-                            if run[SHARE + i] > zero:
-                                v_transmission[row, column, d] = run[V_RGB + d * RUN + i]
+                        for i in range(start, min(count, start + LANES)):
+                            column = first + i
+                            if not run[MASK + i] > zero:
+                                continue
+                            v_mask[row, column] = run[V_SHARE + i] * run[RAW + i]
+                            v_reflections[k, row, column, 3] = run[V_GAIN + i]
+                            for d in range(3):
+                                v_reflections[k, row, column, d] = run[V_BRIGHT + d * RUN + i]
+                                if run[SHARE + i] > zero:
+                                    v_transmission[row, column, d] = run[V_RGB + d * RUN + i]
         for k in range(panes):
             for row in range(height):
                 for axis in range(3):

@@ -28,8 +28,8 @@ def interleaved(typing, vectors):
 
     def build(builder, packed):
         a, b, c, d = (builder.extract_value(packed, i) for i in range(4))
-        pairs = [_zipped(builder, *pair) for pair in ((a, c), (b, d))]
-        rows = [row for even, odd in zip(*pairs, strict=True) for row in _zipped(builder, even, odd)]
+        pairs = [zipped(builder, *pair) for pair in ((a, c), (b, d))]
+        rows = [row for even, odd in zip(*pairs, strict=True) for row in zipped(builder, even, odd)]
         return cgutils.pack_array(builder, rows, a.type)
 
     if isinstance(vectors, types.UniTuple) and vectors.count == 4 and isinstance(vectors.dtype, VectorType):
@@ -50,7 +50,7 @@ def sorted_apart(typing, vectors):
         return plain(vectors, (vectors,), build)
 
 
-def _zipped(builder: Any, a: Any, b: Any) -> tuple[Any, Any]:
+def zipped(builder: Any, a: Any, b: Any) -> tuple[Any, Any]:
     """a0 b0 a1 b1 ..., in two vectors."""
     lanes = a.type.count
     order = [i // 2 + i % 2 * lanes for i in range(2 * lanes)]

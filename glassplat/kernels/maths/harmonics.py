@@ -51,11 +51,12 @@ class ColorMaths(NamedTuple):
 
 def color_maths(real: type) -> ColorMaths:
     """Builds the functions for `real`, np.float32 or np.float64."""
-    basis = _basis(real)
+    basis = harmonic_basis(real)
     return ColorMaths(_color(basis), _color_gradient(real, basis))
 
 
-def _basis(real: type) -> Callable[..., Any]:
+def harmonic_basis(real: type) -> Callable[..., Any]:
+    """The function of a unit direction (x, y, z) that gives all 16 harmonics."""
     c0, c1, c_xy, c_zz, c_xx, c_yxx, c_xyz, c_yzz, c_zzz, c_zxx = (real(c) for c in SH_CONSTANTS)
     two, three, four = real(2.0), real(3.0), real(4.0)
 

@@ -1,12 +1,11 @@
-"""Projection on the CPU: chunks of Gaussians, every camera of the batch while a chunk is at hand.
+"""Projection on the CPU: chunks of Gaussians, in every camera of the batch.
 
-Chunks have a fixed size, whatever the number of threads. Places come first and colours second: coefficients are most of
-a Gaussian's memory, and a loop that only fetches them lets the processor wait for several at once.
+Chunks have a fixed size, whatever the number of threads. Of a chunk the Gaussians that may show are listed first, then
+those that do, each time sixteen at once; colours come last, as coefficients are most of a Gaussian's memory.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
@@ -18,10 +17,13 @@ from torch import Tensor
 
 from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
 from glassplat.kernels.cpu.schedule import even_stride
-from glassplat.kernels.maths.harmonics import color_maths
-from glassplat.kernels.maths.projection import ALPHA_MIN, LOW_PASS, screen_maths, shape_maths, vector_maths
+from glassplat.kernels.cpu.vector import absolute, bits_of, lowest_bit, maximum, store, vector_kind
+from glassplat.kernels.cpu.vector_rows import store_all
+from glassplat.kernels.maths.projection import screen_maths
 from glassplat.kernels.project.cpu_backward import project_backward
+from glassplat.kernels.project.cpu_lanes import COLUMNS, LANES, lane_steps
 from glassplat.kernels.project.cpu_view import CHUNK, LENS_VALUES, view_steps
+from glassplat.kernels.project.steps import culling
 from glassplat.kernels.tensor_checks import REAL_OF
 
 
@@ -57,92 +59,136 @@ def project_gradients(
     return found, cameras
 
 
-def placing(real: type) -> Callable[..., Any]:
-    """One Gaussian in one camera: fills everything but the colour, where it is visible."""
-    _, pose, _, view, *_ = view_steps(real)
-    dot = vector_maths().dot
-    half_extents = screen_maths(real).half_extents
-    is_finite = shape_maths(real).is_finite
-    zero, one = real(0.0), real(1.0)
+def listing(real: type) -> Callable[..., Any]:
+    """The step that lists the Gaussians of a chunk that may show in a camera."""
+    load_triples, may_show, *_ = lane_steps(real)
 
     @inlined
-    def place(
-        n, c, mean, opacity, axes, cam_from_world, intrinsics, lens, windows,
+    def list_candidates(
+        listed, means, log_scales, ends, begin, end, c, cam_from_world, intrinsics, lens, near, clip_planes, clips,
+        windows,
+    ):  # fmt: skip
+        """Returns how many there are; means and log scales are flat, `ends` is scratch."""
+        found, count = 0, means.size // 3
+        for n in range(begin, end, LANES):
+            if n + LANES <= count:
+                mean, scales = load_triples(means, n), load_triples(log_scales, n)
+            else:
+                for i in range(3 * LANES):
+                    source = min(n + i // 3, count - 1) * 3 + i % 3
+                    ends[i], ends[3 * LANES + i] = means[source], log_scales[source]
+                mean, scales = load_triples(ends, 0), load_triples(ends, LANES)
+            bits = may_show(
+                c, mean, scales, cam_from_world, intrinsics, lens, near, clip_planes, clips, windows
+            )  # fmt: skip
+            bits &= (np.int64(1) << min(LANES, end - n)) - 1
+            while bits != 0:
+                listed[found] = n + lowest_bit(bits)
+                bits &= bits - 1
+                found += 1
+        return found
+
+    return list_candidates
+
+
+def placing_listed(real: type) -> Callable[..., Any]:
+    """The step that fills everything but the colours of those listed that are visible."""
+    place, half_extents = lane_steps(real).place, screen_maths(real).half_extents
+    zero = real(0.0)
+    U, V, XX, XY, YY, DEPTH, OPACITY, WIDE, HIGH = (field * LANES for field in range(9))
+
+    @inlined
+    def place_listed(
+        listed, found, columns, c, means, quats, log_scales, logit_opacities, cam_from_world, intrinsics, lens, windows,
         means2d, conics, depths, opacities, radii,
     ):  # fmt: skip
-        row_x, row_y, row_z, offset = pose(cam_from_world, c)
-        depth = dot(row_z, mean) + offset[2]
-        position = dot(row_x, mean) + offset[0], dot(row_y, mean) + offset[1], depth
-        tangent, _, _, _, covariance = view((row_x, row_y, row_z), position, axes, intrinsics, lens, c)
-        xx, xy, yy, determinant = covariance
-        u = intrinsics[c, 0] * tangent[0] + intrinsics[c, 2]
-        v = intrinsics[c, 1] * tangent[1] + intrinsics[c, 3]
-        reach_x, reach_y = half_extents(xx, yy, opacity)
-        # Written so that NaN fails every comparison and the Gaussian stays culled.
-        across = u + reach_x > windows[c, 0] and u - reach_x < windows[c, 2]
-        down = v + reach_y > windows[c, 1] and v - reach_y < windows[c, 3]
-        if across and down and reach_x > zero and is_finite(determinant) and is_finite(depth):
-            inverse = one / determinant
-            means2d[c, n, 0], means2d[c, n, 1] = u, v
-            conics[c, n, 0], conics[c, n, 1], conics[c, n, 2] = yy * inverse, -xy * inverse, xx * inverse
-            depths[c, n], opacities[c, n] = depth, opacity
-            radii[c, n, 0], radii[c, n, 1] = reach_x, reach_y
+        """Returns how many there are, which the list holds then; `columns` is scratch."""
+        shown = 0
+        for first in range(0, found, LANES):
+            last = min(first + LANES, found) - 1
+            for i in range(LANES):
+                n = listed[min(first + i, last)]
+                for k in range(3):
+                    columns[k * LANES + i], columns[(7 + k) * LANES + i] = means[n, k], log_scales[n, k]
+                for k in range(4):
+                    columns[(3 + k) * LANES + i] = quats[n, k]
+                columns[10 * LANES + i] = logit_opacities[n]
+            values, bits = place(columns, c, cam_from_world, intrinsics, lens)
+            store_all(columns, 0, values)
+            bits &= (np.int64(1) << (last + 1 - first)) - 1
+            while bits != 0:
+                i = lowest_bit(bits)
+                bits &= bits - 1
+                u, v, opacity = columns[U + i], columns[V + i], columns[OPACITY + i]
+                reach_x, reach_y = half_extents(columns[WIDE + i], columns[HIGH + i], opacity)
+                # Written so that NaN fails every comparison and the Gaussian stays culled.
+                across = u + reach_x > windows[c, 0] and u - reach_x < windows[c, 2]
+                down = v + reach_y > windows[c, 1] and v - reach_y < windows[c, 3]
+                if across and down and reach_x > zero:
+                    n = listed[first + i]
+                    means2d[c, n, 0], means2d[c, n, 1] = u, v
+                    conics[c, n, 0], conics[c, n, 1] = columns[XX + i], columns[XY + i]
+                    conics[c, n, 2] = columns[YY + i]
+                    depths[c, n], opacities[c, n] = columns[DEPTH + i], opacity
+                    radii[c, n, 0], radii[c, n, 1] = reach_x, reach_y
+                    listed[shown] = n
+                    shown += 1
+        return shown
 
-    return place
+    return place_listed
 
 
-def culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
-    """Writing zeros for one Gaussian in one camera, whether it is on the kept sides, and whether it may show at all."""
-    vec3, pose, *_ = view_steps(real)
-    dot = vector_maths().dot
-    zero, one, low_pass = real(0.0), real(1.0), real(LOW_PASS)
-    # A coverage of at most 1 sinks to ALPHA_MIN within this squared number of standard deviations; a percent is slack.
-    most_deviations = real(1.01 * 2.0 * math.log(1.0 / ALPHA_MIN))
+def coloring(real: type) -> Callable[..., Any]:
+    """The step that fills the colours of those listed; whoever has none that is finite is culled."""
+    *_, tabulate, color = lane_steps(real)
+    cull, full = culling(real)[0], vector_kind(real, LANES).full
+    zero, half, largest = real(0.0), real(0.5), real(np.finfo(real).max)
+    whole = COLUMNS * LANES
 
     @inlined
-    def cull(n, c, means2d, conics, depths, opacities, colors, radii):
-        depths[c, n] = opacities[c, n] = zero
-        means2d[c, n, 0] = means2d[c, n, 1] = radii[c, n, 0] = radii[c, n, 1] = zero
-        for j in range(3):
-            conics[c, n, j] = colors[c, n, j] = zero
+    def color_listed(
+        listed, shown, columns, table, positions, c, degree, means, sh, row_size, lens,
+        means2d, conics, depths, opacities, colors, radii,
+    ):  # fmt: skip
+        """`sh` is flat, with rows of `row_size`; columns, table and positions are scratch."""
+        terms = (degree + 1) * (degree + 1)
+        read = (3 * terms + LANES - 1) // LANES * LANES
+        for first in range(0, shown, LANES):
+            last = min(first + LANES, shown) - 1
+            inside = listed[last] * row_size + read <= sh.size
+            for i in range(LANES):
+                n = listed[min(first + i, last)]
+                positions[i] = n * row_size
+                for k in range(3):
+                    columns[k * LANES + i] = means[n, k]
+                if not inside:
+                    for k in range(3 * terms):
+                        table[whole + i * COLUMNS + k] = sh[n * row_size + k]
+                    positions[i] = whole + i * COLUMNS
+            tabulate(sh if inside else table, positions, terms, table, 0)
+            red, green, blue = color(table, columns, 0, degree, lens, c)
+            bits = bits_of(absolute(red) + absolute(green) + absolute(blue) <= largest)
+            none = full(zero)
+            store(columns, 0, maximum(red + half, none))
+            store(columns, LANES, maximum(green + half, none))
+            store(columns, 2 * LANES, maximum(blue + half, none))
+            for i in range(last + 1 - first):
+                n = listed[first + i]
+                if (bits >> i) & 1:
+                    colors[c, n, 0], colors[c, n, 1] = columns[i], columns[LANES + i]
+                    colors[c, n, 2] = columns[2 * LANES + i]
+                else:
+                    cull(n, c, means2d, conics, depths, opacities, colors, radii)
 
-    @inlined
-    def in_front(c, mean, cam_from_world, near, clip_planes, clips):
-        row_z = cam_from_world[c, 2, 0], cam_from_world[c, 2, 1], cam_from_world[c, 2, 2]
-        if not dot(row_z, mean) + cam_from_world[c, 2, 3] > near:
-            return False
-        return not clips or dot(vec3(clip_planes, c), mean) + clip_planes[c, 3] > zero
-
-    @inlined
-    def may_show(n, c, mean, log_scales, cam_from_world, intrinsics, lens, near, clip_planes, clips, windows):
-        """Whether a Gaussian is on the kept sides, and a sphere around it comes near the window: cheap and safe."""
-        if not in_front(c, mean, cam_from_world, near, clip_planes, clips):
-            return False
-        row_x, row_y, row_z, offset = pose(cam_from_world, c)
-        depth = dot(row_z, mean) + offset[2]
-        inverse_depth = one / depth
-        u = intrinsics[c, 0] * (dot(row_x, mean) + offset[0]) * inverse_depth + intrinsics[c, 2]
-        v = intrinsics[c, 1] * (dot(row_y, mean) + offset[1]) * inverse_depth + intrinsics[c, 3]
-        past_x, past_y = max(windows[c, 0] - u, u - windows[c, 2]), max(windows[c, 1] - v, v - windows[c, 3])
-        size = math.exp(max(log_scales[n, 0], log_scales[n, 1], log_scales[n, 2])) * inverse_depth
-        wide, high = size * intrinsics[c, 0] * lens[c, 7], size * intrinsics[c, 1] * lens[c, 8]
-        # Written so that NaN leaves the decision to the exact test.
-        beside = past_x > zero and past_x * past_x > most_deviations * (wide * wide + low_pass)
-        return not (beside or (past_y > zero and past_y * past_y > most_deviations * (high * high + low_pass)))
-
-    return cull, in_front, may_show
+    return color_listed
 
 
 @cache
 def project_forward(real: type) -> Kernel:
     """Fills means2d, conics, depths, opacities, colors and radii; zeros where a Gaussian is culled."""
-    vec3, _, shape, _, fill_lenses, direction = view_steps(real)
-    cull, _, may_show = culling(real)
-    place = placing(real)
-    is_finite = shape_maths(real).is_finite
-    color = color_maths(real).color
-    zero, half, candidate = real(0.0), real(0.5), real(-1.0)
-    chunk_size = CHUNK
+    fill_lenses = view_steps(real).fill_lenses
+    list_candidates, place_listed, color_listed = listing(real), placing_listed(real), coloring(real)
+    zero, chunk_size = real(0.0), CHUNK
 
     @kernel("project_forward", real)
     def forward(
@@ -153,44 +199,30 @@ def project_forward(real: type) -> Kernel:
         lens = np.empty((num_cameras, LENS_VALUES), real)
         fill_lenses(lens, cam_from_world, intrinsics, width, height)
         clips = clip_planes.shape[0] > 0
+        flat_means, flat_scales = means.reshape(means.size), log_scales.reshape(log_scales.size)
+        flat_sh, row_size = sh.reshape(sh.size), 3 * sh.shape[1]
         num_chunks = (count + chunk_size - 1) // chunk_size
         stride = even_stride(num_chunks)
         for task in prange(num_chunks):
             chunk = task * stride % num_chunks
             begin, end = chunk * chunk_size, min(count, (chunk + 1) * chunk_size)
-            for n in range(begin, end):
-                mean = vec3(means, n)
-                wanted = False
-                for c in range(num_cameras):
-                    cull(n, c, means2d, conics, depths, opacities, colors, radii)
-                    if may_show(
-                        n, c, mean, log_scales, cam_from_world, intrinsics, lens, near, clip_planes, clips, windows
-                    ):
-                        radii[c, n, 0] = candidate
-                        wanted = True
-                if not wanted:
-                    continue
-                usable, opacity, _, _, axes = shape(means, quats, log_scales, logit_opacities, n)
-                for c in range(num_cameras):
-                    if not radii[c, n, 0] < zero:
-                        continue
-                    radii[c, n, 0] = zero
-                    if usable:
-                        place(
-                            n, c, mean, opacity, axes, cam_from_world, intrinsics, lens, windows,
-                            means2d, conics, depths, opacities, radii,
-                        )  # fmt: skip
-            for c in range(num_cameras if degree >= 0 else 0):
-                for n in range(begin, end):
-                    if not radii[c, n, 0] > zero:
-                        continue
-                    (x, y, z), _ = direction(vec3(means, n), lens, c)
-                    red, green, blue = color(sh, n, degree, x, y, z)
-                    if is_finite(abs(red) + abs(green) + abs(blue)):
-                        colors[c, n, 0] = max(red + half, zero)
-                        colors[c, n, 1] = max(green + half, zero)
-                        colors[c, n, 2] = max(blue + half, zero)
-                    else:
-                        cull(n, c, means2d, conics, depths, opacities, colors, radii)
+            listed, positions = np.empty(chunk_size, np.int64), np.empty(LANES, np.int64)
+            columns, table = np.empty(11 * LANES, real), np.empty(2 * COLUMNS * LANES, real)
+            for c in range(num_cameras):
+                means2d[c, begin:end], conics[c, begin:end], colors[c, begin:end] = zero, zero, zero
+                depths[c, begin:end], opacities[c, begin:end], radii[c, begin:end] = zero, zero, zero
+                found = list_candidates(
+                    listed, flat_means, flat_scales, columns, begin, end, c, cam_from_world, intrinsics, lens, near,
+                    clip_planes, clips, windows,
+                )  # fmt: skip
+                shown = place_listed(
+                    listed, found, columns, c, means, quats, log_scales, logit_opacities, cam_from_world, intrinsics,
+                    lens, windows, means2d, conics, depths, opacities, radii,
+                )  # fmt: skip
+                if degree >= 0:
+                    color_listed(
+                        listed, shown, columns, table, positions, c, degree, means, flat_sh, row_size, lens,
+                        means2d, conics, depths, opacities, colors, radii,
+                    )  # fmt: skip
 
     return forward

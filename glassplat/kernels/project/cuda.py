@@ -13,7 +13,6 @@ from torch import Tensor
 from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.maths.projection import shape_maths, vector_maths
-from glassplat.kernels.project.cpu import culling, placing
 from glassplat.kernels.project.cpu_backward import (
     add_mean,
     camera_sums,
@@ -22,6 +21,7 @@ from glassplat.kernels.project.cpu_backward import (
     view_gradients,
 )
 from glassplat.kernels.project.cpu_view import LENS_VALUES, view_steps
+from glassplat.kernels.project.steps import culling, placing
 from glassplat.kernels.tensor_checks import REAL_OF
 
 THREADS = 128

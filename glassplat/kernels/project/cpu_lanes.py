@@ -1,0 +1,212 @@
+"""What one camera sees of Gaussians, sixteen of them at once: the steps of the forward kernel, in vectors.
+
+The same maths as for one of them (`cpu_view`), which takes vectors as it takes numbers, but for roots and limits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.cpu.vector import (
+    absolute,
+    bits_of,
+    exp,
+    fraction,
+    maximum,
+    minimum,
+    select,
+    square_root,
+    times_power_of_2,
+    vector_kind,
+)
+from glassplat.kernels.cpu.vector_rows import row_loader, store_all, thirds, transposed
+from glassplat.kernels.maths.harmonics import harmonic_basis
+from glassplat.kernels.maths.projection import LOW_PASS, screen_maths, shape_maths, vector_maths
+from glassplat.kernels.project.cpu_view import view_steps
+from glassplat.kernels.project.steps import MOST_DEVIATIONS
+
+LANES = 16
+COLUMNS = 48
+"""Coefficients of a Gaussian at most."""
+
+Step = Callable[..., Any]
+
+
+class LaneSteps(NamedTuple):
+    """Steps that take `LANES` Gaussians.
+
+    Attributes:
+        load_triples: three vectors from an array of triples, of the Gaussians from one on.
+        may_show: bits of those that are on the kept sides of a camera, and come near its window: safe, not exact.
+        place: (means on screen x and y, conic xx, xy and yy, depth, opacity, covariance xx and yy), and bits of those
+            that have finite ones; from columns of means (3), quaternions (4), log scales (3) and logits of opacities.
+        tabulate: puts the first coefficients of Gaussians whose rows begin at positions of an array into columns.
+        color: (red, green, blue) of such columns, before offset and clamp, for columns of means.
+    """
+
+    load_triples: Step
+    may_show: Step
+    place: Step
+    tabulate: Step
+    color: Step
+
+
+def lane_steps(real: type) -> LaneSteps:
+    """Builds the steps for `real`, np.float32 or np.float64."""
+    return LaneSteps(_load_triples(real), _may_show(real), _place(real), *_color(real))
+
+
+def _load_triples(real: type) -> Step:
+    load = vector_kind(real, LANES).load
+
+    @inlined
+    def load_triples(array, n):
+        at = 3 * n
+        return thirds(load(array, at), load(array, at + LANES), load(array, at + 2 * LANES))
+
+    return load_triples
+
+
+def _exponential(real: type) -> Step:
+    """e^x; in single precision held within the normal numbers, relative error below 3e-7."""
+    full = vector_kind(real, LANES).full
+    # Taylor series of 2^f for f in [-1/2, 1/2].
+    e0, e1, e2, e3, e4, e5, e6, e7 = (real(math.log(2.0) ** k / math.factorial(k)) for k in range(8))
+    bits, half, zero, lowest, highest = real(1 / math.log(2.0)), real(0.5), real(0.0), real(-125.0), real(126.0)
+
+    @inlined
+    def fast(x):
+        t = maximum(minimum(x * bits, full(highest)), full(lowest))
+        near = t + select(t > zero, full(half), full(-half))
+        f = t - (near - fraction(near))
+        return times_power_of_2(((((((f * e7 + e6) * f + e5) * f + e4) * f + e3) * f + e2) * f + e1) * f + e0, near)
+
+    return exp if real is np.float64 else fast
+
+
+def _may_show(real: type) -> Step:
+    vec3, pose, *_ = view_steps(real)
+    dot = vector_maths().dot
+    exponential = _exponential(real)
+    zero, one, low_pass, most_deviations = real(0.0), real(1.0), real(LOW_PASS), real(MOST_DEVIATIONS)
+
+    @inlined
+    def may_show(c, mean, log_scales, cam_from_world, intrinsics, lens, near, clip_planes, clips, windows):
+        row_x, row_y, row_z, offset = pose(cam_from_world, c)
+        depth = dot(row_z, mean) + offset[2]
+        kept = depth > near
+        if clips:
+            kept = kept & (dot(vec3(clip_planes, c), mean) + clip_planes[c, 3] > zero)
+        inverse_depth = one / depth
+        u = (dot(row_x, mean) + offset[0]) * inverse_depth * intrinsics[c, 0] + intrinsics[c, 2]
+        v = (dot(row_y, mean) + offset[1]) * inverse_depth * intrinsics[c, 1] + intrinsics[c, 3]
+        past_x = maximum(windows[c, 0] - u, u - windows[c, 2])
+        past_y = maximum(windows[c, 1] - v, v - windows[c, 3])
+        size = exponential(maximum(maximum(log_scales[0], log_scales[1]), log_scales[2])) * inverse_depth
+        wide, high = size * (intrinsics[c, 0] * lens[c, 7]), size * (intrinsics[c, 1] * lens[c, 8])
+        # NaN is beside nothing, which leaves the decision to the exact test.
+        beside_x = (past_x > zero) & (past_x * past_x > (wide * wide + low_pass) * most_deviations)
+        beside_y = (past_y > zero) & (past_y * past_y > (high * high + low_pass) * most_deviations)
+        return bits_of(kept) & ~bits_of(beside_x | beside_y)
+
+    return may_show
+
+
+def _place(real: type) -> Step:
+    _, pose, *_ = view_steps(real)
+    dot, along = vector_maths().dot, vector_maths().along
+    footprint, screen_covariance = screen_maths(real).footprint, screen_maths(real).screen_covariance
+    rotation = shape_maths(real).rotation
+    exponential, (full, load) = _exponential(real), vector_kind(real, LANES)
+    zero, one, largest = real(0.0), real(1.0), real(np.finfo(real).max)
+
+    @inlined
+    def held(tangent, low, high):
+        return minimum(maximum(tangent, full(low)), full(high))
+
+    @inlined
+    def place(columns, c, cam_from_world, intrinsics, lens):
+        mean = load(columns, 0), load(columns, LANES), load(columns, 2 * LANES)
+        w, x, y, z = (
+            load(columns, 3 * LANES), load(columns, 4 * LANES), load(columns, 5 * LANES), load(columns, 6 * LANES)
+        )  # fmt: skip
+        a, b, d = load(columns, 7 * LANES), load(columns, 8 * LANES), load(columns, 9 * LANES)
+        logit = load(columns, 10 * LANES)
+        inverse_norm = one / square_root(w * w + x * x + y * y + z * z)
+        column_x, column_y, column_z = rotation(
+            (w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm)
+        )
+        s_x, s_y, s_z = exponential(a), exponential(b), exponential(d)
+        axis_x = s_x * column_x[0], s_x * column_x[1], s_x * column_x[2]
+        axis_y = s_y * column_y[0], s_y * column_y[1], s_y * column_y[2]
+        axis_z = s_z * column_z[0], s_z * column_z[1], s_z * column_z[2]
+        opacity = one / (one + exponential(-logit))
+        raw = absolute(mean[0]) + absolute(mean[1]) + absolute(mean[2]) + absolute(logit)
+        raw = raw + absolute(a) + absolute(b) + absolute(d)
+        row_x, row_y, row_z, offset = pose(cam_from_world, c)
+        depth = dot(row_z, mean) + offset[2]
+        inverse_depth = one / depth
+        tangent_x = (dot(row_x, mean) + offset[0]) * inverse_depth
+        tangent_y = (dot(row_y, mean) + offset[1]) * inverse_depth
+        fx, fy = intrinsics[c, 0], intrinsics[c, 1]
+        held_x, held_y = held(tangent_x, lens[c, 0], lens[c, 1]), held(tangent_y, lens[c, 2], lens[c, 3])
+        w_x, w_y = footprint(row_x, row_y, row_z, inverse_depth * fx, inverse_depth * fy, held_x, held_y)
+        xx, xy, yy, determinant = screen_covariance(
+            along(w_x, axis_x, axis_y, axis_z), along(w_y, axis_x, axis_y, axis_z)
+        )
+        inverse = one / determinant
+        # Ordered comparisons, so that NaN anywhere culls.
+        sound = (raw <= largest) & (inverse_norm > zero) & (inverse_norm <= largest)
+        sound = sound & (absolute(determinant) <= largest) & (absolute(depth) <= largest)
+        u, v = tangent_x * fx + intrinsics[c, 2], tangent_y * fy + intrinsics[c, 3]
+        return (u, v, yy * inverse, -xy * inverse, xx * inverse, depth, opacity, xx, yy), bits_of(sound)
+
+    return place
+
+
+def _color(real: type) -> tuple[Step, Step]:
+    load_rows, (_, load), basis = row_loader(real, LANES), vector_kind(real, LANES), harmonic_basis(real)
+    one = real(1.0)
+
+    @inlined
+    def tabulate(sh, positions, terms, target, at):
+        """Of the first `terms` coefficients, three numbers each."""
+        for first in range(0, 3 * terms, LANES):
+            store_all(target, at + first * LANES, transposed(load_rows(sh, positions, first)))
+
+    @inlined
+    def channel(table, at, degree, b):
+        value = b[0] * load(table, at)
+        step = 3 * LANES
+        if degree > 0:
+            value = value + b[1] * load(table, at + step) + b[2] * load(table, at + 2 * step)
+            value = value + b[3] * load(table, at + 3 * step)
+        if degree > 1:
+            value = value + b[4] * load(table, at + 4 * step) + b[5] * load(table, at + 5 * step)
+            value = value + b[6] * load(table, at + 6 * step) + b[7] * load(table, at + 7 * step)
+            value = value + b[8] * load(table, at + 8 * step)
+        if degree > 2:
+            value = value + b[9] * load(table, at + 9 * step) + b[10] * load(table, at + 10 * step)
+            value = value + b[11] * load(table, at + 11 * step) + b[12] * load(table, at + 12 * step)
+            value = value + b[13] * load(table, at + 13 * step) + b[14] * load(table, at + 14 * step)
+            value = value + b[15] * load(table, at + 15 * step)
+        return value
+
+    @inlined
+    def color(table, means, at, degree, lens, c):
+        x = load(means, 0) - lens[c, 4]
+        y, z = load(means, LANES) - lens[c, 5], load(means, 2 * LANES) - lens[c, 6]
+        inverse_length = one / square_root(x * x + y * y + z * z)
+        b = basis(x * inverse_length, y * inverse_length, z * inverse_length)
+        return (
+            channel(table, at, degree, b),
+            channel(table, at + LANES, degree, b),
+            channel(table, at + 2 * LANES, degree, b),
+        )
+
+    return tabulate, color

@@ -1,0 +1,57 @@
+"""Rows in memory and vectors of their columns, held against NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from glassplat.kernels.cpu.jit import Kernel, kernel
+from glassplat.kernels.cpu.vector import store, vector_kind
+from glassplat.kernels.cpu.vector_rows import row_loader, store_all, thirds, transposed, triples
+
+kinds = pytest.mark.parametrize(
+    ("real", "lanes"), [(real, lanes) for real in (np.float32, np.float64) for lanes in (4, 16)]
+)
+
+
+def sorting(real: type, lanes: int) -> Kernel:
+    load = vector_kind(real, lanes).load
+
+    @kernel("vector_thirds", real, parallel=False)
+    def compute(values, columns, again):
+        x, y, z = thirds(load(values, 0), load(values, lanes), load(values, 2 * lanes))
+        store(columns, 0, x)
+        store(columns, lanes, y)
+        store(columns, 2 * lanes, z)
+        store_all(again, 1, triples(x, y, z))
+
+    return compute
+
+
+@kinds
+def test_triples_are_taken_apart_and_put_together(real: type, lanes: int) -> None:
+    values = np.arange(3 * lanes, dtype=real)
+    columns, again = np.empty(3 * lanes, real), np.zeros(3 * lanes + 2, real)
+    sorting(real, lanes)(values, columns, again)
+    assert np.array_equal(columns.reshape(3, lanes), values.reshape(lanes, 3).T)
+    assert np.array_equal(again, [0, *values, 0])
+
+
+def turning(real: type, lanes: int) -> Kernel:
+    load_rows = row_loader(real, lanes)
+
+    @kernel("vector_transposed", real, parallel=False)
+    def compute(values, positions, at, out):
+        store_all(out, 0, transposed(load_rows(values, positions, at)))
+
+    return compute
+
+
+@kinds
+def test_rows_anywhere_in_memory_become_columns(real: type, lanes: int) -> None:
+    values = np.random.default_rng(0).uniform(size=40 * lanes).astype(real)
+    positions = np.random.default_rng(1).integers(0, 38 * lanes, lanes)
+    out = np.empty(lanes * lanes, real)
+    turning(real, lanes)(values, positions, 3, out)
+    expected = [values[position + 3 : position + 3 + lanes] for position in positions]
+    assert np.array_equal(out.reshape(lanes, lanes), np.transpose(expected))
