@@ -159,14 +159,20 @@ class Browser:
             self._mouse("mousePressed", x, y, button="left", clickCount=count)
             self._mouse("mouseReleased", x, y, button="left", clickCount=count)
 
-    def drag(self, path: Sequence[tuple[float, float]]) -> None:
-        """Presses at the first place, moves through the others and lets go at the last."""
+    @property
+    def process(self) -> int:
+        """The number of the process that it runs in, with all its children."""
+        return self._process.pid
+
+    def drag(self, path: Sequence[tuple[float, float]], *, pause: float = 0) -> None:
+        """Presses at the first place, moves through the others with pauses of seconds, and lets go at the last."""
         self._mouse("mouseMoved", *path[0])
         self._mouse("mousePressed", *path[0], button="left", clickCount=1)
         for (x, y), (to_x, to_y) in itertools.pairwise(path):
             for step in range(1, STEPS + 1):
                 share = step / STEPS
                 self._mouse("mouseMoved", x + (to_x - x) * share, y + (to_y - y) * share, button="left", buttons=1)
+                time.sleep(pause)
         self._mouse("mouseReleased", *path[-1], button="left", clickCount=1)
 
     def _mouse(self, kind: str, x: float, y: float, **more: Any) -> None:

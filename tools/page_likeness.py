@@ -1,4 +1,4 @@
-"""How like the web page of a run is to its render, and how long the page takes for a picture.
+"""How like the web page of a run is to its render, and how often and how soon the page shows a picture without a GPU.
 
 python -m tools.page_likeness runs/showcase out/index.html
 """
@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import statistics
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from glassplat.commands.publishing.export import cameras_of
+from glassplat.commands.publishing.exporting import cameras_of
 from glassplat.evaluate.metrics import psnr
 from glassplat.files.spz_sections import FLIP
 from glassplat.interface.loading import load
@@ -24,7 +26,7 @@ from glassplat.scene.camera import Camera
 from tools.browser import Browser
 
 VIEWS = 5
-FRAMES = 6
+DRAG_STEPS = 40
 
 
 def wanted(camera: Camera, layer: str) -> str:
@@ -39,8 +41,13 @@ def wanted(camera: Camera, layer: str) -> str:
 
 def picture(browser: Browser, camera: Camera, layer: str = "rgb") -> torch.Tensor:
     """What the page shows of a layer, [H, W, 3] uint8."""
-    pixels = np.frombuffer(base64.b64decode(browser.evaluate(wanted(camera, layer))), dtype=np.uint8)
-    return torch.from_numpy(pixels.reshape(camera.height, camera.width, 4)[::-1, :, :3].copy())
+    return pixels_of(browser.evaluate(wanted(camera, layer)), camera.width, camera.height)
+
+
+def pixels_of(text: str, width: int, height: int) -> torch.Tensor:
+    """What the page's script returns for a picture, as [H, W, 3] uint8."""
+    pixels = np.frombuffer(base64.b64decode(text), dtype=np.uint8)
+    return torch.from_numpy(pixels.reshape(height, width, 4)[::-1, :, :3].copy())
 
 
 def likenesses(browser: Browser, model: Model) -> list[float]:
@@ -54,6 +61,72 @@ def likenesses(browser: Browser, model: Model) -> list[float]:
     return found
 
 
+@dataclass(frozen=True)
+class Walk:
+    """What a page showed while it was dragged and when it was let go."""
+
+    moving: list[dict[str, float]]
+    """Pictures while dragged: `time` in milliseconds, `scale` of its resolution, `splats` that it drew."""
+    resting: list[dict[str, float]]
+    """Pictures after that, up to the whole one."""
+    seconds: float
+    """How long it was dragged."""
+    end: float
+    """When it was held still, in milliseconds."""
+    processor: float
+    """Seconds of processor time that the browser took meanwhile."""
+
+    def report(self) -> str:
+        """Both, in two lines."""
+        scale = statistics.mean(picture["scale"] for picture in self.moving)
+        splats, every = (statistics.mean(p["splats"] for p in ps) for ps in (self.moving, self.resting[-1:]))
+        count, first = len(self.moving), self.resting[0]
+        return (
+            f"moving: {count / self.seconds:.1f} pictures a second in software, {self.processor / count:.3f} s of "
+            f"processor time each, at {scale:.0%} of the resolution, {splats / every:.0%} of the Gaussians\n"
+            f"at rest: the next picture after {(first['time'] - self.end) / 1000:.2f} s, "
+            f"the whole one after {(self.resting[-1]['time'] - self.end) / 1000:.2f} s"
+        )
+
+
+def processor_seconds(process: int) -> float:
+    """User and system time of all that a process has started and that still runs."""
+    seconds, ticks = 0.0, os.sysconf("SC_CLK_TCK")
+    pending, children = [process], _running()
+    while pending:
+        for child, used in children.get(pending.pop(), []):
+            seconds += used / ticks
+            pending.append(child)
+    return seconds
+
+
+def _running() -> dict[int, list[tuple[int, int]]]:
+    """Of every process its children, with the clock ticks that they have used."""
+    children: dict[int, list[tuple[int, int]]] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:  # It has ended meanwhile.
+            continue
+        children.setdefault(int(fields[1]), []).append((int(stat.parent.name), int(fields[11]) + int(fields[12])))
+    return children
+
+
+def walked(browser: Browser) -> Walk:
+    """Drags the page for a while as a person would, holds it still, and waits for the whole picture."""
+    noted = "glassplat.then(({ noted }) => noted)"
+    wait = "glassplat.then(({ noted }) => noted.some(({ scale }) => scale === 1))"
+    browser.wait(wait, "the first whole picture")
+    begin = browser.evaluate("glassplat.then(({ noted }) => { noted.length = 0; return performance.now(); })")
+    used = processor_seconds(browser.process)
+    browser.drag([(200, 150), *((200 + 3 * step, 150 + step) for step in range(DRAG_STEPS))], pause=0.02)
+    end = browser.evaluate("performance.now()")
+    moving, used = browser.evaluate(noted), processor_seconds(browser.process) - used
+    browser.wait(wait, "the whole picture")
+    resting = [picture for picture in browser.evaluate(noted) if picture["time"] > end]
+    return Walk([p for p in moving if p["time"] <= end], resting, (end - begin) / 1000, end, used)
+
+
 def main() -> None:
     """Prints both."""
     run, page = map(Path, sys.argv[1:3])
@@ -63,10 +136,7 @@ def main() -> None:
         print(
             f"{page.stat().st_size / 1e6:.2f} MB, PSNR of {len(found)} views: {', '.join(f'{x:.1f}' for x in found)} dB"
         )
-        for scale in (1, 0.35):
-            call = f"glassplat.then(p => p.measured({{ width: 640, height: 480, frames: {FRAMES}, scale: {scale} }}))"
-            seconds = statistics.median(browser.evaluate(call))
-            print(f"a picture of 640x480 at {scale:.0%} of its resolution: {seconds:.2f} s in software")
+        print(walked(browser).report())
 
 
 if __name__ == "__main__":

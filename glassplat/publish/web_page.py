@@ -36,8 +36,11 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
 
-SCRIPTS = ("vectors.js", "data.js", "sorter.js", "renderer.js", "navigation.js", "panel.js", "main.js")
-SHADERS = ("texels.glsl", "screen.vert", "project.frag", "splat.vert", "splat.frag", "compose.frag")
+SCRIPTS = (
+    "vectors.js", "data.js", "sorter.js", "cameras.js", "graphics.js", "renderer.js", "navigation.js", "panel.js",
+    "pace.js", "display.js", "main.js",
+)  # fmt: skip
+SHADERS = ("texels.glsl", "screen.vert", "project.frag", "splat.vert", "splat.frag", "compose.frag", "copy.frag")
 MOST_VIEWS = 400
 MOST_PANES = 16
 """The page orders the panes of every pixel by hand."""

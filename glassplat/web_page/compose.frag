@@ -53,10 +53,10 @@ float depthOf(int k, vec3 ray) {
   return inside && present[k] ? depth : FAR;
 }
 
-float maskOf(int k, vec2 at) { return texture(masks, vec3(at, float(min(k, MASKS - 1)))).r; }
+float maskOf(int k) { return texture(masks, vec3(within(usedByMirrors), float(k))).r; }
 
-void glaze(int k, vec2 at, vec3 ray, inout vec3 seen, inout vec4 mirror) {
-  float mask = maskOf(k, at);
+void glaze(int k, vec3 ray, inout vec3 seen, inout vec4 mirror) {
+  float mask = maskOf(k);
   if (mask <= 0.0) return;
   vec2 there = within(usedByMirrors);
   vec4 reflected = texture(reflections, vec3(there, float(k)));
@@ -65,13 +65,13 @@ void glaze(int k, vec2 at, vec3 ray, inout vec3 seen, inout vec4 mirror) {
   vec3 light = decoded(color) * gain;
   float strength = strengthOf(reflectances[k], abs(dot(normalize(ray), normals[k]))) * mask;
   seen = encoded(mix(decoded(seen), light, strength));
-  mirror = vec4(encoded(light), strength);
+  mirror = vec4(light, strength);
 }
 #endif
 
 vec3 layerOf(int layer, vec3 seen, vec3 behind, vec4 mirror, float mask) {
   if (layer == 1) return behind;
-  if (layer == 2) return mirror.rgb;
+  if (layer == 2) return encoded(mirror.rgb);
   if (layer == 3) return vec3(mirror.a);
   if (layer == 4) return vec3(mask);
   return seen;
@@ -95,8 +95,8 @@ void main() {
       if (depths[k] < FAR && depths[k] > depth) { farthest = k; depth = depths[k]; }
     }
     if (farthest < 0) break;
-    glaze(farthest, at, ray, seen, mirror);
-    mask = maskOf(farthest, at);
+    glaze(farthest, ray, seen, mirror);
+    mask = maskOf(farthest);
     for (int k = 0; k < PANES; k++) if (k == farthest) depths[k] = FAR;
   }
 #endif

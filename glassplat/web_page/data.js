@@ -51,7 +51,7 @@ function texturesOf(primary, glass, channel) {
   const total = primary.count + glass.count, positions = positionsOf([primary, glass], total);
   const places = new Uint32Array(4 * ROW * texelRows(total)), shapes = new Uint32Array(2 * ROW * texelRows(total));
   const floats = new Float32Array(places.buffer), placeBytes = new Uint8Array(places.buffer);
-  const shapeBytes = new Uint8Array(shapes.buffer), reaches = new Float32Array(total);
+  const shapeBytes = new Uint8Array(shapes.buffer), reaches = new Float32Array(total), areas = new Float32Array(total);
   for (let i = 0; i < total; i++) {
     const [part, j] = i < primary.count ? [primary, i] : [glass, i - primary.count];
     for (let c = 0; c < 3; c++) {
@@ -59,18 +59,20 @@ function texturesOf(primary, glass, channel) {
       placeBytes[16 * i + 12 + c] = part.colors[3 * j + c];
       shapeBytes[8 * i + 4 + c] = part.scales[3 * j + c];
     }
-    if (part === glass) placeBytes[16 * i + 12] = channel[total + j];
     placeBytes[16 * i + 15] = part.opacities[j];
     for (let c = 0; c < 4; c++) shapeBytes[8 * i + c] = part.rotations[4 * j + c];
     shapeBytes[8 * i + 7] = channel[i];
-    reaches[i] = REACH * Math.exp(Math.max(...part.scales.subarray(3 * j, 3 * j + 3)) / 16 - 10);
+    const [, middle, largest] = part.scales.slice(3 * j, 3 * j + 3).sort();
+    reaches[i] = REACH * Math.exp(largest / 16 - 10);
+    areas[i] = Math.exp((middle + largest) / 16 - 20);
   }
   const perSplat = Math.ceil(HARMONIC_BYTES[primary.degree] / 16), width = HARMONIC_BYTES[primary.degree];
   const harmonics = new Uint8Array(16 * ROW * texelRows(primary.count, Math.max(perSplat, 1)));
   for (let i = 0; i < primary.count && width; i++) {
     harmonics.set(primary.harmonics.subarray(i * width, (i + 1) * width), 16 * perSplat * i);
   }
-  return { total, positions, reaches, places, shapes, harmonics: new Uint32Array(harmonics.buffer), perSplat };
+  const owners = channel.subarray(total, total + glass.count);
+  return { total, positions, reaches, areas, owners, places, shapes, harmonics: new Uint32Array(harmonics.buffer), perSplat };
 }
 
 async function loadedScene() {

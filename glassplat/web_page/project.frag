@@ -1,8 +1,8 @@
-// Projects every splat into one camera: one texel each, read by splat.vert. The formulas are those of kernels/project.
+// Projects the splats of an order into one camera: one texel each, read by splat.vert. The formulas are those of kernels/project.
 uniform usampler2D places;   // x, y, z as floats; colour and opacity as bytes
 uniform usampler2D shapes;   // rotation, scales and the value of a channel
-uniform usampler2D harmonics;
-uniform int count, firstGlass, degree, harmonicTexels, masks;
+uniform usampler2D harmonics, order;
+uniform int count, firstGlass, degree, harmonicTexels;
 uniform mat3 camFromWorld;
 uniform vec3 offset, eye;
 uniform vec4 intrinsics;     // fx, fy, cx, cy
@@ -65,8 +65,9 @@ vec3 viewDependent(int index, vec3 d) {
 void main() {
   place = uvec4(0u);
   look = uvec4(0u);
-  int index = int(gl_FragCoord.y) * ROW + int(gl_FragCoord.x);
-  if (index >= count) return;
+  int slot = int(gl_FragCoord.y) * ROW + int(gl_FragCoord.x);
+  if (slot >= count) return;
+  int index = int(texelFetch(order, texel(slot), 0).x);
   uvec4 described = texelFetch(places, texel(index), 0);
   vec3 mean = uintBitsToFloat(described.xyz);
   vec4 color = bytesOf(described.w) / 255.0;
@@ -111,7 +112,6 @@ void main() {
     channel = mirrored ? exp(channelRange.x + channelRange.y * scaleBytes.w) : 0.0;
   }
   seen = max(seen, 0.0);
-  uint owner = isGlass ? 1u + min(uint(color.r * 255.0 + 0.5), uint(masks - 1)) : 0u;
   place = uvec4(floatBitsToUint(center), packHalf2x16(major), packHalf2x16(minor));
-  look = uvec4(packHalf2x16(seen.rg), packHalf2x16(vec2(seen.b, color.a)), packHalf2x16(vec2(channel, reach)), owner);
+  look = uvec4(packHalf2x16(seen.rg), packHalf2x16(vec2(seen.b, color.a)), packHalf2x16(vec2(channel, reach)), 0u);
 }

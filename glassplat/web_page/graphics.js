@@ -1,0 +1,108 @@
+// What a picture is drawn with: programs, textures, framebuffers.
+
+const HEAD = '#version 300 es\n';
+const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i;
+
+function makeGraphics(canvas) {
+  const gl = canvas.getContext('webgl2', { antialias: false, alpha: false, depth: false, powerPreference: 'high-performance' });
+  if (!gl) throw new Error('this browser has no WebGL 2; try a current Firefox, Chrome, Edge or Safari');
+  const named = gl.getExtension('WEBGL_debug_renderer_info');
+  const isSoftware = named ? SOFTWARE.test(gl.getParameter(named.UNMASKED_RENDERER_WEBGL)) : false;
+  const single = ['EXT_color_buffer_float', 'EXT_float_blend', 'OES_texture_float_linear'].map((name) => gl.getExtension(name)).every(Boolean);
+  const half = gl.getExtension('EXT_color_buffer_float') || gl.getExtension('EXT_color_buffer_half_float');
+  // Processors blend single precision twice as fast as half, graphics cards the other way round.
+  const formats = isSoftware && single ? { 1: gl.R32F, 4: gl.RGBA32F } : half ? { 1: gl.R16F, 4: gl.RGBA16F } : { 1: gl.R8, 4: gl.RGBA8 };
+  gl.disable(gl.DEPTH_TEST);
+  gl.disable(gl.DITHER);
+
+  function compiled(kind, source) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader) || 'shader lost');
+    return shader;
+  }
+
+  function program(vertex, shared, fragment, constants = {}) {
+    const defines = HEAD + Object.entries(constants).map(([name, value]) => `#define ${name} ${value}\n`).join('');
+    const made = gl.createProgram(), texels = SHADERS['texels.glsl'];
+    gl.attachShader(made, compiled(gl.VERTEX_SHADER, defines + texels + SHADERS[vertex]));
+    gl.attachShader(made, compiled(gl.FRAGMENT_SHADER, defines + (shared ? SHADERS[shared] : '') + SHADERS[fragment]));
+    gl.linkProgram(made);
+    if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(made) || 'program lost');
+    const places = new Map();
+    const at = (name) => {
+      if (!places.has(name)) places.set(name, gl.getUniformLocation(made, name));
+      return places.get(name);
+    };
+    return { made, at };
+  }
+
+  function filtered(target, filter) {
+    gl.texParameteri(target, gl.TEXTURE_MIN_FILTER, filter);
+    gl.texParameteri(target, gl.TEXTURE_MAG_FILTER, filter);
+    gl.texParameteri(target, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
+    gl.texParameteri(target, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+  }
+
+  function dataTexture(internal, format, data, channels, height = data.length / (channels * ROW)) {
+    const texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texImage2D(gl.TEXTURE_2D, 0, internal, ROW, height, 0, format, gl.UNSIGNED_INT, data);
+    filtered(gl.TEXTURE_2D, gl.NEAREST);
+    return texture;
+  }
+
+  function image(width, height, format, layers = null) {
+    const target = layers === null ? gl.TEXTURE_2D : gl.TEXTURE_2D_ARRAY, texture = gl.createTexture();
+    gl.bindTexture(target, texture);
+    if (layers === null) gl.texStorage2D(target, 1, format, width, height);
+    else gl.texStorage3D(target, 1, format, width, height, Math.max(layers, 1));
+    filtered(target, gl.LINEAR);
+    return texture;
+  }
+
+  function framebuffer(attachments) {
+    const made = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, made);
+    attachments.forEach(([texture, layer = null], k) => {
+      if (layer === null) gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + k, gl.TEXTURE_2D, texture, 0);
+      else gl.framebufferTextureLayer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + k, texture, 0, layer);
+    });
+    gl.drawBuffers(attachments.map((_, k) => gl.COLOR_ATTACHMENT0 + k));
+    return made;
+  }
+
+  // Two triangles for each four vertices. Not instances, which some drivers, and all in software, draw one by one.
+  function rectangles(count) {
+    const indices = new Uint32Array(6 * count), array = gl.createVertexArray();
+    for (let i = 0; i < count; i++) indices.set([4 * i, 4 * i + 1, 4 * i + 2, 4 * i + 2, 4 * i + 1, 4 * i + 3], 6 * i);
+    gl.bindVertexArray(array);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
+    return array;
+  }
+
+  function use({ made, at }, textures) {
+    gl.useProgram(made);
+    textures.forEach(([name, target, texture], unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(target, texture);
+      gl.uniform1i(at(name), unit);
+    });
+    return at;
+  }
+
+  // Whether everything that was asked for until now is drawn, whenever one asks.
+  function fence() {
+    const sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    return () => {
+      const isDone = gl.isContextLost() || gl.getSyncParameter(sync, gl.SYNC_STATUS) === gl.SIGNALED;
+      if (isDone) gl.deleteSync(sync);
+      return isDone;
+    };
+  }
+
+  return { gl, isSoftware, formats, program, dataTexture, image, framebuffer, rectangles, use, fence };
+}
