@@ -136,7 +136,7 @@ class DeferredRecipe:
     view_dependence_weight: NotNegative = 0.0
     background: Annotated[Color | None, ESSENTIAL] = None
     shading: Shading = "deferred"
-    bootstrap: Share = 0.25
+    bootstrap: Share = 0.06
     texels: Annotated[Texels, ESSENTIAL] = 64
     first_texels: Texels = 16
     refinements: Annotated[tuple[Share, Share], Ascending()] = (0.45, 0.65)
@@ -157,7 +157,7 @@ class DeferredRecipe:
     propagation_interval: Several | None = None
     rates: GaussianRates = field(default_factory=partial(GaussianRates, short_run_power=0.0))
     reflection_rates: ReflectionRates = field(default_factory=ReflectionRates)
-    rhythm: Rhythm = field(default_factory=lambda: Rhythm(beat=0.0214, least=150))
+    rhythm: Rhythm = field(default_factory=lambda: Rhythm(beat=0.005, least=150))
     strategy: Annotated[Strategy, ESSENTIAL] = "default"
     densify: DefaultDensify = field(default_factory=DefaultDensify)
     mcmc: McmcDensify = field(default_factory=McmcDensify)
