@@ -10,7 +10,7 @@ from typing import Any
 
 from rich.console import Console
 
-from glassplat.commands.measuring.evaluate import evaluate_run
+from glassplat.commands.measuring.evaluation import evaluate_run
 from glassplat.commands.runs.stored_run import open_run
 from glassplat.commands.training.train import Train
 from glassplat.files.markdown_table import Table

@@ -1,7 +1,8 @@
 """The command line: `glassplat prepare | annotate | train | eval | render | dereflect | export | info | demo | bench`.
 
 A command's module is imported when the command is chosen, and nothing before that which takes long: the list of
-commands appears at once, and Ctrl-C works from the beginning.
+commands appears at once, and Ctrl-C works from the beginning. What does a command's work, and PyTorch with it, is
+imported when the command has understood its options and refused what can be refused without: its method `ready`.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ def guarded(arguments: list[str], *, is_program: bool) -> int:
     with raised_signals() as raised:
         try:
             with immediate_end() if is_program else nullcontext():
-                command = parsed(arguments)
+                command = readied(arguments)
             run(command)
         except KeyboardInterrupt as stop:
             return interrupted(stop, command)
@@ -129,6 +130,25 @@ def guarded(arguments: list[str], *, is_program: bool) -> int:
                 complain(end.label, end.text)
             return end.code
     return 0
+
+
+def readied(arguments: list[str]) -> Any:
+    """The command that the arguments describe, once it has refused what it can and imported what it works with.
+
+    Raises:
+        InputError, OSError: an option is out of range, there is nothing at a path, or something that must stay.
+        SystemExit: as in `parsed`.
+    """
+    if arguments[:1] == ["train"]:
+        from glassplat.commands.console.arguments import check_arguments
+        from glassplat.commands.training.first_look import check_places
+
+        check_arguments(arguments)
+        check_places(arguments[1:])
+    command = parsed(arguments)
+    if hasattr(command, "ready"):
+        command.ready()
+    return command
 
 
 def parsed(arguments: list[str]) -> Any:
@@ -163,7 +183,12 @@ def parsed(arguments: list[str]) -> Any:
 
 def command_line(name: str, options: list[str]) -> tuple[Any, list[str]]:
     """What tyro should make of a command's options, and how it should see them; that of `train` depends on them."""
+    from glassplat.commands.console.loading import load
+
+    if name == "bench":  # Its options need PyTorch, as those of `train` do: they are the recipes'.
+        load("glassplat.commands.measuring.bench")
     if name == "train":
+        load("glassplat.commands.training.train_options")
         from glassplat.commands.training.train_options import train_command
 
         return train_command(options)

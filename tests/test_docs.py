@@ -49,11 +49,8 @@ def test_the_readme_shows_how_to_start() -> None:
 
 
 @pytest.mark.parametrize("arguments", commands("glassplat"), ids=" ".join)
-def test_the_command_line_takes_every_command_shown(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    taken = []
-    monkeypatch.setattr(cli, "run", taken.append)
-    assert cli.main(arguments) == 0
-    assert len(taken) == 1
+def test_the_command_line_takes_every_command_shown(arguments: list[str]) -> None:
+    assert type(cli.parsed(arguments)).__name__.startswith(cli.COMMANDS[arguments[0]].kind)
 
 
 @pytest.mark.parametrize("arguments", commands("make"), ids=" ".join)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from glassplat.commands.publishing.export import cameras_of
+from glassplat.commands.publishing.exporting import cameras_of
 from glassplat.evaluate.metrics import psnr
 from glassplat.files.spz_sections import FLIP
 from glassplat.interface.loading import load

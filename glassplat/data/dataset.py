@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
-from os.path import isdir
 from pathlib import Path
 
 import torch
@@ -19,6 +18,7 @@ from glassplat.data.masks import MaskSet, Polarity, find_ignored, find_masks, kn
 from glassplat.data.random_points import points_in_view
 from glassplat.data.view import WHITE, PreparedView, Rgb, View, ViewOptions, prepare_view
 from glassplat.files.fields import LARGEST_COORDINATE
+from glassplat.files.folders import check_capture_folder
 from glassplat.files.images import is_transparent
 from glassplat.scene.plane import Planes
 
@@ -138,8 +138,7 @@ def load_dataset(
 
 def _load_capture(root: Path) -> Capture:
     """The answer of the first loader that knows the format."""
-    if not isdir(root):
-        raise FileNotFoundError(f"no folder {root}; expected the folder of a capture")
+    check_capture_folder(root)
     for load, _ in LOADERS:
         capture = load(root)
         if capture is not None:

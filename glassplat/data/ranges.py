@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 MOST = 1_000_000_000
 """Of anything that is counted: more than a machine holds, and few enough for every integer type."""
@@ -92,6 +92,8 @@ Seed = Annotated[int, Range(0, 2**32 - 1)]
 ShDegree = Annotated[int, Range(0, 3)]
 PaneLabel = Annotated[int, Range(1, 255)]
 """What a pixel of a mask can hold; 0 is no pane."""
+Up = Literal["x", "y", "z", "-x", "-y", "-z"]
+"""The axis of the world that points up."""
 Color = tuple[Share, Share, Share]
 """sRGB."""
 

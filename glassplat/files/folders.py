@@ -6,6 +6,8 @@ import errno
 import os
 from pathlib import Path
 
+SCENE = "scene.json"
+"""The file by which a folder is known to hold a scene that was exported."""
 IN_THE_WAY = (errno.EEXIST, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
 
 
@@ -26,6 +28,16 @@ def check_folder(path: Path) -> None:
         )
     if not os.access(found, os.W_OK | os.X_OK):
         raise PermissionError(f"nothing may be written in {found}; choose another folder for the output, or allow it")
+
+
+def check_capture_folder(path: Path) -> None:
+    """Look whether a folder is there that may be a capture.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    if not os.path.isdir(path):
+        raise FileNotFoundError(f"no folder {path}; expected the folder of a capture")
 
 
 def make_folder(path: Path) -> None:

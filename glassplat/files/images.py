@@ -6,13 +6,16 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from torch import Tensor
 
 from glassplat.files.atomic import atomic_write
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF", "PPM", "TGA", "JPEG2000")
@@ -108,7 +111,7 @@ def write_image(path: Path | str, image: Tensor | NDArray[np.generic]) -> None:
         ValueError: the shape is not that of an image, a value is not finite, or the format is unknown.
         OSError: the file cannot be written; an older one is unchanged.
     """
-    pixels = _to_uint8(image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image))
+    pixels = _to_uint8(image if isinstance(image, np.ndarray) else image.detach().cpu().numpy())
     if Path(path).suffix.lower() not in IMAGE_SUFFIXES:
         raise ValueError(f"cannot tell the image format of {path}; use one of the suffixes {', '.join(IMAGE_SUFFIXES)}")
     with atomic_write(path) as temporary:

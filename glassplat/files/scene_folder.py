@@ -13,6 +13,7 @@ from glassplat.files.atomic import atomic_write
 from glassplat.files.environment_file import read_environment, write_environment
 from glassplat.files.exposures_json import read_exposures, write_exposures
 from glassplat.files.fields import LARGEST_COORDINATE, Choice, Field, Items, Nullable, Number, Optional, Whole, checked
+from glassplat.files.folders import SCENE
 from glassplat.files.json_text import read_json
 from glassplat.files.planes_json import read_planes, write_planes
 from glassplat.files.ply import read_gaussians, write_gaussians
@@ -21,7 +22,7 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.photographer import Direction
 from glassplat.scene.scene import Scene
 
-PRIMARY, GLASS, PLANES, SCENE = "point_cloud.ply", "glass.ply", "planes.json", "scene.json"
+PRIMARY, GLASS, PLANES = "point_cloud.ply", "glass.ply", "planes.json"
 ENVIRONMENT, SURROUNDINGS, EXPOSURES = "environment.safetensors", "surroundings.ply", "exposures.json"
 PHOTOGRAPHER, POSES = "photographer.ply", "poses.json"
 FILES = (PRIMARY, GLASS, PLANES, ENVIRONMENT, SURROUNDINGS, EXPOSURES, PHOTOGRAPHER, POSES)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 
 from glassplat.data.errors import InputError
+from glassplat.data.ranges import Up
 from glassplat.files.cameras_json import read_cameras
 from glassplat.files.planes_json import read_planes
 from glassplat.files.ply import read_gaussians
@@ -20,7 +21,6 @@ from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
 
 NamedCameras = tuple[tuple[str, Camera], ...]
-Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 AXES: dict[str, tuple[int, int, int]] = {
     "x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1),
 }  # fmt: skip

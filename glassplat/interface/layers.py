@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 from glassplat.data.errors import InputError
-from glassplat.render.layers import PHOTOGRAPHED
 
 Layer = Literal[
     "rgb",
@@ -56,6 +55,8 @@ def check_layers(layers: Sequence[str], recipe: Any) -> None:
     Raises:
         InputError: there are such, or none is asked for.
     """
+    from glassplat.render.layers import PHOTOGRAPHED
+
     known, method = layers_of(recipe), recipe.method
     if method == "planar" and recipe.photographer.learn:
         known = (*known, PHOTOGRAPHED)

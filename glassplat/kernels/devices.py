@@ -7,11 +7,12 @@ import importlib
 import logging
 import os
 import warnings
-from typing import Any, Literal
-
-import torch
+from typing import TYPE_CHECKING, Any, Literal
 
 from glassplat.kernels.cuda.toolchain import has_numba_cuda, install_hint, toolchain_problem
+
+if TYPE_CHECKING:
+    import torch
 
 log = logging.getLogger("glassplat.kernels")
 
@@ -51,6 +52,8 @@ def chosen_device(name: DeviceName) -> torch.device:
     Raises:
         CudaUnavailableError: `cuda` was asked for and cannot be used.
     """
+    import torch
+
     problem = None if name == "cpu" else cuda_problem()
     if name == "cuda" and problem is not None:
         raise CudaUnavailableError(problem)
@@ -65,6 +68,8 @@ def chosen_device(name: DeviceName) -> torch.device:
 
 def cuda_problem() -> str | None:
     """Why no GPU can be used, with the remedy; None where one can."""
+    import torch
+
     if torch.version.cuda is None:
         return "PyTorch is built without CUDA; install another build (https://pytorch.org) or use --device cpu"
     with warnings.catch_warnings(record=True) as said:

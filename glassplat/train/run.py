@@ -14,12 +14,12 @@ from typing import Any, NoReturn
 from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError
 from glassplat.data.photographs_read import photographs_read
-from glassplat.files.folders import check_folder, make_folder
+from glassplat.files.folders import make_folder
 from glassplat.train.background import settled
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.messages import ActionDone, CheckpointWritten, Message, RunBegun, StepDone, Working
-from glassplat.train.run_directory import RunDirectory, RunSettings
-from glassplat.train.run_lock import check_unlocked, run_lock
+from glassplat.train.run_directory import RunDirectory, RunSettings, check_output
+from glassplat.train.run_lock import run_lock
 from glassplat.train.run_log import RunLog, open_log
 from glassplat.train.stage import Stage, check_length
 from glassplat.train.state import TrainState
@@ -77,23 +77,6 @@ def stop_on_interrupt() -> Iterator[StopRequest]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-
-
-def check_output(directory: RunDirectory, *, resume: bool) -> None:
-    """What can be told about a run's directory before the photographs are read; writes nothing.
-
-    Raises:
-        InputError: a fresh run would overwrite something, there is nothing to go on from, or another training writes
-            there.
-        NotADirectoryError: it is a file, or goes through one.
-        PermissionError: nothing may be written there.
-    """
-    check_folder(directory.path)
-    check_unlocked(directory.path)
-    if resume:
-        directory.check_saved()
-    else:
-        directory.check_vacant()
 
 
 def run_training(

@@ -1,4 +1,7 @@
-"""The directory that a run leaves behind."""
+"""The directory that a run leaves behind.
+
+Where it must not be written, or holds no run, is found out without PyTorch: methods import what they need of it.
+"""
 
 from __future__ import annotations
 
@@ -9,25 +12,21 @@ import re
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from glassplat.data.corrected_views import with_corrected_cameras
-from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.data.masks import Polarity
 from glassplat.data.options import options_from_json
 from glassplat.data.ranges import Downscale, Seed, Several
 from glassplat.files.atomic import atomic_write
-from glassplat.files.cameras_json import write_cameras
-from glassplat.files.colmap_text import write_colmap
-from glassplat.files.environment_image import write_equirect
-from glassplat.files.folders import make_folder
+from glassplat.files.folders import check_folder, make_folder
 from glassplat.files.json_text import parse_json, read_json
 from glassplat.files.reading import read_text
-from glassplat.files.scene_folder import read_scene, write_scene
-from glassplat.render.environment import equirect_from_environment
-from glassplat.scene.scene import Scene
-from glassplat.train.recipe import recipe_from_json, recipe_to_json
+from glassplat.train.run_lock import check_unlocked
+
+if TYPE_CHECKING:
+    from glassplat.data.dataset import Dataset
+    from glassplat.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -119,6 +118,14 @@ class RunDirectory:
             return False
         return True
 
+    def check_begun(self) -> None:
+        """Refuse what no run was begun in.
+
+        Raises:
+            InputError: there is no recipe.
+        """
+        self._read("recipe.json")
+
     def check_vacant(self) -> None:
         """Refuse to begin a run where something would be lost by it.
 
@@ -155,6 +162,9 @@ class RunDirectory:
 
     def begin(self, recipe: Any, settings: RunSettings, dataset: Dataset) -> None:
         """Creates the directory and records what is about to run."""
+        from glassplat.files.cameras_json import write_cameras
+        from glassplat.train.recipe import recipe_to_json
+
         make_folder(self.path)
         write_text(self.path / "recipe.json", recipe_to_json(recipe))
         write_text(self.path / "settings.json", json.dumps(dataclasses.asdict(settings), indent=2))
@@ -165,6 +175,10 @@ class RunDirectory:
 
         `sparse/0` is the same as a COLMAP model, of the photographs as training saw them: undistorted and reduced.
         """
+        from glassplat.data.corrected_views import with_corrected_cameras
+        from glassplat.files.cameras_json import write_cameras
+        from glassplat.files.colmap_text import write_colmap
+
         if not len(scene.poses):
             return
         refined = with_corrected_cameras(dataset, scene)
@@ -175,6 +189,8 @@ class RunDirectory:
 
     def recipe(self) -> Any:
         """The recorded recipe."""
+        from glassplat.train.recipe import recipe_from_json
+
         return recipe_from_json(self._read("recipe.json"), str(self.path / "recipe.json"))
 
     def was_begun_with(self, recipe: Any) -> bool:
@@ -183,6 +199,8 @@ class RunDirectory:
         Compared as written: `recipe()` gives options that an earlier version did not have their present defaults,
         with which the run was not made.
         """
+        from glassplat.train.recipe import recipe_to_json
+
         written = self._read("recipe.json")
         return self.recipe() == recipe and parse_json(written, "recipe.json") == json.loads(recipe_to_json(recipe))
 
@@ -205,6 +223,10 @@ class RunDirectory:
 
     def export(self, scene: Scene, step: int) -> Path:
         """Writes the scene in the formats that others read; returns its folder."""
+        from glassplat.files.environment_image import write_equirect
+        from glassplat.files.scene_folder import write_scene
+        from glassplat.render.environment import equirect_from_environment
+
         folder = self.path / "point_cloud" / f"iteration_{step}"
         write_scene(folder, scene)
         if not scene.environment.is_empty:
@@ -214,6 +236,8 @@ class RunDirectory:
 
     def latest_scene(self) -> tuple[Scene, int]:
         """The exported scene of the highest iteration, and that iteration."""
+        from glassplat.files.scene_folder import read_scene
+
         named = {NUMBERED.fullmatch(folder.name): folder for folder in self.path.glob("point_cloud/*")}
         folders = {int(match[1]): folder for match, folder in named.items() if match and folder.is_dir()}
         if not folders:
@@ -234,6 +258,23 @@ class RunDirectory:
             )
         with input_checked():
             return read_text(file)
+
+
+def check_output(directory: RunDirectory, *, resume: bool) -> None:
+    """What can be told about a run's directory before the photographs are read; writes nothing.
+
+    Raises:
+        InputError: a fresh run would overwrite something, there is nothing to go on from, or another training writes
+            there.
+        NotADirectoryError: it is a file, or goes through one.
+        PermissionError: nothing may be written there.
+    """
+    check_folder(directory.path)
+    check_unlocked(directory.path)
+    if resume:
+        directory.check_saved()
+    else:
+        directory.check_vacant()
 
 
 def write_text(path: Path, text: str) -> None:

@@ -188,19 +188,14 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Di
     terms, weights = loss_terms(stage, frame, view, learning)
     tracked = [record for record in frame.screen if record.means2d.requires_grad and record.means2d.numel() > 0]
     centers, probes = [record.means2d for record in tracked], [record.probe for record in tracked]
-    sloped = [(term, weight) for term, weight in zip(terms.values(), weights, strict=True) if term.requires_grad]
-    # The weights enter as the gradients that the terms begin with: no sum over the terms has to be made for it.
-    found = torch.autograd.grad(
-        [term for term, _ in sloped],
-        [*leaves.values(), *centers, *probes],
-        [weight for _, weight in sloped],
-        allow_unused=True,
-    )
+    values = torch.stack([*terms.values()]) * weights
+    # Of their sum, and not of the terms with the weights as `grad_outputs`: to check these, PyTorch imports SymPy.
+    sums = [values.sum()] if values.requires_grad else []
+    found = torch.autograd.grad(sums, [*leaves.values(), *centers, *probes], allow_unused=True)
     gradients = {name: g for name, g in zip(leaves, found[: len(leaves)], strict=True) if g is not None}
     on_screen = found[len(leaves) :]
     pulls = zip(tracked, on_screen[: len(tracked)], on_screen[len(tracked) :], strict=True)
     screen = [(s, v_means, v_probe) for s, v_means, v_probe in pulls if v_means is not None and v_probe is not None]
-    values = torch.stack([term.detach() for term in terms.values()]) * weights
     losses = dict(zip(terms, values.tolist(), strict=True))
     return Differentiated(losses, gradients, screen, frame.space, frame.visible)
 

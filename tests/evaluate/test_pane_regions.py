@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.commands.measuring.evaluate import evaluate_run, plane_text
+from glassplat.commands.measuring.evaluation import evaluate_run, plane_text
 from glassplat.commands.measuring.pane_source import pane_regions
 from glassplat.commands.runs.stored_run import open_run
 from glassplat.data.errors import InputError

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from glassplat import cli
+from glassplat.commands.measuring.demo import SCENE
 from glassplat.densify.default import DefaultDensify
 from glassplat.densify.mcmc import McmcDensify
 from glassplat.kernels.color_space import linear_from_srgb
@@ -60,7 +61,7 @@ def parsed(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
     """The recipe of a command line of `train`."""
     taken: list[Any] = []
     monkeypatch.setattr(cli, "run", taken.append)
-    assert cli.main(["train", arguments[0], "--data", "x", "--output", "y", *arguments[1:]]) == 0
+    assert cli.main(["train", arguments[0], "--data", str(SCENE), "--output", "y", *arguments[1:]]) == 0
     return taken[0].recipe
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -57,6 +58,14 @@ def assert_same_scene(first: Scene, second: Scene) -> None:
 def test_training_lowers_the_loss() -> None:
     steps = run(fresh_state(), SplatRecipe(sh_degree=1).stages(seed=0), 60)
     assert sum(s.loss for s in steps[-6:]) < 0.6 * sum(s.loss for s in steps[:6])
+
+
+def test_a_step_does_without_sympy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which takes half a second to import, and PyTorch imports it to look at gradients that are given."""
+    monkeypatch.setitem(sys.modules, "torch.fx.experimental.symbolic_shapes", None)
+    with pytest.raises(ModuleNotFoundError):
+        torch.autograd.grad([torch.ones((), requires_grad=True) * 1], [torch.ones(())], [torch.ones(())])
+    assert run(fresh_state(), planar_stages(), iterations=20, until=2)
 
 
 def test_planar_goes_through_its_stages() -> None:

@@ -16,7 +16,6 @@ from glassplat.prepare.feature_database import Lens
 from glassplat.prepare.mapping import Mapper
 from glassplat.prepare.preparation import Preparation, prepare
 from glassplat.prepare.reconstruction import Settings
-from glassplat.prepare.report_page import PAGE, write_page
 from glassplat.prepare.workplace import Workplace
 
 
@@ -56,6 +55,8 @@ class Prepare:
             report = prepare(task, progress.show, resume=self.resume, force=self.force)
         for line in report.lines():
             (warn if line.startswith("advice") else say)(console, line)
+        from glassplat.prepare.report_page import PAGE, write_page  # PyTorch, which nothing before needs.
+
         write_page(self.output, self.output / PAGE)
         say(console, f"capture: {self.output}, report: {self.output / PAGE}")
         say(console, f"next: glassplat annotate {self.output}")

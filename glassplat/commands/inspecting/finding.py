@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+FEW_VIEWS = 20
+"""Photographs, below which more are advised."""
+
 
 @dataclass
 class Finding:

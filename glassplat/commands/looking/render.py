@@ -8,18 +8,14 @@ from typing import Annotated
 
 import tyro
 from rich.console import Console
-from rich.progress import track
 
-from glassplat.commands.console.messages import say
-from glassplat.commands.runs.output_folder import check_targets, claim_folder
+from glassplat.commands.console.loading import load
+from glassplat.commands.runs.output_folder import check_claim
 from glassplat.commands.runs.scene_edits import SceneEdits
-from glassplat.commands.runs.stored_run import Split, chosen_views, open_run, photographs_of, pictures_of
-from glassplat.evaluate.evaluate import timed_render
-from glassplat.evaluate.layer_image import layer_image
-from glassplat.files.images import write_image
-from glassplat.interface.layers import Layer, check_layers
+from glassplat.commands.runs.splits import Split
+from glassplat.interface.layers import Layer
 from glassplat.kernels.devices import DeviceName
-from glassplat.render.layers import renderer_with
+from glassplat.train.run_directory import RunDirectory
 
 
 @dataclass(frozen=True)
@@ -44,27 +40,17 @@ class Render:
     device: DeviceName = "auto"
     data: Path | None = None
 
+    def ready(self) -> None:
+        """Refuses what is no run, and an output that holds something else; imports what renders."""
+        RunDirectory(self.run_directory).check_begun()
+        check_claim(self.output, "render")
+        load("glassplat.commands.looking.rendering")
+
     def run(self, console: Console) -> None:
         """Renders."""
-        stored = open_run(self.run_directory, self.device, self.data)
-        check_layers(self.layers, stored.recipe)
-        scene = self.edits.applied(stored.scene)
-        renderer = renderer_with(stored.renderer, self.layers)
-        views = chosen_views(stored.dataset, self.split)
-        paths = pictures_of(stored.dataset)
-        targets = [self.output / layer / paths[view.name] for layer in self.layers for view in views]
-        check_targets(self.output, targets, photographs_of(stored.dataset))
-        if claim_folder(self.output, "render", self.run_directory):
-            say(
-                console,
-                f"adding to {self.output}, which `glassplat render` wrote earlier; images of one name are replaced",
-            )
-        for view in track(views, "rendering", console=console):
-            frame, _ = timed_render(renderer, scene, view)
-            for layer in self.layers:
-                image = layer_image(frame, layer)
-                write_image(self.output / layer / paths[view.name], image)
-        say(console, f"{len(views)} views x {len(self.layers)} layers -> {self.output}")
+        from glassplat.commands.looking.rendering import write_layers
+
+        write_layers(self, console)
 
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from glassplat.commands.console.messages import complain, printable, say
 from glassplat.commands.console.training_progress import in_words
-from glassplat.commands.measuring.evaluate import evaluate_run
+from glassplat.commands.measuring.evaluation import evaluate_run
 from glassplat.commands.runs.stored_run import open_run
 from glassplat.commands.training.train import Train
 from glassplat.data.dataset import load_dataset

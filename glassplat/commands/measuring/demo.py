@@ -7,17 +7,13 @@ from pathlib import Path
 
 from rich.console import Console
 
+from glassplat.commands.console.loading import load
 from glassplat.commands.console.messages import say
 from glassplat.commands.measuring.beside import beside
-from glassplat.commands.measuring.evaluate import evaluate_run, print_results
-from glassplat.commands.runs.stored_run import open_run
-from glassplat.commands.training.train import Train
 from glassplat.data.ranges import Seed, Several
 from glassplat.files.folders import check_folder
 from glassplat.kernels.devices import DeviceName
-from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.run_directory import RunDirectory
-from glassplat.train.splat_recipe import SplatRecipe
 
 SCENE = Path(__file__).parents[2] / "demo_scene"
 
@@ -38,9 +34,20 @@ class Demo:
     seed: Seed = 0
     device: DeviceName = "auto"
 
+    def ready(self) -> None:
+        """Refuses an output that cannot be written, and imports what trains and renders."""
+        check_folder(self.output)
+        load("glassplat.commands.training.train")
+        load("glassplat.commands.measuring.evaluation")
+
     def run(self, console: Console) -> None:
         """Trains both methods, each in a process of its own, evaluates them and says where the pictures are."""
-        check_folder(self.output)
+        from glassplat.commands.measuring.evaluation import evaluate_run, print_results
+        from glassplat.commands.runs.stored_run import open_run
+        from glassplat.commands.training.train import Train
+        from glassplat.train.planar_recipe import PlanarRecipe
+        from glassplat.train.splat_recipe import SplatRecipe
+
         folders = [self.output / method for method in (PlanarRecipe.method, SplatRecipe.method)]
         log = self.output / "splat.log"
         with beside(self._arguments(SplatRecipe.method), log) as splat:

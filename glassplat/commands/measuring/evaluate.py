@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import tyro
 from rich.console import Console
-from rich.table import Table
 
+from glassplat.commands.console.loading import load
 from glassplat.commands.console.messages import say
-from glassplat.commands.measuring.pane_source import PaneSource, pane_regions
-from glassplat.commands.runs.stored_run import StoredRun, open_run
-from glassplat.evaluate.alignment import with_aligned_test_views
-from glassplat.evaluate.evaluate import Evaluation, evaluate
-from glassplat.evaluate.metric_names import PLANE_COLUMNS, missing_reasons, shown_metrics, written
-from glassplat.evaluate.report import Report
 from glassplat.kernels.devices import DeviceName
-from glassplat.render.planar import Planar, with_photographer
-from glassplat.train.checkpoint import recorded_seconds
-from glassplat.train.run_directory import write_text
+from glassplat.train.run_directory import RunDirectory
 
+PaneSource = Literal["auto", "truth", "masks", "rendered"]
 Align = Literal["auto", "always", "never"]
 """Whether test cameras are moved before they are scored."""
 
@@ -48,8 +40,16 @@ class Evaluate:
     panes: PaneSource = "auto"
     align: Align = "auto"
 
+    def ready(self) -> None:
+        """Refuses what is no run, and imports what renders."""
+        RunDirectory(self.run_directory).check_begun()
+        load("glassplat.commands.measuring.evaluation")
+
     def run(self, console: Console) -> None:
         """Evaluates and reports."""
+        from glassplat.commands.measuring.evaluation import evaluate_run, print_results
+        from glassplat.commands.runs.stored_run import open_run
+
         stored = open_run(self.run_directory, self.device, self.data)
         with console.status(f"rendering {len(stored.dataset.test)} test views"):
             results = evaluate_run(stored, self.panes, align=self.align)
@@ -59,88 +59,3 @@ class Evaluate:
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""
         return f"{self.run_directory} itself is as it was: repeat the command to evaluate it"
-
-
-def evaluate_run(stored: StoredRun, panes: PaneSource = "auto", *, align: Align = "auto") -> dict:
-    """Evaluates a run, writes `results.json`, `per_view.json`, sheets and overview; returns the results.
-
-    Raises:
-        InputError: the capture does not say where its panes are in this way.
-    """
-    regions = pane_regions(stored.dataset, panes)
-    aligned = align == "always" or (align == "auto" and len(stored.scene.poses) > 0)
-    if aligned:
-        photographed = with_photographer(stored.renderer, "present")
-        stored = stored._replace(dataset=with_aligned_test_views(stored.scene, photographed, stored.dataset))
-    settings, path = stored.directory.settings(), stored.directory.path
-    blend = stored.renderer.blend if isinstance(stored.renderer, Planar) else None
-    report = Report(path, stored.dataset, blend)
-    evaluation: Evaluation = evaluate(
-        stored.scene,
-        with_photographer(stored.renderer, "beside"),
-        stored.dataset,
-        regions=regions,
-        listen=report.add,
-    )
-    results = {
-        "method": stored.recipe.method,
-        "iterations": stored.iterations,
-        "seed": settings.seed,
-        "downscale": settings.downscale,
-        "train_seconds": train_seconds(stored),
-        "test_cameras": "aligned with their photographs" if aligned else "as the capture has them",
-        **evaluation.results,
-    }
-    write_text(path / "results.json", json.dumps(results, indent=2))
-    write_text(path / "per_view.json", json.dumps(evaluation.per_view, indent=2))
-    report.finish(results, evaluation.per_view)
-    return results
-
-
-def train_seconds(stored: StoredRun) -> float | None:
-    """Training time as the checkpoint recorded it."""
-    file = stored.directory.checkpoint
-    return recorded_seconds(file) if file.is_file() else None
-
-
-def print_results(console: Console, *results: dict) -> None:
-    """Shows the main metrics of one or several runs, side by side, and says why some have no value."""
-    console.print(results_table(*results))
-    for line in notes(*results):
-        say(console, line)
-
-
-def results_table(*results: dict) -> Table:
-    """The main metrics of one or several runs, side by side, by their names in `results.json`."""
-    table = Table("metric", *(r["method"] for r in results))
-    metrics = {name: metric for r in results for name, metric in shown_metrics(r).items()}
-    for name in dict.fromkeys(name for r in results for name in shown_metrics(r)):
-        table.add_row(name, *(written(r.get(name), metrics[name].pattern) for r in results))
-    for result in results:
-        for plane in result.get("planes") or []:
-            cells = (plane_text(plane) if r is result else "" for r in results)
-            table.add_row(f"pane {plane['label']}", *cells)
-    return table
-
-
-def plane_text(plane: dict) -> str:
-    """A pane in one line: its reflectance, and its errors where the truth is known."""
-    text = f"R0 {written(plane['base_reflectance'], PLANE_COLUMNS['base_reflectance'].pattern)}"
-    if plane.get("normal_drift_deg") is not None:
-        text += f", {plane['normal_drift_deg']:.2f}° from the plane of the masks"
-    if plane.get("normal_error_deg") is None:
-        return text
-    return (
-        f"{text} (error {plane['base_reflectance_error']:.3f}), normal off by {plane['normal_error_deg']:.2f}°, "
-        f"centre by {100 * plane['offset_error']:.2f} % of the extent"
-    )
-
-
-def notes(*results: dict) -> list[str]:
-    """Why metrics have no value, a line for each reason."""
-    heads = [f"{result['method']}: " if len(results) > 1 else "" for result in results]
-    return [
-        f"{head}no {', '.join(names)}: {reason}"
-        for head, result in zip(heads, results, strict=True)
-        for reason, names in missing_reasons(result).items()
-    ]

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
+from glassplat.commands.measuring.evaluate import PaneSource
 from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError
 from glassplat.evaluate.pane_regions import MarkedRegions, PaneRegions, RenderedRegions, TrueRegions
 from glassplat.init.planes import PlaneFit, PlaneFitError
 from glassplat.train.plane_entry import fitted_planes
-
-PaneSource = Literal["auto", "truth", "masks", "rendered"]
 
 
 def pane_regions(dataset: Dataset, source: PaneSource) -> PaneRegions:

@@ -8,14 +8,12 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
+from glassplat.commands.console.loading import load
 from glassplat.commands.console.messages import say, warn
+from glassplat.commands.runs.scene_place import check_file
 from glassplat.data.errors import InputError, input_checked
+from glassplat.data.ranges import Up
 from glassplat.files.folders import check_folder
-from glassplat.interface.imported_scene import Up, imported_scene
-from glassplat.interface.model import Model, by_name
-from glassplat.interface.saving import write_as_run
-from glassplat.train.background import BLACK
-from glassplat.train.planar_recipe import PlanarRecipe
 
 
 @dataclass(frozen=True)
@@ -36,11 +34,23 @@ class Import:
     planes: Path | None = None
     up: Up = "-y"
 
-    def run(self, console: Console) -> None:
-        """Reads and writes."""
+    def ready(self) -> None:
+        """Refuses files that cannot be read, and an output that is not empty; imports what reads and writes."""
         check_folder(self.output)
         if self.output.exists() and any(self.output.iterdir()):
             raise InputError(f"{self.output} is not empty; nothing was written. Choose a new folder for --output")
+        for file in (self.file, *([] if self.planes is None else [self.planes])):
+            check_file(file)
+        load("glassplat.interface.saving")
+
+    def run(self, console: Console) -> None:
+        """Reads and writes."""
+        from glassplat.interface.imported_scene import imported_scene
+        from glassplat.interface.model import Model, by_name
+        from glassplat.interface.saving import write_as_run
+        from glassplat.train.background import BLACK
+        from glassplat.train.planar_recipe import PlanarRecipe
+
         with input_checked():
             scene, cameras, lost = imported_scene(self.file, self.planes, self.up)
         if lost:

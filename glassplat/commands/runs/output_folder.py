@@ -23,16 +23,26 @@ def claim_folder(folder: Path, command: str, run: Path) -> bool:
         InputError: the folder holds something else, which must not be overwritten.
         NotADirectoryError: it is a file, or goes through one.
     """
+    found = check_claim(folder, command)
+    make_folder(folder)
+    write_text(folder / RECORD, json.dumps({"command": command, "run": str(run)}))
+    return found
+
+
+def check_claim(folder: Path, command: str) -> bool:
+    """Look whether a command may write into a folder; returns whether it has done so before.
+
+    Raises:
+        InputError, NotADirectoryError: as `claim_folder` does; nothing is written.
+        PermissionError: nothing may be written there.
+    """
     check_folder(folder)
-    record = folder / RECORD
     found = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
-    if found and _recorded_command(record) != command:
+    if found and _recorded_command(folder / RECORD) != command:
         raise InputError(
             f"{folder} is not empty, and not from `glassplat {command}` (it holds {first_names(found)}); nothing was "
             "written. Choose a new folder for --output"
         )
-    make_folder(folder)
-    write_text(record, json.dumps({"command": command, "run": str(run)}))
     return bool(found)
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from glassplat.data.errors import InputError, input_checked
 from glassplat.data.ranges import Finite, PaneLabel, Share
-from glassplat.files.environment_image import read_equirect
-from glassplat.render.environment import environment_from_equirect
-from glassplat.scene.plane_edits import as_mirrors, shifted, tilted, with_reflectance, without_glass
-from glassplat.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from glassplat.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,8 @@ class SceneEdits:
             InputError: there are no panes, no pane has a label, a value is out of range, edits contradict, or the
                 panorama cannot be read or nothing mirrors it.
         """
+        from glassplat.scene.plane_edits import as_mirrors, shifted, tilted, with_reflectance, without_glass
+
         if self.surroundings is not None:
             scene = in_surroundings(scene, self.surroundings)
         if replace(self, surroundings=None) == SceneEdits():
@@ -72,6 +74,9 @@ def in_surroundings(scene: Scene, panorama: Path) -> Scene:
     Raises:
         InputError: the scene mirrors no environment, or the panorama cannot be read.
     """
+    from glassplat.files.environment_image import read_equirect
+    from glassplat.render.environment import environment_from_equirect
+
     if scene.environment.is_empty:
         raise InputError("nothing in the run mirrors its surroundings; train it with `glassplat train deferred`")
     try:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from glassplat.commands.runs.splits import chosen_views
 from glassplat.data.corrected_views import with_corrected_cameras
 from glassplat.data.dataset import TEST_EVERY, Dataset, PointCloud, View, load_dataset
 from glassplat.data.errors import InputError, first_names, input_checked
@@ -18,8 +19,6 @@ from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
 from glassplat.train.background import photo_background, settled
 from glassplat.train.run_directory import RunDirectory
-
-Split = Literal["train", "test", "all"]
 
 
 class StoredRun(NamedTuple):
@@ -112,18 +111,6 @@ def _check_same(directory: RunDirectory, dataset: Dataset) -> None:
         f"{dataset.root} is not the capture that {directory.path} was trained on: {', '.join(only)}. Give the same "
         "photographs to --data"
     )
-
-
-def chosen_views(dataset: Dataset, split: Split) -> tuple[View, ...]:
-    """The views of a split, by name.
-
-    Raises:
-        InputError: there are none.
-    """
-    parts = {"train": dataset.train, "test": dataset.test, "all": (*dataset.train, *dataset.test)}
-    if not parts[split]:
-        raise InputError(f"{dataset.root} has no {split} views; choose another --split")
-    return tuple(sorted(parts[split], key=lambda view: view.name))
 
 
 def pictures_of(dataset: Dataset) -> dict[str, Path]:

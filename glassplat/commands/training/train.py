@@ -21,8 +21,8 @@ from glassplat.kernels.devices import DeviceName, chosen_device
 from glassplat.train.background import photo_background
 from glassplat.train.messages import Message
 from glassplat.train.recipe import Preset, Recipe
-from glassplat.train.run import CHECKPOINT_SECONDS, Listener, check_output
-from glassplat.train.run_directory import RunDirectory, RunSettings
+from glassplat.train.run import CHECKPOINT_SECONDS, Listener
+from glassplat.train.run_directory import RunDirectory, RunSettings, check_output
 
 RecipeKind = TypeVar("RecipeKind", bound=Recipe)
 
@@ -97,7 +97,7 @@ class Train(Generic[RecipeKind]):
         if not self.view:
             yield lambda message: None
             return
-        from glassplat.commands.looking.view import announce
+        from glassplat.commands.looking.viewing import announce
         from glassplat.interface.watching import WatchedTraining
         from glassplat.viewer.ports import LOCAL, vacant_port
 

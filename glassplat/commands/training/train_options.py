@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import operator
 import typing
 from collections.abc import Sequence
@@ -12,11 +11,11 @@ from typing import Annotated, Any
 
 import tyro
 
+from glassplat.commands.training.first_look import FULL_HELP, HELP, last_value
 from glassplat.commands.training.train import Train
 from glassplat.data.ranges import Essential
 from glassplat.train.recipe import RECIPES, Preset, recipe_of
 
-HELP, FULL_HELP = ("-h", "--help"), "--help-advanced"
 POINTER = f"These are the options that most runs need; {FULL_HELP} in place of --help shows all of them."
 
 
@@ -38,9 +37,7 @@ def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
 
 def asked_preset(arguments: Sequence[str]) -> Preset:
     """The preset that the arguments name last; the default one where that is none, which parsing will refuse."""
-    joined = [argument.removeprefix("--preset=") for argument in arguments if argument.startswith("--preset=")]
-    spaced = [value for option, value in itertools.pairwise(arguments) if option == "--preset"]
-    return "paper" if (joined + spaced)[-1:] == ["paper"] else "glassplat"
+    return "paper" if last_value(arguments, "--preset") == "paper" else "glassplat"
 
 
 def in_brief(options: Any) -> Any:

@@ -41,6 +41,10 @@ T, T_GLASS, BEHIND, BEHIND_GLASS, V_MASK, V_DEVIATION, CENTER, WEIGHT, V_IMAGE =
 )
 
 
+LEAN = PAIR_VALUES + tile.GROUP
+"""Column of a pair's row that is free where there are no more than four channels."""
+
+
 def _unblend_primary(real: type, probed: bool) -> Scalar:
     full, load = vector_kind(real, tile.LANES)
     x_centers, y_centers = tile.pixel_centers(real)
@@ -53,10 +57,13 @@ def _unblend_primary(real: type, probed: bool) -> Scalar:
 
     @inlined
     def unblend_primary(planes, state, at, batch, splat, blocks, groups, deviating, row, row_at):
-        """Takes a splat off the pixels of its blocks and writes its sums, of channels beyond the first four zero."""
+        """Takes a splat off the pixels of its blocks and writes its sums, of channels beyond the first four zero.
+
+        With no more than four channels the one after them is the gradient of a deviation by its channel.
+        """
         none, most = full(zero), full(alpha_max)
         g, g_x, g_y, g_xx, g_xy, g_yy = none, none, none, none, none, none
-        pull_x, pull_y, s0, s1, s2, s3 = none, none, none, none, none, none
+        pull_x, pull_y, s0, s1, s2, s3, lean = none, none, none, none, none, none, none
         while blocks != 0:
             b = lowest_bit(blocks)
             blocks &= blocks - 1
@@ -74,9 +81,15 @@ def _unblend_primary(real: type, probed: bool) -> Scalar:
             v2, v3 = load(planes, V_IMAGE + 2 * PIXELS + i), load(planes, V_IMAGE + 3 * PIXELS + i)
             dot = v0 * item(batch, splat + VALUES) + v1 * item(batch, splat + VALUES + 1)
             dot = dot + (v2 * item(batch, splat + VALUES + 2) + v3 * item(batch, splat + VALUES + 3))
-            if groups > 1 or deviating >= 0:
+            if groups > 1:
                 dot = dot_more(dot, planes, i, batch, splat, groups, deviating)
                 store(planes, WEIGHT + i, weight)
+            elif deviating >= 0:
+                difference = item(batch, splat + VALUES + deviating) - load(planes, CENTER + i)
+                v_deviation = load(planes, V_DEVIATION + i)
+                slope = weight * v_deviation
+                dot = dot + v_deviation * absolute(difference)
+                lean = lean + select(difference > zero, slope, select(difference < zero, -slope, none))
             behind = load(planes, BEHIND + i)
             v_alpha = t * dot - behind * inverse
             store(planes, BEHIND + i, behind + weight * dot)
@@ -90,7 +103,7 @@ def _unblend_primary(real: type, probed: bool) -> Scalar:
                 pull_x = pull_x + absolute(gain_x * (two * item(batch, splat + FORM_XX)) + gain_y * across)
                 pull_y = pull_y + absolute(gain_y * (two * item(batch, splat + FORM_YY)) + gain_x * across)
             s0, s1, s2, s3 = s0 + weight * v0, s1 + weight * v1, s2 + weight * v2, s3 + weight * v3
-        sums = (g, g_x, g_y, g_xx, g_xy, g_yy, pull_x, pull_y, s0, s1, s2, s3, none, none, none, none)
+        sums = (g, g_x, g_y, g_xx, g_xy, g_yy, pull_x, pull_y, s0, s1, s2, s3, lean, none, none, none)
         store(row, row_at, sums_of(sums))
 
     return unblend_primary
@@ -367,7 +380,9 @@ def composite_backward(real: type, probed: bool) -> Kernel:
                             rows[row + LANES : row + row_width] = zero
                         else:
                             unblend_primary(planes, state, at, batch, splat, blocks, groups, deviating, rows, row)
-                            if groups > 1 or deviating >= 0:
+                            if groups > 1:
                                 sum_more(planes, batch, splat, blocks, groups, deviating, rows, row, sums)
+                            elif deviating >= 0:
+                                rows[row + PAIR_VALUES + deviating] += rows[row + LEAN]
 
     return backward

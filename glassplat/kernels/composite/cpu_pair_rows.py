@@ -15,7 +15,7 @@ from torch import Tensor
 from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.cpu.jit import Kernel, kernel
 from glassplat.kernels.cpu.schedule import even_stride
-from glassplat.kernels.cpu.vector import store, vector_kind
+from glassplat.kernels.cpu.vector import item, store, vector_kind
 from glassplat.kernels.splats import Splats, TileBins
 
 CHUNK = 512
@@ -74,16 +74,18 @@ def _sum_rows(real: type) -> Kernel:
         stride = even_stride(num_chunks)
         for task in prange(num_chunks):
             chunk = task * stride % num_chunks
+            begin, end = chunk * CHUNK, min(count, (chunk + 1) * CHUNK)
+            v_means[begin:end], v_conics[begin:end], v_opacities[begin:end] = zero, zero, zero
+            v_values[begin:end], v_probe[begin:end] = zero, zero
             total = np.empty(width, real)
-            for s in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-                v_means[s, :], v_conics[s, :], v_opacities[s], v_values[s, :] = zero, zero, zero, zero
-                v_probe[s, :] = zero
-                if offsets[s] == offsets[s + 1]:
+            for s in range(begin, end):
+                first, last = offsets[s], offsets[s + 1]
+                if first == last:
                     continue
                 for column in range(0, width, LANES):
                     part = full(zero)
-                    for k in range(offsets[s], offsets[s + 1]):
-                        part = part + load(rows, slots[k] * width + column)
+                    for k in range(first, last):
+                        part = part + load(rows, item(slots, k) * np.int64(width) + column)
                     store(total, column, part)
                 for d in range(v_values.shape[1]):
                     v_values[s, d] = total[PAIR_VALUES + d]

@@ -110,7 +110,7 @@ def _color(basis: Callable[..., Any]) -> Callable[..., Any]:
 
 def _color_gradient(real: type, basis: Callable[..., Any]) -> Callable[..., Any]:
     add_row, pull = _rows()
-    pulls = _direction_gradients(real)
+    pulls = direction_gradients(real)
     first, second, third = pulls
 
     @inlined
@@ -163,7 +163,7 @@ def _rows() -> tuple[Callable[..., Any], Callable[..., Any]]:
     return add_row, pull
 
 
-def _direction_gradients(real: type) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
+def direction_gradients(real: type) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
     """Gradients of the direction, degree by degree, from the gradients h of the harmonics."""
     _, c1, c_xy, c_zz, c_xx, c_yxx, c_xyz, c_yzz, c_zzz, c_zxx = (real(c) for c in SH_CONSTANTS)
     two, three, four, six, eight = real(2.0), real(3.0), real(4.0), real(6.0), real(8.0)

@@ -26,8 +26,8 @@ from glassplat.kernels.cpu.vector import (
 )
 from glassplat.kernels.cpu.vector_rows import row_loader, store_all, thirds, transposed
 from glassplat.kernels.maths.harmonics import harmonic_basis
-from glassplat.kernels.maths.projection import LOW_PASS, screen_maths, shape_maths, vector_maths
-from glassplat.kernels.project.cpu_view import view_steps
+from glassplat.kernels.maths.projection import LOW_PASS, shape_maths, vector_maths
+from glassplat.kernels.project.cpu_view import view_steps, view_with
 from glassplat.kernels.project.steps import MOST_DEVIATIONS
 
 LANES = 16
@@ -117,72 +117,83 @@ def _may_show(real: type) -> Step:
     return may_show
 
 
-def _place(real: type) -> Step:
-    _, pose, *_ = view_steps(real)
-    dot, along = vector_maths().dot, vector_maths().along
-    footprint, screen_covariance = screen_maths(real).footprint, screen_maths(real).screen_covariance
-    rotation = shape_maths(real).rotation
-    exponential, (full, load) = _exponential(real), vector_kind(real, LANES)
-    zero, one, largest = real(0.0), real(1.0), real(np.finfo(real).max)
+def shapes(real: type) -> Step:
+    """The step that takes columns of quaternions, log scales and logits, after three others.
+
+    It gives unit quaternions, their inverse norms, scales, axes, opacities, and the sum of the raw magnitudes.
+    """
+    rotation, exponential, load, one = (
+        shape_maths(real).rotation,
+        _exponential(real),
+        vector_kind(real, LANES).load,
+        real(1.0),
+    )
+
+    @inlined
+    def shape(columns):
+        w, x = load(columns, 3 * LANES), load(columns, 4 * LANES)
+        y, z = load(columns, 5 * LANES), load(columns, 6 * LANES)
+        a, b, d = load(columns, 7 * LANES), load(columns, 8 * LANES), load(columns, 9 * LANES)
+        logit = load(columns, 10 * LANES)
+        inverse_norm = one / square_root(w * w + x * x + y * y + z * z)
+        quat = w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm
+        column_x, column_y, column_z = rotation(quat)
+        s_x, s_y, s_z = exponential(a), exponential(b), exponential(d)
+        axes = (
+            (s_x * column_x[0], s_x * column_x[1], s_x * column_x[2]),
+            (s_y * column_y[0], s_y * column_y[1], s_y * column_y[2]),
+            (s_z * column_z[0], s_z * column_z[1], s_z * column_z[2]),
+        )
+        raw = absolute(logit) + absolute(a) + absolute(b) + absolute(d)
+        return quat, inverse_norm, (s_x, s_y, s_z), axes, one / (one + exponential(-logit)), raw
+
+    return shape
+
+
+def views(real: type) -> Step:
+    """As `ViewSteps.view`, of vectors."""
+    full = vector_kind(real, LANES).full
 
     @inlined
     def held(tangent, low, high):
         return minimum(maximum(tangent, full(low)), full(high))
 
+    return view_with(real, held)
+
+
+def _place(real: type) -> Step:
+    pose, dot = view_steps(real).pose, vector_maths().dot
+    shape, view, load = shapes(real), views(real), vector_kind(real, LANES).load
+    zero, one, largest = real(0.0), real(1.0), real(np.finfo(real).max)
+
     @inlined
     def place(columns, c, cam_from_world, intrinsics, lens):
         mean = load(columns, 0), load(columns, LANES), load(columns, 2 * LANES)
-        w, x, y, z = (
-            load(columns, 3 * LANES), load(columns, 4 * LANES), load(columns, 5 * LANES), load(columns, 6 * LANES)
-        )  # fmt: skip
-        a, b, d = load(columns, 7 * LANES), load(columns, 8 * LANES), load(columns, 9 * LANES)
-        logit = load(columns, 10 * LANES)
-        inverse_norm = one / square_root(w * w + x * x + y * y + z * z)
-        column_x, column_y, column_z = rotation(
-            (w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm)
-        )
-        s_x, s_y, s_z = exponential(a), exponential(b), exponential(d)
-        axis_x = s_x * column_x[0], s_x * column_x[1], s_x * column_x[2]
-        axis_y = s_y * column_y[0], s_y * column_y[1], s_y * column_y[2]
-        axis_z = s_z * column_z[0], s_z * column_z[1], s_z * column_z[2]
-        opacity = one / (one + exponential(-logit))
-        raw = absolute(mean[0]) + absolute(mean[1]) + absolute(mean[2]) + absolute(logit)
-        raw = raw + absolute(a) + absolute(b) + absolute(d)
+        _, inverse_norm, _, axes, opacity, raw = shape(columns)
         row_x, row_y, row_z, offset = pose(cam_from_world, c)
         depth = dot(row_z, mean) + offset[2]
-        inverse_depth = one / depth
-        tangent_x = (dot(row_x, mean) + offset[0]) * inverse_depth
-        tangent_y = (dot(row_y, mean) + offset[1]) * inverse_depth
-        fx, fy = intrinsics[c, 0], intrinsics[c, 1]
-        held_x, held_y = held(tangent_x, lens[c, 0], lens[c, 1]), held(tangent_y, lens[c, 2], lens[c, 3])
-        w_x, w_y = footprint(row_x, row_y, row_z, inverse_depth * fx, inverse_depth * fy, held_x, held_y)
-        xx, xy, yy, determinant = screen_covariance(
-            along(w_x, axis_x, axis_y, axis_z), along(w_y, axis_x, axis_y, axis_z)
-        )
+        position = dot(row_x, mean) + offset[0], dot(row_y, mean) + offset[1], depth
+        tangent, _, _, _, covariance = view((row_x, row_y, row_z), position, axes, intrinsics, lens, c)
+        xx, xy, yy, determinant = covariance
+        u = tangent[0] * intrinsics[c, 0] + intrinsics[c, 2]
+        v = tangent[1] * intrinsics[c, 1] + intrinsics[c, 3]
         inverse = one / determinant
         # Ordered comparisons, so that NaN anywhere culls.
+        raw = raw + absolute(mean[0]) + absolute(mean[1]) + absolute(mean[2])
         sound = (raw <= largest) & (inverse_norm > zero) & (inverse_norm <= largest)
         sound = sound & (absolute(determinant) <= largest) & (absolute(depth) <= largest)
-        u, v = tangent_x * fx + intrinsics[c, 2], tangent_y * fy + intrinsics[c, 3]
         return (u, v, yy * inverse, -xy * inverse, xx * inverse, depth, opacity, xx, yy), bits_of(sound)
 
     return place
 
 
-def _color(real: type) -> tuple[Step, Step]:
-    load_rows, (_, load), basis = row_loader(real, LANES), vector_kind(real, LANES), harmonic_basis(real)
-    one = real(1.0)
-
-    @inlined
-    def tabulate(sh, positions, terms, target, at):
-        """Of the first `terms` coefficients, three numbers each."""
-        for first in range(0, 3 * terms, LANES):
-            store_all(target, at + first * LANES, transposed(load_rows(sh, positions, first)))
+def channel_of(real: type) -> Step:
+    """The step that gives one colour from harmonics and a table, whose columns of it begin at an index."""
+    load, step = vector_kind(real, LANES).load, 3 * LANES
 
     @inlined
     def channel(table, at, degree, b):
         value = b[0] * load(table, at)
-        step = 3 * LANES
         if degree > 0:
             value = value + b[1] * load(table, at + step) + b[2] * load(table, at + 2 * step)
             value = value + b[3] * load(table, at + 3 * step)
@@ -196,6 +207,19 @@ def _color(real: type) -> tuple[Step, Step]:
             value = value + b[13] * load(table, at + 13 * step) + b[14] * load(table, at + 14 * step)
             value = value + b[15] * load(table, at + 15 * step)
         return value
+
+    return channel
+
+
+def _color(real: type) -> tuple[Step, Step]:
+    load_rows, load, basis = row_loader(real, LANES), vector_kind(real, LANES).load, harmonic_basis(real)
+    channel, one = channel_of(real), real(1.0)
+
+    @inlined
+    def tabulate(sh, positions, terms, target, at):
+        """Of the first `terms` coefficients, three numbers each."""
+        for first in range(0, 3 * terms, LANES):
+            store_all(target, at + first * LANES, transposed(load_rows(sh, positions, first)))
 
     @inlined
     def color(table, means, at, degree, lens, c):

@@ -38,7 +38,7 @@ class ViewSteps(NamedTuple):
 def view_steps(real: type) -> ViewSteps:
     """Builds the parts for `real`, np.float32 or np.float64."""
     vec3, pose = _loads()
-    return ViewSteps(vec3, pose, _shape(real), _view(real), *_lenses(real))
+    return ViewSteps(vec3, pose, _shape(real), view_with(real, screen_maths(real).clamped), *_lenses(real))
 
 
 def _loads() -> tuple[Callable[..., Any], Callable[..., Any]]:
@@ -119,9 +119,10 @@ def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
     return fill_lenses, direction
 
 
-def _view(real: type) -> Callable[..., Any]:
+def view_with(real: type, clamped: Callable[..., Any]) -> Callable[..., Any]:
+    """What a camera sees, of numbers or of vectors, with the function that holds them between two limits."""
     along = vector_maths().along
-    _, clamped, footprint, screen_covariance, *_ = screen_maths(real)
+    _, _, footprint, screen_covariance, *_ = screen_maths(real)
     one = real(1.0)
 
     @inlined

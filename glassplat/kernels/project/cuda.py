@@ -13,14 +13,14 @@ from torch import Tensor
 from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.maths.projection import shape_maths, vector_maths
-from glassplat.kernels.project.cpu_backward import (
+from glassplat.kernels.project.cpu_view import LENS_VALUES, view_steps
+from glassplat.kernels.project.gradient_steps import (
     add_mean,
     camera_sums,
     place_gradients,
     shape_gradients,
     view_gradients,
 )
-from glassplat.kernels.project.cpu_view import LENS_VALUES, view_steps
 from glassplat.kernels.project.steps import culling, placing
 from glassplat.kernels.tensor_checks import REAL_OF
 

@@ -20,8 +20,8 @@ from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.disc import MAP
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.maths.projection import shape_maths, vector_maths
-from glassplat.kernels.project.cpu_backward import camera_sums, view_gradients
 from glassplat.kernels.project.cpu_view import CHUNK, LENS_VALUES, view_steps
+from glassplat.kernels.project.gradient_steps import camera_sums, view_gradients
 from glassplat.kernels.project.steps import culling
 from glassplat.kernels.project_discs.steps import disc_steps
 from glassplat.kernels.tensor_checks import REAL_OF

@@ -13,9 +13,9 @@ from torch import Tensor
 from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.maths.projection import shape_maths, vector_maths
-from glassplat.kernels.project.cpu_backward import camera_sums, view_gradients
 from glassplat.kernels.project.cpu_view import LENS_VALUES, view_steps
 from glassplat.kernels.project.cuda import camera_lenses
+from glassplat.kernels.project.gradient_steps import camera_sums, view_gradients
 from glassplat.kernels.project.steps import culling
 from glassplat.kernels.project_discs.cpu import WIDTHS
 from glassplat.kernels.project_discs.steps import disc_steps

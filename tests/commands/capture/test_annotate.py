@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from glassplat.cli import main
-from glassplat.commands.capture import annotate
+from glassplat.commands.capture import marking
 from tests.annotate.conftest import write_room
 from tests.annotate.suggested import suggestions
 
@@ -23,7 +23,7 @@ def test_suggestions_are_printed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     room = write_room(tmp_path / "room")
-    monkeypatch.setattr(annotate, "suggested_panes", lambda views, extent, listen: suggestions())
+    monkeypatch.setattr(marking, "suggested_panes", lambda views, extent, listen: suggestions())
     code, told = told_by(capsys, str(room), "--suggest", "--no-page")
     assert code == 0
     assert "suggestion 1:" in told and "7 things are seen in it and directly too, in 5 photographs" in told

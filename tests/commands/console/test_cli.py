@@ -79,7 +79,7 @@ def test_the_strategy_and_its_cap_are_chosen_by_name(tmp_path: Path, capsys: pyt
     recipe = json.loads((run / "recipe.json").read_text())
     assert recipe["strategy"] == "mcmc" and recipe["mcmc"]["cap"] == 5000
     with pytest.raises(SystemExit):
-        train("planar", run, "--strategy", "genetic")
+        train("planar", tmp_path / "other", "--strategy", "genetic")
     assert "genetic" in capsys.readouterr().err
 
 
@@ -115,7 +115,7 @@ def test_planar_without_masks_says_what_to_annotate(tmp_path: Path, capsys: pyte
 
 def test_an_unknown_option_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stopped:
-        main(["train", "splat", "--data", "x", "--output", "y", "--no-such-option"])
+        main(["train", "splat", "--data", str(SCENE), "--output", "y", "--no-such-option"])
     assert stopped.value.code == 2
     assert "no-such-option" in capsys.readouterr().err
 

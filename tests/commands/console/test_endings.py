@@ -117,6 +117,7 @@ NAME = re.compile(r"the traceback is in (\S+\.log)\. Please report it")
 
 def ended(work: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> int:
     """The exit code of a command that does this."""
+    monkeypatch.setattr(Evaluate, "ready", lambda self: None)
     monkeypatch.setattr(Evaluate, "run", lambda self, console: work())
     return main(["eval", "run"])
 

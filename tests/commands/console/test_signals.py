@@ -15,7 +15,7 @@ import pytest
 from glassplat.cli import main
 from glassplat.commands.looking.render import Render
 from glassplat.commands.measuring.bench import Bench, BenchScenes
-from glassplat.commands.measuring.demo import Demo
+from glassplat.commands.measuring.demo import SCENE, Demo
 from glassplat.commands.measuring.evaluate import Evaluate
 from glassplat.commands.publishing.dereflect import Dereflect
 from glassplat.commands.training.train import Train
@@ -33,7 +33,7 @@ class Sender(importlib.abc.MetaPathFinder):
         return None
 
 sys.meta_path.insert(0, Sender())
-sys.argv = ["glassplat", "train", "splat", "--data", "none", "--output", "none"]
+sys.argv = ["glassplat", *{arguments!r}]
 from glassplat.cli import main
 sys.exit(main())
 """
@@ -60,13 +60,14 @@ def ended(script: str) -> tuple[int, str, str]:
         ("tyro", "SIGINT"),
         ("torch._C", "SIGINT"),
         ("numba.core", "SIGINT"),
-        ("glassplat.train.run", "SIGTERM"),
+        ("glassplat.init.planes", "SIGTERM"),
         ("torch._C", "SIGHUP"),
     ],
 )
 def test_a_signal_among_the_imports_is_one_line(name: str, number: str) -> None:
-    code, _, said = ended(SIGNALLED_WHILE_IMPORTING.format(name=name, signal=number))
-    assert (code, said) == (CODES[number], f"{WORDS[number]}\n")
+    for arguments in (["train", "splat", "--data", str(SCENE), "--output", "none"], ["info", str(SCENE)]):
+        code, _, said = ended(SIGNALLED_WHILE_IMPORTING.format(name=name, signal=number, arguments=arguments))
+        assert (code, said) == (CODES[number], f"{WORDS[number]}\n")
 
 
 def test_loading_pycolmap_leaves_termination_as_it_was() -> None:
@@ -92,6 +93,7 @@ def test_a_signal_while_running_says_what_is_left_and_removes_what_is_half_writt
             time.sleep(10)
 
     before = [signal.getsignal(getattr(signal, name)) for name in CODES]
+    monkeypatch.setattr(Evaluate, "ready", lambda self: None)
     monkeypatch.setattr(Evaluate, "run", work)
     assert main(["eval", "my_run"]) == CODES[number]
     said = capsys.readouterr().err
@@ -110,6 +112,7 @@ def test_an_interrupt_that_a_library_disguises_is_still_an_interrupt(
         except KeyboardInterrupt as stop:
             raise ImportError("Cannot import the C++ backend") from stop
 
+    monkeypatch.setattr(Evaluate, "ready", lambda self: None)
     monkeypatch.setattr(Evaluate, "run", work)
     assert main(["eval", "my_run"]) == 130
     assert capsys.readouterr().err.startswith("interrupted; ")
@@ -122,6 +125,7 @@ def test_a_signal_that_is_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch)
             os.kill(os.getpid(), getattr(signal, name))
         time.sleep(0.01)
 
+    monkeypatch.setattr(Evaluate, "ready", lambda self: None)
     monkeypatch.setattr(Evaluate, "run", work)
     before = {name: signal.signal(getattr(signal, name), signal.SIG_IGN) for name in ("SIGHUP", "SIGINT")}
     try:
@@ -133,6 +137,7 @@ def test_a_signal_that_is_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch)
 
 def test_a_command_can_run_in_another_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     codes: list[int] = []
+    monkeypatch.setattr(Evaluate, "ready", lambda self: None)
     monkeypatch.setattr(Evaluate, "run", lambda self, console: None)
     worker = threading.Thread(target=lambda: codes.append(main(["eval", "my_run"])))
     worker.start()

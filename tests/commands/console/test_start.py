@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 
 import glassplat
 from glassplat.cli import COMMANDS, command_class, main
+from glassplat.commands.measuring.demo import SCENE
 
 SLOW = ["torch", "numba", "scipy", "numpy", "PIL", "pycolmap", "OpenEXR", "safetensors"]
 IMPORTS = """
@@ -64,6 +66,74 @@ def test_a_command_does_not_wait_for_what_it_may_never_need(name: str) -> None:
         check=False,
     )
     assert json.loads(done.stdout.splitlines()[-1])[:2] == [0, []]
+
+
+REFUSED = {
+    "prepare none --output new": "no folder or video none",
+    "annotate none": "no folder none",
+    "annotate capture --no-page": "nothing to do",
+    "train splat --data none --output new": "no folder none",
+    "train splat --data=capture --data=none --output new": "no folder none",
+    "train planar --data capture --output trained": "trained already holds a run",
+    "train planar --data capture --output new --resume": "nothing was saved yet in new",
+    "train planar --data capture --output splats.ply": "splats.ply is a file",
+    "eval capture": "capture is not a run directory",
+    "render capture --output new": "capture is not a run directory",
+    "render begun --output capture": "capture is not empty",
+    "dereflect none --output new": "none is not a run directory",
+    "dereflect begun --output capture": "capture is not empty",
+    "view none.ply": "no file none.ply",
+    "view splats.ply --port 0": "port is 0",
+    "view splats.ply --output splats.ply": "splats.ply is a file",
+    "video none --output film.webp": "none is not a run directory",
+    "video begun --output film.avi": "film.avi is no name of a film",
+    "video begun --output film.gif --path keyframes --keyframes none.json": "no file none.json",
+    "export none --output new": "none is not a run directory",
+    "export begun --output capture": "capture is not empty",
+    "export begun --output new --layer transmission --bake-reflections": "no reflections to bake",
+    "import none.ply --output new": "no file none.ply",
+    "import splats.ply --output capture": "capture is not empty",
+    "info none": "there is nothing at none",
+    "info splats.txt": "splats.txt is no file that is known",
+    "demo --output splats.ply": "splats.ply is a file",
+}
+"""Command lines, and what is said of each without PyTorch."""
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a capture, two runs and files, as far as they are looked at before PyTorch is there."""
+    root = tmp_path_factory.mktemp("places")
+    for name in ("capture/images", "begun", "trained", "photographs"):
+        (root / name).mkdir(parents=True)
+    for name in ("begun/recipe.json", "trained/recipe.json", "trained/checkpoint.safetensors", "splats.ply"):
+        (root / name).write_bytes(b"")
+    (root / "splats.txt").write_bytes(b"")
+    for path in sorted((SCENE / "images").iterdir())[:3]:
+        shutil.copy(path, root / "photographs")
+    return root
+
+
+@pytest.mark.parametrize("line", REFUSED)
+def test_what_can_be_refused_at_once_is_refused_without_pytorch(line: str, places: Path) -> None:
+    script = IMPORTS.format(arguments=line.split(), slow=["torch", "numba"])
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=places)
+    assert json.loads(done.stdout.splitlines()[-1])[:2] == [2, []]
+    assert REFUSED[line] in " ".join(done.stderr.split()) and done.stderr.startswith("error: ")
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS.keys() - {"train", "bench"}))
+def test_a_command_explains_itself_without_pytorch(name: str) -> None:
+    script = IMPORTS.format(arguments=[name, "--help"], slow=["torch", "numba"])
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert json.loads(done.stdout.splitlines()[-1])[:2] == [0, []]
+
+
+def test_photographs_are_described_without_pytorch(places: Path) -> None:
+    script = IMPORTS.format(arguments=["info", "photographs"], slow=["torch", "numba"])
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=places)
+    assert json.loads(done.stdout.splitlines()[-1])[:2] == [0, []]
+    assert "photographs without poses" in done.stdout
 
 
 def test_the_package_runs_as_a_module() -> None:

@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from glassplat.commands.console.messages import message_console
-from glassplat.commands.measuring.evaluate import notes, plane_text, print_results
+from glassplat.commands.measuring.evaluation import notes, plane_text, print_results
 
 NO_WEIGHTS = "no LPIPS weights in [folder]; get vgg.pth"
 PLANAR = {

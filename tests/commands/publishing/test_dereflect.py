@@ -63,6 +63,10 @@ def test_photographs_are_never_overwritten(tmp_path: Path, capsys: pytest.Captur
     images = tmp_path / "capture" / "images"
     before = {path.name: path.read_bytes() for path in images.iterdir()}
     assert main(["dereflect", str(run), "--output", str(images)]) == 2
+    assert "images is not empty, and not from `glassplat dereflect`" in message(capsys)
+    before[RECORD] = b'{"command": "dereflect"}'
+    (images / RECORD).write_bytes(before[RECORD])
+    assert main(["dereflect", str(run), "--output", str(images)]) == 2
     assert "is a photograph of the capture; nothing was written" in message(capsys)
     assert {path.name: path.read_bytes() for path in images.iterdir()} == before
 

@@ -164,5 +164,5 @@ def test_every_method_is_offered(monkeypatch: pytest.MonkeyPatch) -> None:
     taken = []
     monkeypatch.setattr(cli, "run", taken.append)
     for method, kind in RECIPES.items():
-        assert main(["train", method, "--data", "x", "--output", "y"]) == 0
+        assert main(["train", method, "--data", str(SCENE), "--output", "y"]) == 0
         assert type(taken[-1].recipe) is kind
