@@ -140,8 +140,10 @@ def readied(arguments: list[str]) -> Any:
         SystemExit: as in `parsed`.
     """
     if arguments[:1] == ["train"]:
+        from glassplat.commands.console.arguments import check_arguments
         from glassplat.commands.training.first_look import check_places
 
+        check_arguments(arguments)
         check_places(arguments[1:])
     command = parsed(arguments)
     if hasattr(command, "ready"):

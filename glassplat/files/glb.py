@@ -2,7 +2,8 @@
 
 Splats are a primitive of points with attributes: rotation (`xyzw`), scale (not logarithmic), opacity (a share), and the
 coefficients of the harmonics, one attribute each. A glTF has x to the left and y up where a PLY has x to the right and
-y down; both directions of the way turn it.
+y down; both directions of the way turn it. Channels, as the intensity with which a Gaussian is mirrored, are attributes
+of our own, which other programs leave alone.
 """
 
 from __future__ import annotations
@@ -20,12 +21,15 @@ from glassplat.files.atomic import atomic_write
 from glassplat.files.fields import Choice, Field, Optional, checked
 from glassplat.files.glb_container import NODE, PRIMITIVE, SCENE, GltfReader, GltfWriter
 from glassplat.files.glb_placement import Placement, placed, placement_of
+from glassplat.files.ply import CHANNEL_PREFIXES, is_channel
 from glassplat.kernels.color_space import linear_from_srgb
 from glassplat.scene.gaussians import DISC_SCALES, SH_ZERO, Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
 POINTS = 0
 ROTATION, SCALE, OPACITY = (f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))
+CHANNEL = "_GLASSPLAT_"
+"""glTF leaves names that begin with an underscore to applications."""
 SPLATS: dict[str, Field] = {
     "kernel": Choice(("ellipse",)),
     "colorSpace": Optional(Choice(("srgb_rec709_display",)), "srgb_rec709_display"),
@@ -42,7 +46,7 @@ PLAIN_COUNT, BYTES_PER_GAUSSIAN = 2**20, 8
 
 
 def write_glb(path: Path | str, gaussians: Gaussians) -> None:
-    """Writes shapes, opacities and colours as GLB, atomically; channels have no place in it.
+    """Writes shapes, opacities, colours and channels as GLB, atomically.
 
     A viewer that does not know the extension shows the centres as coloured points.
 
@@ -51,10 +55,17 @@ def write_glb(path: Path | str, gaussians: Gaussians) -> None:
         gaussians: at least one, with colours, in the capture's frame; discs get a third scale of zero.
 
     Raises:
-        ValueError: no Gaussians, no colours, or a value that is not finite.
+        ValueError: no Gaussians, no colours, a channel whose name PLY could not hold or that has capital letters, or a
+            value that is not finite.
     """
     if not len(gaussians) or gaussians.max_sh_degree < 0:
         raise ValueError("no Gaussians, or none with colours, cannot be written as GLB; expected f_dc_0 to f_dc_2")
+    unreadable = [name for name in gaussians.channels if name != name.lower() or not is_channel(name)]
+    if unreadable:
+        raise ValueError(
+            f"cannot store channels {unreadable} as GLB: expected names in small letters that begin with one of "
+            f"{CHANNEL_PREFIXES}"
+        )
     broken = [name for name, tensor in gaussians.tensors().items() if not bool(tensor.isfinite().all())]
     if broken:
         raise ValueError(f"Gaussians whose {', '.join(broken)} are not all finite cannot be written as GLB")
@@ -88,12 +99,17 @@ def read_glb(path: Path | str) -> Gaussians:
         raise ValueError(f"{path} shows no splats: expected a primitive of points with {EXTENSION} in its scene")
     most = max(part.sh.shape[1] for part in found)
     are_discs = all(part.are_discs for part in found)
-    whole = functools.reduce(Gaussians.joined, (_alike(part, most, are_discs=are_discs) for part in found))
+    shared = functools.reduce(set.intersection, (set(part.channels) for part in found))
+    alike = (_alike(part, most, are_discs=are_discs) for part in found)
+    whole = functools.reduce(
+        Gaussians.joined,
+        (replace(part, channels={name: part.channels[name] for name in sorted(shared)}) for part in alike),
+    )
     return _turned(replace(whole, active_sh_degree=round(most**0.5) - 1))
 
 
 def _glb_bytes(gaussians: Gaussians) -> bytes:
-    turned = _turned(replace(gaussians, sh=gaussians.sh[:, : (gaussians.active_sh_degree + 1) ** 2], channels={}))
+    turned = _turned(replace(gaussians, sh=gaussians.sh[:, : (gaussians.active_sh_degree + 1) ** 2]))
     quats = torch.nn.functional.normalize(turned.quats, dim=1)
     quats = torch.where(quats.norm(dim=1, keepdim=True) > 0, quats, quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
     opacities = torch.sigmoid(turned.logit_opacities)
@@ -108,6 +124,8 @@ def _glb_bytes(gaussians: Gaussians) -> bytes:
     }
     for index, name in enumerate(_harmonic_names(turned.sh.shape[1])):
         attributes[name] = writer.add(_numpy(turned.sh[:, index]))
+    for name, values in turned.channels.items():
+        attributes[CHANNEL + name.upper()] = writer.add(_numpy(values))
     splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
     primitive = {"mode": POINTS, "attributes": attributes, "extensions": {EXTENSION: splats}}
     return writer.file(
@@ -172,10 +190,15 @@ def _read_primitive(file: GltfReader, attributes: dict[str, int], where: str) ->
     """The splats of a primitive, in the frame of glTF."""
     degree = _stored_degree(attributes, where)
     names = _harmonic_names((degree + 1) ** 2)
+    channels = {name.removeprefix(CHANNEL).lower(): name for name in attributes if name.startswith(CHANNEL)}
+    channels = {channel: name for channel, name in channels.items() if is_channel(channel)}
     missing = [name for name in ("POSITION", ROTATION, SCALE, OPACITY, *names) if name not in attributes]
     if missing:
         raise ValueError(f"{where} lacks {', '.join(missing)}; expected all that {EXTENSION} asks for")
-    counts = {name: file.count(attributes[name]) for name in ("POSITION", ROTATION, SCALE, OPACITY, *names)}
+    counts = {
+        name: file.count(attributes[name])
+        for name in ("POSITION", ROTATION, SCALE, OPACITY, *names, *channels.values())
+    }
     if len(set(counts.values())) > 1:
         raise ValueError(f"the attributes of {where} have {sorted(set(counts.values()))} rows; expected one number")
     scales = _tensor(file.array(attributes[SCALE], 3))
@@ -192,6 +215,7 @@ def _read_primitive(file: GltfReader, attributes: dict[str, int], where: str) ->
         log_scales=scales[:, : DISC_SCALES if are_discs else 3].clamp(min=LEAST_SCALE).log(),
         logit_opacities=torch.logit(shares.double().clamp(LEAST_SHARE, 1 - LEAST_SHARE)).float(),
         sh=torch.stack([_tensor(file.array(attributes[name], 3)) for name in names], dim=1),
+        channels={name: _tensor(file.array(attributes[stored], 1))[:, 0] for name, stored in channels.items()},
         active_sh_degree=degree,
     )
 

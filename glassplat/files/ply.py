@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.files.ply_table import PlyTable, read_table, write_table
-from glassplat.scene.gaussians import DISC_SCALES, Gaussians
+from glassplat.scene.gaussians import DISC_SCALES, PER_GAUSSIAN, Gaussians
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
@@ -26,6 +26,11 @@ CHANNEL_PREFIXES = ("log_", "logit_", "raw_")
 SH_COEFFICIENTS = (1, 4, 9, 16)
 
 
+def is_channel(name: str) -> bool:
+    """Whether a property is a channel: not one of a foreign program, nor the name of what all Gaussians have."""
+    return name.startswith(CHANNEL_PREFIXES) and name not in PER_GAUSSIAN
+
+
 def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
     """Writes a set of Gaussians as a standard 3DGS or, of discs, 2DGS PLY: float32, binary little endian, atomically.
 
@@ -36,7 +41,7 @@ def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
     Raises:
         ValueError: a channel's name could not be told from a foreign property when read back.
     """
-    unreadable = [name for name in gaussians.channels if not name.startswith(CHANNEL_PREFIXES)]
+    unreadable = [name for name in gaussians.channels if not is_channel(name)]
     if unreadable:
         raise ValueError(
             f"cannot store channels {unreadable}: a raw channel's name begins with one of {CHANNEL_PREFIXES}"
@@ -73,7 +78,7 @@ def read_gaussians(path: Path | str) -> Gaussians:
         log_scales=_stacked(columns, SCALE if SCALE[-1] in columns else DISC_SCALE),
         logit_opacities=columns["opacity"],
         sh=sh,
-        channels={name: column for name, column in columns.items() if name.startswith(CHANNEL_PREFIXES)},
+        channels={name: column for name, column in columns.items() if is_channel(name)},
         active_sh_degree=max(round(sh.shape[1] ** 0.5) - 1, 0),
     )
 

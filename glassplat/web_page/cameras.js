@@ -27,7 +27,7 @@ function boundsOf(pane, pose, [fx, fy, cx, cy], [width, height], near) {
 
 // While something moves, what a pane reflects weakly is drawn at half the scale, and with it the pane's mask.
 function scaleOfMirrors({ moving, scale, reflectances }) {
-  return moving && Math.max(...reflectances, 0) < 0.3 ? Math.min(scale, Math.max(0.5 * scale, 0.2)) : scale;
+  return moving && Math.max(...reflectances, 0) < 0.3 ? Math.min(scale, Math.max(0.5 * scale, 0.15)) : scale;
 }
 
 // What the sorter has to know of a view: for the picture the camera itself; then for each pane's mask the same camera,

@@ -62,6 +62,51 @@ def test_what_is_written_comes_back(coefficients: int, tmp_path: Path) -> None:
     torch.testing.assert_close(after.quats, torch.nn.functional.normalize(before.quats, dim=1))
 
 
+def test_channels_come_back_bit_for_bit(tmp_path: Path) -> None:
+    values = torch.linspace(-3, 2, len(typical()))
+    before = replace(typical(), channels={"log_intensity": values, "logit_strength": values.flip(0)})
+    path = written(tmp_path, before)
+    after = read_glb(path)
+    assert set(after.channels) == set(before.channels)
+    assert all(torch.equal(after.channels[name], before.channels[name]) for name in before.channels)
+    attributes = pygltflib.GLTF2().load(path).meshes[0].primitives[0].attributes
+    assert hasattr(attributes, "_GLASSPLAT_LOG_INTENSITY"), "other programs leave alone what begins with an underscore"
+
+
+def test_what_all_gaussians_have_is_no_channel(tmp_path: Path) -> None:
+    def rename(document: dict[str, Any]) -> None:
+        attributes = document["meshes"][0]["primitives"][0]["attributes"]
+        attributes["_GLASSPLAT_LOG_SCALES"] = attributes.pop("_GLASSPLAT_LOG_INTENSITY")
+        attributes["_GLASSPLAT_MEANS"] = attributes["_GLASSPLAT_LOG_SCALES"]
+
+    before = replace(typical(), channels={"log_intensity": torch.zeros(len(typical()))})
+    after = read_glb(edited(written(tmp_path, before), rename))
+    assert not after.channels and torch.equal(after.means, before.means)
+
+
+def test_sets_of_which_one_has_no_channels_come_back_without(tmp_path: Path) -> None:
+    def twice(document: dict[str, Any]) -> None:
+        primitives = document["meshes"][0]["primitives"]
+        bare = {k: v for k, v in primitives[0]["attributes"].items() if not k.startswith("_")}
+        primitives.append({**primitives[0], "attributes": bare})
+
+    before = replace(typical(), channels={"log_intensity": torch.zeros(len(typical()))})
+    after = read_glb(edited(written(tmp_path, before), twice))
+    assert len(after) == 2 * len(before) and not after.channels
+
+
+def test_a_channel_of_another_length_is_refused(tmp_path: Path) -> None:
+    def shorten(document: dict[str, Any]) -> None:
+        attributes = document["meshes"][0]["primitives"][0]["attributes"]
+        document["accessors"][attributes["_GLASSPLAT_LOG_INTENSITY"]]["count"] -= 1
+
+    before = replace(typical(), channels={"log_intensity": torch.zeros(len(typical()))})
+    with pytest.raises(ValueError, match="one number"):
+        read_glb(edited(written(tmp_path, before), shorten))
+    with pytest.raises(ValueError, match="small letters"):
+        write_glb(tmp_path / "b.glb", replace(before, channels={"log_X": before.logit_opacities}))
+
+
 def test_discs_come_back_as_discs(tmp_path: Path) -> None:
     before = replace(typical(), log_scales=typical().log_scales[:, :2].contiguous())
     after = read_glb(written(tmp_path, before))

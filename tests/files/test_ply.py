@@ -203,6 +203,14 @@ def test_a_channel_that_could_not_be_read_back_is_refused(tmp_path: Path) -> Non
     assert not list(tmp_path.iterdir())
 
 
+def test_what_all_gaussians_have_is_no_channel(tmp_path: Path) -> None:
+    write_gaussians(tmp_path / "a.ply", random_gaussians(4, ("log_intensity",)))
+    data = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(data.replace(b"float log_intensity", b"float log_scales"))
+    read = read_gaussians(tmp_path / "a.ply")
+    assert not read.channels and read.log_scales.shape[1] == 3
+
+
 def test_discs_have_two_scales_in_the_file_and_when_read_back(tmp_path: Path) -> None:
     solid = random_gaussians(4, ("logit_strength",))
     original = Gaussians(**{**vars(solid), "log_scales": solid.log_scales[:, :2].contiguous()})

@@ -157,6 +157,8 @@ def test_the_picture_at_rest_is_that_which_is_drawn_all_at_once(dusty: Browser) 
     dusty.evaluate("glassplat.then(({ pace, navigation }) => { pace.most = () => 150; navigation.orbit(0.05, 0.02); })")
     dusty.wait("glassplat.then(({ noted, isRefining }) => noted.at(-1)?.scale < 1 || isRefining())", "a coarse picture")
     dusty.wait("glassplat.then(({ noted }) => noted.at(-1)?.scale === 1)", "the whole picture")
+    dusty.wait("document.getAnimations().length === 0", "the controls to be gone")
+    dusty.evaluate("new Promise((next) => requestAnimationFrame(() => requestAnimationFrame(next)))")
     shown = torch.from_numpy(dusty.picture())
     whole = """glassplat.then((page) => {
       const { rotation, offset } = page.navigation.pose(), { intrinsics, size: [width, height] } = page.lensOf();

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
@@ -23,10 +26,32 @@ def load(module: str, console: Console | None = None) -> Any:
         console: where the line appears; that of standard error if not given.
     """
     console = console or message_console(stderr=True)
-    if module in sys.modules or not console.is_terminal:
+    with _uncollected(), _announced(console, module):
         return importlib.import_module(module)
+
+
+@contextmanager
+def _announced(console: Console, module: str) -> Iterator[None]:
+    """Shows the line meanwhile, where somebody may be watching and the module is not there yet."""
+    if module in sys.modules or not console.is_terminal:
+        yield
+        return
     console.print(LINE, end="", highlight=False)
     try:
-        return importlib.import_module(module)
+        yield
     finally:
         console.control(Control(ControlType.CARRIAGE_RETURN, (ControlType.ERASE_IN_LINE, 2)))
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Keeps Python from looking for garbage among what is imported, now and later: all of it stays to the end."""
+    if not gc.isenabled():
+        yield
+        return
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()

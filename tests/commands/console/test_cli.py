@@ -79,7 +79,7 @@ def test_the_strategy_and_its_cap_are_chosen_by_name(tmp_path: Path, capsys: pyt
     recipe = json.loads((run / "recipe.json").read_text())
     assert recipe["strategy"] == "mcmc" and recipe["mcmc"]["cap"] == 5000
     with pytest.raises(SystemExit):
-        train("planar", run, "--strategy", "genetic")
+        train("planar", tmp_path / "other", "--strategy", "genetic")
     assert "genetic" in capsys.readouterr().err
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import sys
 
@@ -47,3 +48,14 @@ def test_the_line_is_gone_before_an_error_is_printed() -> None:
     with pytest.raises(ModuleNotFoundError):
         load("glassplat.no_such_module", console)
     assert shown(console).endswith("\x1b[2K")
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_garbage_is_collected_afterwards_as_before(enabled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gc, "isenabled", lambda: enabled)
+    asked: list[str] = []
+    for name in ("disable", "freeze", "enable"):
+        monkeypatch.setattr(gc, name, lambda name=name: asked.append(name))
+    with pytest.raises(ModuleNotFoundError):
+        load("glassplat.no_such_module", terminal())
+    assert asked == (["disable", "freeze", "enable"] if enabled else [])

@@ -19,6 +19,7 @@ from glassplat.commands.console.training_progress import (
     TrainingProgress,
     in_words,
 )
+from glassplat.commands.measuring.demo import SCENE
 from glassplat.train.messages import (
     ActionDone,
     CheckpointWritten,
@@ -165,7 +166,7 @@ def test_a_training_into_a_file_says_how_it_goes(
 def test_the_distance_of_checkpoints_is_positive(
     seconds: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = ["--data", "nowhere", "--output", str(tmp_path / "run"), "--checkpoint-every", seconds]
+    options = ["--data", str(SCENE), "--output", str(tmp_path / "run"), "--checkpoint-every", seconds]
     assert main(["train", "splat", *options]) == 2
     assert "--checkpoint-every is" in capsys.readouterr().err
 
