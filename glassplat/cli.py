@@ -139,15 +139,8 @@ def readied(arguments: list[str]) -> Any:
         InputError, OSError: an option is out of range, there is nothing at a path, or something that must stay.
         SystemExit: as in `parsed`.
     """
-    if arguments[:1] == ["train"]:
-        from glassplat.commands.console.arguments import check_arguments
-        from glassplat.commands.training.first_look import check_places
-
-        check_arguments(arguments)
-        check_places(arguments[1:])
     command = parsed(arguments)
-    if hasattr(command, "ready"):
-        command.ready()
+    command.ready()
     return command
 
 
@@ -183,12 +176,7 @@ def parsed(arguments: list[str]) -> Any:
 
 def command_line(name: str, options: list[str]) -> tuple[Any, list[str]]:
     """What tyro should make of a command's options, and how it should see them; that of `train` depends on them."""
-    from glassplat.commands.console.loading import load
-
-    if name == "bench":  # Its options need PyTorch, as those of `train` do: they are the recipes'.
-        load("glassplat.commands.measuring.bench")
     if name == "train":
-        load("glassplat.commands.training.train_options")
         from glassplat.commands.training.train_options import train_command
 
         return train_command(options)

@@ -23,7 +23,8 @@ from glassplat.evaluate.plane_errors import plane_table
 from glassplat.evaluate.truth import GroundTruth, load_truth
 from glassplat.files.markdown_table import Table
 from glassplat.files.ply import read_gaussians
-from glassplat.init.planes import PlaneFitError, fit_planes
+from glassplat.init.plane_options import PlaneFitError
+from glassplat.init.planes import fit_planes
 
 COLUMNS = ("scene / pane", "fits", "refused", "good", "degrees, median (max)", "% of extent, median (max)", "seconds")
 LEAST_SHARE = 0.01

@@ -8,44 +8,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from glassplat.data.errors import InputError
 
-WHITE = 255
+HIGHEST_COLOR = 255
 
 
 @dataclass(frozen=True)
-class PointCloud:
-    """Coloured points in world space.
+class RawPoints:
+    """Coloured points in world space, as the files have them.
 
     Attributes:
-        positions: [P, 3] float32, world units.
+        positions: [P, 3] float32, world units; infinite where they were beyond float32.
         colors: [P, 3] uint8 sRGB.
     """
 
-    positions: Tensor
-    colors: Tensor
-
-    def __post_init__(self) -> None:
-        expected = (self.positions.shape[0], 3)
-        if tuple(self.positions.shape) != expected or tuple(self.colors.shape) != expected:
-            raise ValueError(
-                f"expected positions and colors of shape [P, 3], got {list(self.positions.shape)} and "
-                f"{list(self.colors.shape)}"
-            )
-        if self.positions.dtype != torch.float32 or self.colors.dtype != torch.uint8:
-            raise TypeError(
-                f"expected float32 positions and uint8 colors, got {self.positions.dtype}, {self.colors.dtype}"
-            )
+    positions: NDArray[np.float32]
+    colors: NDArray[np.uint8]
 
     def __len__(self) -> int:
-        return self.positions.shape[0]
+        return len(self.positions)
 
     @staticmethod
-    def from_arrays(positions: NDArray[Any], colors: NDArray[Any]) -> PointCloud:
+    def from_arrays(positions: NDArray[Any], colors: NDArray[Any]) -> RawPoints:
         """Points from arrays of any real type.
 
         Positions beyond float32 become infinite.
@@ -54,14 +40,12 @@ class PointCloud:
             InputError: a colour is not in 0..255.
         """
         colors = np.asarray(colors)
-        outside = ~((colors >= 0) & (colors <= WHITE))
+        outside = ~((colors >= 0) & (colors <= HIGHEST_COLOR))
         if outside.any():
-            raise InputError(f"a point has the colour value {colors[outside][0]:g}; expected 0 to {WHITE}")
+            raise InputError(f"a point has the colour value {colors[outside][0]:g}; expected 0 to {HIGHEST_COLOR}")
         with np.errstate(over="ignore"):
             positions = np.ascontiguousarray(positions, dtype=np.float32).reshape(-1, 3)
-        return PointCloud(
-            torch.from_numpy(positions), torch.from_numpy(np.ascontiguousarray(colors, dtype=np.uint8).reshape(-1, 3))
-        )
+        return RawPoints(positions, np.ascontiguousarray(colors, dtype=np.uint8).reshape(-1, 3))
 
 
 @dataclass(frozen=True)
@@ -97,10 +81,10 @@ class Capture:
 
     shots: tuple[Shot, ...]
     test_shots: tuple[Shot, ...] | None
-    points: PointCloud | None
+    points: RawPoints | None
     format_name: str
     warnings: tuple[str, ...] = ()
-    random_points: Callable[[], PointCloud] | None = None
+    random_points: Callable[[], RawPoints] | None = None
     masks: Mapping[str, Path] | None = None
 
 

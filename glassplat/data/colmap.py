@@ -9,7 +9,7 @@ from __future__ import annotations
 from os.path import isfile
 from pathlib import Path
 
-from glassplat.data.capture import Capture, PointCloud, Shot
+from glassplat.data.capture import Capture, RawPoints, Shot
 from glassplat.data.colmap_model import Model, model_suffix, pose_matrix, read_model
 from glassplat.data.errors import InputError, first_names
 
@@ -61,7 +61,7 @@ def _shots(root: Path, model: Model) -> tuple[Shot, ...]:
     )
 
 
-def _points_or_none(model: Model) -> PointCloud | None:
+def _points_or_none(model: Model) -> RawPoints | None:
     return model.points if len(model.points) else None
 
 

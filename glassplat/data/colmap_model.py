@@ -14,14 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from glassplat.data.capture import PointCloud
+from glassplat.data.capture import RawPoints
 from glassplat.data.errors import InputError, input_checked
 from glassplat.data.lens import make_lens
 from glassplat.files.reading import reading
-from glassplat.scene.pose import rotation_from_quat
 
 UNIT_TOLERANCE = 1e-2
 """How far the length of a quaternion may be from one, as rounding in a text file."""
@@ -46,7 +44,7 @@ class Model:
 
     lenses: dict[int, Any]
     images: tuple[ModelImage, ...]
-    points: PointCloud
+    points: RawPoints
 
 
 def model_suffix(folder: Path) -> str | None:
@@ -74,7 +72,7 @@ def read_model(folder: Path) -> Model:
     rows = _records_of(points_path) if lexists(points_path) else []
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
     with input_checked(points_path):
-        return Model(lenses, images, PointCloud.from_arrays(table[:, :3], table[:, 3:]))
+        return Model(lenses, images, RawPoints.from_arrays(table[:, :3], table[:, 3:]))
 
 
 def pose_matrix(image: ModelImage) -> NDArray[np.float64]:
@@ -86,8 +84,11 @@ def pose_matrix(image: ModelImage) -> NDArray[np.float64]:
     if not abs(math.hypot(*image.quat) - 1) < UNIT_TOLERANCE:
         quat = list(image.quat)
         raise InputError(f"the rotation of {image.name} is {quat}; expected a finite unit quaternion (w, x, y, z)")
+    from glassplat.data.colmap_library import pycolmap
+
+    w, x, y, z = np.array(image.quat) / math.hypot(*image.quat)
     pose = np.eye(4)
-    pose[:3, :3] = rotation_from_quat(torch.tensor(image.quat, dtype=torch.float64)).numpy()
+    pose[:3, :3] = pycolmap.Rotation3d(np.array([x, y, z, w])).matrix()
     pose[:3, 3] = image.translation
     return pose
 

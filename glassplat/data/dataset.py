@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
-from glassplat.data import colmap, mirror_nerf, transforms
 from glassplat.data.axes import axes_evidence
-from glassplat.data.capture import Capture, Loader, PointCloud, Shot
-from glassplat.data.errors import InputError, UnknownFormatError, first_names, input_checked
+from glassplat.data.backgrounds import WHITE, Rgb
+from glassplat.data.capture import Capture, Shot
+from glassplat.data.capture_files import CaptureFiles, read_capture
+from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.data.given_planes import given_planes
-from glassplat.data.masks import MaskSet, Polarity, find_ignored, find_masks, known_masks
+from glassplat.data.masks import Polarity
+from glassplat.data.point_cloud import PointCloud
 from glassplat.data.random_points import points_in_view
-from glassplat.data.view import WHITE, PreparedView, Rgb, View, ViewOptions, prepare_view
+from glassplat.data.view import PreparedView, View, ViewOptions, prepare_view
 from glassplat.files.fields import LARGEST_COORDINATE
-from glassplat.files.folders import check_capture_folder
 from glassplat.files.images import is_transparent
 from glassplat.scene.plane import Planes
 
@@ -31,13 +32,6 @@ SAME_PLACE = 1e-6
 """Cameras closer together than this share of their distance from the origin differ by rounding only."""
 LEAST_RADIUS = 1e-9
 """World units. The square of a smaller one is lost in float32."""
-
-LOADERS: tuple[tuple[Loader, str], ...] = (
-    (colmap.load_colmap, colmap.LOOKED_FOR),
-    (mirror_nerf.load_mirror_nerf, mirror_nerf.LOOKED_FOR),
-    (transforms.load_transforms, transforms.LOOKED_FOR),
-)
-"""Tried in this order; each with what it looks for, for the message when none fits."""
 
 
 @dataclass(frozen=True)
@@ -92,17 +86,31 @@ def load_dataset(
         FileNotFoundError: no such folder.
         InputError: a format that is not known, or a capture that cannot be used; the message says why.
     """
-    root = Path(root)
+    check_downscale(downscale)
+    return dataset_of(read_capture(root, mask_polarity=mask_polarity), downscale=downscale, background=background)
+
+
+def check_downscale(downscale: float) -> None:
+    """Refuse a factor that reduces nothing.
+
+    Raises:
+        InputError: it is below 1, or no number.
+    """
     if not math.isfinite(downscale) or downscale < 1:
         raise InputError(f"downscale is {downscale}; expected a number of at least 1")
-    capture = _load_capture(root)
-    shots = sorted((*capture.shots, *(capture.test_shots or ())), key=lambda shot: shot.name)
-    _check_names(shots)
-    masks = _masks(root, capture, shots, mask_polarity)
+
+
+def dataset_of(files: CaptureFiles, *, downscale: float = 1.0, background: Rgb = WHITE) -> Dataset:
+    """What `load_dataset` returns, of a capture whose folder was read.
+
+    Raises:
+        InputError: as `load_dataset`.
+    """
+    check_downscale(downscale)
+    root, capture, shots, masks = files.root, files.capture, files.shots, files.masks
     options = ViewOptions(downscale, background)
-    ignored = find_ignored(root, {shot.name: shot.image_path for shot in shots})
     prepared = [
-        prepare_view(shot, masks.masks.get(shot.name), options, ignored=ignored.get(shot.name)) for shot in shots
+        prepare_view(shot, masks.masks.get(shot.name), options, ignored=files.ignored.get(shot.name)) for shot in shots
     ]
     transparent = _any_transparent(shots)
     train, test, split = _split([p.view for p in prepared], capture)
@@ -132,27 +140,8 @@ def load_dataset(
         background=background if transparent else None,
         planes=given_planes(root, [view.camera for view in train]),
         downscale=downscale,
-        mask_polarity=mask_polarity,
+        mask_polarity=files.mask_polarity,
     )
-
-
-def _load_capture(root: Path) -> Capture:
-    """The answer of the first loader that knows the format."""
-    check_capture_folder(root)
-    for load, _ in LOADERS:
-        capture = load(root)
-        if capture is not None:
-            return capture
-    looked_for = "; ".join(text for _, text in LOADERS)
-    found = first_names(sorted(path.name for path in root.iterdir()), limit=8) or "nothing"
-    raise UnknownFormatError(f"{root} is no capture that can be read. Looked for: {looked_for}. Found: {found}.")
-
-
-def _masks(root: Path, capture: Capture, shots: list[Shot], polarity: Polarity) -> MaskSet:
-    """The masks that the format names, or else those whose names fit."""
-    if capture.masks is not None:
-        return known_masks(root, capture.masks, polarity)
-    return find_masks(root, {shot.name: shot.image_path for shot in shots}, polarity)
 
 
 def _check_axes(train: tuple[View, ...], points: PointCloud | None, format_name: str) -> None:
@@ -167,16 +156,10 @@ def _check_axes(train: tuple[View, ...], points: PointCloud | None, format_name:
         )
 
 
-def _any_transparent(shots: list[Shot]) -> bool:
+def _any_transparent(shots: Sequence[Shot]) -> bool:
     """Whether a photograph has transparent pixels."""
     with input_checked():
         return any(is_transparent(shot.image_path) for shot in shots)
-
-
-def _check_names(shots: list[Shot]) -> None:
-    repeated = [name for name, count in Counter(shot.name for shot in shots).items() if count > 1]
-    if repeated:
-        raise InputError(f"photographs that occur more than once: {first_names(repeated)}; keep one pose for each")
 
 
 def _split(views: list[View], capture: Capture) -> tuple[tuple[View, ...], tuple[View, ...], str]:
@@ -219,15 +202,16 @@ def _points(capture: Capture, train: tuple[View, ...]) -> tuple[PointCloud, list
     """The capture's points, or random ones with a warning."""
     if capture.points is None:
         make = capture.random_points or (lambda: points_in_view([view.camera for view in train]))
-        points = make()
+        points = PointCloud.of(make())
         return points, [
             f"The {capture.format_name} capture has no points; {len(points)} random points are used instead."
         ]
+    found = PointCloud.of(capture.points)
     # Where a coordinate is NaN, the comparison is false.
-    usable = (capture.points.positions.abs() <= LARGEST_COORDINATE).all(dim=1)
+    usable = (found.positions.abs() <= LARGEST_COORDINATE).all(dim=1)
     if usable.all():
-        return capture.points, []
-    kept = PointCloud(capture.points.positions[usable], capture.points.colors[usable])
+        return found, []
+    kept = PointCloud(found.positions[usable], found.colors[usable])
     if not len(kept):
         raise InputError(f"no point of the capture is finite and within {LARGEST_COORDINATE:g}; export the model again")
     return kept, [f"{int((~usable).sum())} points that are not finite or beyond {LARGEST_COORDINATE:g} are left out."]

@@ -20,12 +20,11 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from glassplat.data.axes import AxesEvidence, axes_evidence
-from glassplat.data.capture import Capture, PointCloud, Shot
+from glassplat.data.capture import Capture, RawPoints, Shot
 from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.data.mask_values import read_mask_at_threshold
 from glassplat.data.masks import MASK_FOLDER, PaneMask
@@ -37,8 +36,11 @@ from glassplat.data.transforms_file import (
     read_settings,
     shots_of,
 )
-from glassplat.data.view import View, ViewOptions, prepare_view
 from glassplat.files.images import IMAGE_SUFFIXES, image_size
+
+if TYPE_CHECKING:
+    from glassplat.data.axes import AxesEvidence
+    from glassplat.data.view import View
 
 TRAIN, VAL, TEST = (f"transforms_{part}.json" for part in ("train", "val", "test"))
 LOOKED_FOR = f"a Mirror-NeRF scene ({TRAIN} and {MASK_FOLDER}/)"
@@ -173,13 +175,18 @@ def _mask_names(photograph: Path) -> list[str]:
     return [photograph.name, *(stem + suffix for stem in stems for suffix in IMAGE_SUFFIXES)]
 
 
-def _evidence(shots: tuple[Shot, ...], masks: Mapping[str, Path], points: PointCloud | None) -> AxesEvidence | None:
+def _evidence(shots: tuple[Shot, ...], masks: Mapping[str, Path], points: RawPoints | None) -> AxesEvidence | None:
     """What some of the masks, or else the points, say about the axes of the poses."""
+    from glassplat.data.axes import axes_evidence  # Takes PyTorch, which no other format needs to be read.
+    from glassplat.data.point_cloud import PointCloud
+
     views = [_view(shot, masks.get(shot.name)) for shot in shots]
-    return axes_evidence(views, None if points is None else points.positions)
+    return axes_evidence(views, None if points is None else PointCloud.of(points).positions)
 
 
 def _view(shot: Shot, mask: Path | None) -> View:
+    from glassplat.data.view import ViewOptions, prepare_view
+
     pane_mask = None if mask is None else PaneMask(mask, inverted=False, read=read_mask_at_threshold)
     return prepare_view(shot, pane_mask, ViewOptions()).view
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from glassplat.data.capture import PointCloud
-from glassplat.scene.camera import Camera
+from glassplat.data.capture import RawPoints
+
+if TYPE_CHECKING:
+    from glassplat.scene.camera import Camera
 
 GREY = 128
 SPHERE_COUNT = 20_000
@@ -24,22 +26,22 @@ AHEAD = 3.0
 """How far ahead points are placed otherwise, in radii of the camera path."""
 
 
-def points_in_box(count: int = BOX_COUNT, half_size: float = BOX_HALF_SIZE) -> PointCloud:
+def points_in_box(count: int = BOX_COUNT, half_size: float = BOX_HALF_SIZE) -> RawPoints:
     """Uniform points in a cube about the origin; the default is what synthetic Blender scenes fit in."""
     positions = np.random.default_rng(SEED).uniform(-half_size, half_size, (count, 3))
-    return PointCloud.from_arrays(positions, np.full((count, 3), GREY))
+    return RawPoints.from_arrays(positions, np.full((count, 3), GREY))
 
 
-def points_in_view(cameras: Sequence[Camera], count: int = SPHERE_COUNT) -> PointCloud:
+def points_in_view(cameras: Sequence[Camera], count: int = SPHERE_COUNT) -> RawPoints:
     """Uniform points in a ball about what the cameras look at, reaching as far as the cameras stand away."""
-    centers = torch.stack([camera.center.double() for camera in cameras]).numpy()
-    forward = torch.stack([camera.cam_from_world[2, :3].double() for camera in cameras]).numpy()
+    centers = np.stack([camera.center.double().numpy() for camera in cameras])
+    forward = np.stack([camera.cam_from_world[2, :3].double().numpy() for camera in cameras])
     target, radius = _ball(centers, forward)
     generator = np.random.default_rng(SEED)
     directions = generator.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     distances = radius * generator.uniform(size=(count, 1)) ** (1 / 3)
-    return PointCloud.from_arrays(target + distances * directions, np.full((count, 3), GREY))
+    return RawPoints.from_arrays(target + distances * directions, np.full((count, 3), GREY))
 
 
 def _ball(centers: NDArray[np.float64], forward: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from glassplat.data.capture import PointCloud, Shot
+from glassplat.data.capture import RawPoints, Shot
 from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.data.poses import rigid_pose
 from glassplat.data.random_points import GREY
@@ -99,7 +99,7 @@ def _cam_from_world(frame: Settings, name: str) -> NDArray[np.float64]:
     return pose
 
 
-def read_points(root: Path, settings: Settings) -> PointCloud | None:
+def read_points(root: Path, settings: Settings) -> RawPoints | None:
     """The points of the file that the settings name, or of one that usually holds them."""
     named = settings.get("ply_file_path")
     if named is not None and not isfile(root / named):
@@ -125,4 +125,4 @@ def read_points(root: Path, settings: Settings) -> PointCloud | None:
         else np.stack([c for c in rgb if c is not None], 1)
     )
     with input_checked(path):
-        return PointCloud.from_arrays(positions, colors) if len(positions) else None
+        return RawPoints.from_arrays(positions, colors) if len(positions) else None

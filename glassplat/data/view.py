@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from glassplat.data.backgrounds import WHITE, Rgb
 from glassplat.data.capture import Shot
 from glassplat.data.errors import InputError, input_checked
 from glassplat.data.lens import MOST_SKEW, Pinhole, PixelMap, lens_for_image, nearest_resize, pinhole_of
@@ -21,8 +22,6 @@ from glassplat.data.poses import rigid_pose
 from glassplat.files.images import image_size, read_image
 from glassplat.scene.camera import Camera
 
-Rgb = tuple[float, float, float]
-WHITE: Rgb = (1.0, 1.0, 1.0)
 LEAST_SIDE = 8
 """Pixels along the side of a photograph that was reduced; below that are no edges to tell panes or details by."""
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
 
-from glassplat.data.ranges import ESSENTIAL, Ascending, Count, NotNegative, Positive, PositiveShare, Several, Share
 from glassplat.densify.edit import Edit, Moments, apply_edit, clone, forget, keep, split
+from glassplat.densify.options import DefaultDensify
 from glassplat.kernels.screen_statistics import Sums, Views, add_views
 from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import Gaussians
@@ -80,145 +79,86 @@ class ScreenStatistics:
         return torch.where(self.view_count[1] > 0, over_direct, over_all)
 
 
-@dataclass(frozen=True)
-class DefaultDensify:
-    """When and how 3DGS adds and removes Gaussians, with the criterion of AbsGS (arXiv 2404.10484) for splits.
+@torch.no_grad()
+def densified(
+    options: DefaultDensify,
+    gaussians: Gaussians,
+    moments: Moments,
+    statistics: ScreenStatistics,
+    *,
+    extent: float,
+    generator: torch.Generator,
+    part: str = "primary",
+    prune_large: bool = False,
+) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
+    """A set of Gaussians and their moments after cloning, splitting and pruning.
 
-    A small Gaussian whose mean screen gradient exceeds a threshold is cloned; a large one at which single pixels pull
-    more than another threshold is split in two. Where a large Gaussian smears detail, pixels pull it to all sides;
-    3DGS, which looks at the gradient here too, lets it be. Nearly transparent ones are removed.
+    Statistics start again at `ScreenStatistics.zeros` afterwards.
 
-    Attributes:
-        split_by: what tells that a large Gaussian is too large: the `pull` of single pixels, or as in 3DGS the
-            `gradient` that clones small ones.
-        interval: steps between densifications.
-        whole_passes: wait at least for about one pass over the views, twice the interval at the most, so that
-            every Gaussian has been seen when it is judged.
-        adapt_to_size: raise the thresholds where photographs are smaller than a megapixel, for which they were found.
-        start: share of the run after which densification begins.
-        stop: share of the run after which it ends.
-        gradient_threshold: mean gradient norm, in normalised device coordinates, above which a small Gaussian is
-            cloned.
-        pull_threshold: mean pull of single pixels, in the same unit, above which a large Gaussian is split by `pull`.
-        dense_fraction: Gaussians whose longest axis is above this share of the scene extent are
-            split, smaller ones cloned.
-        prune_opacity: Gaussians less opaque than this are removed.
-        prune_large_start: share of the run after which what is too large is removed as well; 1 never does.
-        prune_scale_fraction: with `prune_large`, Gaussians with an axis above this share of the
-            scene extent are removed.
-        prune_radius_fraction: with `prune_large`, Gaussians that any view saw with a radius above
-            this share of its longer side are removed; None keeps them. 3DGS states a limit of 20
-            pixels but clears the radii before it looks at them, so its published results have none.
-        cap: largest number of Gaussians to grow to; None takes `per_pixel`.
-        per_pixel: largest number of Gaussians to grow to for each pixel of all training photographs, which is reached
-            where these contradict each other, by cars and leaves, and never stop asking for more; 0 for no limit.
-        least_contribution: Gaussians that add less than so many pixels to every training view, directly and mirrored,
-            are removed; 0 keeps them.
-        contribution_moments: shares of the run at which they are: when the set has stopped growing, and in `planar`
-            once more when nothing is perturbed any longer.
+    Args:
+        options: when and how.
+        gaussians: the set to edit.
+        moments: optimiser moments by dotted name; those of other parts pass through.
+        statistics: what was gathered since the last call, one row per Gaussian.
+        extent: radius of the capture in world units.
+        generator: source of randomness, on the device of `gaussians`.
+        part: the scene part that `gaussians` is.
+        prune_large: also remove what is too large; 3DGS does so once the opacities have been
+            reset for the first time.
     """
-
-    split_by: Literal["pull", "gradient"] = "pull"
-    interval: Several = 100
-    whole_passes: bool = True
-    adapt_to_size: bool = True
-    start: Share = 500 / 30_000
-    stop: Share = 15_000 / 30_000
-    gradient_threshold: Positive = 2e-4
-    pull_threshold: Positive = 1.2e-3
-    dense_fraction: Positive = 0.01
-    prune_opacity: Share = 0.005
-    prune_large_start: Share = 1.0
-    prune_scale_fraction: Positive = 0.1
-    prune_radius_fraction: PositiveShare | None = None
-    cap: Annotated[Count | None, ESSENTIAL] = None
-    per_pixel: NotNegative = 0.02
-    least_contribution: NotNegative = 0.2
-    contribution_moments: Annotated[tuple[Share, ...], Ascending()] = (0.5, 0.8)
-
-    @staticmethod
-    def published() -> DefaultDensify:
-        """As 3DGS does it, which removes what is too large once the opacities have been reset."""
-        return DefaultDensify(
-            split_by="gradient",
-            whole_passes=False,
-            adapt_to_size=False,
-            prune_large_start=3000 / 30_000,
-            per_pixel=0.0,
-            least_contribution=0.0,
+    if statistics.max_radius.shape[0] != len(gaussians):
+        raise ValueError(
+            f"statistics hold {statistics.max_radius.shape[0]} rows for {len(gaussians)} Gaussians; "
+            "start new statistics whenever the set has changed"
         )
+    grown = _growth(options, gaussians, statistics, extent=extent, generator=generator)
+    radius = torch.where(grown.fresh, 0, statistics.max_radius[grown.source])
+    superfluous = _superfluous(options, gaussians, grown, radius, extent=extent, prune_large=prune_large)
+    return apply_edit(gaussians, moments, grown.then(keep(~superfluous)), part=part)
 
-    @torch.no_grad()
-    def densify(
-        self,
-        gaussians: Gaussians,
-        moments: Moments,
-        statistics: ScreenStatistics,
-        *,
-        extent: float,
-        generator: torch.Generator,
-        part: str = "primary",
-        prune_large: bool = False,
-    ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
-        """A set of Gaussians and their moments after cloning, splitting and pruning.
 
-        Statistics start again at `ScreenStatistics.zeros` afterwards.
+def _growth(
+    options: DefaultDensify,
+    gaussians: Gaussians,
+    statistics: ScreenStatistics,
+    *,
+    extent: float,
+    generator: torch.Generator,
+) -> Edit:
+    large = gaussians.log_scales.amax(dim=1) > math.log(options.dense_fraction * extent)
+    needs = statistics.mean_gradient / options.gradient_threshold
+    if options.split_by == "pull":
+        needs = torch.where(large, statistics.mean_pull / options.pull_threshold, needs)
+    chosen = _within_cap(options, needs)
+    halved = split(gaussians, (chosen & large).nonzero().squeeze(1), generator=generator)
+    # What was not split moved forward by as many rows as were split before it.
+    row_after_split = (~(chosen & large)).cumsum(dim=0) - 1
+    return halved.then(clone(len(halved), row_after_split[chosen & ~large]))
 
-        Args:
-            gaussians: the set to edit.
-            moments: optimiser moments by dotted name; those of other parts pass through.
-            statistics: what was gathered since the last call, one row per Gaussian.
-            extent: radius of the capture in world units.
-            generator: source of randomness, on the device of `gaussians`.
-            part: the scene part that `gaussians` is.
-            prune_large: also remove what is too large; 3DGS does so once the opacities have been
-                reset for the first time.
-        """
-        if statistics.max_radius.shape[0] != len(gaussians):
-            raise ValueError(
-                f"statistics hold {statistics.max_radius.shape[0]} rows for {len(gaussians)} Gaussians; "
-                "start new statistics whenever the set has changed"
-            )
-        grown = self._growth(gaussians, statistics, extent=extent, generator=generator)
-        radius = torch.where(grown.fresh, 0, statistics.max_radius[grown.source])
-        superfluous = self._superfluous(gaussians, grown, radius, extent=extent, prune_large=prune_large)
-        return apply_edit(gaussians, moments, grown.then(keep(~superfluous)), part=part)
 
-    def _growth(
-        self, gaussians: Gaussians, statistics: ScreenStatistics, *, extent: float, generator: torch.Generator
-    ) -> Edit:
-        large = gaussians.log_scales.amax(dim=1) > math.log(self.dense_fraction * extent)
-        needs = statistics.mean_gradient / self.gradient_threshold
-        if self.split_by == "pull":
-            needs = torch.where(large, statistics.mean_pull / self.pull_threshold, needs)
-        chosen = self._within_cap(needs)
-        halved = split(gaussians, (chosen & large).nonzero().squeeze(1), generator=generator)
-        # What was not split moved forward by as many rows as were split before it.
-        row_after_split = (~(chosen & large)).cumsum(dim=0) - 1
-        return halved.then(clone(len(halved), row_after_split[chosen & ~large]))
+def _within_cap(options: DefaultDensify, need: Tensor) -> Tensor:
+    """[N] bool: what to clone or split, of what needs it by 1 or more; under a cap, what needs it most."""
+    chosen = need >= 1
+    if options.cap is None:
+        return chosen
+    room = max(options.cap - need.shape[0], 0)
+    order = torch.where(chosen, need, -1).argsort(descending=True, stable=True)
+    within = torch.zeros_like(chosen)
+    within[order[:room]] = True
+    return chosen & within
 
-    def _within_cap(self, need: Tensor) -> Tensor:
-        """[N] bool: what to clone or split, of what needs it by 1 or more; under a cap, what needs it most."""
-        chosen = need >= 1
-        if self.cap is None:
-            return chosen
-        room = max(self.cap - need.shape[0], 0)
-        order = torch.where(chosen, need, -1).argsort(descending=True, stable=True)
-        within = torch.zeros_like(chosen)
-        within[order[:room]] = True
-        return chosen & within
 
-    def _superfluous(
-        self, gaussians: Gaussians, edit: Edit, radius: Tensor, *, extent: float, prune_large: bool
-    ) -> Tensor:
-        """[M] bool: which Gaussians of the edited set to remove; `radius` [M] as in `max_radius`."""
-        superfluous = torch.sigmoid(edit.result(gaussians, "logit_opacities")) < self.prune_opacity
-        if prune_large:
-            longest = edit.result(gaussians, "log_scales").amax(dim=1)
-            superfluous |= longest > math.log(self.prune_scale_fraction * extent)
-            if self.prune_radius_fraction is not None:
-                superfluous |= radius > self.prune_radius_fraction
-        return superfluous
+def _superfluous(
+    options: DefaultDensify, gaussians: Gaussians, edit: Edit, radius: Tensor, *, extent: float, prune_large: bool
+) -> Tensor:
+    """[M] bool: which Gaussians of the edited set to remove; `radius` [M] as in `max_radius`."""
+    superfluous = torch.sigmoid(edit.result(gaussians, "logit_opacities")) < options.prune_opacity
+    if prune_large:
+        longest = edit.result(gaussians, "log_scales").amax(dim=1)
+        superfluous |= longest > math.log(options.prune_scale_fraction * extent)
+        if options.prune_radius_fraction is not None:
+            superfluous |= radius > options.prune_radius_fraction
+    return superfluous
 
 
 @torch.no_grad()

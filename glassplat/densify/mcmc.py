@@ -7,16 +7,13 @@ ones are added in the same way, and noise on the positions lets the transparent 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cache
-from typing import Annotated, Literal
 
 import torch
-import tyro
 from torch import Tensor
 
-from glassplat.data.ranges import ESSENTIAL, Count, InnerShare, NotNegative, Positive, Range, Several, Share
 from glassplat.densify.edit import Edit, Moments, apply_edit
+from glassplat.densify.options import McmcDensify
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.pose import rotation_from_quat
 
@@ -26,124 +23,88 @@ MOST_LOGIT = 16.0
 """Opacity 1 - 1e-7, all that float32 tells from 1. The terms of the alternating sum grow with the logit."""
 
 
-@dataclass(frozen=True)
-class McmcDensify:
-    """When and how Gaussians are relocated, added and moved (Kheradmand et al. 2024).
+@torch.no_grad()
+def resampled(
+    options: McmcDensify,
+    gaussians: Gaussians,
+    moments: Moments,
+    *,
+    cap: int,
+    generator: torch.Generator,
+    part: str = "primary",
+) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
+    """A set of Gaussians and their moments after relocation and growth; what it renders stays nearly the same.
 
-    Attributes:
-        cap: largest number of Gaussians to grow to; None takes half as many as a photograph has pixels, for what
-            detail can be told apart follows the pixels.
-        interval: steps between relocations.
-        start: share of the run after which relocation begins.
-        stop: share of the run after which relocation and growth end; the noise goes on.
-        growth: factor by which the number grows in every three hundredth of the run, until the cap: with the published
-            30,000 iterations at every relocation. A single relocation at most doubles it.
-        dead_opacity: Gaussians at most this opaque are relocated.
-        noise_rate: noise on the positions, as a multiple of their learning rate; 0 switches it
-            off.
-        noise_sharpness: how fast the noise fades above `dead_opacity`.
-        opacity_weight: lambda_o, weight of the mean opacity in the objective.
-        scale_weight: lambda_Sigma, weight of the mean standard deviation in the objective.
-        reach: what noise and regularisers act on at a step: what its view shows (`shown`; the regularisers on what it
-            shows directly), or as published on `all` Gaussians.
-        initial_opacity: opacity of the first Gaussians.
-        initial_spread: standard deviation of the first Gaussians, as a share of the distance to their neighbours. The
-            published 0.1 takes a thousand steps or more to grow over the gaps (docs/experiments.md).
+    The moments are zeroed for every row that moved or is new, and for the live ones they were placed on, whose
+    opacity and size changed.
+
+    Args:
+        options: when and how.
+        gaussians: the set to edit.
+        moments: optimiser moments by dotted name; those of other parts pass through.
+        cap: largest number of Gaussians to grow to; a set that is larger stays as large.
+        generator: source of randomness, on the device of `gaussians`.
+        part: the scene part that `gaussians` is.
     """
+    relocated, moments = apply_edit(gaussians, moments, relocation(options, gaussians, generator), part=part)
+    return apply_edit(relocated, moments, addition(options, relocated, cap, generator), part=part)
 
-    cap: Annotated[Count | None, ESSENTIAL, tyro.conf.arg(aliases=("--cap",))] = None
-    interval: Several = 100
-    start: Share = 500 / 30_000
-    stop: Share = 25_000 / 30_000
-    growth: Annotated[float, Range(1, 100)] = 1.05
-    dead_opacity: InnerShare = 0.005
-    noise_rate: NotNegative = 5e5
-    noise_sharpness: NotNegative = 100.0
-    opacity_weight: NotNegative = 0.01
-    scale_weight: NotNegative = 0.01
-    reach: Literal["shown", "all"] = "shown"
-    initial_opacity: InnerShare = 0.5
-    initial_spread: Positive = 1.0
 
-    @staticmethod
-    def published() -> McmcDensify:
-        """As 3DGS-MCMC does it."""
-        return McmcDensify(reach="all", initial_spread=0.1)
+def relocation(options: McmcDensify, gaussians: Gaussians, generator: torch.Generator) -> Edit:
+    """Moves every dead Gaussian onto a live one, drawn with a probability proportional to its opacity.
 
-    @torch.no_grad()
-    def densify(
-        self,
-        gaussians: Gaussians,
-        moments: Moments,
-        *,
-        cap: int,
-        generator: torch.Generator,
-        part: str = "primary",
-    ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
-        """A set of Gaussians and their moments after relocation and growth; what it renders stays nearly the same.
+    Without live ones nothing moves; where more than `MOST_COPIES` would share a place, the surplus stays dead.
+    """
+    live = _live(options, gaussians)
+    dead = (~live).nonzero().squeeze(1)
+    targets = drawn_by_opacity(gaussians, live, dead.shape[0], generator)
+    fits = rank_among_equals(targets) < MOST_COPIES - 1
+    source = torch.arange(len(gaussians), device=dead.device)
+    source[dead[: targets.shape[0]][fits]] = targets[fits]
+    return shared_among_copies(gaussians, source)
 
-        The moments are zeroed for every row that moved or is new, and for the live ones they were placed on, whose
-        opacity and size changed.
 
-        Args:
-            gaussians: the set to edit.
-            moments: optimiser moments by dotted name; those of other parts pass through.
-            cap: largest number of Gaussians to grow to; a set that is larger stays as large.
-            generator: source of randomness, on the device of `gaussians`.
-            part: the scene part that `gaussians` is.
-        """
-        relocated, moments = apply_edit(gaussians, moments, self.relocation(gaussians, generator), part=part)
-        return apply_edit(relocated, moments, self.addition(relocated, cap, generator), part=part)
+def addition(options: McmcDensify, gaussians: Gaussians, cap: int, generator: torch.Generator) -> Edit:
+    """Appends new Gaussians up to the growth factor and the cap, placed as relocated ones are."""
+    count = len(gaussians)
+    # Rounded up, because a set of a few Gaussians would never grow otherwise.
+    room = max(min(cap, math.ceil(options.growth * count)) - count, 0)
+    targets = drawn_by_opacity(gaussians, _live(options, gaussians), room, generator)
+    targets = targets[rank_among_equals(targets) < MOST_COPIES - 1]
+    return shared_among_copies(gaussians, torch.cat([torch.arange(count, device=targets.device), targets]))
 
-    def relocation(self, gaussians: Gaussians, generator: torch.Generator) -> Edit:
-        """Moves every dead Gaussian onto a live one, drawn with a probability proportional to its opacity.
 
-        Without live ones nothing moves; where more than `MOST_COPIES` would share a place, the surplus stays dead.
-        """
-        live = self._live(gaussians)
-        dead = (~live).nonzero().squeeze(1)
-        targets = drawn_by_opacity(gaussians, live, dead.shape[0], generator)
-        fits = rank_among_equals(targets) < MOST_COPIES - 1
-        source = torch.arange(len(gaussians), device=dead.device)
-        source[dead[: targets.shape[0]][fits]] = targets[fits]
-        return shared_among_copies(gaussians, source)
+@torch.no_grad()
+def exploring_noise(
+    options: McmcDensify, gaussians: Gaussians, *, rate: float, extent: float, generator: torch.Generator
+) -> Tensor:
+    """[N, 3] offsets of the centres in world units: the noise term of the paper's Langevin dynamics.
 
-    def addition(self, gaussians: Gaussians, cap: int, generator: torch.Generator) -> Edit:
-        """Appends new Gaussians up to the growth factor and the cap, placed as relocated ones are."""
-        count = len(gaussians)
-        # Rounded up, because a set of a few Gaussians would never grow otherwise.
-        room = max(min(cap, math.ceil(self.growth * count)) - count, 0)
-        targets = drawn_by_opacity(gaussians, self._live(gaussians), room, generator)
-        targets = targets[rank_among_equals(targets) < MOST_COPIES - 1]
-        return shared_among_copies(gaussians, torch.cat([torch.arange(count, device=targets.device), targets]))
+    noise_rate * rate * sigmoid(-noise_sharpness (opacity - dead_opacity)) * covariance @ eta, eta standard normal.
+    The published factor multiplies an area by a length-like rate and so depends on the capture's units; here
+    lengths are measured in scene extents, which is the same where the extent is one.
 
-    @torch.no_grad()
-    def noise(self, gaussians: Gaussians, *, rate: float, extent: float, generator: torch.Generator) -> Tensor:
-        """[N, 3] offsets of the centres in world units: the noise term of the paper's Langevin dynamics.
+    Args:
+        options: how strong it is, and where.
+        gaussians: the set whose centres are moved.
+        rate: learning rate of the positions per scene extent, as it stands at this step.
+        extent: radius of the capture in world units.
+        generator: source of randomness, on the device of `gaussians`.
+    """
+    shape, kind = gaussians.means.shape, gaussians.means.dtype
+    unit = torch.randn(shape, generator=generator, dtype=kind, device=gaussians.means.device)
+    rotations = rotation_from_quat(gaussians.quats)
+    variances = gaussians.deviations.square()
+    along_axes = (rotations.transpose(1, 2) @ unit[..., None]).squeeze(-1) * variances
+    directions = (rotations @ along_axes[..., None]).squeeze(-1) / extent
+    opacities = torch.sigmoid(gaussians.logit_opacities)
+    gate = torch.sigmoid(-options.noise_sharpness * (opacities - options.dead_opacity))
+    return options.noise_rate * rate * gate[:, None] * directions
 
-        noise_rate * rate * sigmoid(-noise_sharpness (opacity - dead_opacity)) * covariance @ eta, eta standard normal.
-        The published factor multiplies an area by a length-like rate and so depends on the capture's units; here
-        lengths are measured in scene extents, which is the same where the extent is one.
 
-        Args:
-            gaussians: the set whose centres are moved.
-            rate: learning rate of the positions per scene extent, as it stands at this step.
-            extent: radius of the capture in world units.
-            generator: source of randomness, on the device of `gaussians`.
-        """
-        shape, kind = gaussians.means.shape, gaussians.means.dtype
-        unit = torch.randn(shape, generator=generator, dtype=kind, device=gaussians.means.device)
-        rotations = rotation_from_quat(gaussians.quats)
-        variances = gaussians.deviations.square()
-        along_axes = (rotations.transpose(1, 2) @ unit[..., None]).squeeze(-1) * variances
-        directions = (rotations @ along_axes[..., None]).squeeze(-1) / extent
-        opacities = torch.sigmoid(gaussians.logit_opacities)
-        gate = torch.sigmoid(-self.noise_sharpness * (opacities - self.dead_opacity))
-        return self.noise_rate * rate * gate[:, None] * directions
-
-    def _live(self, gaussians: Gaussians) -> Tensor:
-        """[N] bool: which Gaussians are opaque enough to stay."""
-        return torch.sigmoid(gaussians.logit_opacities) > self.dead_opacity
+def _live(options: McmcDensify, gaussians: Gaussians) -> Tensor:
+    """[N] bool: which Gaussians are opaque enough to stay."""
+    return torch.sigmoid(gaussians.logit_opacities) > options.dead_opacity
 
 
 def drawn_by_opacity(gaussians: Gaussians, live: Tensor, count: int, generator: torch.Generator) -> Tensor:

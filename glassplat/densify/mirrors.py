@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Annotated
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
-from glassplat.data.ranges import InnerShare, Range, Share
 from glassplat.data.view import View
+from glassplat.densify.options import MirrorSearch
 from glassplat.densify.reflectors import LEAST_SHOWN, evenly, in_region, residual_spreads
 from glassplat.render.contribution import gathered
 from glassplat.render.depth_normals import cell_side, depth_normals
@@ -34,73 +33,57 @@ FACING = 1e-3
 """Length of a sum of normals, in pixels, from which it tells a direction."""
 
 
-@dataclass(frozen=True)
-class MirrorSearch:
-    """What is taken for a mirror when reflections begin, and as which.
+@torch.no_grad()
+def mirror_lookalikes(
+    options: MirrorSearch, scene: Scene, views: Sequence[View], renderer: Renderer
+) -> tuple[Tensor, Tensor]:
+    """[N] bool each: which primary Gaussians the views show, and which of these look like mirrors.
 
-    Attributes:
-        begin_found: whether anything is; without, every strength grows from `first_strength` (the papers).
-        views: how many training views to look at.
-        spread: standard deviation over the views of a Gaussian's colour, sRGB, from which it looks like a mirror.
-        strength: reflection strength of what was found.
-        least_opacity: opacities of what was found are raised to this.
-        flatness: of what was found, the shortest axis as a share of the middle one, at most.
+    That is a Gaussian of the region whose pixels, but for one constant colour, differ from view to view. One by
+    itself may lie where a pattern is not resolved yet; so its neighbours count as well.
+
+    Args:
+        options: what looks like one.
+        scene: with an environment of which the region is known, or everywhere is.
+        views: those that are trained on.
+        renderer: draws the primary Gaussians.
     """
+    plain = replace(scene, primary=replace(scene.primary, active_sh_degree=0))
+    shown, spreads = residual_spreads(plain, evenly(views, options.views), renderer)
+    seen = shown > LEAST_SHOWN
+    rows = seen.nonzero().squeeze(1)
+    variances = torch.zeros_like(spreads)
+    near = neighbours(scene.primary.means[rows], COLOR_NEIGHBOURS)
+    weights, values = shown[rows][near], spreads[rows].square()[near]
+    variances[rows] = (weights * values).sum(1) / weights.sum(1)
+    return seen, seen & (variances > options.spread**2) & in_region(scene)
 
-    begin_found: bool = True
-    views: Annotated[int, Range(2, 1000)] = 24
-    spread: Share = 0.03
-    strength: InnerShare = 0.73
-    least_opacity: InnerShare = 0.9
-    flatness: InnerShare = 0.37
 
-    @torch.no_grad()
-    def looks(self, scene: Scene, views: Sequence[View], renderer: Renderer) -> tuple[Tensor, Tensor]:
-        """[N] bool each: which primary Gaussians the views show, and which of these look like mirrors.
+@torch.no_grad()
+def made_mirrors(options: MirrorSearch, scene: Scene, views: Sequence[View], chosen: Tensor) -> Gaussians:
+    """The primary Gaussians, the chosen [N] ones as mirrors whose normals are those of the depths around them.
 
-        That is a Gaussian of the region whose pixels, but for one constant colour, differ from view to view. One by
-        itself may lie where a pattern is not resolved yet; so its neighbours count as well.
-
-        Args:
-            scene: with an environment of which the region is known, or everywhere is.
-            views: those that are trained on.
-            renderer: draws the primary Gaussians.
-        """
-        plain = replace(scene, primary=replace(scene.primary, active_sh_degree=0))
-        shown, spreads = residual_spreads(plain, evenly(views, self.views), renderer)
-        seen = shown > LEAST_SHOWN
-        rows = seen.nonzero().squeeze(1)
-        variances = torch.zeros_like(spreads)
-        near = neighbours(scene.primary.means[rows], COLOR_NEIGHBOURS)
-        weights, values = shown[rows][near], spreads[rows].square()[near]
-        variances[rows] = (weights * values).sum(1) / weights.sum(1)
-        return seen, seen & (variances > self.spread**2) & in_region(scene)
-
-    @torch.no_grad()
-    def as_mirrors(self, scene: Scene, views: Sequence[View], chosen: Tensor) -> Gaussians:
-        """The primary Gaussians, the chosen [N] ones as mirrors whose normals are those of the depths around them.
-
-        Their colours stay, but for what turns with the view: what the reflection explains, it takes from them.
-        """
-        gaussians = scene.primary
-        normals = seen_normals(scene, evenly(views, self.views))
-        turned = chosen & (normals.norm(dim=1) > FACING)
-        rows = turned.nonzero().squeeze(1)
-        near = neighbours(gaussians.means[rows], NORMAL_NEIGHBOURS)
-        normals[rows] = normals[rows][near].sum(1)
-        quats, log_scales = facing(gaussians, normalize(normals, dim=1), math.log(self.flatness))
-        sh = gaussians.sh.clone()
-        sh[chosen, 1:] = 0
-        strengths, opacities = gaussians.channels["logit_strength"], gaussians.logit_opacities
-        return gaussians.with_tensors(
-            {
-                "quats": torch.where(turned[:, None], quats, gaussians.quats),
-                "log_scales": torch.where(turned[:, None], log_scales, gaussians.log_scales),
-                "logit_strength": strengths.masked_fill(chosen, logit(self.strength)),
-                "logit_opacities": torch.where(chosen, opacities.clamp(min=logit(self.least_opacity)), opacities),
-                "sh": sh,
-            }
-        )
+    Their colours stay, but for what turns with the view: what the reflection explains, it takes from them.
+    """
+    gaussians = scene.primary
+    normals = seen_normals(scene, evenly(views, options.views))
+    turned = chosen & (normals.norm(dim=1) > FACING)
+    rows = turned.nonzero().squeeze(1)
+    near = neighbours(gaussians.means[rows], NORMAL_NEIGHBOURS)
+    normals[rows] = normals[rows][near].sum(1)
+    quats, log_scales = facing(gaussians, normalize(normals, dim=1), math.log(options.flatness))
+    sh = gaussians.sh.clone()
+    sh[chosen, 1:] = 0
+    strengths, opacities = gaussians.channels["logit_strength"], gaussians.logit_opacities
+    return gaussians.with_tensors(
+        {
+            "quats": torch.where(turned[:, None], quats, gaussians.quats),
+            "log_scales": torch.where(turned[:, None], log_scales, gaussians.log_scales),
+            "logit_strength": strengths.masked_fill(chosen, logit(options.strength)),
+            "logit_opacities": torch.where(chosen, opacities.clamp(min=logit(options.least_opacity)), opacities),
+            "sh": sh,
+        }
+    )
 
 
 def neighbours(points: Tensor, count: int) -> Tensor:

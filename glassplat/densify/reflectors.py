@@ -15,8 +15,7 @@ from torch import Tensor
 from glassplat.data.view import View
 from glassplat.render.contribution import contributions, gathered
 from glassplat.render.frame import Frame, Renderer
-from glassplat.scene.activations import logit
-from glassplat.scene.gaussians import SH_ZERO
+from glassplat.scene.activations import SH_ZERO, logit
 from glassplat.scene.scene import Scene
 
 LEAST_SHOWN = 0.1

@@ -24,7 +24,7 @@ from glassplat.evaluate.uses import Uses
 from glassplat.files.atomic import atomic_write
 from glassplat.files.images import write_image
 from glassplat.files.picture_paths import flat_picture_names
-from glassplat.render.glazing import Blend
+from glassplat.render.choices import Blend
 
 USES_FILE = "uses.png"
 SETTINGS = ("iterations", "seed", "resolution", "split", "lpips_backbone", "pane_region")

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from glassplat.evaluate.evaluate import EvaluatedView
 from glassplat.evaluate.metrics import quantized
 from glassplat.evaluate.sheet import Panel, composed
+from glassplat.render.choices import Blend
 from glassplat.render.dereflect import as_mirror_image, dereflected_photo
-from glassplat.render.glazing import Blend
 
 MOST_VIEWS = 2
 SMALLEST_SHARE = 0.05

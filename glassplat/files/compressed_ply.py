@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from glassplat.files.ply_table import PlyTable, read_table
-from glassplat.scene.gaussians import SH_ZERO, Gaussians
+from glassplat.scene.activations import SH_ZERO
+from glassplat.scene.gaussians import Gaussians
 
 CHUNK = 256
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")

@@ -23,7 +23,8 @@ from glassplat.files.glb_container import NODE, PRIMITIVE, SCENE, GltfReader, Gl
 from glassplat.files.glb_placement import Placement, placed, placement_of
 from glassplat.files.ply import CHANNEL_PREFIXES, is_channel
 from glassplat.kernels.color_space import linear_from_srgb
-from glassplat.scene.gaussians import DISC_SCALES, SH_ZERO, Gaussians
+from glassplat.scene.activations import SH_ZERO
+from glassplat.scene.gaussians import DISC_SCALES, Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
 POINTS = 0

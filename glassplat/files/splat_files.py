@@ -17,7 +17,8 @@ from glassplat.files.ply_table import read_table
 from glassplat.files.reading import reading
 from glassplat.files.scene_folder import LARGEST_COLOR, LARGEST_LOG
 from glassplat.files.spz import GZIP, read_spz
-from glassplat.scene.gaussians import SH_ZERO, Gaussians
+from glassplat.scene.activations import SH_ZERO
+from glassplat.scene.gaussians import Gaussians
 
 SUFFIXES = (".ply", ".spz", ".glb", ".splat")
 SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])

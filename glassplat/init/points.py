@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.data.capture import PointCloud
-from glassplat.scene.activations import logit
-from glassplat.scene.gaussians import DISC_SCALES, SH_ZERO, Gaussians
+from glassplat.data.point_cloud import PointCloud
+from glassplat.scene.activations import SH_ZERO, logit
+from glassplat.scene.gaussians import DISC_SCALES, Gaussians
 
 NEIGHBOURS = 3
 SMALLEST_SCALE = 1e-6

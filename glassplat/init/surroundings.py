@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from glassplat.data.capture import PointCloud
+from glassplat.data.point_cloud import PointCloud
 from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import Gaussians
 

@@ -14,8 +14,8 @@ from glassplat.kernels.devices import DeviceName, chosen_device
 from glassplat.train.background import settled
 from glassplat.train.messages import Message, Working
 from glassplat.train.recipe import RECIPES, Recipe
-from glassplat.train.run import CHECKPOINT_SECONDS, Listener, Run, first_state
-from glassplat.train.run_directory import RunDirectory, RunSettings
+from glassplat.train.run import Listener, Run, first_state
+from glassplat.train.run_directory import CHECKPOINT_SECONDS, RunDirectory, RunSettings
 from glassplat.train.stage import check_length
 from glassplat.train.state import TrainState
 from glassplat.train.trainer import train

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from torch import Tensor
-
-Fresnel = Literal["pane", "schlick", "none"]
-"""How reflectance follows the angle: as that of a pane with two surfaces, by Schlick's curve of one, or not at all."""
 
 
 class Panes(NamedTuple):

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from glassplat.data.capture import PointCloud
 from glassplat.data.dataset import View
+from glassplat.data.point_cloud import PointCloud
 from glassplat.scene.eye import Eye
 from glassplat.scene.plane import Planes
 

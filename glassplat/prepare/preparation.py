@@ -62,7 +62,7 @@ def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force:
         InputError: photographs that cannot be used, or too few of them could be placed; the message says what to do.
         OSError: the capture cannot be written.
     """
-    _check_places(task)
+    check_places(task)
     quiet_pycolmap()
     workplace = Workplace(task.output)
     workplace.begin(task.record(), resume=resume, force=force)
@@ -81,7 +81,12 @@ def is_video(source: Path) -> bool:
     return source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES
 
 
-def _check_places(task: Preparation) -> None:
+def check_places(task: Preparation) -> None:
+    """Refuse an input that is no photographs, and an output among them.
+
+    Raises:
+        InputError: says what to choose instead.
+    """
     source, output = task.source.resolve(), task.output.resolve()
     if source.is_file() and not is_video(source):
         known = ", ".join(VIDEO_SUFFIXES)

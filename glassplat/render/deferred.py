@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -15,6 +14,7 @@ from glassplat.kernels.shade_environment import shade_environment
 from glassplat.kernels.shade_environment.shaded import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
 from glassplat.kernels.splats import Projected
 from glassplat.kernels.surface_channels import surface_channels
+from glassplat.render.choices import Shading
 from glassplat.render.frame import Frame
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
@@ -35,7 +35,6 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 from glassplat.scene.tint import has_tint
 
-Shading = Literal["deferred", "forward"]
 INVISIBLE = 1 / 512
 """A pixel that reflects less changes by at most half a step of eight bits, from black to white."""
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from glassplat.render.choices import Blend
 from glassplat.render.frame import Frame
-from glassplat.render.glazing import Blend, curves
+from glassplat.render.glazing import curves
 from glassplat.scene.exposure import Exposures
 
 TRUSTED_STRENGTH, DISTRUSTED_STRENGTH = 0.35, 0.65

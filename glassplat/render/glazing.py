@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,12 +12,13 @@ from glassplat.kernels.bin_tiles import TILE, bin_tiles
 from glassplat.kernels.blend_panes import blend_panes
 from glassplat.kernels.color_space import linear_from_srgb, srgb_from_linear
 from glassplat.kernels.composite import composite
-from glassplat.kernels.panes import BlendedPanes, Fresnel
+from glassplat.kernels.fresnel import Fresnel
+from glassplat.kernels.panes import BlendedPanes
 from glassplat.kernels.splats import Splats
+from glassplat.render.choices import Blend
 from glassplat.render.seen_panes import SeenPanes
 from glassplat.scene.camera import Camera
 
-Blend = Literal["srgb", "linear"]
 FAINT = 0.5
 """A pane that is less visible in a pixel, as at its rim, leaves the layers to the pane behind it."""
 

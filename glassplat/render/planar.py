@@ -12,13 +12,15 @@ from torch import Tensor
 from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.color_and_depth import color_and_depth
 from glassplat.kernels.composite import composite
+from glassplat.kernels.fresnel import Fresnel
 from glassplat.kernels.join_channels import join_channels
 from glassplat.kernels.layer_slopes import layer_slopes, slopes_at
 from glassplat.kernels.pane_layers import pane_layers
-from glassplat.kernels.panes import Fresnel, PaneHits, Panes
+from glassplat.kernels.panes import PaneHits, Panes
 from glassplat.kernels.project import GradientSum
 from glassplat.kernels.shade_environment.shaded import SURFACE_CHANNELS
 from glassplat.kernels.splats import Deviation, Projected, Splats
+from glassplat.render.choices import Blend
 from glassplat.render.curved import (
     Shades,
     curved_layers,
@@ -29,7 +31,7 @@ from glassplat.render.curved import (
     within_panes,
 )
 from glassplat.render.frame import Frame, Renderer, ScreenPass, SpacePass
-from glassplat.render.glazing import Blend, Glazed, glazed, own_masks, visibilities
+from glassplat.render.glazing import Glazed, glazed, own_masks, visibilities
 from glassplat.render.mirror_images import project_mirrored, project_photographer
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,

@@ -23,8 +23,9 @@ from glassplat.render.rasterize import (
 )
 from glassplat.render.surface import Surface, reflected_rays, seen_surface, view_directions
 from glassplat.render.tint import tint_layer
+from glassplat.scene.activations import SH_ZERO
 from glassplat.scene.camera import Camera
-from glassplat.scene.gaussians import SH_ZERO, Gaussians
+from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
 START_PER_EXTENT = 0.005

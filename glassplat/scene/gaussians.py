@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-SH_ZERO = 0.28209479177387814  # value of the constant spherical harmonic
 DISC_SCALES = 2
 """Scales of a disc; an ellipsoid has one more."""
 PER_GAUSSIAN = ("means", "quats", "log_scales", "logit_opacities", "sh")

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from glassplat.data.dataset import Dataset
-from glassplat.densify.default import DefaultDensify, reset_opacity
+from glassplat.densify.default import densified, reset_opacity
 from glassplat.densify.edit import Moments, apply_edit, forget, keep
-from glassplat.densify.mcmc import McmcDensify
+from glassplat.densify.mcmc import exploring_noise, resampled
+from glassplat.densify.options import DefaultDensify, McmcDensify
 from glassplat.densify.order import in_morton_order
 from glassplat.densify.perturb import perturb_opacities
 from glassplat.render.contribution import contributions
@@ -21,7 +22,7 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 from glassplat.scene.sight import behind_panes
 from glassplat.train.messages import Working
-from glassplat.train.optimizer import Rate
+from glassplat.train.rates import Rate
 from glassplat.train.stage import Clock, Every, Work
 from glassplat.train.state import TrainState
 
@@ -106,7 +107,8 @@ class Densify:
             gradient_threshold=self.densifier.gradient_threshold * factor,
             pull_threshold=self.densifier.pull_threshold * factor,
         )
-        edited, moments = densifier.densify(
+        edited, moments = densified(
+            densifier,
             gaussians,
             state.optimizer.moments,
             statistics,
@@ -200,7 +202,8 @@ class Relocate:
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state`, if there is anything to edit."""
         densifier = replace(self.densifier, growth=growth_of(self.densifier, clock.iterations))
-        edited, moments = densifier.densify(
+        edited, moments = resampled(
+            densifier,
             state.scene.primary,
             state.optimizer.moments,
             cap=cap_of(self.densifier, dataset),
@@ -231,7 +234,9 @@ class Explore:
         """Edits `state`."""
         primary, extent = state.scene.primary, state.scene.extent
         rate = self.rate.at(clock.progress, 1.0, clock.iterations)
-        offsets = self.densifier.noise(primary, rate=rate, extent=extent, generator=state.generator("explore"))
+        offsets = exploring_noise(
+            self.densifier, primary, rate=rate, extent=extent, generator=state.generator("explore")
+        )
         if visible is not None and self.densifier.reach == "shown":
             offsets *= visible[:, None]
         state.scene = replace(state.scene, primary=primary.with_tensors({"means": primary.means + offsets}))

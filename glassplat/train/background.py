@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from glassplat.data.dataset import Dataset
+from glassplat.data.backgrounds import BLACK, WHITE, Rgb
 from glassplat.data.errors import InputError
-from glassplat.data.view import WHITE, Rgb
 
-BLACK: Rgb = (0.0, 0.0, 0.0)
-"""Behind captures of places, which fill their photographs."""
+if TYPE_CHECKING:
+    from glassplat.data.dataset import Dataset
 
 
 def photo_background(recipe: Any) -> Rgb:

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Annotated
+from dataclasses import dataclass, replace
 
 import torch
 
 from glassplat.data.dataset import Dataset
-from glassplat.data.ranges import ESSENTIAL, Ascending, Finite, InnerShare, NotNegative, Positive, PositiveShare, Share
 from glassplat.densify.edit import append, apply_edit, keep
-from glassplat.densify.mirrors import MirrorSearch, neighbours
+from glassplat.densify.mirrors import neighbours
+from glassplat.densify.options import NormalPropagation
 from glassplat.densify.outlines import fitted_ellipsoid, mirrored_by, outlines_of, refined_ellipsoid, surface_gaussians
-from glassplat.densify.propagate import NormalPropagation
+from glassplat.densify.propagate import colors_disturbed, normals_propagated
 from glassplat.losses.geometry import normal_consistency
 from glassplat.losses.reflectors import mean_strength, strength_outside
 from glassplat.losses.term import LossTerm, weighted
@@ -25,16 +23,16 @@ from glassplat.render.traced import Traced
 from glassplat.scene.activations import logit
 from glassplat.scene.gaussians import Gaussians
 from glassplat.train.actions import Densify, GrowSh, PruneIdle, ResetOpacity
-from glassplat.train.deferred_recipe import ReflectionRates, Texels, doublings
+from glassplat.train.deferred_stages import doublings
 from glassplat.train.environment_entry import AddEnvironment
 from glassplat.train.messages import Working
-from glassplat.train.optimizer import Rate
+from glassplat.train.mirror_options import CurvedMirrors
 from glassplat.train.propagation import RefineEnvironment
+from glassplat.train.rates import Rate
 from glassplat.train.reflection_entry import BeginReflections
 from glassplat.train.stage import Clock, Every, Stage, Work, carried_out
 from glassplat.train.state import TrainState
 from glassplat.train.surroundings_entry import AddSurroundings
-from glassplat.train.traced_recipe import SurroundingsOptions
 
 log = logging.getLogger("glassplat.train")
 
@@ -50,130 +48,78 @@ NEIGHBOURS = 16
 """Gaussians, itself among them, of which one has to be a mirror for normals to spread to another."""
 
 
-@dataclass(frozen=True)
-class CurvedMirrors:
-    """Whether things that are not flat mirror what is around them, as those of `traced` do: a silver bowl in a case.
+def with_curved_mirrors(options: CurvedMirrors, planar: Planar) -> Planar:
+    """The renderer of the finished scene."""
+    return replace(planar, curved=Traced(planar.background, options.least_strength)) if options.learn else planar
 
-    Attributes:
-        learn: look for such things.
-        start: share of the run at which they begin to reflect; panes have to be known by then, and what they reflect
-            nearly so, or it would be taken for theirs.
-        spread_until: share of the run until which normals spread over what is beside a mirror.
-        beat: distance between two such moments, as a share of the run.
-        least_strength: rays are traced where the strength is larger.
-        first_strength: of what was not taken for a mirror.
-        search: what is taken for a mirror at once.
-        least_overlap: how well the outlines of what was found have to be those of an ellipsoid, pixels in both as a
-            share of those in either, for it to begin as that; 1 never lets it.
-        surroundings: how the Gaussians learn that reflections show.
-        texels: edge length of a face of the environment behind them in the end.
-        first_texels: edge length at the start.
-        refinements: shares of the run at which it doubles for the first and for the last time.
-        region: only what lies in this sphere may reflect: centre and radius, world units.
-        find_region: without one, look for the place that the cameras stand around.
-        outside_weight: of the mean strength outside of the region in the objective.
-        strength_weight: of the mean strength of all Gaussians.
-        consistency_weight: of the difference between normals and the slope of the depths, while normals spread.
-        propagation: how normals spread.
-        rates: learning rates of strength and environment.
+
+def curved_mirrors_learnt(options: CurvedMirrors, stages: tuple[Stage, ...], sh: float) -> tuple[Stage, ...]:
+    """The stages: from `start` on things reflect, which divides the last one into up to three.
+
+    Args:
+        options: when and how.
+        stages: of a run with panes; their renderers show no curved mirrors.
+        sh: share of the run between two rises of the degree of the surroundings' colours.
     """
+    if not options.learn:
+        return stages
+    *earlier, last = stages
+    began = 1 - last.share / sum(stage.share for stage in stages)
+    total = last.share / (1 - began)
+    first, spreading = max(options.start, began), max(options.spread_until, options.start, began)
+    without = replace(last, share=(first - began) * total)
+    reflecting = _reflecting(options, last, sh)
+    spread = replace(
+        _spreading(options, reflecting),
+        name="4 curved mirrors",
+        share=(spreading - first) * total,
+        entry=_entry(options, last),
+    )
+    rest = replace(reflecting, name="5 refinement", share=(1 - spreading) * total, entry=None)
+    return (*earlier, without, spread, rest)
 
-    learn: Annotated[bool, ESSENTIAL] = False
-    start: PositiveShare = 0.37
-    spread_until: Share = 0.65
-    beat: PositiveShare = 0.0214
-    least_strength: Share = 0.02
-    first_strength: InnerShare = 1e-3
-    search: MirrorSearch = field(default_factory=partial(MirrorSearch, views=200))
-    least_overlap: Share = 0.6
-    surroundings: SurroundingsOptions = field(default_factory=SurroundingsOptions)
-    texels: Texels = 64
-    first_texels: Texels = 16
-    refinements: Annotated[tuple[Share, Share], Ascending()] = (0.5, 0.7)
-    region: tuple[Finite, Finite, Finite, Positive] | None = None
-    find_region: bool = True
-    outside_weight: NotNegative = 0.4
-    strength_weight: NotNegative = 0.005
-    consistency_weight: NotNegative = 0.3
-    propagation: NormalPropagation = field(default_factory=NormalPropagation)
-    rates: ReflectionRates = field(default_factory=ReflectionRates)
 
-    def renderer(self, planar: Planar) -> Planar:
-        """The renderer of the finished scene."""
-        return replace(planar, curved=Traced(planar.background, self.least_strength)) if self.learn else planar
+def _reflecting(options: CurvedMirrors, stage: Stage, sh: float) -> Stage:
+    """A stage of `planar` in which things reflect."""
+    assert isinstance(stage.renderer, Planar)
+    traced = Traced(stage.renderer.background, options.least_strength, faintest=0.0)
+    guidance = weighted(
+        LossTerm("outside", options.outside_weight, strength_outside),
+        LossTerm("strength", options.strength_weight, mean_strength),
+    )
+    around = options.surroundings.densify
+    kept = [action for action in stage.actions if not isinstance(action, ResetOpacity)]
+    moments = doublings(options.first_texels, options.texels, options.refinements)
+    return replace(
+        stage,
+        renderer=replace(stage.renderer, curved=traced),
+        losses=(*stage.losses, *guidance),
+        rates={**slowly_turning(stage.rates), **options.rates.of(), **options.surroundings.rates.of("surroundings")},
+        actions=(
+            *kept,
+            Densify(around, "surroundings"),
+            PruneIdle(around, "surroundings", curved_contributions),
+            GrowSh(Every(sh), "surroundings"),
+            RefineEnvironment(moments, options.texels),
+        ),
+        densify_until=max(stage.densify_until, around.stop),
+    )
 
-    def learnt_in(self, stages: tuple[Stage, ...], sh: float) -> tuple[Stage, ...]:
-        """The stages: from `start` on things reflect, which divides the last one into up to three.
 
-        Args:
-            stages: of a run with panes; their renderers show no curved mirrors.
-            sh: share of the run between two rises of the degree of the surroundings' colours.
-        """
-        if not self.learn:
-            return stages
-        *earlier, last = stages
-        began = 1 - last.share / sum(stage.share for stage in stages)
-        total = last.share / (1 - began)
-        first, spreading = max(self.start, began), max(self.spread_until, self.start, began)
-        without = replace(last, share=(first - began) * total)
-        reflecting = self._reflecting(last, sh)
-        spread = replace(
-            self._spreading(reflecting),
-            name="4 curved mirrors",
-            share=(spreading - first) * total,
-            entry=self._entry(last),
-        )
-        rest = replace(reflecting, name="5 refinement", share=(1 - spreading) * total, entry=None)
-        return (*earlier, without, spread, rest)
+def _spreading(options: CurvedMirrors, stage: Stage) -> Stage:
+    """A stage in which normals spread."""
+    consistency = weighted(LossTerm("consistency", options.consistency_weight, normal_consistency))
+    when = Every(options.beat, options.start, options.spread_until)
+    spread = SpreadMirrors(when, options.propagation)
+    return replace(stage, losses=(*stage.losses, *consistency), actions=(*stage.actions, spread))
 
-    def contradiction(self) -> str | None:
-        """What is wrong with the options together, if anything."""
-        if self.learn and self.spread_until <= self.start:
-            return (
-                f"--curved.spread-until is {self.spread_until} and --curved.start {self.start}; normals spread in "
-                "between, so expected --curved.spread-until to be larger"
-            )
-        return None
 
-    def _reflecting(self, stage: Stage, sh: float) -> Stage:
-        """A stage of `planar` in which things reflect."""
-        assert isinstance(stage.renderer, Planar)
-        traced = Traced(stage.renderer.background, self.least_strength, faintest=0.0)
-        guidance = weighted(
-            LossTerm("outside", self.outside_weight, strength_outside),
-            LossTerm("strength", self.strength_weight, mean_strength),
-        )
-        around = self.surroundings.densify
-        kept = [action for action in stage.actions if not isinstance(action, ResetOpacity)]
-        moments = doublings(self.first_texels, self.texels, self.refinements)
-        return replace(
-            stage,
-            renderer=replace(stage.renderer, curved=traced),
-            losses=(*stage.losses, *guidance),
-            rates={**slowly_turning(stage.rates), **self.rates.of(), **self.surroundings.rates.of("surroundings")},
-            actions=(
-                *kept,
-                Densify(around, "surroundings"),
-                PruneIdle(around, "surroundings", curved_contributions),
-                GrowSh(Every(sh), "surroundings"),
-                RefineEnvironment(moments, self.texels),
-            ),
-            densify_until=max(stage.densify_until, around.stop),
-        )
-
-    def _spreading(self, stage: Stage) -> Stage:
-        """A stage in which normals spread."""
-        consistency = weighted(LossTerm("consistency", self.consistency_weight, normal_consistency))
-        when = Every(self.beat, self.start, self.spread_until)
-        spread = SpreadMirrors(when, self.propagation)
-        return replace(stage, losses=(*stage.losses, *consistency), actions=(*stage.actions, spread))
-
-    def _entry(self, stage: Stage) -> BeginCurved:
-        """How things begin to reflect."""
-        environment = AddEnvironment(min(self.first_texels, self.texels), self.region, self.find_region)
-        around = AddSurroundings(self.surroundings.start, self.surroundings.sh_degree)
-        begin = BeginReflections(environment, around, self.search, stage.renderer)
-        return BeginCurved(self.first_strength, begin, self.least_overlap)
+def _entry(options: CurvedMirrors, stage: Stage) -> BeginCurved:
+    """How things begin to reflect."""
+    environment = AddEnvironment(min(options.first_texels, options.texels), options.region, options.find_region)
+    around = AddSurroundings(options.surroundings.start, options.surroundings.sh_degree)
+    begin = BeginReflections(environment, around, options.search, stage.renderer)
+    return BeginCurved(options.first_strength, begin, options.least_overlap)
 
 
 def slowly_turning(rates: Mapping[str, Rate]) -> dict[str, Rate]:
@@ -264,8 +210,8 @@ class SpreadMirrors:
         # What has got the right shape needs no normals from its neighbours.
         if RESHAPED in state.records or not bool(near.any()):
             return False
-        primary, moments = self.propagation.propagate(primary, moments, near)
-        primary, moments = self.propagation.disturb(primary, moments, state.generator(self.name), near)
+        primary, moments = normals_propagated(self.propagation, primary, moments, near)
+        primary, moments = colors_disturbed(self.propagation, primary, moments, state.generator(self.name), near)
         state.scene, state.optimizer.moments = replace(state.scene, primary=primary), moments
         return True
 

@@ -2,83 +2,42 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
-import torch
-
-from glassplat.data.dataset import Dataset
 from glassplat.data.ranges import (
     ESSENTIAL,
     Ascending,
     Color,
     Finite,
     InnerShare,
-    LearningRate,
     NotNegative,
     Positive,
-    Range,
     Several,
     Share,
     ShDegree,
 )
-from glassplat.densify.default import DefaultDensify
-from glassplat.densify.mcmc import McmcDensify
-from glassplat.densify.mirrors import MirrorSearch
-from glassplat.densify.propagate import NormalPropagation
-from glassplat.losses.geometry import normal_consistency
-from glassplat.losses.reflectors import mean_strength, mean_tint, strength_outside
-from glassplat.losses.term import LossTerm, weighted
-from glassplat.render.deferred import INVISIBLE, Deferred, Shading
-from glassplat.render.splat import Splat
-from glassplat.scene.activations import logit
-from glassplat.scene.gaussians import SH_ZERO
-from glassplat.scene.scene import Scene
-from glassplat.scene.tint import TINT
-from glassplat.train.actions import Densify, GrowSh, ResetOpacity
-from glassplat.train.background import BLACK
-from glassplat.train.environment_entry import AddEnvironment, StayMatte
-from glassplat.train.optimizer import PUBLISHED_ITERATIONS, Rate
-from glassplat.train.photo_exposure import PhotoExposure
-from glassplat.train.pose_refinement import PoseRefinement
-from glassplat.train.propagation import (
-    DensifyWhilePropagating,
-    GrowShAfterPropagation,
-    Propagate,
+from glassplat.densify.options import DefaultDensify, McmcDensify, MirrorSearch, NormalPropagation
+from glassplat.render.choices import Shading
+from glassplat.scene.activations import SH_ZERO
+from glassplat.train.mirror_options import (
     PropagationSchedule,
-    RefineEnvironment,
-    ResetRaised,
+    Texels,
 )
-from glassplat.train.reflection_entry import BeginReflections
-from glassplat.train.splat_recipe import GaussianRates, SplatRecipe, image_terms
-from glassplat.train.stage import Action, Every, Stage
-from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
+from glassplat.train.photograph_options import PhotoExposure, PoseRefinement
+from glassplat.train.rates import PUBLISHED_ITERATIONS, GaussianRates, ReflectionRates
+from glassplat.train.rhythm import Rhythm, Strategy
+
+if TYPE_CHECKING:
+    from glassplat.data.dataset import Dataset
+    from glassplat.render.deferred import Deferred
+    from glassplat.scene.scene import Scene
+    from glassplat.train.stage import Stage
+
 
 CODE_ITERATIONS = 61_000
 """Length of the runs of the public code on synthetic scenes."""
-Texels = Annotated[int, Range(1, 2048)]
-
-
-@dataclass(frozen=True)
-class ReflectionRates:
-    """Learning rates of what reflects.
-
-    Attributes:
-        strength: logit of the reflection strength.
-        environment: raw texels of the environment.
-        tint: logits of what red, green and blue reflect more or less strongly.
-    """
-
-    strength: LearningRate = 2e-2
-    environment: LearningRate = 5e-2
-    tint: LearningRate = 2e-2
-
-    def of(self) -> dict[str, Rate]:
-        """The rates by dotted parameter name."""
-        tints = {f"primary.{name}": Rate(self.tint) for name in TINT}
-        return {"primary.logit_strength": Rate(self.strength), "environment.raw": Rate(self.environment), **tints}
 
 
 @dataclass(frozen=True)
@@ -200,109 +159,6 @@ class DeferredRecipe:
             mcmc=McmcDensify.published(),
         )
 
-    def initialise(self, dataset: Dataset) -> Scene:
-        """The first scene: one Gaussian per point that hardly reflects, and no environment yet."""
-        primary = self._population().initial(dataset.points, self.sh_degree)
-        strengths = torch.full((len(primary),), logit(self.first_strength))
-        primary = replace(primary, channels={"logit_strength": strengths})
-        scene = Scene(primary, dataset.extent)
-        return self.poses.begun(self.exposure.begun(scene, dataset), dataset)
-
-    def renderer(self) -> Deferred:
-        """The renderer of the finished scene, with all its layers."""
-        return Deferred(self.background or BLACK, self.shading, least_strength=INVISIBLE)
-
-    def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
-        """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has one stage."""
-        short = iterations < self.least_iterations
-        stages = self._matte_stages(seed, iterations) if short else self._reflecting_stages()
-        return self.poses.learnt_in(self.exposure.learnt_in(stages))
-
-    def _reflecting_stages(self) -> tuple[Stage, ...]:
-        """Those of a run that is long enough for normals to spread."""
-        population = self._population()
-        image = image_terms(self.ssim_weight, self.view_dependence_weight)
-        bootstrap = Stage(
-            name="1 bootstrap",
-            share=self.bootstrap,
-            renderer=Splat(self.background or BLACK, depth=False),
-            losses=(*image, *population.terms),
-            rates=(self._rates_of_splat() if self.search.begin_found else self.rates).of("primary"),
-            actions=(*population.edits, *self._regular(population)),
-            motions=population.motions,
-            densify_until=population.densify_until,
-        )
-        beat = Every(self.rhythm.beat, 0.0, self.schedule.stop, self.rhythm.least, skip_multiples_of=3)
-        renderer = Deferred(self.background or BLACK, self.shading, depth=self.consistency_weight != 0)
-        guidance = weighted(
-            LossTerm("outside", self.outside_weight, strength_outside),
-            LossTerm("strength", self.strength_weight, mean_strength),
-            LossTerm("tint", self.tint_weight if self.tint else 0.0, mean_tint),
-            LossTerm("consistency", self.consistency_weight, normal_consistency),
-        )
-        reflection = Stage(
-            name="2 reflection",
-            share=self.schedule.stop - self.bootstrap,
-            renderer=renderer,
-            losses=(*image, *guidance, *population.terms),
-            rates=self.rates.of("primary") | self.reflection_rates.of(),
-            actions=(
-                *self._edits(population),
-                # Before the resets: it looks at what is seen, also at the beats that it leaves to them.
-                self._propagate(beat, renderer),
-                GrowShAfterPropagation(Every(self.rhythm.sh)),
-                *self._resets(population),
-                RefineEnvironment(self._doublings(), self.texels),
-            ),
-            motions=population.motions,
-            entry=self.entry(),
-            densify_until=population.densify_until,
-        )
-        refinement = replace(
-            reflection,
-            entry=None,
-            name="3 refinement",
-            share=1 - self.schedule.stop,
-            renderer=Deferred(self.background or BLACK, self.shading, depth=False),
-            losses=tuple(term for term in reflection.losses if term.name != "consistency"),
-        )
-        return bootstrap, reflection, refinement
-
-    def _matte_stages(self, seed: int, iterations: int) -> tuple[Stage, ...]:
-        """The one stage of a run that is too short for normals to spread: that of `splat`."""
-        usual = Rhythm()
-        plain = SplatRecipe(
-            sh_degree=self.sh_degree,
-            ssim_weight=self.ssim_weight,
-            view_dependence_weight=self.view_dependence_weight,
-            background=self.background,
-            rates=self._rates_of_splat(),
-            rhythm=replace(self.rhythm, beat=usual.beat, least=usual.least),
-            strategy=self.strategy,
-            densify=self.densify,
-            mcmc=self.mcmc,
-        )
-        (stage,) = plain.stages(seed)
-        entry = StayMatte(iterations, self.least_iterations, self._environment())
-        return (replace(stage, name="as splat", entry=entry),)
-
-    def _rates_of_splat(self) -> GaussianRates:
-        """The learning rates where nothing reflects that higher ones would spoil."""
-        return replace(self.rates, short_run_power=GaussianRates().short_run_power) if self.hurry_matte else self.rates
-
-    def _regular(self, population: Population) -> tuple[Action, ...]:
-        """What happens in the bootstrap as in `splat`: a scene has to look right for mirrors to be told from it."""
-        return (GrowSh(Every(self.rhythm.sh)), *population.resets) if self.search.begin_found else ()
-
-    def entry(self) -> BeginReflections:
-        """How things begin to reflect."""
-        seen_by = Splat(self.background or BLACK, depth=False)
-        return BeginReflections(self._environment(), None, self.search, seen_by, self.tint, harmonics_wait=True)
-
-    def _environment(self) -> AddEnvironment:
-        """What is mirrored."""
-        return AddEnvironment(min(self.first_texels, self.texels), self.region, self.find_region)
-
     def contradiction(self) -> str | None:
         """What is wrong with the options together, if anything."""
         if self.schedule.stop <= self.bootstrap:
@@ -312,56 +168,20 @@ class DeferredRecipe:
             )
         return None
 
-    def _doublings(self) -> tuple[float, ...]:
-        """The shares of the run at which the environment's edge length doubles."""
-        return doublings(self.first_texels, self.texels, self.refinements)
+    def initialise(self, dataset: Dataset) -> Scene:
+        """The first scene: one Gaussian per point that hardly reflects, and no environment yet."""
+        from glassplat.train.deferred_stages import first_scene
 
-    def _edits(self, population: Population) -> tuple[Action, ...]:
-        """What changes the number of Gaussians once they reflect."""
-        if self.propagation_interval is None or self.strategy == "mcmc":
-            return population.edits
-        slow = replace(self.densify, interval=self.propagation_interval)
-        return tuple(
-            DensifyWhilePropagating(slow, regular=edit) if isinstance(edit, Densify) else edit
-            for edit in population.edits
-        )
+        return first_scene(self, dataset)
 
-    def _resets(self, population: Population) -> tuple[ResetOpacity, ...]:
-        """The resets during and after propagation."""
-        if not self.schedule.last_reset:
-            return population.resets
-        return tuple(ResetRaised.instead_of(reset) for reset in population.resets)
+    def renderer(self) -> Deferred:
+        """The renderer of the finished scene, with all its layers."""
+        from glassplat.train.deferred_stages import finished_renderer
 
-    def _propagate(self, beat: Every, renderer: Deferred) -> Propagate:
-        return Propagate(
-            beat,
-            self.propagation,
-            self.schedule,
-            renderer,
-            matte_rates=self._matte_rates(),
-            hurries_found=self.hurry_found,
-        )
+        return finished_renderer(self)
 
-    def _matte_rates(self) -> dict[str, Rate]:
-        """What brings the learning rates to those of `splat`, where nothing reflects that higher ones would spoil."""
-        if not self.hurry_matte:
-            return {}
-        missing = GaussianRates().short_run_power - self.rates.short_run_power
-        return {
-            name: Rate(1.0, short_run_power=missing)
-            for name, rate in GaussianRates().of("primary").items()
-            if rate.short_run_power
-        }
+    def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
+        """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has one stage."""
+        from glassplat.train.deferred_stages import stages_of
 
-    def _population(self) -> Population:
-        means_rate = self.rates.of("primary")["primary.means"]
-        return population_of(
-            self.strategy, default=self.densify, mcmc=self.mcmc, rhythm=self.rhythm, means_rate=means_rate
-        )
-
-
-def doublings(first_texels: int, texels: int, refinements: tuple[float, float]) -> tuple[float, ...]:
-    """The shares of the run, evenly from a first to a last one, at which an edge length doubles until it is reached."""
-    count = max(math.ceil(math.log2(texels / first_texels)), 0)
-    first, last = refinements
-    return tuple(first + (last - first) * number / max(count - 1, 1) for number in range(count))
+        return stages_of(self, seed, iterations)

@@ -9,47 +9,9 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.adam import Update, adam
-
-PUBLISHED_ITERATIONS = 30_000
-"""Length of the runs for which 3DGS, and TR-Gaussians after it, chose their learning rates."""
-FASTEST_ITERATIONS = 3_000
-"""Shorter runs learn no faster than one of this length, the shortest for which higher rates were measured."""
+from glassplat.train.rates import Rate
 
 Moments = dict[str, tuple[Tensor, Tensor]]
-
-
-@dataclass(frozen=True)
-class Rate:
-    """A learning rate over the run.
-
-    Attributes:
-        start: rate at the first iteration.
-        end: rate that it decays to exponentially; None keeps `start`.
-        decay: share of the run at which `end` is reached.
-        per_extent: multiply by the scene extent (for positions).
-        rest: factor for every SH coefficient but the constant one; only for `sh`.
-        short_run_power: a run of fewer iterations than the published 30,000 multiplies the rate by their ratio to this
-            power (`FASTEST_ITERATIONS` at the least), because Adam moves a parameter by about its rate at every step,
-            however small the gradient.
-    """
-
-    start: float
-    end: float | None = None
-    decay: float = 1.0
-    per_extent: bool = False
-    rest: float | None = None
-    short_run_power: float = 0.0
-
-    def at(self, progress: float, extent: float, iterations: int = PUBLISHED_ITERATIONS) -> float:
-        """The rate at a progress in [0, 1] of a run of so many iterations."""
-        length = min(max(iterations, FASTEST_ITERATIONS), PUBLISHED_ITERATIONS)
-        scale = (PUBLISHED_ITERATIONS / length) ** self.short_run_power
-        if self.per_extent:
-            scale *= extent
-        if self.end is None or self.start == 0:
-            return self.start * scale
-        decayed = min(progress / self.decay, 1.0)
-        return float(self.start ** (1 - decayed) * self.end**decayed * scale)
 
 
 @dataclass

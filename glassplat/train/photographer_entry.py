@@ -2,58 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Annotated
+from dataclasses import dataclass, replace
 
 from glassplat.data.dataset import Dataset
-from glassplat.data.ranges import Range, ShDegree
-from glassplat.densify.default import DefaultDensify
+from glassplat.densify.options import DefaultDensify
 from glassplat.init.photographer import first_photographer
 from glassplat.render.planar import Planar
 from glassplat.scene.photographer import upward
 from glassplat.train.actions import Densify
-from glassplat.train.splat_recipe import GaussianRates
+from glassplat.train.photograph_options import Photographer
 from glassplat.train.stage import Entry, Stage, Work, carried_out
 from glassplat.train.state import TrainState
 
 PART = "photographer"
-
-
-@dataclass(frozen=True)
-class Photographer:
-    """Whether the panes show who took the photographs: Gaussians that the camera carries along.
-
-    Attributes:
-        learn: look for one.
-        upright: the body stands on the ground however the camera is tilted; if not, it leans with the camera.
-        count: Gaussians at first.
-        sh_degree: highest degree of their colours.
-        rates: learning rates.
-    """
-
-    learn: bool = False
-    upright: bool = True
-    count: Annotated[int, Range(1, 1_000_000)] = 500
-    sh_degree: ShDegree = 0
-    rates: GaussianRates = field(default_factory=GaussianRates)
-
-    def learnt_in(self, stages: tuple[Stage, ...], densify: DefaultDensify, seed: int) -> tuple[Stage, ...]:
-        """The stages: in those that know panes the photographer is shown and learns, from the first of them on."""
-        if not self.learn:
-            return stages
-        first = next(number for number, stage in enumerate(stages) if isinstance(stage.renderer, Planar))
-        entry = AddPhotographer(self, seed, after=stages[first].entry)
-        learning = [self._learning(stage, densify) for stage in stages[first:]]
-        return (*stages[:first], replace(learning[0], entry=entry), *learning[1:])
-
-    def _learning(self, stage: Stage, densify: DefaultDensify) -> Stage:
-        assert isinstance(stage.renderer, Planar)
-        return replace(
-            stage,
-            renderer=replace(stage.renderer, photographer="present"),
-            rates={**stage.rates, **self.rates.of(PART)},
-            actions=(*stage.actions, Densify(densify, part=PART)),
-        )
 
 
 @dataclass(frozen=True)
@@ -85,3 +46,25 @@ class AddPhotographer:
         up = upward(cameras) if self.options.upright else None
         state.scene = replace(state.scene, photographer=body, up=up)
         return True
+
+
+def photographer_learnt(
+    options: Photographer, stages: tuple[Stage, ...], densify: DefaultDensify, seed: int
+) -> tuple[Stage, ...]:
+    """The stages: in those that know panes the photographer is shown and learns, from the first of them on."""
+    if not options.learn:
+        return stages
+    first = next(number for number, stage in enumerate(stages) if isinstance(stage.renderer, Planar))
+    entry = AddPhotographer(options, seed, after=stages[first].entry)
+    learning = [_learning(options, stage, densify) for stage in stages[first:]]
+    return (*stages[:first], replace(learning[0], entry=entry), *learning[1:])
+
+
+def _learning(options: Photographer, stage: Stage, densify: DefaultDensify) -> Stage:
+    assert isinstance(stage.renderer, Planar)
+    return replace(
+        stage,
+        renderer=replace(stage.renderer, photographer="present"),
+        rates={**stage.rates, **options.rates.of(PART)},
+        actions=(*stage.actions, Densify(densify, part=PART)),
+    )

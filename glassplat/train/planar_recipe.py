@@ -2,72 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar, Literal
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from glassplat.data.dataset import Dataset
 from glassplat.data.ranges import (
     ESSENTIAL,
     Ascending,
     Color,
     InnerShare,
-    LearningRate,
     NotNegative,
     Positive,
     Range,
     Share,
     ShDegree,
 )
-from glassplat.densify.default import DefaultDensify
-from glassplat.densify.mcmc import McmcDensify
-from glassplat.init.planes import PlaneFit, PlaneFitError
-from glassplat.kernels.panes import Fresnel
-from glassplat.losses.geometry import depth_deviation_loss
-from glassplat.losses.reflection import gradient_conflict, intensity_departure, mask_loss
-from glassplat.losses.term import LossTerm, weighted
-from glassplat.render.glazing import Blend
-from glassplat.render.planar import Planar
-from glassplat.render.splat import Splat
-from glassplat.scene.scene import Scene
-from glassplat.train.actions import Densify, GrowSh, PerturbOpacity, ResetOpacity
-from glassplat.train.background import BLACK
-from glassplat.train.curved_mirrors import CurvedMirrors
-from glassplat.train.optimizer import PUBLISHED_ITERATIONS, Rate
-from glassplat.train.photo_exposure import PhotoExposure
-from glassplat.train.photographer_entry import Photographer
-from glassplat.train.plane_entry import PlaneEntry, fitted_planes
-from glassplat.train.pose_refinement import PoseRefinement
-from glassplat.train.splat_recipe import GaussianRates, image_terms
-from glassplat.train.stage import Every, Stage
-from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
+from glassplat.densify.options import DefaultDensify, McmcDensify
+from glassplat.init.plane_options import PlaneFit
+from glassplat.kernels.fresnel import Fresnel
+from glassplat.render.choices import Blend
+from glassplat.train.mirror_options import (
+    CurvedMirrors,
+)
+from glassplat.train.photograph_options import PhotoExposure, Photographer, PoseRefinement
+from glassplat.train.rates import PUBLISHED_ITERATIONS, GaussianRates, PlaneRates
+from glassplat.train.rhythm import Rhythm, Strategy
 
-
-@dataclass(frozen=True)
-class PlaneRates:
-    """Learning rates of planes and glass, which the paper leaves out; see docs/experiments.md.
-
-    Attributes:
-        center: plane position in stage 2, per scene extent.
-        normal: plane normal in stage 2.
-        reflectance: logit of R0.
-        mark: logit of the glass mark.
-        joint_factor: factor on `center` and `normal` in stage 3 (paper: 0.1).
-    """
-
-    center: LearningRate = 1e-4
-    normal: LearningRate = 1e-4
-    reflectance: LearningRate = 1e-2
-    mark: LearningRate = 5e-2
-    joint_factor: Share = 0.1
-
-    def of(self, factor: float) -> dict[str, Rate]:
-        """The rates by dotted parameter name."""
-        return {
-            "planes.centers": Rate(self.center * factor, per_extent=True),
-            "planes.raw_normals": Rate(self.normal * factor),
-            "planes.logit_reflectances": Rate(self.reflectance),
-            "glass.logit_mark": Rate(self.mark),
-        }
+if TYPE_CHECKING:
+    from glassplat.data.dataset import Dataset
+    from glassplat.render.planar import Planar
+    from glassplat.scene.scene import Scene
+    from glassplat.train.stage import Stage
 
 
 @dataclass(frozen=True)
@@ -85,15 +49,6 @@ class ReflectionWeights:
     conflict: NotNegative = 0.2
     mask: NotNegative = 0.5
     intensity: NotNegative = 0.05
-
-    def terms(self) -> tuple[LossTerm, ...]:
-        """The terms whose weight is not zero."""
-        return weighted(
-            LossTerm("depth", self.depth, depth_deviation_loss),
-            LossTerm("conflict", self.conflict, gradient_conflict),
-            LossTerm("mask", self.mask, mask_loss),
-            LossTerm("intensity", self.intensity, intensity_departure),
-        )
 
 
 @dataclass(frozen=True)
@@ -216,154 +171,28 @@ class PlanarRecipe:
             mcmc=McmcDensify.published(),
         )
 
-    def initialise(self, dataset: Dataset) -> Scene:
-        """The first scene: one Gaussian per point, no planes yet.
-
-        Raises:
-            PlaneFitError: the masks do not do. The planes are fitted to the measured points once and forgotten,
-                because a bad mask should end a run before the first iteration and not at the second stage.
-        """
-        if not dataset.pane_labels and dataset.planes is None:
-            raise PlaneFitError(
-                f"{self._lack_of_masks(dataset)}, and planar needs to know where the panes are: expected masks of 3 to "
-                f"10 photographs in {dataset.root / 'masks'}, named <photograph's name>.png, each pixel the label 1, "
-                "2, ... of a pane, or 0 (`glassplat annotate` writes them). `glassplat train splat` needs none"
-            )
-        if dataset.measured_points:
-            fitted_planes(dataset, None, self.plane_fit)
-        scene = Scene(self._population().initial(dataset.points, self.sh_degree), dataset.extent)
-        return self.poses.begun(self.exposure.begun(scene, dataset), dataset)
-
-    @staticmethod
-    def _lack_of_masks(dataset: Dataset) -> str:
-        count = sum(view.is_annotated for view in (*dataset.train, *dataset.test))
-        return f"none of the {count} masks of {dataset.root} names a pane" if count else f"{dataset.root} has no masks"
-
     def contradiction(self) -> str | None:
         """What is wrong with the options together, if anything."""
         return self.curved.contradiction()
 
+    def initialise(self, dataset: Dataset) -> Scene:
+        """The first scene: one Gaussian per point, no planes yet.
+
+        Raises:
+            PlaneFitError: the masks do not do.
+        """
+        from glassplat.train.planar_stages import first_scene
+
+        return first_scene(self, dataset)
+
     def renderer(self) -> Planar:
         """The renderer of the finished scene, with all its layers."""
-        return self.curved.renderer(self._of_panes())
+        from glassplat.train.planar_stages import finished_renderer
 
-    def _of_panes(self) -> Planar:
-        """The renderer of panes, without curved mirrors."""
-        return Planar(
-            self.background or BLACK,
-            fresnel=self.fresnel,
-            intensity=self.intensity,
-            blend=self.blend,
-            nearest_only=self.panes == "nearest",
-        )
+        return finished_renderer(self)
 
     def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
         """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
-        first, second, third = self.stage_shares
-        population = self._population()
-        entry = PlaneEntry(
-            self.plane_fit,
-            self.glass_count,
-            seed,
-            detect_mirrors=self.detect_mirrors,
-            fixed_mirrors=self.fixed_mirrors,
-            seed_reflections=self.seed_reflections,
-        )
-        initialisation = Stage(
-            name="1 initialisation",
-            share=first,
-            renderer=Splat(self.background or BLACK, depth=False),
-            losses=(*image_terms(self.ssim_weight, self.view_dependence_weight), *population.terms),
-            rates=self.rates.of("primary"),
-            actions=(*population.edits, GrowSh(Every(self.rhythm.sh)), *self._early_resets(population)),
-            motions=population.motions,
-            densify_until=population.densify_until,
-        )
-        if not self.multi_stage:
-            stages: tuple[Stage, ...] = (initialisation, replace(self._joint(second + third), entry=entry))
-        else:
-            stages = (initialisation, self._adjustment(second, entry), self._joint(third))
-        stages = self.photographer.learnt_in(stages, self.densify, seed)
-        stages = self.curved.learnt_in(stages, self.rhythm.sh)
-        return self.poses.learnt_in(self.exposure.learnt_in(stages))
+        from glassplat.train.planar_stages import stages_of
 
-    def _adjustment(self, share: float, entry: PlaneEntry) -> Stage:
-        """Stage 2: the reflection's gradient reaches the planes, not the Gaussians."""
-        population = self._population()
-        return Stage(
-            name="2 plane adjustment",
-            share=share,
-            renderer=self._training_renderer("planes"),
-            losses=self._joint_terms(population),
-            rates=self.rates.of("primary") | self.rates.of("glass") | self.plane_rates.of(1.0),
-            actions=(
-                *population.edits,
-                GrowSh(Every(self.rhythm.sh)),
-                Densify(self.densify, part="glass"),
-                *self._early_resets(population),
-                *self._clearing(),
-            ),
-            motions=population.motions,
-            entry=entry,
-            densify_until=self.densify.stop,
-        )
-
-    def _joint(self, share: float) -> Stage:
-        """Stage 3: everything learns, opacities are perturbed, planes move slowly."""
-        population = self._population()
-        beat = Every(self.rhythm.beat, 0.0, self.perturbation.stop, self.rhythm.least, skip_multiples_of=3)
-        return Stage(
-            name="3 joint optimisation",
-            share=share,
-            renderer=self._training_renderer("all"),
-            losses=self._joint_terms(population),
-            rates=self.rates.of("primary")
-            | self.rates.of("glass")
-            | self.plane_rates.of(self.plane_rates.joint_factor)
-            | ({"primary.log_intensity": Rate(self.rates.intensity)} if self.intensity else {}),
-            actions=(
-                *population.edits,
-                GrowSh(Every(self.rhythm.sh)),
-                Densify(self.densify, part="glass"),
-                *population.resets,
-                *self._clearing(),
-                PerturbOpacity(beat, self.perturbation.amplitude, self.perturbation.bounds),
-            ),
-            motions=population.motions,
-            densify_until=self.densify.stop,
-        )
-
-    def _joint_terms(self, population: Population) -> tuple[LossTerm, ...]:
-        image = image_terms(self.ssim_weight, self.view_dependence_weight)
-        return (*image, *self.weights.terms(), *population.terms)
-
-    def _population(self) -> Population:
-        means_rate = self.rates.of("primary")["primary.means"]
-        start = self.mcmc.start if self.early_growth else max(self.mcmc.start, self._joint_start)
-        mcmc = replace(self.mcmc, start=start)
-        return population_of(self.strategy, default=self.densify, mcmc=mcmc, rhythm=self.rhythm, means_rate=means_rate)
-
-    def _early_resets(self, population: Population) -> tuple[ResetOpacity, ...]:
-        """The resets of the first two stages, if there are to be any."""
-        return population.resets if self.early_resets else ()
-
-    def _clearing(self) -> tuple[ResetOpacity, ...]:
-        """The one reset under `mcmc`, where joint optimisation begins; `default` has its own."""
-        # A second one would come after the stop.
-        once = Every(self._joint_start, stop=1.5 * self._joint_start)
-        return (ResetOpacity(once),) if self.strategy == "mcmc" and not self.early_growth else ()
-
-    @property
-    def _joint_start(self) -> float:
-        """Share of the run after which all three parts learn together."""
-        first, second, third = self.stage_shares
-        return (first + second) / (first + second + third)
-
-    def _training_renderer(self, gradient: str) -> Planar:
-        return replace(
-            self._of_panes(),
-            reflection_gradient="all" if gradient == "all" else "planes",
-            deviation=self.weights.depth != 0,
-            deviation_depth_gradient=self.moving_mean,
-            tells_mirrored=self.densify_by == "direct",
-        )
+        return stages_of(self, seed, iterations)

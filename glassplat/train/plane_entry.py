@@ -12,7 +12,8 @@ from glassplat.data.dataset import Dataset
 from glassplat.densify.edit import append, apply_edit, keep
 from glassplat.init.glass import glass_gaussians
 from glassplat.init.material import mirrored_coverage, mirrors_among, pane_pixels
-from glassplat.init.planes import PlaneFit, fit_planes, with_mirrors
+from glassplat.init.plane_options import PlaneFit
+from glassplat.init.planes import fit_planes, with_mirrors
 from glassplat.init.points import gaussians_from_points
 from glassplat.init.virtual_scene import virtual_points
 from glassplat.scene.camera import Camera

@@ -5,18 +5,18 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import torch
 
 from glassplat.data.dataset import Dataset
-from glassplat.data.ranges import Count, Several, Share
-from glassplat.densify.propagate import NormalPropagation
+from glassplat.densify.options import NormalPropagation
+from glassplat.densify.propagate import colors_disturbed, normals_propagated
 from glassplat.densify.reflectors import Search
 from glassplat.render.environment import resized
 from glassplat.render.frame import Renderer
 from glassplat.train.actions import Densify, GrowSh, ResetOpacity
-from glassplat.train.optimizer import Rate
+from glassplat.train.mirror_options import PropagationSchedule
+from glassplat.train.rates import Rate
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
 
@@ -47,27 +47,6 @@ OVERLOOKED = (
     "but %.0f %% of what is seen looks different from different sides. More --iterations give normals more time to "
     "spread, and --region X Y Z RADIUS names the place where something reflects"
 )
-
-
-@dataclass(frozen=True)
-class PropagationSchedule:
-    """When normals are propagated: at the beats of `Rhythm`, but for those that reset opacities.
-
-    Attributes:
-        end: `settled` ends it when what reflects has stopped growing (the paper's criterion), `fixed` at `stop`.
-        stop: share of the run after which nothing is propagated any more.
-        patience: beats without growth after which it counts as settled; a strength needs some hundred steps to be seen,
-            however short the run. None is needed where nothing reflects nor looks as if it did.
-        pause: steps for which raised opacities are held.
-        last_reset: after the end, reset opacities only if they have been raised since the last time; if not, regular
-            resets go on as if nothing had been propagated.
-    """
-
-    end: Literal["settled", "fixed"] = "settled"
-    stop: Share = 0.75
-    patience: Several = 5
-    pause: Count = 100
-    last_reset: bool = True
 
 
 @dataclass(frozen=True)
@@ -111,8 +90,8 @@ class Propagate:
             return False
         if not self.when.due(clock):
             return False
-        primary, moments = self.propagation.propagate(state.scene.primary, state.optimizer.moments)
-        primary, moments = self.propagation.disturb(primary, moments, state.generator(self.name))
+        primary, moments = normals_propagated(self.propagation, state.scene.primary, state.optimizer.moments)
+        primary, moments = colors_disturbed(self.propagation, primary, moments, state.generator(self.name))
         state.scene, state.optimizer.moments = replace(state.scene, primary=primary), moments
         if self.propagation.propagates:
             state.optimizer.paused["primary.logit_opacities"] = self.schedule.pause

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
-from glassplat.data.dataset import Dataset
+from glassplat.data.backgrounds import Rgb
 from glassplat.data.errors import InputError, input_checked
 from glassplat.data.options import options_from_json, shown
-from glassplat.data.view import Rgb
 from glassplat.files.json_text import parse_json
-from glassplat.render.frame import Renderer
-from glassplat.scene.scene import Scene
 from glassplat.train.deferred_recipe import DeferredRecipe
-from glassplat.train.optimizer import PUBLISHED_ITERATIONS
 from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.rates import PUBLISHED_ITERATIONS
 from glassplat.train.splat_recipe import SplatRecipe
-from glassplat.train.stage import Stage
 from glassplat.train.traced_recipe import TracedRecipe
+
+if TYPE_CHECKING:
+    from glassplat.data.dataset import Dataset
+    from glassplat.render.frame import Renderer
+    from glassplat.scene.scene import Scene
+    from glassplat.train.stage import Stage
 
 
 class Recipe(Protocol):

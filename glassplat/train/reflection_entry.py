@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 from glassplat.data.dataset import Dataset
 from glassplat.densify.edit import forget
-from glassplat.densify.mirrors import MirrorSearch
+from glassplat.densify.mirrors import made_mirrors, mirror_lookalikes
+from glassplat.densify.options import MirrorSearch
 from glassplat.render.frame import Renderer
 from glassplat.scene.tint import with_tint
 from glassplat.train.environment_entry import AddEnvironment
@@ -46,11 +47,11 @@ class BeginReflections:
         if self.surroundings is None and not self.mirrors.begin_found:
             return True
         yield Working("looking for mirrors", 0, 1)
-        seen, mirrors = self.mirrors.looks(state.scene, dataset.train, self.renderer)
+        seen, mirrors = mirror_lookalikes(self.mirrors, state.scene, dataset.train, self.renderer)
         if self.surroundings is not None:
             self.surroundings(state, dataset, seen & ~mirrors)
         if self.mirrors.begin_found:
-            primary = self.mirrors.as_mirrors(state.scene, dataset.train, mirrors)
+            primary = made_mirrors(self.mirrors, state.scene, dataset.train, mirrors)
             if self.harmonics_wait and bool(mirrors.any()):
                 primary = replace(primary, active_sh_degree=0)
             state.scene = replace(state.scene, primary=primary)

@@ -18,7 +18,7 @@ from glassplat.files.folders import make_folder
 from glassplat.train.background import settled
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.messages import ActionDone, CheckpointWritten, Message, RunBegun, StepDone, Working
-from glassplat.train.run_directory import RunDirectory, RunSettings, check_output
+from glassplat.train.run_directory import CHECKPOINT_SECONDS, RunDirectory, RunSettings, check_output
 from glassplat.train.run_lock import run_lock
 from glassplat.train.run_log import RunLog, open_log
 from glassplat.train.stage import Stage, check_length
@@ -26,8 +26,6 @@ from glassplat.train.state import TrainState
 from glassplat.train.trainer import train
 
 Listener = Callable[[Message], None]
-CHECKPOINT_SECONDS = 120.0
-"""What a power cut may cost at the most, unless the user says otherwise."""
 STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 """Ctrl-C, what a shut-down or a job scheduler sends before it kills, and what a closed terminal leaves behind."""
 

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from glassplat.data.dataset import Dataset
     from glassplat.scene.scene import Scene
 
+CHECKPOINT_SECONDS = 120.0
+"""What a power cut may cost at the most, unless the user says otherwise."""
+
 
 @dataclass(frozen=True)
 class RunSettings:

@@ -2,72 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar, Literal
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from glassplat.data.dataset import Dataset
-from glassplat.data.ranges import ESSENTIAL, Color, LearningRate, NotNegative, PositiveShare, Range, Share, ShDegree
-from glassplat.densify.default import DefaultDensify
-from glassplat.densify.mcmc import McmcDensify
-from glassplat.init.points import as_discs
-from glassplat.losses.discs import disc_normals, distortion
-from glassplat.losses.parsimony import view_dependence
-from glassplat.losses.photometric import PhotometricLoss
-from glassplat.losses.term import LossTerm, weighted
-from glassplat.render.splat import Splat
-from glassplat.scene.scene import Scene
-from glassplat.train.actions import GrowSh
-from glassplat.train.background import BLACK
-from glassplat.train.optimizer import PUBLISHED_ITERATIONS, Rate
-from glassplat.train.photo_exposure import PhotoExposure
-from glassplat.train.pose_refinement import PoseRefinement
-from glassplat.train.stage import Every, Stage
-from glassplat.train.strategy import Population, Rhythm, Strategy, population_of
+from glassplat.data.ranges import (
+    ESSENTIAL,
+    Color,
+    NotNegative,
+    Share,
+    ShDegree,
+)
+from glassplat.densify.options import DefaultDensify, McmcDensify
+from glassplat.train.photograph_options import PhotoExposure, PoseRefinement
+from glassplat.train.rates import PUBLISHED_ITERATIONS, GaussianRates
+from glassplat.train.rhythm import Rhythm, Strategy
 
-
-@dataclass(frozen=True)
-class GaussianRates:
-    """Learning rates of a set of Gaussians (3DGS).
-
-    Attributes:
-        means: position, per scene extent, at the start of the run; decays to `means_end`.
-        decay: share of the run at which it has done so.
-        sh: constant SH coefficient; the others get a twentieth.
-        opacity, scale, rotation: of the raw values.
-        intensity: of the reflection intensity's logarithm.
-        short_run_power: in a run of n < 30,000 iterations the rates of position, colour, scale and rotation are
-            (30,000 / n) to this power times as large, n being 3,000 at the least; 0 keeps the published ones
-            (docs/experiments.md).
-    """
-
-    means: LearningRate = 1.6e-4
-    means_end: PositiveShare = 1.6e-6
-    decay: PositiveShare = 1.0
-    sh: LearningRate = 2.5e-3
-    opacity: LearningRate = 5e-2
-    scale: LearningRate = 5e-3
-    rotation: LearningRate = 1e-3
-    intensity: LearningRate = 5e-3
-    short_run_power: Annotated[float, Range(0, 2)] = 0.5
-
-    def of(self, part: str) -> dict[str, Rate]:
-        """The rates by dotted parameter name."""
-        power = self.short_run_power
-        return {
-            f"{part}.means": Rate(self.means, self.means_end, decay=self.decay, per_extent=True, short_run_power=power),
-            f"{part}.sh": Rate(self.sh, rest=1 / 20, short_run_power=power),
-            f"{part}.logit_opacities": Rate(self.opacity),
-            f"{part}.log_scales": Rate(self.scale, short_run_power=power),
-            f"{part}.quats": Rate(self.rotation, short_run_power=power),
-        }
-
-
-def image_terms(ssim_weight: float, view_dependence_weight: float) -> tuple[LossTerm, ...]:
-    """(1 - lambda) L1 + lambda D-SSIM (TR-Gaussians, Eq. 18), and what keeps colours from turning with the view."""
-    return weighted(
-        LossTerm("photometric", 1.0, PhotometricLoss(ssim_weight)),
-        LossTerm("view dependence", view_dependence_weight, view_dependence),
-    )
+if TYPE_CHECKING:
+    from glassplat.data.dataset import Dataset
+    from glassplat.render.splat import Splat
+    from glassplat.scene.scene import Scene
+    from glassplat.train.stage import Stage
 
 
 Primitive = Literal["ellipsoid", "disc"]
@@ -88,15 +42,6 @@ class DiscTerms:
     distortion_start: Share = 3_000 / 30_000
     normal_weight: NotNegative = 0.05
     normal_start: Share = 7_000 / 30_000
-
-    def by_start(self) -> tuple[tuple[float, LossTerm], ...]:
-        """The terms that count at all, with the shares of the run after which they do, in order."""
-        terms = (
-            (self.distortion_start, LossTerm("distortion", self.distortion_weight, distortion)),
-            (self.normal_start, LossTerm("normals", self.normal_weight, disc_normals)),
-        )
-        wanted = [(start, term) for start, term in terms if term.weight > 0 and start < 1]
-        return tuple(sorted(wanted, key=lambda pair: pair[0]))
 
 
 @dataclass(frozen=True)
@@ -147,45 +92,18 @@ class SplatRecipe:
 
     def initialise(self, dataset: Dataset) -> Scene:
         """The first scene: one Gaussian per point."""
-        first = self._population().initial(dataset.points, self.sh_degree)
-        scene = Scene(as_discs(first) if self.primitive == "disc" else first, dataset.extent)
-        return self.poses.begun(self.exposure.begun(scene, dataset), dataset)
+        from glassplat.train.splat_stages import first_scene
+
+        return first_scene(self, dataset)
 
     def renderer(self) -> Splat:
         """The renderer of the finished scene, with all its layers."""
-        return Splat(self.background or BLACK)
+        from glassplat.train.splat_stages import finished_renderer
+
+        return finished_renderer(self)
 
     def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
         """One stage; of discs a new one whenever one of their terms begins to count."""
-        population = self._population()
-        first = Stage(
-            name="splat",
-            share=1.0,
-            renderer=self._bare(),
-            losses=(*image_terms(self.ssim_weight, self.view_dependence_weight), *population.terms),
-            rates=self.rates.of("primary"),
-            actions=(*population.edits, GrowSh(Every(self.rhythm.sh)), *population.resets),
-            motions=population.motions,
-            densify_until=population.densify_until,
-        )
-        stages, began = [first], 0.0
-        for start, term in self.discs.by_start() if self.primitive == "disc" else ():
-            last = stages.pop()
-            stages += [replace(last, share=start - began)] if start > began else []
-            losses = (*last.losses, term)
-            with_normals = any(known.function is disc_normals for known in losses)
-            name = f"{last.name}, {term.name}"
-            stages.append(replace(last, name=name, renderer=self._bare(normal=with_normals), losses=losses))
-            began = start
-        stages[-1] = replace(stages[-1], share=1 - began)
-        return self.poses.learnt_in(self.exposure.learnt_in(tuple(stages)))
+        from glassplat.train.splat_stages import stages_of
 
-    def _bare(self, *, normal: bool = False) -> Splat:
-        """The renderer with what the losses need and no more."""
-        return Splat(self.background or BLACK, depth=False, normal=normal)
-
-    def _population(self) -> Population:
-        means_rate = self.rates.of("primary")["primary.means"]
-        return population_of(
-            self.strategy, default=self.densify, mcmc=self.mcmc, rhythm=self.rhythm, means_rate=means_rate
-        )
+        return stages_of(self, seed, iterations)

@@ -15,7 +15,7 @@ from glassplat.data.errors import InputError
 from glassplat.losses.term import LossTerm
 from glassplat.render.frame import Renderer
 from glassplat.train.messages import Working
-from glassplat.train.optimizer import Rate
+from glassplat.train.rates import Rate
 from glassplat.train.state import TrainState
 
 

@@ -3,47 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
 
-from glassplat.data.capture import PointCloud
-from glassplat.data.ranges import PositiveShare, Range, Several, Share
-from glassplat.densify.default import DefaultDensify
-from glassplat.densify.mcmc import McmcDensify
+from glassplat.data.point_cloud import PointCloud
+from glassplat.densify.options import DefaultDensify, McmcDensify
 from glassplat.init.points import gaussians_from_points
 from glassplat.losses.parsimony import mean_opacity, mean_scale, of_all
 from glassplat.losses.term import LossTerm, weighted
 from glassplat.scene.gaussians import Gaussians
 from glassplat.train.actions import Densify, Explore, PruneIdle, Relocate, ResetOpacity
 from glassplat.train.averaging import AverageLast
-from glassplat.train.optimizer import Rate
+from glassplat.train.rates import Rate
+from glassplat.train.rhythm import Rhythm, Strategy
 from glassplat.train.stage import Action, Every, Motion
-
-Strategy = Literal["default", "mcmc"]
-
-
-@dataclass(frozen=True)
-class Rhythm:
-    """When opacities are disturbed, when the SH degree grows, and how a run ends.
-
-    Times are shares of the run (3DGS: of 30,000 iterations).
-
-    Every third beat resets the opacities, as in 3DGS; `planar` perturbs them at the other two, so that
-    the two never meet (TR-Gaussians, Section III-C3).
-
-    Attributes:
-        beat: distance between beats, as a share of the run.
-        least: fewest iterations between beats; what a beat disturbs needs as many to recover.
-        reset_stop: share of the run after which no reset happens; the `mcmc` strategy has none.
-        sh: distance between rises of the SH degree, as a share of the run.
-        averaged_passes: passes over the views at the end of the run of which the scene becomes the mean; 0 keeps the
-            last step.
-    """
-
-    beat: PositiveShare = 1 / 30
-    least: Several = 250
-    reset_stop: Share = 0.45
-    sh: PositiveShare = 1 / 30
-    averaged_passes: Annotated[float, Range(0, 1000)] = 1.0
 
 
 @dataclass(frozen=True)

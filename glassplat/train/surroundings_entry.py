@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
 
 from torch import Tensor
 
 from glassplat.data.dataset import Dataset
-from glassplat.data.ranges import ESSENTIAL, InnerShare, Range
 from glassplat.densify.edit import apply_edit
 from glassplat.densify.order import in_morton_order
 from glassplat.init.points import as_discs
@@ -20,27 +18,8 @@ from glassplat.init.surroundings import (
     surroundings_in_box,
 )
 from glassplat.scene.gaussians import Gaussians
+from glassplat.train.mirror_options import SurroundingsStart
 from glassplat.train.state import TrainState
-
-
-@dataclass(frozen=True)
-class SurroundingsStart:
-    """What the first surroundings are.
-
-    Attributes:
-        source: Gaussians all over the box of the scene (the paper's), or copies of what stands in the scene and does
-            not reflect, or both.
-        cells: along an edge of the box; None takes as many as suit the photographs, 32 at the most (paper: 32).
-        per_cell: Gaussians in each cell.
-        outside: share of the points left out of the box at either end of each axis.
-        opacity: of those in the box.
-    """
-
-    source: Annotated[Literal["box", "scene", "both"], ESSENTIAL] = "scene"
-    cells: Annotated[int, Range(1, 256)] | None = None
-    per_cell: Annotated[int, Range(1, 1000)] = 5
-    outside: Annotated[float, Range(0, 0.45)] = 0.005
-    opacity: InnerShare = 0.1
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from glassplat.data.dataset import Dataset
 from glassplat.data.ranges import (
     ESSENTIAL,
     Ascending,
@@ -19,55 +18,31 @@ from glassplat.data.ranges import (
     Share,
     ShDegree,
 )
-from glassplat.densify.default import DefaultDensify
-from glassplat.densify.mcmc import McmcDensify
-from glassplat.densify.mirrors import MirrorSearch
-from glassplat.densify.propagate import NormalPropagation
-from glassplat.init.points import as_discs
-from glassplat.losses.monocular import MonocularNormals
-from glassplat.losses.term import LossTerm, weighted
-from glassplat.render.deferred import Deferred
-from glassplat.render.traced import Traced, mirrored_contributions
-from glassplat.scene.gaussians import SH_ZERO
-from glassplat.scene.scene import Scene
-from glassplat.train.actions import Densify, GrowSh, PruneIdle, ResetOpacity
-from glassplat.train.background import BLACK
-from glassplat.train.deferred_recipe import DeferredRecipe, ReflectionRates, Texels
-from glassplat.train.optimizer import PUBLISHED_ITERATIONS
-from glassplat.train.photo_exposure import PhotoExposure
-from glassplat.train.pose_refinement import PoseRefinement
-from glassplat.train.propagation import Propagate, PropagationSchedule, RefineEnvironment
-from glassplat.train.splat_recipe import GaussianRates, Primitive
-from glassplat.train.stage import Action, Every, Stage
-from glassplat.train.strategy import Rhythm, Strategy
-from glassplat.train.surroundings_entry import AddSurroundings, SurroundingsStart
+from glassplat.densify.options import DefaultDensify, McmcDensify, MirrorSearch, NormalPropagation
+from glassplat.scene.activations import SH_ZERO
+from glassplat.train.deferred_recipe import DeferredRecipe
+from glassplat.train.mirror_options import (
+    PropagationSchedule,
+    SurroundingsOptions,
+    SurroundingsStart,
+    Texels,
+)
+from glassplat.train.photograph_options import PhotoExposure, PoseRefinement
+from glassplat.train.rates import PUBLISHED_ITERATIONS, GaussianRates, ReflectionRates
+from glassplat.train.rhythm import Rhythm, Strategy
+from glassplat.train.splat_recipe import Primitive
+
+if TYPE_CHECKING:
+    from glassplat.data.dataset import Dataset
+    from glassplat.render.deferred import Deferred
+    from glassplat.render.traced import Traced
+    from glassplat.scene.scene import Scene
+    from glassplat.train.stage import Stage
+
 
 CODE_ITERATIONS = 60_000
 """Length of the longest runs of the public code."""
 Mirrors = Literal["both", "surroundings", "environment"]
-
-
-@dataclass(frozen=True)
-class SurroundingsOptions:
-    """How the surroundings learn.
-
-    Attributes:
-        start: what they are at first.
-        sh_degree: highest degree of the colours that turn with the ray.
-        rates: learning rates.
-        densify: when and how Gaussians are added and pruned, by gradients in space times half of the distance.
-        reset: also reset their opacities when those of the scene are (paper).
-    """
-
-    start: SurroundingsStart = field(default_factory=SurroundingsStart)
-    sh_degree: ShDegree = 1
-    rates: GaussianRates = field(default_factory=GaussianRates)
-    densify: DefaultDensify = field(
-        default_factory=partial(
-            DefaultDensify, split_by="gradient", stop=0.7, least_contribution=0.02, contribution_moments=(0.8,)
-        )
-    )
-    reset: bool = False
 
 
 @dataclass(frozen=True)
@@ -217,72 +192,31 @@ class TracedRecipe:
             mcmc=McmcDensify.published(),
         )
 
+    def contradiction(self) -> str | None:
+        """What is wrong with the options together, if anything."""
+        return self.distant().contradiction()
+
+    def distant(self) -> DeferredRecipe:
+        """The recipe of `deferred` with the options that both have."""
+        return DeferredRecipe(**{name: getattr(self, name) for name in SHARED})
+
     def initialise(self, dataset: Dataset) -> Scene:
         """The first scene: one Gaussian per point that hardly reflects, and nothing to mirror yet."""
-        scene = self._distant().initialise(dataset)
-        return replace(scene, primary=as_discs(scene.primary)) if self.primitive == "disc" else scene
+        from glassplat.train.traced_stages import first_scene
+
+        return first_scene(self, dataset)
 
     def renderer(self) -> Traced | Deferred:
         """The renderer of the finished scene, with all its layers."""
-        if self.mirrors == "environment" and self.primitive == "ellipsoid":
-            return self._distant().renderer()
-        return Traced(self.background or BLACK, self.least_strength)
+        from glassplat.train.traced_stages import finished_renderer
+
+        return finished_renderer(self)
 
     def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
         """Bootstrap, reflections, everything without propagation; a short run has one stage."""
-        known = self._distant().stages(seed, iterations)
-        if len(known) == 1:
-            return known
-        bootstrap, distant, refinement = known
-        if self.primitive == "disc":
-            distant, refinement = self._rendered(distant), self._rendered(refinement)
-        if self.consistency_to_end:
-            refinement = replace(refinement, losses=distant.losses, renderer=distant.renderer)
-        guided = weighted(LossTerm("monocular normals", self.monocular_weight, MonocularNormals()))
-        distant, refinement = (replace(s, losses=(*s.losses, *guided)) for s in (distant, refinement))
-        if self.mirrors == "environment":
-            return bootstrap, distant, refinement
-        entry = self._distant().entry()
-        around = AddSurroundings(self.surroundings.start, self.surroundings.sh_degree)
-        environment = None if self.mirrors == "surroundings" else entry.environment
-        near = replace(self._tracing(distant), entry=replace(entry, environment=environment, surroundings=around))
-        return bootstrap, near, self._tracing(refinement)
+        from glassplat.train.traced_stages import stages_of
 
-    def contradiction(self) -> str | None:
-        """What is wrong with the options together, if anything."""
-        return self._distant().contradiction()
-
-    def _tracing(self, stage: Stage) -> Stage:
-        """A stage of `deferred` in which rays find what is mirrored."""
-        stage = self._rendered(stage)
-        return replace(
-            stage,
-            rates={**stage.rates, **self.surroundings.rates.of("surroundings")},
-            actions=(*stage.actions, *self._surroundings_actions(stage)),
-            densify_until=max(stage.densify_until, self.surroundings.densify.stop),
-        )
-
-    def _rendered(self, stage: Stage) -> Stage:
-        """A stage of `deferred` with this method's renderer, which propagation looks through as well."""
-        renderer = Traced(self.background or BLACK, self.least_strength, faintest=0.0, joint=self.joint)
-        kept = [a for a in stage.actions if self.mirrors != "surroundings" or not isinstance(a, RefineEnvironment)]
-        actions = [replace(action, renderer=renderer) if isinstance(action, Propagate) else action for action in kept]
-        return replace(stage, renderer=renderer, actions=tuple(actions))
-
-    def _surroundings_actions(self, stage: Stage) -> list[Action]:
-        """What changes the surroundings, but for learning."""
-        options = self.surroundings
-        resets = [a for a in stage.actions if isinstance(a, ResetOpacity)] if options.reset else []
-        return [
-            Densify(options.densify, "surroundings"),
-            PruneIdle(options.densify, "surroundings", mirrored_contributions),
-            GrowSh(Every(self.rhythm.sh), "surroundings"),
-            *(ResetOpacity(reset.when, reset.ceiling, "surroundings") for reset in resets),
-        ]
-
-    def _distant(self) -> DeferredRecipe:
-        """The recipe of `deferred` with the options that both have."""
-        return DeferredRecipe(**{name: getattr(self, name) for name in SHARED})
+        return stages_of(self, seed, iterations)
 
 
 SHARED = tuple({f.name for f in fields(DeferredRecipe)} & {f.name for f in fields(TracedRecipe)})

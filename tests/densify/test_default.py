@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from glassplat.densify.default import DefaultDensify, ScreenStatistics, reset_opacity
+from glassplat.densify.default import ScreenStatistics, densified, reset_opacity
+from glassplat.densify.options import DefaultDensify
 from glassplat.kernels.screen_statistics import Views
 from glassplat.scene.gaussians import Gaussians
 
@@ -31,9 +32,9 @@ def seen(gradients: list[float], pulls: list[float] | None = None, radius: float
     return ScreenStatistics(*sums, torch.full((count,), radius))
 
 
-def densified(options: DefaultDensify, gaussians: Gaussians, statistics: ScreenStatistics, **extra: bool) -> Gaussians:
+def edited(options: DefaultDensify, gaussians: Gaussians, statistics: ScreenStatistics, **extra: bool) -> Gaussians:
     rng = torch.Generator().manual_seed(0)
-    return options.densify(gaussians, {}, statistics, extent=EXTENT, generator=rng, **extra)[0]
+    return densified(options, gaussians, {}, statistics, extent=EXTENT, generator=rng, **extra)[0]
 
 
 def test_mirror_images_count_only_for_what_is_not_seen_directly() -> None:
@@ -59,7 +60,7 @@ def test_statistics_do_not_depend_on_the_resolution() -> None:
 
 def test_small_ones_are_cloned_large_ones_split_and_the_rest_kept() -> None:
     gaussians = make_gaussians([0.001, 0.5, 0.001, 0.5])
-    after = densified(DefaultDensify(), gaussians, seen([1e-3, 1e-3, 1e-5, 1e-5]))
+    after = edited(DefaultDensify(), gaussians, seen([1e-3, 1e-3, 1e-5, 1e-5]))
     assert len(after) == 6
     sizes = after.log_scales[:, 0].exp()
     assert sizes.tolist() == pytest.approx([0.001, 0.001, 0.5, 0.5 / 1.6, 0.5 / 1.6, 0.001])
@@ -68,7 +69,7 @@ def test_small_ones_are_cloned_large_ones_split_and_the_rest_kept() -> None:
 
 def test_pixels_that_pull_against_each_other_split_what_is_large_only() -> None:
     gaussians = make_gaussians([0.001, 0.5, 0.5])
-    after = densified(DefaultDensify(), gaussians, seen([0.0, 0.0, 1e-3], pulls=[1e-2, 1e-2, 1e-4]))
+    after = edited(DefaultDensify(), gaussians, seen([0.0, 0.0, 1e-3], pulls=[1e-2, 1e-2, 1e-4]))
     assert after.log_scales[:, 0].exp().tolist() == pytest.approx([0.001, 0.5, 0.5 / 1.6, 0.5 / 1.6])
 
 
@@ -76,36 +77,37 @@ def test_transparent_gaussians_are_pruned_together_with_their_moments() -> None:
     gaussians = make_gaussians([0.001] * 3, [0.5, 0.004, 0.5])
     moments = {"primary.means": (gaussians.means + 1, gaussians.means + 2)}
     rng = torch.Generator().manual_seed(0)
-    after, moments = DefaultDensify().densify(gaussians, moments, seen([0.0, 1.0, 0.0]), extent=EXTENT, generator=rng)
+    statistics = seen([0.0, 1.0, 0.0])
+    after, moments = densified(DefaultDensify(), gaussians, moments, statistics, extent=EXTENT, generator=rng)
     assert torch.equal(after.means, gaussians.means[[0, 2]])
     assert torch.equal(moments["primary.means"][0], gaussians.means[[0, 2]] + 1)
 
 
 def test_large_ones_are_pruned_only_when_asked() -> None:
     gaussians = make_gaussians([0.1, 0.3])
-    assert len(densified(DefaultDensify(), gaussians, seen([0.0, 0.0]))) == 2
-    assert len(densified(DefaultDensify(), gaussians, seen([0.0, 0.0]), prune_large=True)) == 1
+    assert len(edited(DefaultDensify(), gaussians, seen([0.0, 0.0]))) == 2
+    assert len(edited(DefaultDensify(), gaussians, seen([0.0, 0.0]), prune_large=True)) == 1
     wide = seen([0.0, 0.0], radius=0.3)
-    assert len(densified(DefaultDensify(prune_radius_fraction=0.2), gaussians, wide, prune_large=True)) == 0
+    assert len(edited(DefaultDensify(prune_radius_fraction=0.2), gaussians, wide, prune_large=True)) == 0
 
 
 def test_cap_lets_the_largest_gradients_grow() -> None:
     gaussians = make_gaussians([0.001] * 4)
-    after = densified(DefaultDensify(cap=6), gaussians, seen([3e-4, 9e-4, 8e-4, 0.0]))
+    after = edited(DefaultDensify(cap=6), gaussians, seen([3e-4, 9e-4, 8e-4, 0.0]))
     assert after.means[4:].tolist() == gaussians.means[[1, 2]].tolist()
-    assert len(densified(DefaultDensify(cap=3), gaussians, seen([1.0] * 4))) == 4
+    assert len(edited(DefaultDensify(cap=3), gaussians, seen([1.0] * 4))) == 4
 
 
 def test_same_seed_same_bits() -> None:
     gaussians, statistics = make_gaussians([0.5] * 8), seen([1.0] * 8)
-    first = densified(DefaultDensify(), gaussians, statistics)
-    second = densified(DefaultDensify(), gaussians, statistics)
+    first = edited(DefaultDensify(), gaussians, statistics)
+    second = edited(DefaultDensify(), gaussians, statistics)
     assert torch.equal(first.means, second.means)
 
 
 def test_stale_statistics_are_refused() -> None:
     with pytest.raises(ValueError, match="3 rows for 2 Gaussians"):
-        densified(DefaultDensify(), make_gaussians([0.1, 0.1]), ScreenStatistics.zeros(3))
+        edited(DefaultDensify(), make_gaussians([0.1, 0.1]), ScreenStatistics.zeros(3))
 
 
 def test_reset_lowers_high_opacities_and_forgets_their_moments() -> None:

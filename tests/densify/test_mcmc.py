@@ -8,7 +8,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.densify.mcmc import MOST_COPIES, McmcDensify, rank_among_equals, shared_contribution
+from glassplat.densify.mcmc import (
+    MOST_COPIES,
+    exploring_noise,
+    rank_among_equals,
+    relocation,
+    resampled,
+    shared_contribution,
+)
+from glassplat.densify.options import McmcDensify
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.pose import rotation_from_quat
 
@@ -73,7 +81,7 @@ def test_extreme_opacities_stay_finite() -> None:
 
 def test_the_dead_end_up_where_the_live_are_and_share_their_contribution() -> None:
     before = make_gaussians([0.9, 0.001, 0.4, 0.005, 0.002, 0.6])
-    after, _ = OPTIONS.densify(before, {}, cap=0, generator=rng())
+    after, _ = resampled(OPTIONS, before, {}, cap=0, generator=rng())
     live = [0, 2, 5]
     assert len(after) == len(before)
     assert torch.equal(after.means[live], before.means[live])
@@ -88,7 +96,7 @@ def test_the_dead_end_up_where_the_live_are_and_share_their_contribution() -> No
 
 def test_live_ones_are_drawn_in_proportion_to_their_opacity() -> None:
     opacities = [0.8, 0.2] * 100 + [0.001] * 1000
-    edit = OPTIONS.relocation(make_gaussians(opacities), rng())
+    edit = relocation(OPTIONS, make_gaussians(opacities), rng())
     moved = edit.source[200:]
     assert (moved < 200).all()
     assert (moved % 2 == 0).float().mean().item() == pytest.approx(0.8, abs=0.04)
@@ -96,7 +104,7 @@ def test_live_ones_are_drawn_in_proportion_to_their_opacity() -> None:
 
 def test_moments_start_again_where_values_changed() -> None:
     before = make_gaussians([0.9, 0.001] + [0.006] * 4)
-    after, moments = OPTIONS.densify(before, make_moments(before), cap=0, generator=rng())
+    after, moments = resampled(OPTIONS, before, make_moments(before), cap=0, generator=rng())
     changed = after.logit_opacities != before.logit_opacities
     assert changed.sum() == 2
     for name, tensor in before.tensors().items():
@@ -108,14 +116,14 @@ def test_moments_start_again_where_values_changed() -> None:
 def test_moments_of_other_parts_pass_through() -> None:
     before = make_gaussians([0.9, 0.001])
     pair = (torch.ones(7), torch.ones(7))
-    _, moments = OPTIONS.densify(before, {"glass.logit_mark": pair}, cap=10, generator=rng())
+    _, moments = resampled(OPTIONS, before, {"glass.logit_mark": pair}, cap=10, generator=rng())
     assert moments["glass.logit_mark"] is pair or moments["glass.logit_mark"][0] is pair[0]
 
 
 @pytest.mark.parametrize(("cap", "expected"), [(1000, 105), (103, 103), (100, 100), (50, 100)])
 def test_growth_is_a_twentieth_up_to_the_cap(cap: int, expected: int) -> None:
     before = make_gaussians([0.5] * 100)
-    after, moments = OPTIONS.densify(before, make_moments(before), cap=cap, generator=rng())
+    after, moments = resampled(OPTIONS, before, make_moments(before), cap=cap, generator=rng())
     assert len(after) == expected
     new = moments["primary.means"][0][100:]
     assert new.shape == (expected - 100, 3) and not new.any()
@@ -124,7 +132,7 @@ def test_growth_is_a_twentieth_up_to_the_cap(cap: int, expected: int) -> None:
 
 def test_a_place_takes_no_more_than_the_sum_is_exact_for() -> None:
     before = make_gaussians([0.8] + [0.001] * 200)
-    after, _ = OPTIONS.densify(before, {}, cap=0, generator=rng())
+    after, _ = resampled(OPTIONS, before, {}, cap=0, generator=rng())
     together = (after.means == before.means[0]).all(dim=1)
     assert together.sum() == MOST_COPIES
     opacities = torch.sigmoid(after.logit_opacities[together].double())
@@ -135,30 +143,30 @@ def test_a_place_takes_no_more_than_the_sum_is_exact_for() -> None:
 @pytest.mark.parametrize("opacities", [[], [0.001], [0.001, 0.002, 0.004]], ids=["none", "one dead", "all dead"])
 def test_without_live_ones_nothing_happens(opacities: list[float]) -> None:
     before = make_gaussians(opacities)
-    after, moments = OPTIONS.densify(before, make_moments(before), cap=100, generator=rng())
+    after, moments = resampled(OPTIONS, before, make_moments(before), cap=100, generator=rng())
     for name, tensor in before.tensors().items():
         assert torch.equal(after.tensors()[name], tensor)
         assert torch.equal(moments[f"primary.{name}"][0], tensor + 10)
-    assert OPTIONS.noise(before, rate=1e-4, extent=1.0, generator=rng()).shape == before.means.shape
+    assert exploring_noise(OPTIONS, before, rate=1e-4, extent=1.0, generator=rng()).shape == before.means.shape
 
 
 def test_a_single_live_one_is_doubled() -> None:
-    after, _ = OPTIONS.densify(make_gaussians([0.75]), {}, cap=100, generator=rng())
+    after, _ = resampled(OPTIONS, make_gaussians([0.75]), {}, cap=100, generator=rng())
     assert torch.sigmoid(after.logit_opacities).tolist() == pytest.approx([0.5, 0.5])
 
 
 def test_the_same_seed_gives_the_same_set_and_another_seed_another() -> None:
     before = make_gaussians([0.9, 0.001, 0.5, 0.3, 0.002] * 20)
-    sets = [OPTIONS.densify(before, {}, cap=1000, generator=rng(seed))[0] for seed in (3, 3, 4)]
+    sets = [resampled(OPTIONS, before, {}, cap=1000, generator=rng(seed))[0] for seed in (3, 3, 4)]
     assert all(torch.equal(t, sets[1].tensors()[name]) for name, t in sets[0].tensors().items())
     assert not torch.equal(sets[0].means, sets[2].means)
-    noises = [OPTIONS.noise(before, rate=1e-4, extent=1.0, generator=rng(seed)) for seed in (3, 3, 4)]
+    noises = [exploring_noise(OPTIONS, before, rate=1e-4, extent=1.0, generator=rng(seed)) for seed in (3, 3, 4)]
     assert torch.equal(noises[0], noises[1]) and not torch.equal(noises[0], noises[2])
 
 
 def test_noise_leaves_opaque_ones_alone_and_follows_its_gate() -> None:
     gaussians = make_gaussians([0.99, 0.005, 0.5])
-    noise = OPTIONS.noise(gaussians, rate=1.6e-4, extent=1.0, generator=rng())
+    noise = exploring_noise(OPTIONS, gaussians, rate=1.6e-4, extent=1.0, generator=rng())
     assert torch.equal(gaussians.means[0] + noise[0], gaussians.means[0])
     assert noise[1].norm() > 1e-3
     assert noise[2].norm() < 1e-15
@@ -167,7 +175,9 @@ def test_noise_leaves_opaque_ones_alone_and_follows_its_gate() -> None:
 def test_noise_is_shaped_by_the_covariance() -> None:
     count = 40_000
     one = make_gaussians([0.005])
-    noise = OPTIONS.noise(one.select(torch.zeros(count, dtype=torch.int64)), rate=1e-3, extent=2.0, generator=rng())
+    noise = exploring_noise(
+        OPTIONS, one.select(torch.zeros(count, dtype=torch.int64)), rate=1e-3, extent=2.0, generator=rng()
+    )
     rotation = rotation_from_quat(one.quats[0])
     covariance = rotation @ torch.diag((2 * one.log_scales[0]).exp()) @ rotation.T
     expected = (5e5 * 1e-3 * 0.5 / 2.0 * covariance) @ (5e5 * 1e-3 * 0.5 / 2.0 * covariance).T
@@ -177,8 +187,8 @@ def test_noise_is_shaped_by_the_covariance() -> None:
 def test_noise_does_not_depend_on_the_units_of_the_capture() -> None:
     metres = make_gaussians([0.004] * 5)
     millimetres = metres.with_tensors({"log_scales": metres.log_scales + math.log(1000)})
-    small = OPTIONS.noise(metres, rate=1e-4, extent=3.0, generator=rng())
-    large = OPTIONS.noise(millimetres, rate=1e-4, extent=3000.0, generator=rng())
+    small = exploring_noise(OPTIONS, metres, rate=1e-4, extent=3.0, generator=rng())
+    large = exploring_noise(OPTIONS, millimetres, rate=1e-4, extent=3000.0, generator=rng())
     assert torch.allclose(large, 1000 * small, rtol=1e-4)
 
 
@@ -190,6 +200,6 @@ def test_ranks_count_earlier_equals() -> None:
 def test_noise_leaves_discs_in_their_plane() -> None:
     solid = make_gaussians([0.01] * 40)
     discs = Gaussians(**{**vars(solid), "log_scales": solid.log_scales[:, :2].contiguous()})
-    offsets = McmcDensify().noise(discs, rate=1.0, extent=1.0, generator=torch.Generator().manual_seed(0))
+    offsets = exploring_noise(McmcDensify(), discs, rate=1.0, extent=1.0, generator=torch.Generator().manual_seed(0))
     normals = rotation_from_quat(discs.quats)[:, :, 2]
     assert float((offsets * normals).sum(1).abs().max()) < 1e-4 * float(offsets.norm(dim=1).max())

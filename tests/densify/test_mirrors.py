@@ -11,12 +11,14 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from glassplat.data.view import View
-from glassplat.densify.mirrors import FACING, MirrorSearch, facing, neighbours, seen_normals
+from glassplat.densify.mirrors import FACING, facing, made_mirrors, mirror_lookalikes, neighbours, seen_normals
+from glassplat.densify.options import MirrorSearch
 from glassplat.init.points import as_discs
 from glassplat.render.splat import Splat
+from glassplat.scene.activations import SH_ZERO
 from glassplat.scene.camera import Camera
 from glassplat.scene.environment import Environment
-from glassplat.scene.gaussians import SH_ZERO, Gaussians
+from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.pose import rotation_from_quat
 from glassplat.scene.scene import Scene
 from tests.densify.brightened_views import brightened_views
@@ -78,21 +80,21 @@ def inner(scene: Scene) -> Tensor:
 
 def test_what_looks_different_from_different_sides_looks_like_a_mirror() -> None:
     scene = slope()
-    seen, found = SEARCH.looks(scene, views(0.2, -0.2, 0.2, -0.2), Splat())
+    seen, found = mirror_lookalikes(SEARCH, scene, views(0.2, -0.2, 0.2, -0.2), Splat())
     x = scene.primary.means[:, 0]
     assert bool(seen.all()) and bool(found[x < -0.3].all()) and not bool(found[x > 0.3].any())
 
 
 def test_what_is_the_same_from_every_side_does_not_however_wrong_it_is() -> None:
-    assert not bool(SEARCH.looks(slope(), views(0.2, 0.2, 0.2), Splat())[1].any())
+    assert not bool(mirror_lookalikes(SEARCH, slope(), views(0.2, 0.2, 0.2), Splat())[1].any())
 
 
 def test_mirrors_are_looked_for_in_the_region_and_where_something_is_seen() -> None:
     scene = slope()
     elsewhere = replace(scene, environment=replace(scene.environment, region=(9.0, 0.0, 0.0, 1.0)))
-    assert not bool(SEARCH.looks(elsewhere, views(0.2, -0.2), Splat())[1].any())
+    assert not bool(mirror_lookalikes(SEARCH, elsewhere, views(0.2, -0.2), Splat())[1].any())
     behind = scene.with_parameters({"primary.means": scene.primary.means * torch.tensor([1.0, 1.0, -1.0])})
-    seen, found = SEARCH.looks(behind, views(0.2, -0.2), Splat())
+    seen, found = mirror_lookalikes(SEARCH, behind, views(0.2, -0.2), Splat())
     assert not bool(seen.any()) and not bool(found.any())
 
 
@@ -111,7 +113,7 @@ def test_depths_tell_which_way_a_surface_faces(discs: bool) -> None:
 def test_what_was_found_becomes_a_flat_mirror_and_nothing_else_changes() -> None:
     scene = slope()
     chosen = inner(scene) & (scene.primary.means[:, 0] < 0)
-    mirrors = SEARCH.as_mirrors(scene, views(0.0), chosen)
+    mirrors = made_mirrors(SEARCH, scene, views(0.0), chosen)
     for name, tensor in mirrors.tensors().items():
         assert torch.equal(tensor[~chosen], scene.primary.tensors()[name][~chosen]), name
     found = mirrors.select(chosen)

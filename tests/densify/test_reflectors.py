@@ -11,10 +11,10 @@ from glassplat.data.view import View
 from glassplat.densify.reflectors import Search, evenly, in_region, residual_spreads
 from glassplat.render.contribution import contributions
 from glassplat.render.deferred import Deferred
-from glassplat.scene.activations import logit
+from glassplat.scene.activations import SH_ZERO, logit
 from glassplat.scene.camera import Camera
 from glassplat.scene.environment import Environment
-from glassplat.scene.gaussians import SH_ZERO, Gaussians
+from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 from tests.densify.brightened_views import brightened_views
 

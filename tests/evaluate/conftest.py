@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from glassplat.data.point_cloud import PointCloud
 from PIL import Image
 from torch import Tensor
 
-from glassplat.data.capture import PointCloud
 from glassplat.data.dataset import Dataset
 from glassplat.data.view import View
 from glassplat.render.frame import Frame

@@ -20,8 +20,8 @@ from glassplat.evaluate.report import Report, overview_page, sheet_names
 from glassplat.evaluate.sheet import BACKGROUND, CAPTION_HEIGHT, MARGIN, TITLE_HEIGHT, comparison_sheet
 from glassplat.evaluate.surface_truth import TrueSurface
 from glassplat.files.images import read_image
+from glassplat.render.choices import Blend
 from glassplat.render.dereflect import dereflected_photo
-from glassplat.render.glazing import Blend
 from glassplat.scene.plane import Planes
 
 

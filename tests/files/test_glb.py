@@ -21,7 +21,8 @@ from hypothesis import strategies as st
 from glassplat.files.glb import EXTENSION, read_glb, write_glb
 from glassplat.files.glb_container import CHUNK, HEADER
 from glassplat.kernels.project.reference import rotations, sh_basis
-from glassplat.scene.gaussians import SH_ZERO, Gaussians
+from glassplat.scene.activations import SH_ZERO
+from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.pose import rotation_from_quat
 from tests.files.test_spz import shapes, typical
 

@@ -18,7 +18,8 @@ from glassplat.files.splat_files import SPLAT_ROW, drawable, read_splats
 from glassplat.files.spz import write_spz
 from glassplat.init.glass import with_intensity
 from glassplat.kernels.project.reference import rotations
-from glassplat.scene.gaussians import SH_ZERO, Gaussians
+from glassplat.scene.activations import SH_ZERO
+from glassplat.scene.gaussians import Gaussians
 from tests.files.test_spz import shapes, typical
 
 

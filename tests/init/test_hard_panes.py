@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from glassplat.init.planes import PlaneFit, PlaneFitError, fit_planes
+from glassplat.init.plane_options import PlaneFit, PlaneFitError
+from glassplat.init.planes import fit_planes
 from glassplat.scene.camera import Camera
 from glassplat.scene.pose import rotation_from_quat
 from tests.init.pane_scene import (

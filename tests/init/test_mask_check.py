@@ -9,7 +9,8 @@ import pytest
 
 from glassplat.init.annotation import pane_views
 from glassplat.init.mask_check import meeting_of_each, odd_ones
-from glassplat.init.planes import PlaneFit, fit_planes
+from glassplat.init.plane_options import PlaneFit
+from glassplat.init.planes import fit_planes
 from glassplat.init.ransac import FramedPlanes, PlaneEquations
 from tests.init.pane_scene import EYES, FRONT, Annotations, Pane, frame_and_clutter, scene_of
 

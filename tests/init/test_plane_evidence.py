@@ -12,8 +12,9 @@ import torch
 from glassplat.init.annotation import pane_views
 from glassplat.init.plane_evidence import Fit, best_supported, score
 from glassplat.init.plane_objective import Objective
+from glassplat.init.plane_options import PlaneFit
 from glassplat.init.plane_search import first_hypotheses
-from glassplat.init.planes import PlaneFit, fit_planes
+from glassplat.init.planes import fit_planes
 from glassplat.init.ransac import FramedPlanes, PlaneEquations
 from tests.init.pane_scene import FRONT, Pane, camera_from, frame_and_clutter, label_image, normal_error, scene_of
 

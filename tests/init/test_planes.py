@@ -10,7 +10,8 @@ from glassplat.init.annotation import pane_views
 from glassplat.init.consistency import mask_agreement
 from glassplat.init.plane_moves import planes_nearby
 from glassplat.init.plane_objective import Objective
-from glassplat.init.planes import PlaneFit, PlaneFitError, fit_planes
+from glassplat.init.plane_options import PlaneFit, PlaneFitError
+from glassplat.init.planes import fit_planes
 from glassplat.init.ransac import FramedPlanes, PlaneEquations
 from glassplat.scene.camera import Camera
 from glassplat.scene.pose import rotation_from_quat

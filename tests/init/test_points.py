@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 import torch
 
-from glassplat.data.capture import PointCloud
+from glassplat.data.capture import RawPoints
+from glassplat.data.point_cloud import PointCloud
 from glassplat.init.points import gaussians_from_points, morton_order
-from glassplat.scene.gaussians import SH_ZERO
+from glassplat.scene.activations import SH_ZERO
 
 
 def cloud(count: int, seed: int = 0) -> PointCloud:
     generator = np.random.default_rng(seed)
-    return PointCloud.from_arrays(generator.normal(size=(count, 3)), generator.integers(0, 256, (count, 3)))
+    return PointCloud.of(
+        RawPoints.from_arrays(generator.normal(size=(count, 3)), generator.integers(0, 256, (count, 3)))
+    )
 
 
 def test_every_point_is_one_gaussian_of_its_colour() -> None:
@@ -49,7 +52,7 @@ def test_few_points_have_a_size(count: int) -> None:
 
 def test_points_that_coincide_have_a_size() -> None:
     positions = np.repeat([[0.0, 0, 0], [1.0, 0, 0]], 5, axis=0)
-    points = PointCloud.from_arrays(positions, np.zeros_like(positions))
+    points = PointCloud.of(RawPoints.from_arrays(positions, np.zeros_like(positions)))
     torch.testing.assert_close(gaussians_from_points(points).log_scales.exp(), torch.full((10, 3), 1e-6))
 
 

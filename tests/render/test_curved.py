@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from glassplat.render.choices import Blend
 from glassplat.render.curved import before, curved_contributions, mirrored_cameras
-from glassplat.render.glazing import Blend
 from glassplat.render.mirror_images import half_spaces_of
 from glassplat.render.planar import Planar
 from glassplat.render.traced import Traced, mirrored_contributions

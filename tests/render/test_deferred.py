@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from glassplat.kernels.cube_lookup.reference import cube_lookup
-from glassplat.render.deferred import Deferred, Shading, view_directions
+from glassplat.render.choices import Shading
+from glassplat.render.deferred import Deferred, view_directions
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
 from glassplat.scene.environment import Environment

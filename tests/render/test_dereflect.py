@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from glassplat.kernels.color_space import linear_from_srgb, srgb_from_linear
+from glassplat.render.choices import Blend
 from glassplat.render.dereflect import as_mirror_image, dereflected_photo
 from glassplat.render.frame import Frame
-from glassplat.render.glazing import Blend
 from glassplat.render.planar import Planar
 from glassplat.scene.exposure import Exposures
 from glassplat.scene.plane_edits import as_mirrors

@@ -9,9 +9,9 @@ import torch
 
 from glassplat.kernels.blend_panes.reference import REFLECTANCE
 from glassplat.kernels.color_space import linear_from_srgb
+from glassplat.kernels.fresnel import Fresnel
 from glassplat.kernels.maths.pane import LAWS
-from glassplat.kernels.panes import Fresnel
-from glassplat.render.glazing import Blend
+from glassplat.render.choices import Blend
 from glassplat.render.planar import Planar, detached
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera

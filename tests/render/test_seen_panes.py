@@ -11,8 +11,9 @@ from torch import Tensor
 
 from glassplat.kernels.color_space import linear_from_srgb
 from glassplat.losses.reflection import gradient_conflict
+from glassplat.render.choices import Blend
 from glassplat.render.contribution import contributions
-from glassplat.render.glazing import FAINT, Blend, curves
+from glassplat.render.glazing import FAINT, curves
 from glassplat.render.planar import Planar
 from glassplat.render.seen_panes import glass_owners, nearest_hits, panes_in_camera, seen_panes
 from glassplat.scene.gaussians import Gaussians

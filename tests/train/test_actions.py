@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from glassplat.densify.default import DefaultDensify, ScreenStatistics
+from glassplat.densify.default import ScreenStatistics
+from glassplat.densify.options import DefaultDensify
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, PruneIdle, limit_of
 from glassplat.train.splat_recipe import SplatRecipe

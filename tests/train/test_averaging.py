@@ -12,10 +12,10 @@ from torch import Tensor
 from glassplat.train.averaging import AverageLast
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.messages import StepDone
+from glassplat.train.rhythm import Rhythm
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Clock, Stage
 from glassplat.train.state import TrainState
-from glassplat.train.strategy import Rhythm
 from glassplat.train.trainer import train
 from tests.train.tiny_capture import tiny_capture
 

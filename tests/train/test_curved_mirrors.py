@@ -12,23 +12,20 @@ from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError
 from glassplat.data.options import options_from_json
 from glassplat.data.view import View
-from glassplat.densify.default import DefaultDensify
-from glassplat.densify.mirrors import MirrorSearch
-from glassplat.densify.propagate import NormalPropagation
+from glassplat.densify.options import DefaultDensify, MirrorSearch, NormalPropagation
 from glassplat.densify.reflectors import residual_spreads
 from glassplat.files.scene_folder import read_scene, write_scene
 from glassplat.render.planar import Planar
 from glassplat.scene.gaussians import Gaussians
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
-from glassplat.train.curved_mirrors import RESHAPED, BeginCurved, CurvedMirrors, SpreadMirrors, beside_mirrors
+from glassplat.train.curved_mirrors import RESHAPED, BeginCurved, SpreadMirrors, beside_mirrors
 from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
+from glassplat.train.mirror_options import CurvedMirrors, SurroundingsOptions, SurroundingsStart
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
+from glassplat.train.rhythm import Rhythm
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
-from glassplat.train.strategy import Rhythm
-from glassplat.train.surroundings_entry import SurroundingsStart
-from glassplat.train.traced_recipe import SurroundingsOptions
 from glassplat.train.trainer import train
 from tests.densify.test_outlines import TRUE, cameras, surrounded
 from tests.render.test_curved import CAMERA, glossy

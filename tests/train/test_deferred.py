@@ -12,8 +12,7 @@ import pytest
 import torch
 
 from glassplat.data.view import View
-from glassplat.densify.mirrors import MirrorSearch
-from glassplat.densify.propagate import NormalPropagation
+from glassplat.densify.options import MirrorSearch, NormalPropagation
 from glassplat.densify.reflectors import Search
 from glassplat.render.deferred import Deferred
 from glassplat.scene.activations import logit
@@ -22,22 +21,16 @@ from glassplat.train.actions import ResetOpacity
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.messages import ActionDone, Message, StepDone
-from glassplat.train.optimizer import Rate
-from glassplat.train.propagation import (
-    ENDED,
-    RAISED,
-    Propagate,
-    PropagationSchedule,
-    RefineEnvironment,
-    ResetRaised,
-)
+from glassplat.train.mirror_options import PropagationSchedule
+from glassplat.train.propagation import ENDED, RAISED, Propagate, RefineEnvironment, ResetRaised
+from glassplat.train.rates import GaussianRates, Rate
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
+from glassplat.train.rhythm import Rhythm, Strategy
 from glassplat.train.run import run_training
 from glassplat.train.run_directory import RunDirectory, RunSettings
-from glassplat.train.splat_recipe import GaussianRates, SplatRecipe
+from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
-from glassplat.train.strategy import Rhythm, Strategy
 from glassplat.train.traced_recipe import TracedRecipe
 from glassplat.train.trainer import train
 from tests.train.progress_of import finished

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch.overrides import TorchFunctionMode
 
-from glassplat.densify.default import DefaultDensify
+from glassplat.densify.options import DefaultDensify
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.state import TrainState

@@ -9,12 +9,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from glassplat.data.point_cloud import PointCloud
 
 from glassplat.cli import main
-from glassplat.data.dataset import PointCloud, load_dataset
+from glassplat.data.dataset import load_dataset
 from glassplat.data.errors import InputError
 from glassplat.files.planes_json import read_planes, write_planes
-from glassplat.init.planes import PlaneFit, PlaneFitError
+from glassplat.init.plane_options import PlaneFit, PlaneFitError
 from glassplat.scene.plane import Planes
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.plane_entry import PlaneEntry, fitted_planes

@@ -12,7 +12,8 @@ from glassplat.data.dataset import Dataset
 from glassplat.data.view import View
 from glassplat.files.scene_folder import read_scene, write_scene
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
-from glassplat.train.photo_exposure import PhotoExposure
+from glassplat.train.photo_exposure import exposures_begun
+from glassplat.train.photograph_options import PhotoExposure
 from glassplat.train.recipe import RECIPES
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.state import TrainState
@@ -34,7 +35,7 @@ def darkened(dataset: Dataset) -> Dataset:
 
 def trained(recipe: SplatRecipe, steps: int = 240) -> TrainState:
     dataset = darkened(tiny_capture())
-    scene = recipe.exposure.begun(replace(true_scene(), planes=type(true_scene().planes).empty()), dataset)
+    scene = exposures_begun(recipe.exposure, replace(true_scene(), planes=type(true_scene().planes).empty()), dataset)
     state = TrainState(scene, 0)
     frozen = tuple(
         replace(

@@ -21,7 +21,8 @@ from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.messages import StepDone
-from glassplat.train.photographer_entry import AddPhotographer, Photographer
+from glassplat.train.photograph_options import Photographer
+from glassplat.train.photographer_entry import AddPhotographer
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Clock, Stage, carried_out

@@ -12,7 +12,7 @@ import torch
 
 from glassplat.cli import main
 from glassplat.data.dataset import Dataset, View
-from glassplat.densify.default import DefaultDensify
+from glassplat.densify.options import DefaultDensify
 from glassplat.files.ply_table import write_table
 from glassplat.train.actions import PruneIdle
 from glassplat.train.deferred_recipe import DeferredRecipe

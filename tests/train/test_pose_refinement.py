@@ -25,7 +25,8 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.pose_correction import PoseCorrections, moved_camera
 from glassplat.scene.scene import Scene
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
-from glassplat.train.pose_refinement import PoseRefinement
+from glassplat.train.photograph_options import PoseRefinement
+from glassplat.train.pose_refinement import poses_begun
 from glassplat.train.recipe import RECIPES
 from glassplat.train.run import run_training
 from glassplat.train.run_directory import RunDirectory, RunSettings
@@ -120,7 +121,7 @@ def test_a_view_keeps_its_photograph_when_its_camera_moves() -> None:
 def test_a_camera_that_is_off_finds_its_place() -> None:
     dataset = shaken(tiny_capture())
     recipe = SplatRecipe(poses=REFINED)
-    scene = recipe.poses.begun(true_scene(), dataset)
+    scene = poses_begun(recipe.poses, true_scene(), dataset)
     stages = tuple(
         replace(s, renderer=Planar(), rates={"poses.twists": s.rates["poses.twists"]}, actions=(), motions=())
         for s in recipe.stages(0)

@@ -14,30 +14,24 @@ import torch
 
 from glassplat import cli
 from glassplat.commands.measuring.demo import SCENE
-from glassplat.densify.default import DefaultDensify
-from glassplat.densify.mcmc import McmcDensify
+from glassplat.densify.options import DefaultDensify, McmcDensify
 from glassplat.kernels.color_space import linear_from_srgb
 from glassplat.render.planar import Planar
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, Explore, PerturbOpacity, Relocate, ResetOpacity
 from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.messages import ActionDone, StepDone
-from glassplat.train.optimizer import Rate
+from glassplat.train.mirror_options import PropagationSchedule, SurroundingsStart
 from glassplat.train.planar_recipe import PlanarRecipe, ReflectionWeights
+from glassplat.train.planar_stages import planar_population
 from glassplat.train.plane_entry import PlaneEntry
-from glassplat.train.propagation import (
-    ENDED,
-    DensifyWhilePropagating,
-    Propagate,
-    PropagationSchedule,
-    ResetRaised,
-)
+from glassplat.train.propagation import ENDED, DensifyWhilePropagating, Propagate, ResetRaised
+from glassplat.train.rates import Rate
 from glassplat.train.recipe import RECIPES, recipe_of
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Clock, Stage, stage_starts
 from glassplat.train.state import TrainState
 from glassplat.train.strategy import mcmc_population
-from glassplat.train.surroundings_entry import SurroundingsStart
 from glassplat.train.trainer import differentiate, train
 from tests.densify.test_default import densified, make_gaussians, seen
 from tests.render.test_seen_panes import CAMERA, vitrine
@@ -125,7 +119,7 @@ def test_a_short_run_of_a_preset_learns(method: str, strategy: Any) -> None:
 def planeless(recipe: PlanarRecipe) -> Scene:
     """The first scene of a recipe, without the trial fit that the few points of the tiny capture do not do for."""
     dataset = tiny_capture()
-    return Scene(recipe._population().initial(dataset.points, recipe.sh_degree), dataset.extent)
+    return Scene(planar_population(recipe).initial(dataset.points, recipe.sh_degree), dataset.extent)
 
 
 def place_true_planes(state: TrainState, dataset: object) -> None:

@@ -8,17 +8,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.densify.mirrors import MirrorSearch
+from glassplat.densify.options import MirrorSearch
 from glassplat.render.splat import Splat
 from glassplat.scene.activations import logit
 from glassplat.scene.tint import TINT
 from glassplat.train.actions import GrowSh, ResetOpacity
 from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.environment_entry import AddEnvironment
+from glassplat.train.mirror_options import SurroundingsStart
 from glassplat.train.propagation import GrowShAfterPropagation
 from glassplat.train.reflection_entry import BeginReflections
 from glassplat.train.state import TrainState
-from glassplat.train.surroundings_entry import AddSurroundings, SurroundingsStart
+from glassplat.train.surroundings_entry import AddSurroundings
 from glassplat.train.traced_recipe import TracedRecipe
 from tests.train.progress_of import followed
 from tests.train.tiny_capture import tiny_capture

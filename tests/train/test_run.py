@@ -20,7 +20,7 @@ import torch
 
 from glassplat.data.dataset import load_dataset
 from glassplat.data.errors import InputError
-from glassplat.init.planes import PlaneFitError
+from glassplat.init.plane_options import PlaneFitError
 from glassplat.scene.scene import Scene
 from glassplat.train.checkpoint import load_checkpoint, recorded_seconds, save_checkpoint
 from glassplat.train.messages import CheckpointWritten, Message, RunBegun, StepDone, Working

@@ -10,8 +10,8 @@ import pytest
 from glassplat.data.errors import InputError
 from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.messages import Working
-from glassplat.train.optimizer import Rate
 from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.rates import Rate
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Clock, Every, Work, check_length, missed_stages, stage_starts
 from tests.train.progress_of import followed

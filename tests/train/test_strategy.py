@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from glassplat.data.view import View
-from glassplat.densify.mcmc import McmcDensify
+from glassplat.densify.options import McmcDensify
 from glassplat.losses.photometric import PhotometricLoss
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, Explore, Relocate, ResetOpacity, cap_of, growth_of
@@ -20,10 +20,10 @@ from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.messages import ActionDone, Message, StepDone
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
+from glassplat.train.rhythm import Rhythm
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Clock, Stage, stage_starts
 from glassplat.train.state import TrainState
-from glassplat.train.strategy import Rhythm
 from glassplat.train.trainer import differentiate, train
 from tests.train.tiny_capture import tiny_capture, true_scene
 

@@ -9,21 +9,22 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.densify.default import DefaultDensify, ScreenStatistics
-from glassplat.densify.mirrors import MirrorSearch
+from glassplat.densify.default import ScreenStatistics
+from glassplat.densify.options import DefaultDensify, MirrorSearch
 from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import Gaussians
 from glassplat.train.actions import Densify, PruneIdle, ResetOpacity
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
-from glassplat.train.propagation import Propagate, PropagationSchedule, RefineEnvironment
+from glassplat.train.mirror_options import PropagationSchedule, SurroundingsOptions, SurroundingsStart
+from glassplat.train.propagation import Propagate, RefineEnvironment
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
+from glassplat.train.rhythm import Rhythm
 from glassplat.train.stage import Clock, Every
 from glassplat.train.state import TrainState
-from glassplat.train.strategy import Rhythm
-from glassplat.train.surroundings_entry import AddSurroundings, SurroundingsStart
-from glassplat.train.traced_recipe import SurroundingsOptions, TracedRecipe
+from glassplat.train.surroundings_entry import AddSurroundings
+from glassplat.train.traced_recipe import TracedRecipe
 from glassplat.train.trainer import differentiate, train
 from tests.train.progress_of import finished
 from tests.train.tiny_capture import tiny_capture

@@ -16,7 +16,8 @@ from glassplat.losses.term import LossTerm
 from glassplat.scene.scene import Scene
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.messages import ActionDone, StageEntered, StepDone
-from glassplat.train.planar_recipe import PlanarRecipe, PlaneEntry
+from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.plane_entry import PlaneEntry
 from glassplat.train.splat_recipe import SplatRecipe
 from glassplat.train.stage import Stage
 from glassplat.train.state import TrainState

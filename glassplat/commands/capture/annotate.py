@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from glassplat.commands.console.loading import load
+from glassplat.commands.console.importing import import_now
 from glassplat.data.errors import InputError
 from glassplat.data.ranges import Range
 from glassplat.files.folders import check_capture_folder
@@ -38,7 +38,7 @@ class Annotate:
         if not (self.page or self.suggest):
             raise InputError("nothing to do: --no-page serves no page, and without --suggest nothing is looked for")
         check_capture_folder(self.capture)
-        load("glassplat.commands.capture.marking")
+        import_now("glassplat.commands.capture.marking")
 
     def run(self, console: Console) -> None:
         """Serves the page until it is closed, or Ctrl-C."""

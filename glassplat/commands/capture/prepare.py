@@ -14,7 +14,7 @@ from glassplat.commands.console.work_progress import WorkProgress
 from glassplat.data.ranges import Range, Share
 from glassplat.prepare.feature_database import Lens
 from glassplat.prepare.mapping import Mapper
-from glassplat.prepare.preparation import Preparation, prepare
+from glassplat.prepare.preparation import Preparation, check_places, prepare
 from glassplat.prepare.reconstruction import Settings
 from glassplat.prepare.workplace import Workplace
 
@@ -45,14 +45,20 @@ class Prepare:
     resume: bool = False
     force: bool = False
 
-    def run(self, console: Console) -> None:
-        """Prepares, with progress, and says what became of the photographs."""
+    def ready(self) -> None:
+        """Refuses an input that is no photographs, and an output among them."""
+        check_places(self._task())
+
+    def _task(self) -> Preparation:
         settings = Settings(lens=self.lens, mapper=self.mapper)
-        task = Preparation(
+        return Preparation(
             self.input, self.output, self.max_size, self.frames, self.least_registered, settings=settings
         )
+
+    def run(self, console: Console) -> None:
+        """Prepares, with progress, and says what became of the photographs."""
         with WorkProgress(console) as progress:
-            report = prepare(task, progress.show, resume=self.resume, force=self.force)
+            report = prepare(self._task(), progress.show, resume=self.resume, force=self.force)
         for line in report.lines():
             (warn if line.startswith("advice") else say)(console, line)
         from glassplat.prepare.report_page import PAGE, write_page  # PyTorch, which nothing before needs.

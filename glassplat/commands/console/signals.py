@@ -70,6 +70,16 @@ def immediate_end() -> Iterator[None]:
 
 
 @contextmanager
+def held_signals() -> Iterator[None]:
+    """Answers signals when the context ends: for imports while something runs that has to be told to end."""
+    held: list[int] = []
+    with _answered(lambda number, frame: held.append(number)):
+        yield
+    for number in held[:1]:
+        signal.raise_signal(number)
+
+
+@contextmanager
 def _answered(answer: signal._HANDLER) -> Iterator[None]:
     """Has the signals answered, but for those that the process was told to ignore, as by `nohup`."""
     if threading.current_thread() is not threading.main_thread():

@@ -11,7 +11,7 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from glassplat.commands.console.loading import load
+from glassplat.commands.console.importing import import_now
 from glassplat.commands.console.messages import say, warn
 from glassplat.commands.inspecting.finding import Finding
 from glassplat.commands.inspecting.info_of_photographs import photographs_finding, preparation_finding, video_finding
@@ -49,7 +49,7 @@ class Info:
         """Looks and tells."""
         finding = finder_of(self.path)(self.path)
         if self.page is not None:
-            load(CAPTURES).write_capture_page(self.path, self.page)
+            import_now(CAPTURES).write_capture_page(self.path, self.page)
         if self.json:
             say(console, json.dumps({"path": str(self.path), **finding.as_json()}, indent=1))
             return
@@ -81,7 +81,7 @@ def finder_of(path: Path) -> Callable[[Path], Finding]:
 def _finder_of_file(path: Path) -> Callable[[Path], Finding]:
     suffix = path.suffix.lower()
     if suffix in SPLATS:
-        return load(SCENES).splat_finding
+        return import_now(SCENES).splat_finding
     if suffix in VIDEO_SUFFIXES:
         return video_finding
     raise InputError(f"{path} is no file that is known; expected {KINDS}")
@@ -89,22 +89,22 @@ def _finder_of_file(path: Path) -> Callable[[Path], Finding]:
 
 def _finder_of_folder(path: Path) -> Callable[[Path], Finding]:
     if (path / "recipe.json").is_file():
-        return load(SCENES).run_finding
+        return import_now(SCENES).run_finding
     if RunDirectory(path).is_saved:
         raise InputError(f"{path} holds a scene, but no recipe.json; expected what `glassplat train --output` wrote")
     if path.name.endswith(".partial") and (path / "settings.json").is_file():
         return preparation_finding
     if (path / SCENE).is_file():
-        return load(SCENES).scene_finding
+        return import_now(SCENES).scene_finding
     if all(one.suffix.lower() in IMAGE_SUFFIXES for one in path.iterdir()):
         return _photographs_or_nothing
-    load(CAPTURES)
+    import_now(CAPTURES)
     return _capture_or_photographs
 
 
 def _capture_or_photographs(path: Path) -> Finding:
     try:
-        return load(CAPTURES).capture_finding(path)
+        return import_now(CAPTURES).capture_finding(path)
     except UnknownFormatError:
         return _photographs_or_nothing(path)
 

@@ -8,7 +8,7 @@ from glassplat.commands.inspecting.finding import FEW_VIEWS, Finding
 from glassplat.data.dataset import Dataset, load_dataset
 from glassplat.data.errors import InputError
 from glassplat.files.json_text import read_json
-from glassplat.init.planes import PlaneFit, PlaneFitError
+from glassplat.init.plane_options import PlaneFit, PlaneFitError
 from glassplat.init.virtual_scene import virtual_points
 from glassplat.prepare.report_page import PAGE, write_page
 from glassplat.prepare.workplace import RECORD

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from glassplat.commands.console.loading import load
+from glassplat.commands.console.importing import import_now
 from glassplat.commands.runs.output_folder import check_claim
 from glassplat.commands.runs.scene_edits import SceneEdits
 from glassplat.commands.runs.splits import Split
@@ -44,7 +44,7 @@ class Render:
         """Refuses what is no run, and an output that holds something else; imports what renders."""
         RunDirectory(self.run_directory).check_begun()
         check_claim(self.output, "render")
-        load("glassplat.commands.looking.rendering")
+        import_now("glassplat.commands.looking.rendering")
 
     def run(self, console: Console) -> None:
         """Renders."""

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
-from glassplat.commands.console.loading import load
+from glassplat.commands.console.importing import import_now
 from glassplat.commands.runs.scene_edits import SceneEdits
 from glassplat.commands.runs.scene_place import check_file, check_scene
 from glassplat.data.errors import InputError, input_checked
@@ -81,7 +81,7 @@ class Video:
         check_scene(self.scene)
         if self.keyframes is not None:
             check_file(self.keyframes)
-        load("glassplat.commands.looking.filming")
+        import_now("glassplat.commands.looking.filming")
 
     def run(self, console: Console) -> None:
         """Renders, keeping every picture, and encodes them."""

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from glassplat.commands.console.loading import load
+from glassplat.commands.console.importing import import_now
 from glassplat.commands.runs.scene_edits import SceneEdits
 from glassplat.commands.runs.scene_place import check_scene
 from glassplat.data.ranges import Range
@@ -45,7 +45,7 @@ class View:
         if self.output is not None:
             check_folder(self.output)
         check_port(self.host, self.port)
-        load("glassplat.commands.looking.viewing")
+        import_now("glassplat.commands.looking.viewing")
 
     def run(self, console: Console) -> None:
         """Serves until it is interrupted."""

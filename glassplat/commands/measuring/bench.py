@@ -12,8 +12,16 @@ from typing import Annotated, Any, Literal, get_args
 import tyro
 from rich.console import Console
 
-from glassplat.commands.console.messages import say
-from glassplat.commands.measuring.bench_runs import RUNS, FinishedRun, PlannedRun, earlier_runs, execute, scene_names
+from glassplat.commands.console.importing import import_now
+from glassplat.commands.console.messages import message_console, say
+from glassplat.commands.measuring.bench_runs import (
+    RUNS,
+    FinishedRun,
+    PlannedRun,
+    earlier_runs,
+    say_captures,
+    scene_names,
+)
 from glassplat.commands.measuring.bench_seconds import BenchSeconds, Method
 from glassplat.commands.measuring.bench_tables import (
     Measured,
@@ -70,16 +78,25 @@ class BenchScenes:
     downscale: Downscale = 1.0
     mask_polarity: Polarity = "auto"
 
-    def run(self, console: Console) -> None:
-        """Runs what is missing and writes `scenes.md` and `scenes.json`, of earlier commands' runs in it too."""
+    def planned(self) -> list[PlannedRun]:
+        """The runs that are asked for.
+
+        Raises:
+            InputError: options that contradict, or an output that no run can be written to.
+        """
         recipes = {
             variant_name(method, strategy, preset): with_strategy(recipe_of(method, preset), strategy)
             for preset in unique(self.presets, "presets")
             for strategy in unique(self.strategies, "strategies")
             for method in unique(self.methods, "methods")
         }
-        runs = planned_runs(self, recipes)
-        variants = all_variants()
+        return planned_runs(self, recipes)
+
+    def run(self, console: Console) -> None:
+        """Runs what is missing and writes `scenes.md` and `scenes.json`, of earlier commands' runs in it too."""
+        from glassplat.commands.measuring.bench_execution import execute
+
+        runs, variants = self.planned(), all_variants()
         earlier = earlier_runs(self.output, variants, runs)
         execute(runs, console, lambda done: write_scenes(self.output, in_order([*done, *earlier], variants)))
         say(console, f"tables: {self.output / 'scenes.md'}, {self.output / 'scenes.json'}")
@@ -109,12 +126,20 @@ class BenchAblation:
     downscale: Downscale = 1.0
     mask_polarity: Polarity = "auto"
 
+    def planned(self) -> list[PlannedRun]:
+        """The runs that are asked for.
+
+        Raises:
+            InputError: options that contradict, or an output that no run can be written to.
+        """
+        return planned_runs(self, ablation_recipes(RECIPES[self.method](), self.chosen()))
+
     def run(self, console: Console) -> None:
         """Runs what is missing and writes `ablation.md` and `ablation.json`, of earlier commands' runs in it too."""
-        full = RECIPES[self.method]()
-        ablations = self.chosen()
-        runs = planned_runs(self, ablation_recipes(full, ablations))
-        known = ABLATIONS[self.method]
+        from glassplat.commands.measuring.bench_execution import execute
+
+        full, ablations, known = RECIPES[self.method](), self.chosen(), ABLATIONS[self.method]
+        runs = self.planned()
         variants = ablation_recipes(full, known)
         earlier = earlier_runs(self.output, variants, runs)
         kept = {run.run.variant for run in earlier}
@@ -151,6 +176,11 @@ class Bench:
     """
 
     comparison: Annotated[AnyBench, tyro.conf.arg(name="")]
+
+    def ready(self) -> None:
+        """Refuses what stands in the way, says what the captures' folders hold, and imports what trains."""
+        say_captures(self.comparison.planned(), message_console())
+        import_now("glassplat.commands.measuring.bench_execution")
 
     def run(self, console: Console) -> None:
         """Runs the comparison."""

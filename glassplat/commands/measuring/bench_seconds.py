@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from glassplat.commands.console.messages import say
-from glassplat.commands.measuring.bench_runs import RUNS, PlannedRun, scene_names, train_and_evaluate
+from glassplat.commands.measuring.bench_runs import RUNS, PlannedRun, scene_names
 from glassplat.commands.measuring.seconds_chart import Curve, chart
 from glassplat.commands.training.train import Train
 from glassplat.data.errors import InputError
@@ -78,11 +78,28 @@ class BenchSeconds:
     downscale: Downscale = 1.0
     mask_polarity: Polarity = "auto"
 
-    def run(self, console: Console) -> None:
-        """Runs what is missing and writes `seconds.md`, `seconds.json` and a chart for each scene."""
+    def planned(self) -> list[PlannedRun]:
+        """The runs that are asked for; those that are not begun get their lengths from those before them.
+
+        Raises:
+            InputError: options that name nothing, or an output that no run can be written to.
+        """
+        self._check()
+        return [
+            self._planned(scene, data, method, asked, [])
+            for scene, data in zip(scene_names(self.data), self.data, strict=True)
+            for method in dict.fromkeys(self.methods)
+            for asked in (0.0, *sorted(set(self.seconds)))
+        ]
+
+    def _check(self) -> None:
         check_folder(self.output)
         if not self.methods or not self.seconds:
             raise InputError("--methods or --seconds names nothing; expected at least one of each")
+
+    def run(self, console: Console) -> None:
+        """Runs what is missing and writes `seconds.md`, `seconds.json` and a chart for each scene."""
+        self._check()
         finished: list[Timed] = []
         for scene, data in zip(scene_names(self.data), self.data, strict=True):
             for method in dict.fromkeys(self.methods):
@@ -92,6 +109,8 @@ class BenchSeconds:
 
     def _curve(self, scene: str, data: Path, method: Method, console: Console) -> list[Timed]:
         """The pilot and a run for each time, in the order of their length."""
+        from glassplat.commands.measuring.bench_execution import train_and_evaluate
+
         found: list[Timed] = []
         for asked in (0.0, *sorted(set(self.seconds))):
             planned = self._planned(scene, data, method, asked, found)

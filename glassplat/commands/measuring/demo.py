@@ -7,13 +7,16 @@ from pathlib import Path
 
 from rich.console import Console
 
-from glassplat.commands.console.loading import load
 from glassplat.commands.console.messages import say
+from glassplat.commands.console.signals import held_signals
 from glassplat.commands.measuring.beside import beside
+from glassplat.commands.training.train import Train
 from glassplat.data.ranges import Seed, Several
 from glassplat.files.folders import check_folder
 from glassplat.kernels.devices import DeviceName
+from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.run_directory import RunDirectory
+from glassplat.train.splat_recipe import SplatRecipe
 
 SCENE = Path(__file__).parents[2] / "demo_scene"
 
@@ -35,29 +38,31 @@ class Demo:
     device: DeviceName = "auto"
 
     def ready(self) -> None:
-        """Refuses an output that cannot be written, and imports what trains and renders."""
+        """Refuses an output that cannot be written."""
         check_folder(self.output)
-        load("glassplat.commands.training.train")
-        load("glassplat.commands.measuring.evaluation")
 
     def run(self, console: Console) -> None:
         """Trains both methods, each in a process of its own, evaluates them and says where the pictures are."""
-        from glassplat.commands.measuring.evaluation import evaluate_run, print_results
-        from glassplat.commands.runs.stored_run import open_run
-        from glassplat.commands.training.train import Train
-        from glassplat.train.planar_recipe import PlanarRecipe
-        from glassplat.train.splat_recipe import SplatRecipe
-
         folders = [self.output / method for method in (PlanarRecipe.method, SplatRecipe.method)]
         log = self.output / "splat.log"
         with beside(self._arguments(SplatRecipe.method), log) as splat:
             say(console, f"planar is trained here, and splat beside it: {log}")
             here = Train(PlanarRecipe(), SCENE, folders[0], self.iterations, seed=self.seed, device=self.device)
-            here.resuming(begun(folders[0])).run(console)
+            self._trained(here.resuming(begun(folders[0])), console)
             with console.status("waiting for splat"):
                 splat.wait()
+        from glassplat.commands.measuring.evaluation import evaluate_run, print_results
+        from glassplat.commands.runs.stored_run import open_run
+
         print_results(console, *(evaluate_run(open_run(folder, self.device)) for folder in folders))
         say(console, f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
+
+    @staticmethod
+    def _trained(train: Train[PlanarRecipe], console: Console) -> None:
+        """Trains; Ctrl-C waits for PyTorch to be imported, so that the other process is told to end."""
+        with held_signals():
+            train.ready()
+        train.run(console)
 
     def _arguments(self, method: str) -> list[str]:
         """Of the command line that trains one method, or goes on where it was interrupted."""

@@ -9,7 +9,7 @@ from typing import Literal
 import tyro
 from rich.console import Console
 
-from glassplat.commands.console.loading import load
+from glassplat.commands.console.importing import import_now
 from glassplat.commands.console.messages import say
 from glassplat.kernels.devices import DeviceName
 from glassplat.train.run_directory import RunDirectory
@@ -43,7 +43,7 @@ class Evaluate:
     def ready(self) -> None:
         """Refuses what is no run, and imports what renders."""
         RunDirectory(self.run_directory).check_begun()
-        load("glassplat.commands.measuring.evaluation")
+        import_now("glassplat.commands.measuring.evaluation")
 
     def run(self, console: Console) -> None:
         """Evaluates and reports."""

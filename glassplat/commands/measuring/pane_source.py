@@ -6,7 +6,7 @@ from glassplat.commands.measuring.evaluate import PaneSource
 from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError
 from glassplat.evaluate.pane_regions import MarkedRegions, PaneRegions, RenderedRegions, TrueRegions
-from glassplat.init.planes import PlaneFit, PlaneFitError
+from glassplat.init.plane_options import PlaneFit, PlaneFitError
 from glassplat.train.plane_entry import fitted_planes
 
 

@@ -9,7 +9,7 @@ from typing import Literal
 import tyro
 from rich.console import Console
 
-from glassplat.commands.console.loading import load
+from glassplat.commands.console.importing import import_now
 from glassplat.commands.runs.output_folder import check_claim
 from glassplat.commands.runs.splits import Split
 from glassplat.kernels.devices import DeviceName
@@ -41,7 +41,7 @@ class Dereflect:
         """Refuses what is no run, and an output that holds something else; imports what renders."""
         RunDirectory(self.run_directory).check_begun()
         check_claim(self.output, "dereflect")
-        load("glassplat.commands.publishing.reflections_off")
+        import_now("glassplat.commands.publishing.reflections_off")
 
     def run(self, console: Console) -> None:
         """Writes the images."""

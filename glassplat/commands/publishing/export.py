@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
-from glassplat.commands.console.loading import load
+from glassplat.commands.console.importing import import_now
 from glassplat.commands.runs.output_folder import check_claim
 from glassplat.commands.runs.scene_edits import SceneEdits
 from glassplat.commands.runs.scene_place import check_scene
@@ -56,7 +56,7 @@ class Export:
             raise InputError("--layer transmission has no reflections to bake; give one of the two")
         check_scene(self.run_directory)
         check_claim(self.output, "export")
-        load("glassplat.commands.publishing.exporting")
+        import_now("glassplat.commands.publishing.exporting")
 
     def run(self, console: Console) -> None:
         """Writes the files."""

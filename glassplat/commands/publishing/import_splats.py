@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from glassplat.commands.console.loading import load
+from glassplat.commands.console.importing import import_now
 from glassplat.commands.console.messages import say, warn
 from glassplat.commands.runs.scene_place import check_file
 from glassplat.data.errors import InputError, input_checked
@@ -41,14 +41,14 @@ class Import:
             raise InputError(f"{self.output} is not empty; nothing was written. Choose a new folder for --output")
         for file in (self.file, *([] if self.planes is None else [self.planes])):
             check_file(file)
-        load("glassplat.interface.saving")
+        import_now("glassplat.interface.saving")
 
     def run(self, console: Console) -> None:
         """Reads and writes."""
+        from glassplat.data.backgrounds import BLACK
         from glassplat.interface.imported_scene import imported_scene
         from glassplat.interface.model import Model, by_name
         from glassplat.interface.saving import write_as_run
-        from glassplat.train.background import BLACK
         from glassplat.train.planar_recipe import PlanarRecipe
 
         with input_checked():

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from glassplat.commands.runs.splits import chosen_views
 from glassplat.data.corrected_views import with_corrected_cameras
-from glassplat.data.dataset import TEST_EVERY, Dataset, PointCloud, View, load_dataset
+from glassplat.data.dataset import TEST_EVERY, Dataset, View, load_dataset
 from glassplat.data.errors import InputError, first_names, input_checked
+from glassplat.data.point_cloud import PointCloud
 from glassplat.files.cameras_json import read_cameras
 from glassplat.files.picture_paths import picture_paths
 from glassplat.kernels.devices import DeviceName, chosen_device

@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Generic, TypeVar
 
 import tyro
 from rich.console import Console
 
-from glassplat.commands.console.messages import say, warn
-from glassplat.commands.console.training_progress import TrainingProgress
-from glassplat.data.dataset import Dataset, load_dataset
+from glassplat.commands.console.importing import import_now
+from glassplat.commands.console.messages import message_console, say
+from glassplat.data.capture_files import CaptureFiles, read_capture
 from glassplat.data.masks import Polarity
 from glassplat.data.ranges import Downscale, Positive, Seed, Several
-from glassplat.interface.training import Training
 from glassplat.kernels.devices import DeviceName, chosen_device
-from glassplat.train.background import photo_background
-from glassplat.train.messages import Message
 from glassplat.train.recipe import Preset, Recipe
-from glassplat.train.run import CHECKPOINT_SECONDS, Listener
-from glassplat.train.run_directory import RunDirectory, RunSettings, check_output
+from glassplat.train.run_directory import CHECKPOINT_SECONDS, RunDirectory, RunSettings, check_output
 
 RecipeKind = TypeVar("RecipeKind", bound=Recipe)
 
@@ -59,55 +54,22 @@ class Train(Generic[RecipeKind]):
     preset: Preset = "glassplat"
     view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
 
+    def ready(self) -> None:
+        """Refuses what stands in the way, says what the capture's folder holds, and imports what trains."""
+        check_output(RunDirectory(self.output), resume=self.resume)
+        say(message_console(), self.files)
+        import_now("glassplat.commands.training.training_run")
+
+    @cached_property
+    def files(self) -> CaptureFiles:
+        """What the capture's folder holds; read when it is first asked for, without PyTorch."""
+        return read_capture(self.data, mask_polarity=self.mask_polarity)
+
     def run(self, console: Console) -> None:
         """Trains, with a progress bar or lines."""
-        check_output(RunDirectory(self.output), resume=self.resume)
-        background = photo_background(self.recipe)
-        dataset = load_dataset(
-            self.data, downscale=self.downscale, background=background, mask_polarity=self.mask_polarity
-        )
-        describe(dataset, console)
-        training = Training(
-            dataset,
-            self.recipe,
-            iterations=self.iterations,
-            output=self.output,
-            seed=self.seed,
-            device=self.device,
-            resume=self.resume,
-            checkpoint_every=self.checkpoint_every,
-        )
-        with TrainingProgress(console, self.iterations) as progress, self._watched(training, dataset, console) as watch:
+        from glassplat.commands.training.training_run import train
 
-            def listen(message: Message) -> None:
-                progress.show(message)
-                watch(message)
-
-            scene = training.run(listen).scene
-        say(
-            console,
-            f"trained {self.recipe.method} for {training.step} iterations in {training.seconds:.0f} s: "
-            f"{len(scene.primary)} Gaussians, {len(scene.planes)} panes -> {self.output}",
-        )
-        say(console, f"next: glassplat eval {self.output}")
-
-    @contextmanager
-    def _watched(self, training: Training, dataset: Dataset, console: Console) -> Iterator[Listener]:
-        """What else listens: the viewer, where it is asked for."""
-        if not self.view:
-            yield lambda message: None
-            return
-        from glassplat.commands.looking.viewing import announce
-        from glassplat.interface.watching import WatchedTraining
-        from glassplat.viewer.ports import LOCAL, vacant_port
-
-        watched = WatchedTraining(
-            training, dataset, host=LOCAL, port=vacant_port(LOCAL), announce=lambda viewer: announce(viewer, console)
-        )
-        try:
-            yield watched.hear
-        finally:
-            watched.stop()
+        train(self, console)
 
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""
@@ -124,17 +86,3 @@ class Train(Generic[RecipeKind]):
     def resuming(self, begun: bool) -> Train:
         """The same run, going on from its checkpoint if it has begun."""
         return replace(self, resume=begun)
-
-
-def describe(dataset: Dataset, console: Console) -> None:
-    """Says what was loaded, with the loader's warnings."""
-    annotated = sum(view.is_annotated for view in dataset.train)
-    given = f", {len(dataset.planes)} in planes.json" if dataset.planes is not None else ""
-    say(
-        console,
-        f"{dataset.root}: {len(dataset.train)} training and {len(dataset.test)} test views, "
-        f"{len(dataset.points.positions)} points, {annotated} annotated views with {len(dataset.pane_labels)} panes"
-        f"{given}",
-    )
-    for warning in dataset.warnings:
-        warn(console, warning)

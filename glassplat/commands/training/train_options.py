@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import operator
 import typing
 from collections.abc import Sequence
@@ -11,11 +12,11 @@ from typing import Annotated, Any
 
 import tyro
 
-from glassplat.commands.training.first_look import FULL_HELP, HELP, last_value
 from glassplat.commands.training.train import Train
 from glassplat.data.ranges import Essential
 from glassplat.train.recipe import RECIPES, Preset, recipe_of
 
+HELP, FULL_HELP = ("-h", "--help"), "--help-advanced"
 POINTER = f"These are the options that most runs need; {FULL_HELP} in place of --help shows all of them."
 
 
@@ -38,6 +39,17 @@ def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
 def asked_preset(arguments: Sequence[str]) -> Preset:
     """The preset that the arguments name last; the default one where that is none, which parsing will refuse."""
     return "paper" if last_value(arguments, "--preset") == "paper" else "glassplat"
+
+
+def last_value(arguments: Sequence[str], option: str) -> str | None:
+    """The value that arguments give to an option last; None where they give none."""
+    found = None
+    for before, argument in itertools.pairwise(["", *arguments]):
+        if argument.startswith(f"{option}="):
+            found = argument.removeprefix(f"{option}=")
+        elif before == option and not argument.startswith("-"):
+            found = argument
+    return found
 
 
 def in_brief(options: Any) -> Any:

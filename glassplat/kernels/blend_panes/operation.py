@@ -9,8 +9,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.devices import kernels_for
+from glassplat.kernels.fresnel import Fresnel
 from glassplat.kernels.maths.pane import LAWS
-from glassplat.kernels.panes import BlendedPanes, Fresnel
+from glassplat.kernels.panes import BlendedPanes
 from glassplat.kernels.tensor_checks import check_device, check_tensors
 
 

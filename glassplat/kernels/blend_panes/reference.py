@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.color_space import linear_from_srgb, srgb_from_linear
+from glassplat.kernels.fresnel import Fresnel
 from glassplat.kernels.pane_hits.reference import ray_grid
-from glassplat.kernels.panes import BlendedPanes, Fresnel
+from glassplat.kernels.panes import BlendedPanes
 
 
 def two_surfaces(base: Tensor, cosine: Tensor) -> Tensor:

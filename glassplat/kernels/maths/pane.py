@@ -10,8 +10,8 @@ import math
 from typing import NamedTuple, get_args
 
 from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.fresnel import Fresnel
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.panes import Fresnel
 
 LAWS: tuple[Fresnel, ...] = get_args(Fresnel)
 """Kernels are given a law as its position here."""

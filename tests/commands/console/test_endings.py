@@ -17,7 +17,7 @@ from glassplat.cli import main
 from glassplat.commands.console.endings import LONGEST_QUOTE
 from glassplat.commands.measuring.evaluate import Evaluate
 from glassplat.data.errors import InputError
-from glassplat.init.planes import PlaneFitError
+from glassplat.init.plane_options import PlaneFitError
 from glassplat.kernels.devices import CudaUnavailableError
 from glassplat.train.trainer import TrainingDivergedError
 

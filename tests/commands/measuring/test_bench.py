@@ -16,7 +16,7 @@ from glassplat.commands.measuring import bench
 from glassplat.commands.measuring.bench_runs import FinishedRun, PlannedRun, RunClock, scene_names
 from glassplat.commands.training.train import Train, TrainingProgress
 from glassplat.data.errors import InputError
-from glassplat.init.planes import PlaneFitError
+from glassplat.init.plane_options import PlaneFitError
 from glassplat.train.ablations import ABLATIONS, Ablated, Switch
 from glassplat.train.checkpoint import load_checkpoint
 from glassplat.train.messages import Message, StepDone

@@ -30,8 +30,9 @@ from glassplat.kernels.blend_panes import reference as blend_twin
 from glassplat.kernels.composite import reference as composite_twin
 from glassplat.kernels.cube_lookup import reference as lookup_twin
 from glassplat.kernels.devices import SIMULATED, kernels_for
+from glassplat.kernels.fresnel import Fresnel
 from glassplat.kernels.pane_hits import reference as hits_twin
-from glassplat.kernels.panes import Fresnel, Panes
+from glassplat.kernels.panes import Panes
 from glassplat.kernels.photometric import reference as photometric_twin
 from glassplat.kernels.project import reference as project_twin
 from glassplat.kernels.shade_environment import reference as shade_twin

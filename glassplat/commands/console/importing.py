@@ -18,7 +18,7 @@ LINE = "loading PyTorch ..."
 """Shown in a terminal only, and gone when the work begins. The cursor stays: Ctrl-C may end the process at once."""
 
 
-def load(module: str, console: Console | None = None) -> Any:
+def import_now(module: str, console: Console | None = None) -> Any:
     """A module of `glassplat` that imports PyTorch, imported now if it is not there yet.
 
     Args:

@@ -9,7 +9,7 @@ import sys
 import pytest
 from rich.console import Console
 
-from glassplat.commands.console.loading import LINE, load
+from glassplat.commands.console.importing import LINE, import_now
 
 MODULE = "glassplat.commands.console.work_progress"
 
@@ -26,27 +26,27 @@ def shown(console: Console) -> str:
 def test_a_terminal_shows_a_line_that_is_gone_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, MODULE, raising=False)
     console = terminal()
-    assert load(MODULE, console).__name__ == MODULE
+    assert import_now(MODULE, console).__name__ == MODULE
     assert shown(console) == f"{LINE}\r\x1b[2K"
 
 
 def test_what_is_there_is_not_announced() -> None:
     console = terminal()
-    assert load("glassplat.commands.console.loading", console).LINE is LINE
+    assert import_now("glassplat.commands.console.importing", console).LINE is LINE
     assert shown(console) == ""
 
 
 def test_a_file_gets_no_such_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, MODULE, raising=False)
     console = Console(file=io.StringIO())
-    load(MODULE, console)
+    import_now(MODULE, console)
     assert shown(console) == ""
 
 
 def test_the_line_is_gone_before_an_error_is_printed() -> None:
     console = terminal()
     with pytest.raises(ModuleNotFoundError):
-        load("glassplat.no_such_module", console)
+        import_now("glassplat.no_such_module", console)
     assert shown(console).endswith("\x1b[2K")
 
 
@@ -57,5 +57,5 @@ def test_garbage_is_collected_afterwards_as_before(enabled: bool, monkeypatch: p
     for name in ("disable", "freeze", "enable"):
         monkeypatch.setattr(gc, name, lambda name=name: asked.append(name))
     with pytest.raises(ModuleNotFoundError):
-        load("glassplat.no_such_module", terminal())
+        import_now("glassplat.no_such_module", terminal())
     assert asked == (["disable", "freeze", "enable"] if enabled else [])

@@ -1,0 +1,86 @@
+"""How `traced` trains."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from glassplat.data.backgrounds import BLACK
+from glassplat.data.dataset import Dataset
+from glassplat.init.points import as_discs
+from glassplat.losses.monocular import MonocularNormals
+from glassplat.losses.term import LossTerm, weighted
+from glassplat.render.deferred import Deferred
+from glassplat.render.traced import Traced, mirrored_contributions
+from glassplat.scene.scene import Scene
+from glassplat.train.actions import Densify, GrowSh, PruneIdle, ResetOpacity
+from glassplat.train.deferred_stages import first_reflections
+from glassplat.train.propagation import Propagate, RefineEnvironment
+from glassplat.train.rates import PUBLISHED_ITERATIONS
+from glassplat.train.stage import Action, Every, Stage
+from glassplat.train.surroundings_entry import AddSurroundings
+from glassplat.train.traced_recipe import TracedRecipe
+
+
+def first_scene(recipe: TracedRecipe, dataset: Dataset) -> Scene:
+    """The first scene: one Gaussian per point that hardly reflects, and nothing to mirror yet."""
+    scene = recipe.distant().initialise(dataset)
+    return replace(scene, primary=as_discs(scene.primary)) if recipe.primitive == "disc" else scene
+
+
+def finished_renderer(recipe: TracedRecipe) -> Traced | Deferred:
+    """The renderer of the finished scene, with all its layers."""
+    if recipe.mirrors == "environment" and recipe.primitive == "ellipsoid":
+        return recipe.distant().renderer()
+    return Traced(recipe.background or BLACK, recipe.least_strength)
+
+
+def stages_of(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
+    """Bootstrap, reflections, everything without propagation; a short run has one stage."""
+    known = recipe.distant().stages(seed, iterations)
+    if len(known) == 1:
+        return known
+    bootstrap, distant, refinement = known
+    if recipe.primitive == "disc":
+        distant, refinement = _rendered(recipe, distant), _rendered(recipe, refinement)
+    if recipe.consistency_to_end:
+        refinement = replace(refinement, losses=distant.losses, renderer=distant.renderer)
+    guided = weighted(LossTerm("monocular normals", recipe.monocular_weight, MonocularNormals()))
+    distant, refinement = (replace(s, losses=(*s.losses, *guided)) for s in (distant, refinement))
+    if recipe.mirrors == "environment":
+        return bootstrap, distant, refinement
+    entry = first_reflections(recipe.distant())
+    around = AddSurroundings(recipe.surroundings.start, recipe.surroundings.sh_degree)
+    environment = None if recipe.mirrors == "surroundings" else entry.environment
+    near = replace(_tracing(recipe, distant), entry=replace(entry, environment=environment, surroundings=around))
+    return bootstrap, near, _tracing(recipe, refinement)
+
+
+def _tracing(recipe: TracedRecipe, stage: Stage) -> Stage:
+    """A stage of `deferred` in which rays find what is mirrored."""
+    stage = _rendered(recipe, stage)
+    return replace(
+        stage,
+        rates={**stage.rates, **recipe.surroundings.rates.of("surroundings")},
+        actions=(*stage.actions, *_surroundings_actions(recipe, stage)),
+        densify_until=max(stage.densify_until, recipe.surroundings.densify.stop),
+    )
+
+
+def _rendered(recipe: TracedRecipe, stage: Stage) -> Stage:
+    """A stage of `deferred` with this method's renderer, which propagation looks through as well."""
+    renderer = Traced(recipe.background or BLACK, recipe.least_strength, faintest=0.0, joint=recipe.joint)
+    kept = [a for a in stage.actions if recipe.mirrors != "surroundings" or not isinstance(a, RefineEnvironment)]
+    actions = [replace(action, renderer=renderer) if isinstance(action, Propagate) else action for action in kept]
+    return replace(stage, renderer=renderer, actions=tuple(actions))
+
+
+def _surroundings_actions(recipe: TracedRecipe, stage: Stage) -> list[Action]:
+    """What changes the surroundings, but for learning."""
+    options = recipe.surroundings
+    resets = [a for a in stage.actions if isinstance(a, ResetOpacity)] if options.reset else []
+    return [
+        Densify(options.densify, "surroundings"),
+        PruneIdle(options.densify, "surroundings", mirrored_contributions),
+        GrowSh(Every(recipe.rhythm.sh), "surroundings"),
+        *(ResetOpacity(reset.when, reset.ceiling, "surroundings") for reset in resets),
+    ]
