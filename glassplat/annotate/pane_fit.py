@@ -237,9 +237,10 @@ def _missing(marks: Marks, known: int) -> str:
     views = marks.views()
     if len(views) < 2:
         return "mark the same corners in a second photograph, taken from another place"
+    corners = "1 corner is" if known == 1 else f"{known} corners are"
     return (
-        f"{known} corners are known from two places, expected at least 3: mark the same corners in two photographs "
-        "taken farther apart"
+        f"{corners} known from two places, expected at least 3: mark the same corners in two photographs taken farther "
+        "apart"
     )
 
 

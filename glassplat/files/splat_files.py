@@ -16,11 +16,11 @@ from glassplat.files.ply import read_gaussians
 from glassplat.files.ply_table import read_table
 from glassplat.files.reading import reading
 from glassplat.files.scene_folder import LARGEST_COLOR, LARGEST_LOG
+from glassplat.files.splat_suffixes import SPLAT_SUFFIXES
 from glassplat.files.spz import GZIP, read_spz
 from glassplat.scene.activations import SH_ZERO
 from glassplat.scene.gaussians import Gaussians
 
-SUFFIXES = (".ply", ".spz", ".glb", ".splat")
 SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
 LEAST_SCALE = 1e-12
 
@@ -46,7 +46,7 @@ def read_splats(path: Path | str) -> Gaussians:
         return read_glb(path)
     if path.suffix.lower() == ".splat":
         return _read_rows(path)
-    raise ValueError(f"{path} is no splat file that can be read; expected one of {', '.join(SUFFIXES)}")
+    raise ValueError(f"{path} is no splat file that can be read; expected one of {', '.join(SPLAT_SUFFIXES)}")
 
 
 def drawable(gaussians: Gaussians, path: Path | str) -> tuple[Gaussians, int]:

@@ -6,7 +6,7 @@ import hashlib
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,19 +57,26 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
     """The photographs below a folder in the order in which they were numbered; every one is decoded once, to check it.
 
     Raises:
-        InputError: there are too few, one is broken or too small, or they are of a kind that cannot be read.
+        InputError: there are too few, some are broken or too small, or they are of a kind that cannot be read.
     """
     paths = _photograph_paths(folder)
     names = capture_names(paths, folder)
     found: dict[bytes, Photograph] = {}
     twins: list[str] = []
+    broken: dict[str, InputError] = {}
     for done, path in enumerate(paths):
         listen(Progress("looking at the photographs", done, len(paths)))
-        photograph, contents = _examined(path, names[path], max_size)
+        try:
+            photograph, contents = _examined(path, names[path], max_size)
+        except InputError as error:
+            broken[path.name] = error
+            continue
         if contents in found:
             twins.append(f"{path.name} (as {found[contents].path.name})")
         else:
             found[contents] = photograph
+    if broken:
+        raise _refusal(broken, len(paths))
     if len(found) < FEWEST:
         same = f", and {first_names(twins)} the same again" if twins else ""
         raise InputError(
@@ -77,6 +84,17 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
             "from places a step apart"
         )
     return list(found.values())
+
+
+def _refusal(broken: Mapping[str, InputError], count: int) -> InputError:
+    """What is wrong with some of so many photographs, by their names."""
+    first = next(iter(broken.values()))
+    if len(broken) == 1:
+        return first
+    return InputError(
+        f"{len(broken)} of {count} photographs cannot be used ({first_names(list(broken))}); replace or remove them. "
+        f"Of the first: {first}"
+    )
 
 
 def broken_photographs(paths: Sequence[Path]) -> list[str]:

@@ -81,11 +81,35 @@ def chosen_frames(footage: Footage, most: int) -> NDArray[np.int64]:
     return np.sort(order[firsts])
 
 
+class NoOpenCVError(InputError):
+    """A video was to be read, and OpenCV is not installed; the message says what to do."""
+
+
+@dataclass(frozen=True)
+class VideoFacts:
+    """What a video says of itself: the number of its frames, and their width and height in pixels."""
+
+    frames: int
+    width: int
+    height: int
+
+
+def video_facts(video: Path) -> VideoFacts | None:
+    """What a video says of itself; None where OpenCV can read no picture of it.
+
+    Raises:
+        NoOpenCVError: OpenCV is not installed.
+    """
+    cv2 = _opencv()
+    frame = next(_frames(cv2, video), None)
+    return None if frame is None else VideoFacts(_length(cv2, video), frame.shape[1], frame.shape[0])
+
+
 def _opencv() -> Any:
     try:
         return importlib.import_module("cv2")
     except ImportError as error:
-        raise InputError(
+        raise NoOpenCVError(
             "reading a video needs OpenCV, which is not installed; run pip install 'glassplat[video]', or give a "
             "folder of photographs"
         ) from error

@@ -155,6 +155,7 @@ def test_edges_of_five_corners_are_fitted_too() -> None:
     ("kept", "expected"),
     [
         ({0: 4}, "a second photograph, taken from another place"),
+        ({0: 4, 1: 1}, "1 corner is known from two places"),
         ({0: 4, 1: 2}, "2 corners are known from two places, expected at least 3"),
     ],
 )

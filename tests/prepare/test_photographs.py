@@ -144,6 +144,11 @@ def no_picture(folder: Path) -> None:
     (folder / "1.png").write_text("<html>not found</html>")
 
 
+def several(folder: Path) -> None:
+    broken(folder)
+    (folder / "2.png").write_bytes(b"")
+
+
 def tiny(folder: Path) -> None:
     picture(5, (30, 20)).save(folder / "thumbnail.png")
 
@@ -175,6 +180,7 @@ def nothing(folder: Path) -> None:
     ("spoil", "expected"),
     [
         (broken, r"cannot read .*1\.png as an image"),
+        (several, r"2 of 3 photographs cannot be used \(1\.png, 2\.png\).*Of the first: cannot read .*1\.png as"),
         (no_picture, r"cannot read .*1\.png as an image"),
         (tiny, r"thumbnail\.png is 30x20 pixels large; expected a photograph, 64"),
         (heic, r"1 photographs in .* are HEIC files.*IMG_1\.HEIC.*save them as JPEG"),

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.control import Control, ControlType
 
 from glassplat.commands.console.messages import message_console
+from glassplat.commands.console.signals import held_signals
 
 LINE = "loading PyTorch ..."
 """Shown in a terminal only, and gone when the work begins. The cursor stays: Ctrl-C may end the process at once."""
@@ -28,6 +29,12 @@ def import_now(module: str, console: Console | None = None) -> Any:
     console = console or message_console(stderr=True)
     with _uncollected(), _announced(console, module):
         return importlib.import_module(module)
+
+
+def import_held(module: str) -> Any:
+    """The same while a command works: signals are answered after the import, which must not break off."""
+    with held_signals():
+        return import_now(module)
 
 
 @contextmanager

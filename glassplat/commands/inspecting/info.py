@@ -4,27 +4,27 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 from rich.console import Console
 
-from glassplat.commands.console.importing import import_now
+from glassplat.commands.console.importing import import_held
 from glassplat.commands.console.messages import say, warn
-from glassplat.commands.inspecting.finding import Finding
+from glassplat.commands.inspecting.finding import KINDS, Finder, Finding
+from glassplat.commands.inspecting.info_of_capture import capture_finding
 from glassplat.commands.inspecting.info_of_photographs import photographs_finding, preparation_finding, video_finding
-from glassplat.data.errors import InputError, UnknownFormatError, first_names
+from glassplat.commands.inspecting.info_of_scene import run_finding, scene_finding, splat_finding
+from glassplat.data.errors import InputError, UnknownFormatError
 from glassplat.files.folders import SCENE
 from glassplat.files.images import IMAGE_SUFFIXES
+from glassplat.files.splat_suffixes import SPLAT_SUFFIXES
 from glassplat.prepare.video import VIDEO_SUFFIXES
 from glassplat.train.run_directory import RunDirectory
 
-CAPTURES, SCENES = (f"glassplat.commands.inspecting.info_of_{what}" for what in ("capture", "scene"))
-"""What needs PyTorch to find out, and is imported only for a path that needs it."""
-SPLATS = (".ply", ".spz", ".glb")
-KINDS = "a capture, photographs, a video, a run, an exported scene, or a splat file (.ply, .spz, .glb)"
+CAPTURE_DETAILS = "glassplat.commands.inspecting.capture_details"
 
 
 @dataclass(frozen=True)
@@ -42,32 +42,39 @@ class Info:
     page: Path | None = None
 
     def ready(self) -> None:
-        """Refuses what is not known, and imports what reads the rest."""
+        """Refuses what is not known."""
         finder_of(self.path)
 
     def run(self, console: Console) -> None:
-        """Looks and tells."""
-        finding = finder_of(self.path)(self.path)
+        """Looks, and tells what is found as soon as it is."""
+        whole = Finding()
+        for part in finder_of(self.path)(self.path):
+            if not self.json:
+                self._tell_facts(part, console)
+            whole.add(part)
         if self.page is not None:
-            import_now(CAPTURES).write_capture_page(self.path, self.page)
+            import_held(CAPTURE_DETAILS).write_capture_page(self.path, self.page)
         if self.json:
-            say(console, json.dumps({"path": str(self.path), **finding.as_json()}, indent=1))
+            say(console, json.dumps({"path": str(self.path), **whole.as_json()}, indent=1))
             return
-        say(console, f"{self.path}: {finding.kind}")
-        for name, fact in finding.facts.items():
-            say(console, f"  {name}: {fact}")
-        for problem in finding.problems:
+        for problem in whole.problems:
             warn(console, problem)
-        for command in finding.next:
+        for command in whole.next:
             say(console, f"next: {command}")
+
+    def _tell_facts(self, part: Finding, console: Console) -> None:
+        if part.kind:
+            say(console, f"{self.path}: {part.kind}")
+        for name, fact in part.facts.items():
+            say(console, f"  {name}: {fact}")
 
     def left_behind(self) -> str:
         """What an interrupt leaves: everything."""
         return "nothing was changed"
 
 
-def finder_of(path: Path) -> Callable[[Path], Finding]:
-    """What finds out about a path; imported now, with PyTorch where it needs that.
+def finder_of(path: Path) -> Finder:
+    """What finds out about a path.
 
     Raises:
         FileNotFoundError: nothing is there.
@@ -78,40 +85,31 @@ def finder_of(path: Path) -> Callable[[Path], Finding]:
     return _finder_of_folder(path) if path.is_dir() else _finder_of_file(path)
 
 
-def _finder_of_file(path: Path) -> Callable[[Path], Finding]:
+def _finder_of_file(path: Path) -> Finder:
     suffix = path.suffix.lower()
-    if suffix in SPLATS:
-        return import_now(SCENES).splat_finding
+    if suffix in SPLAT_SUFFIXES:
+        return splat_finding
     if suffix in VIDEO_SUFFIXES:
         return video_finding
     raise InputError(f"{path} is no file that is known; expected {KINDS}")
 
 
-def _finder_of_folder(path: Path) -> Callable[[Path], Finding]:
+def _finder_of_folder(path: Path) -> Finder:
     if (path / "recipe.json").is_file():
-        return import_now(SCENES).run_finding
+        return run_finding
     if RunDirectory(path).is_saved:
         raise InputError(f"{path} holds a scene, but no recipe.json; expected what `glassplat train --output` wrote")
     if path.name.endswith(".partial") and (path / "settings.json").is_file():
         return preparation_finding
     if (path / SCENE).is_file():
-        return import_now(SCENES).scene_finding
+        return scene_finding
     if all(one.suffix.lower() in IMAGE_SUFFIXES for one in path.iterdir()):
-        return _photographs_or_nothing
-    import_now(CAPTURES)
+        return photographs_finding
     return _capture_or_photographs
 
 
-def _capture_or_photographs(path: Path) -> Finding:
+def _capture_or_photographs(path: Path) -> Iterator[Finding]:
     try:
-        return import_now(CAPTURES).capture_finding(path)
+        yield from capture_finding(path)
     except UnknownFormatError:
-        return _photographs_or_nothing(path)
-
-
-def _photographs_or_nothing(path: Path) -> Finding:
-    found = photographs_finding(path)
-    if found is None:
-        names = first_names(sorted(one.name for one in path.iterdir()), 8) or "nothing"
-        raise InputError(f"{path} is nothing that is known; expected {KINDS}; it holds {names}")
-    return found
+        yield from photographs_finding(path)

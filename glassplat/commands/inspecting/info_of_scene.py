@@ -1,130 +1,53 @@
-"""What `glassplat info` says of runs and of splat files."""
+"""What `glassplat info` says of runs, exported scenes and splat files, and of the scenes in them with PyTorch."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
 
-import torch
-
+from glassplat.commands.console.importing import import_held
 from glassplat.commands.inspecting.finding import Finding
-from glassplat.data.errors import InputError
-from glassplat.files.glb import read_glb
-from glassplat.files.json_text import read_json
-from glassplat.files.ply import read_gaussians
-from glassplat.files.scene_folder import SCENE, read_scene
-from glassplat.files.spz import read_spz
-from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.scene import Scene
+from glassplat.files.folders import SCENE
 from glassplat.train.run_directory import RunDirectory
 
-SPLAT_READERS: dict[str, Callable[[Path], Gaussians]] = {
-    ".ply": read_gaussians,
-    ".spz": read_spz,
-    ".glb": read_glb,
-}
-MEASURES = {"psnr": "PSNR", "pane_psnr": "PSNR over panes", "ssim": "SSIM", "lpips": "LPIPS"}
-MANY_FAINT = 0.5
-FAINT = 0.01
+DETAILS = "glassplat.commands.inspecting.scene_details"
 
 
-def splat_finding(path: Path) -> Finding:
+def splat_finding(path: Path) -> Iterator[Finding]:
     """A file of Gaussians.
 
     Raises:
         InputError: it cannot be read.
     """
-    try:
-        gaussians = SPLAT_READERS[path.suffix.lower()](path)
-    except ValueError as error:
-        raise InputError(str(error)) from error
-    finding = Finding("a splat file", {"bytes": path.stat().st_size})
-    _look_at(gaussians, finding)
+    first = Finding("a splat file", {"bytes": path.stat().st_size})
     if (path.parent / SCENE).is_file():
-        finding.facts["beside it"] = ", ".join(sorted(one.name for one in path.parent.iterdir() if one != path))
-    return finding
+        first.facts["beside it"] = ", ".join(sorted(one.name for one in path.parent.iterdir() if one != path))
+    yield first
+    yield import_held(DETAILS).splats_part(path)
 
 
-def run_finding(path: Path) -> Finding:
-    """The directory of a training."""
+def run_finding(path: Path) -> Iterator[Finding]:
+    """The directory of a training.
+
+    Raises:
+        InputError: its records are damaged.
+    """
     directory = RunDirectory(path)
     recipe, settings = directory.recipe(), directory.settings()
     finding = Finding(f"a {recipe.method} run")
     finding.facts |= {"capture": settings.data, "iterations": settings.iterations, "downscale": settings.downscale}
     if not os.path.isdir(settings.data):
         finding.problems.append(f"its capture is no longer at {settings.data}; say with --data where it is now")
-    try:
-        scene, step = directory.latest_scene()
-    except InputError as error:
-        begun = directory.checkpoint.is_file()
-        finding.problems.append("it was interrupted, and goes on with --resume" if begun else str(error))
-        finding.next.append(f"the train command that began it, {'with --resume' if begun else 'again'}")
-        return finding
-    finding.facts["trained to"] = step
-    _describe_scene(scene, finding)
-    _describe_results(directory, finding)
-    return finding
+    yield finding
+    yield import_held(DETAILS).trained_part(directory)
 
 
-def scene_finding(path: Path) -> Finding:
+def scene_finding(path: Path) -> Iterator[Finding]:
     """A folder that a scene was exported to.
 
     Raises:
         InputError: it cannot be read.
     """
-    try:
-        scene = read_scene(path)
-    except (ValueError, FileNotFoundError) as error:
-        raise InputError(str(error)) from error
-    finding = Finding("an exported scene")
-    _describe_scene(scene, finding)
-    return finding
-
-
-def _describe_scene(scene: Scene, finding: Finding) -> None:
-    _look_at(scene.primary, finding)
-    planes = scene.planes
-    if len(planes):
-        told = (
-            f"{label}{' (mirror)' if label in planes.mirrors else f' (R0 {float(reflectance):.3f})'}"
-            for label, reflectance in zip(planes.labels, planes.base_reflectances, strict=True)
-        )
-        finding.facts["panes"] = ", ".join(told)
-    if len(scene.photographer):
-        finding.facts["photographer"] = f"{len(scene.photographer)} Gaussians, which panes show in photographs only"
-    if not scene.environment.is_empty:
-        finding.facts["environment"] = f"a cube map of {scene.environment.size} texels a side"
-
-
-def _look_at(gaussians: Gaussians, finding: Finding) -> None:
-    """Number, colours, reach and oddities of Gaussians."""
-    finding.facts["Gaussians"] = len(gaussians)
-    if not len(gaussians):
-        finding.problems.append("it holds no Gaussian")
-        return
-    finding.facts["degree of harmonics"] = gaussians.max_sh_degree
-    finite = torch.isfinite(gaussians.means).all(dim=1)
-    if not bool(finite.all()):
-        finding.problems.append(f"{int((~finite).sum())} Gaussians have no place that is finite; they are not drawn")
-    means = gaussians.means[finite]
-    low, high = (torch.quantile(means[:: max(1, len(means) // 100_000)], share, dim=0) for share in (0.02, 0.98))
-    spans = " x ".join(f"{float(side):.3g}" for side in high - low)
-    finding.facts["size of the middle 96 %"] = f"{spans} world units"
-    faint = float((torch.sigmoid(gaussians.logit_opacities) < FAINT).float().mean())
-    if faint > MANY_FAINT:
-        finding.problems.append(f"{faint:.0%} of the Gaussians are nearly invisible; `glassplat export` can prune them")
-
-
-def _describe_results(directory: RunDirectory, finding: Finding) -> None:
-    path = directory.path
-    if not directory.results.is_file():
-        finding.next.append(f"glassplat eval {path}    measures it on its test views")
-    else:
-        try:
-            results = read_json(directory.results)
-            measures = [f"{label} {results[name]:.3f}" for name, label in MEASURES.items() if results.get(name)]
-            finding.facts["measured"] = ", ".join(measures)
-        except (ValueError, TypeError, AttributeError):
-            finding.problems.append(f"{directory.results} is damaged; evaluate it again")
-    finding.next.append(f"glassplat render {path} --layers rgb --output PICTURES")
+    yield Finding("an exported scene", {"files": ", ".join(sorted(one.name for one in path.iterdir()))})
+    yield import_held(DETAILS).scene_part(path)

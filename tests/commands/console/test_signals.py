@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from glassplat.cli import main
+from glassplat.commands.console.signals import Interrupted, held_signals, raised_signals
 from glassplat.commands.looking.render import Render
 from glassplat.commands.measuring.bench import Bench, BenchScenes
 from glassplat.commands.measuring.demo import SCENE, Demo
@@ -51,6 +52,17 @@ def ended(script: str) -> tuple[int, str, str]:
     """Exit code, output and errors of a script in a process of its own."""
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=100)
     return done.returncode, done.stdout, done.stderr
+
+
+def test_signals_that_are_held_are_answered_afterwards() -> None:
+    done: list[str] = []
+    with raised_signals() as raised, pytest.raises(Interrupted, match="terminated"):
+        with held_signals():
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.01)
+            done.append("what must not break off")
+        done.append("what comes after it")
+    assert done == ["what must not break off"] and len(raised) == 1
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,8 @@ import pytest
 import glassplat
 from glassplat.cli import COMMANDS, command_class, main
 from glassplat.commands.measuring.demo import SCENE
+from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.recipe import recipe_to_json
 
 SLOW = ["torch", "numba", "scipy", "numpy", "PIL", "pycolmap", "OpenEXR", "safetensors"]
 IMPORTS = """
@@ -122,11 +124,49 @@ def test_what_can_be_refused_at_once_is_refused_without_pytorch(line: str, place
     assert REFUSED[line] in " ".join(done.stderr.split()) and done.stderr.startswith("error: ")
 
 
-@pytest.mark.parametrize("name", sorted(COMMANDS.keys() - {"train", "bench"}))
+@pytest.mark.parametrize("name", sorted(COMMANDS))
 def test_a_command_explains_itself_without_pytorch(name: str) -> None:
     script = IMPORTS.format(arguments=[name, "--help"], slow=["torch", "numba"])
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert json.loads(done.stdout.splitlines()[-1])[:2] == [0, []]
+
+
+WITHOUT_PYTORCH = """
+import importlib.abc, sys
+
+class Missing(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == "torch":
+            raise OSError("PyTorch was imported")
+
+sys.meta_path.insert(0, Missing())
+from glassplat.cli import main
+sys.exit(main({arguments!r}))
+"""
+FIRST_WORDS = {
+    "train splat --data SCENE --output new": "a COLMAP capture of 96 photographs",
+    "train planar --preset paper --data=SCENE --output new": "8 masks of panes",
+    "demo --output new": "planar is trained here, and splat beside it",
+    "bench scenes --data SCENE --output new": "a COLMAP capture of 96 photographs",
+    "bench ablation --data SCENE --output new --switches depth": "a COLMAP capture of 96 photographs",
+    "bench seconds --data SCENE --output new": "a COLMAP capture of 96 photographs",
+    "info SCENE": "a capture format: COLMAP points: 6048",
+    "info run": "a planar run capture: gone iterations: 3000",
+    "info splats.ply": "a splat file bytes: 0",
+}
+"""Command lines, and what each says before it needs PyTorch."""
+
+
+@pytest.mark.parametrize("line", FIRST_WORDS)
+def test_a_command_begins_before_pytorch_is_imported(line: str, tmp_path: Path) -> None:
+    (tmp_path / "splats.ply").write_bytes(b"")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "recipe.json").write_text(recipe_to_json(PlanarRecipe()))
+    (tmp_path / "run" / "settings.json").write_text(json.dumps({"data": "gone", "iterations": 3000}))
+    script = WITHOUT_PYTORCH.format(arguments=line.replace("SCENE", str(SCENE)).split())
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert FIRST_WORDS[line] in " ".join(done.stdout.split())
+    assert (done.returncode, done.stderr) == (1, "stopped: PyTorch was imported\n")
 
 
 def test_photographs_are_described_without_pytorch(places: Path) -> None:

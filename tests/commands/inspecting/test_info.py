@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -16,6 +18,7 @@ from glassplat.files.ply import write_gaussians
 from glassplat.files.spz import write_spz
 from glassplat.scene.gaussians import Gaussians
 from tests.commands.tiny_run import write_run
+from tests.prepare.test_video import film
 from tests.train.tiny_capture import true_scene
 
 
@@ -49,6 +52,26 @@ def test_photographs_are_to_be_prepared(tmp_path: Path, capsys: pytest.CaptureFi
     found = told(tmp_path / "photographs", capsys)
     assert found["kind"] == "photographs without poses" and found["facts"]["photographs"] == 96
     assert any("glassplat prepare" in line for line in found["next"])
+
+
+def test_a_video_is_looked_into(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    offsets = np.linspace(0, 40, 12)
+    found = told(film(tmp_path / "walk.avi", offsets), capsys)
+    assert found["kind"] == "a video" and found["healthy"] and found["facts"]["frames"] == 12
+    assert any("glassplat prepare" in line for line in found["next"])
+    (tmp_path / "notes.mp4").write_text("no video")
+    found = told(tmp_path / "notes.mp4", capsys)
+    assert found["kind"] == "a file that has the name of a video" and not found["next"]
+    assert "OpenCV can read no picture of it" in found["problems"][0]
+
+
+def test_without_opencv_a_video_is_told_by_its_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    (tmp_path / "walk.mp4").write_text("no video")
+    found = told(tmp_path / "walk.mp4", capsys)
+    assert found["kind"] == "a video, by its name" and "needs OpenCV" in found["problems"][0]
 
 
 def test_photographs_that_prepare_would_refuse_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

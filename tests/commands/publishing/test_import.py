@@ -12,7 +12,7 @@ from glassplat.cli import main
 from glassplat.files.images import read_image
 from glassplat.files.planes_json import write_planes
 from glassplat.files.ply import write_gaussians
-from glassplat.files.splat_files import SUFFIXES
+from glassplat.files.splat_suffixes import SPLAT_SUFFIXES
 from glassplat.interface.loading import load
 from tests.commands.tiny_run import write_run
 from tests.files.test_spz import typical
@@ -72,7 +72,7 @@ def test_panes_can_be_given_by_hand(tmp_path: Path) -> None:
     assert float(strength.max()) > 0.1
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", SPLAT_SUFFIXES)
 def test_hostile_files_get_one_message(suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / f"a{suffix}"
     file.write_bytes(b"\x00" * 31)
