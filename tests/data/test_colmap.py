@@ -35,7 +35,7 @@ def test_reads_what_colmap_wrote(capture, binary: bool, folder: str) -> None:
         assert list(shot.lens.params) == capture.lenses[0][1]
     assert found.points is not None
     order = np.lexsort(capture.points.T)
-    read_order = np.lexsort(found.points.positions.numpy().astype(float).T)
+    read_order = np.lexsort(found.points.positions.astype(float).T)
     np.testing.assert_allclose(found.points.positions[read_order], capture.points[order], atol=1e-6)
     np.testing.assert_array_equal(found.points.colors[read_order], capture.colors[order])
 

@@ -27,24 +27,24 @@ def ring(direction: float) -> list[Camera]:
 
 
 def test_cameras_around_an_object() -> None:
-    offsets = points_in_view(ring(-1.0)).positions - torch.tensor([5.0, 0.0, 1.0])
-    assert offsets.norm(dim=1).max() == pytest.approx(3.0, rel=0.01)
-    assert offsets.mean(0).norm() < 0.1
+    offsets = points_in_view(ring(-1.0)).positions - np.array([5.0, 0.0, 1.0])
+    assert np.linalg.norm(offsets, axis=1).max() == pytest.approx(3.0, rel=0.01)
+    assert np.linalg.norm(offsets.mean(0)) < 0.1
 
 
 def test_cameras_that_look_outwards_get_points_beyond_them() -> None:
-    offsets = points_in_view(ring(1.0)).positions - torch.tensor([5.0, 0.0, 1.0])
-    assert (offsets.norm(dim=1) > 3.0).float().mean() > 0.9
+    offsets = points_in_view(ring(1.0)).positions - np.array([5.0, 0.0, 1.0])
+    assert (np.linalg.norm(offsets, axis=1) > 3.0).mean() > 0.9
 
 
 def test_cameras_side_by_side_get_points_ahead() -> None:
     cameras = [camera_at(np.array([0.1 * i, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])) for i in range(5)]
     positions = points_in_view(cameras).positions
-    assert (positions[:, 1] > 0).float().mean() > 0.99
+    assert (positions[:, 1] > 0).mean() > 0.99
 
 
 def test_box_is_uniform_and_repeatable() -> None:
     first, second = points_in_box(), points_in_box()
-    assert torch.equal(first.positions, second.positions)
+    np.testing.assert_array_equal(first.positions, second.positions)
     assert len(first) == 100_000
-    torch.testing.assert_close(first.positions.std(0), torch.full((3,), 1.3 / 3**0.5), rtol=0.02, atol=0)
+    np.testing.assert_allclose(first.positions.std(0), np.full(3, 1.3 / 3**0.5), rtol=0.02)

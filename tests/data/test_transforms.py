@@ -149,7 +149,7 @@ def test_points_beside_the_file(capture, name: str, binary: bool) -> None:
         path.write_text("\n".join([*header, *rows, ""]))
     points = load(capture, **settings).points
     assert points is not None
-    order = np.lexsort(points.positions.numpy().astype(float).T)
+    order = np.lexsort(points.positions.astype(float).T)
     expected = np.lexsort(capture.points.T)
     np.testing.assert_allclose(points.positions[order], capture.points[expected], atol=1e-6)
     np.testing.assert_array_equal(points.colors[order], capture.colors[expected])

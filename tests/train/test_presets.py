@@ -33,7 +33,7 @@ from glassplat.train.stage import Clock, Stage, stage_starts
 from glassplat.train.state import TrainState
 from glassplat.train.strategy import mcmc_population
 from glassplat.train.trainer import differentiate, train
-from tests.densify.test_default import densified, make_gaussians, seen
+from tests.densify.test_default import edited, make_gaussians, seen
 from tests.render.test_seen_panes import CAMERA, vitrine
 from tests.train.progress_of import finished
 from tests.train.tiny_capture import tiny_capture, true_scene
@@ -145,7 +145,7 @@ def test_large_gaussians_are_split_by_the_gradient_if_asked() -> None:
     gaussians = make_gaussians([0.5, 0.5])
     # Pixels pull at the first without moving it, and the second moves without much pull.
     statistics = seen([1e-5, 1e-3], pulls=[1e-2, 1.1e-3])
-    pulled, moved = (densified(DefaultDensify(split_by=by), gaussians, statistics) for by in ("pull", "gradient"))
+    pulled, moved = (edited(DefaultDensify(split_by=by), gaussians, statistics) for by in ("pull", "gradient"))
     assert len(pulled) == len(moved) == 3
     assert torch.equal(pulled.means[0], gaussians.means[1]) and torch.equal(moved.means[0], gaussians.means[0])
 
