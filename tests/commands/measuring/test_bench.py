@@ -12,9 +12,11 @@ from typing import Any, get_args
 import pytest
 
 from glassplat.cli import main
+from glassplat.commands.console.training_progress import TrainingProgress
 from glassplat.commands.measuring import bench
-from glassplat.commands.measuring.bench_runs import FinishedRun, PlannedRun, RunClock, scene_names
-from glassplat.commands.training.train import Train, TrainingProgress
+from glassplat.commands.measuring.bench_execution import RunClock
+from glassplat.commands.measuring.bench_runs import FinishedRun, PlannedRun, scene_names
+from glassplat.commands.training.train import Train
 from glassplat.data.errors import InputError
 from glassplat.init.plane_options import PlaneFitError
 from glassplat.train.ablations import ABLATIONS, Ablated, Switch
