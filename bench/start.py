@@ -1,14 +1,13 @@
 """How soon a command says its first word: python -m bench.start [--run RUN].
 
-That is the clock's time from the start of the process to its first line, when it has refused or begun: `train` says it
-when it has read its capture, what renders when it knows its device. In a terminal a line about PyTorch comes earlier.
+That is the clock's time from the start of the process to its first line, when it has refused or begun: `train`, `bench`
+and `info` say it when they have read what the capture's folder holds, `demo` when it has begun to train, what renders
+when it has read the run's records. All of that comes before PyTorch, of whose import a terminal shows a line.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-import signal
 import statistics
 import subprocess
 import sys
@@ -33,10 +32,16 @@ COMMANDS = (
     ("train", "splat", "--data", "nothing-here", "--output", OUTPUT),
     ("train", "splat", "--data", str(SCENE), "--output", OUTPUT),
     ("train", "planar", "--data", str(SCENE), "--output", OUTPUT),
+    ("demo", "--output", OUTPUT),
+    ("bench", "--help"),
+    ("bench", "scenes", "--data", str(SCENE), "--output", OUTPUT),
     ("info", str(SCENE / "images")),
+    ("info", str(SCENE)),
 )
 OF_RUNS = (
     ("info", "{run}"),
+    ("eval", "{run}"),
+    ("view", "{run}"),
     ("render", "{run}", "--output", OUTPUT),
     ("video", "{run}", "--output", f"{OUTPUT}.mp4"),
     ("export", "{run}", "--output", OUTPUT),
@@ -60,13 +65,12 @@ def first_line(arguments: Sequence[str]) -> FirstLine:
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        start_new_session=True,
     ) as process:
         assert process.stdout is not None
         text = process.stdout.readline()
         seconds = time.perf_counter() - begin
         if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
+            process.terminate()  # Not killed: `demo` has another command to end.
     return FirstLine(text.strip(), seconds)
 
 

@@ -329,7 +329,7 @@ def write_environment(mitsuba: Any, environment: Array, folder: Path) -> None:
 def write_points(count: int, folder: Path) -> None:
     """Writes `points3d.ply`: random points of the box in which such captures lie."""
     cloud = points_in_box(count)
-    rows = np.concatenate([cloud.positions.numpy(), cloud.colors.numpy()], axis=1).astype(np.float32)
+    rows = np.concatenate([cloud.positions, cloud.colors], axis=1).astype(np.float32)
     write_table(folder / "points3d.ply", ["x", "y", "z", "red", "green", "blue"], rows)
 
 

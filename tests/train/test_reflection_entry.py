@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 from glassplat.densify.options import MirrorSearch
 from glassplat.render.splat import Splat
 from glassplat.scene.activations import logit
+from glassplat.scene.scene import Scene
 from glassplat.scene.tint import TINT
 from glassplat.train.actions import GrowSh, ResetOpacity
 from glassplat.train.deferred_recipe import DeferredRecipe
@@ -24,27 +26,29 @@ from glassplat.train.traced_recipe import TracedRecipe
 from tests.train.progress_of import followed
 from tests.train.tiny_capture import tiny_capture
 
+Found = Callable[..., tuple[Tensor, Tensor]]
+"""Stands in for `mirror_lookalikes`."""
 
-@dataclass(frozen=True)
-class Every3rd(MirrorSearch):
+
+def every_3rd(options: MirrorSearch, scene: Scene, views: object, renderer: object) -> tuple[Tensor, Tensor]:
     """Takes every third Gaussian for a mirror."""
-
-    def looks(self, scene, views, renderer) -> tuple[Tensor, Tensor]:  # type: ignore[no-untyped-def]
-        rows = torch.arange(len(scene.primary))
-        return torch.ones_like(rows, dtype=torch.bool), rows % 3 == 0
+    rows = torch.arange(len(scene.primary))
+    return torch.ones_like(rows, dtype=torch.bool), rows % 3 == 0
 
 
-@dataclass(frozen=True)
-class Nothing(MirrorSearch):
+def nothing(options: MirrorSearch, scene: Scene, views: object, renderer: object) -> tuple[Tensor, Tensor]:
     """Finds no mirror."""
-
-    def looks(self, scene, views, renderer) -> tuple[Tensor, Tensor]:  # type: ignore[no-untyped-def]
-        seen = torch.ones(len(scene.primary), dtype=torch.bool)
-        return seen, torch.zeros_like(seen)
+    seen = torch.ones(len(scene.primary), dtype=torch.bool)
+    return seen, torch.zeros_like(seen)
 
 
 def begun(
-    search: MirrorSearch, *, near: bool = True, tint: bool = False, harmonics_wait: bool = False
+    found: Found,
+    search: MirrorSearch | None = None,
+    *,
+    near: bool = True,
+    tint: bool = False,
+    harmonics_wait: bool = False,
 ) -> tuple[TrainState, list[str]]:
     """A state in which reflections have begun, and what was told on the way."""
     state = TrainState(TracedRecipe(sh_degree=1).initialise(tiny_capture()), seed=0)
@@ -52,13 +56,15 @@ def begun(
     ones = {name: torch.ones_like(tensor) for name, tensor in state.scene.primary.tensors().items()}
     state.optimizer.moments = {f"primary.{name}": (tensor, tensor.clone()) for name, tensor in ones.items()}
     around = AddSurroundings(SurroundingsStart("scene"), 1) if near else None
-    entry = BeginReflections(AddEnvironment(2), around, search, Splat(), tint, harmonics_wait)
-    messages, _ = followed(entry(state, tiny_capture()))
+    entry = BeginReflections(AddEnvironment(2), around, search or MirrorSearch(), Splat(), tint, harmonics_wait)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("glassplat.train.reflection_entry.mirror_lookalikes", found)
+        messages, _ = followed(entry(state, tiny_capture()))
     return state, [message.what for message in messages]
 
 
 def test_what_looks_like_a_mirror_becomes_one_and_the_rest_is_what_it_mirrors() -> None:
-    state, told = begun(Every3rd())
+    state, told = begun(every_3rd)
     count = len(state.scene.primary)
     chosen = torch.arange(count) % 3 == 0
     strengths = torch.sigmoid(state.scene.primary.channels["logit_strength"])
@@ -72,7 +78,7 @@ def test_what_looks_like_a_mirror_becomes_one_and_the_rest_is_what_it_mirrors() 
 
 
 def test_the_papers_start_from_hardly_any_reflection() -> None:
-    state, _ = begun(Every3rd(begin_found=False))
+    state, _ = begun(every_3rd, MirrorSearch(begin_found=False))
     assert float(state.scene.primary.channels["logit_strength"].max()) < logit(0.01)
     assert all(bool((first == 1).all()) for first, _ in state.optimizer.moments.values())
     # What looks like a mirror is not copied, all the same.
@@ -80,7 +86,7 @@ def test_the_papers_start_from_hardly_any_reflection() -> None:
 
 
 def test_without_anything_near_and_without_a_search_no_mirrors_are_looked_for() -> None:
-    state, told = begun(MirrorSearch(begin_found=False), near=False)
+    state, told = begun(every_3rd, MirrorSearch(begin_found=False), near=False)
     assert told == [] and not state.scene.environment.is_empty and not len(state.scene.surroundings)
 
 
@@ -99,11 +105,15 @@ def test_mirrors_are_searched_for_but_not_in_the_papers(kind: type[DeferredRecip
     assert kind().search.begin_found and not kind.paper().search.begin_found
 
 
-@pytest.mark.parametrize(("search", "degree"), [(Every3rd(), 0), (Nothing(), 1), (Every3rd(begin_found=False), 1)])
-def test_what_colors_have_learnt_of_mirrors_is_left_out_if_there_are_any(search: MirrorSearch, degree: int) -> None:
-    state, _ = begun(search, harmonics_wait=True)
+@pytest.mark.parametrize(
+    ("found", "begin_found", "degree"), [(every_3rd, True, 0), (nothing, True, 1), (every_3rd, False, 1)]
+)
+def test_what_colors_have_learnt_of_mirrors_is_left_out_if_there_are_any(
+    found: Found, begin_found: bool, degree: int
+) -> None:
+    state, _ = begun(found, MirrorSearch(begin_found=begin_found), harmonics_wait=True)
     assert state.scene.primary.active_sh_degree == degree
-    assert begun(search)[0].scene.primary.active_sh_degree == 1
+    assert begun(found, MirrorSearch(begin_found=begin_found))[0].scene.primary.active_sh_degree == 1
 
 
 @pytest.mark.parametrize("recipe", [DeferredRecipe(), TracedRecipe()])
@@ -115,7 +125,7 @@ def test_colors_wait_until_normals_have_spread(recipe: DeferredRecipe | TracedRe
 
 def test_reflections_begin_white_and_may_learn_a_color_where_that_is_asked_for() -> None:
     search = MirrorSearch(begin_found=False)
-    white, tinted = (begun(search, tint=tint)[0].scene for tint in (False, True))
+    white, tinted = (begun(nothing, search, tint=tint)[0].scene for tint in (False, True))
     assert not set(TINT) & set(white.primary.channels)
     assert set(TINT) <= set(tinted.primary.channels)
     assert not any(bool(tinted.primary.channels[name].any()) for name in TINT)

@@ -12,6 +12,7 @@ from rich.console import Console
 from glassplat.commands.console.importing import import_now
 from glassplat.commands.runs.output_folder import check_claim
 from glassplat.commands.runs.scene_edits import SceneEdits
+from glassplat.commands.runs.scene_place import say_scene
 from glassplat.commands.runs.splits import Split
 from glassplat.interface.layers import Layer
 from glassplat.kernels.devices import DeviceName
@@ -44,6 +45,7 @@ class Render:
         """Refuses what is no run, and an output that holds something else; imports what renders."""
         RunDirectory(self.run_directory).check_begun()
         check_claim(self.output, "render")
+        say_scene(self.run_directory)
         import_now("glassplat.commands.looking.rendering")
 
     def run(self, console: Console) -> None:

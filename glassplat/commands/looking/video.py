@@ -11,7 +11,7 @@ from rich.console import Console
 
 from glassplat.commands.console.importing import import_now
 from glassplat.commands.runs.scene_edits import SceneEdits
-from glassplat.commands.runs.scene_place import check_file, check_scene
+from glassplat.commands.runs.scene_place import check_file, check_scene, say_scene
 from glassplat.data.errors import InputError, input_checked
 from glassplat.data.ranges import Range
 from glassplat.interface.layers import Layer
@@ -81,6 +81,7 @@ class Video:
         check_scene(self.scene)
         if self.keyframes is not None:
             check_file(self.keyframes)
+        say_scene(self.scene)
         import_now("glassplat.commands.looking.filming")
 
     def run(self, console: Console) -> None:

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from glassplat.commands.console.importing import import_now
 from glassplat.commands.runs.scene_edits import SceneEdits
-from glassplat.commands.runs.scene_place import check_scene
+from glassplat.commands.runs.scene_place import check_scene, say_scene
 from glassplat.data.ranges import Range
 from glassplat.files.folders import check_folder
 from glassplat.kernels.devices import DeviceName
@@ -45,6 +45,7 @@ class View:
         if self.output is not None:
             check_folder(self.output)
         check_port(self.host, self.port)
+        say_scene(self.scene)
         import_now("glassplat.commands.looking.viewing")
 
     def run(self, console: Console) -> None:

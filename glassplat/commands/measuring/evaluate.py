@@ -11,6 +11,7 @@ from rich.console import Console
 
 from glassplat.commands.console.importing import import_now
 from glassplat.commands.console.messages import say
+from glassplat.commands.runs.scene_place import say_scene
 from glassplat.kernels.devices import DeviceName
 from glassplat.train.run_directory import RunDirectory
 
@@ -43,6 +44,7 @@ class Evaluate:
     def ready(self) -> None:
         """Refuses what is no run, and imports what renders."""
         RunDirectory(self.run_directory).check_begun()
+        say_scene(self.run_directory)
         import_now("glassplat.commands.measuring.evaluation")
 
     def run(self, console: Console) -> None:

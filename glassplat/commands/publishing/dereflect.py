@@ -11,6 +11,7 @@ from rich.console import Console
 
 from glassplat.commands.console.importing import import_now
 from glassplat.commands.runs.output_folder import check_claim
+from glassplat.commands.runs.scene_place import say_scene
 from glassplat.commands.runs.splits import Split
 from glassplat.kernels.devices import DeviceName
 from glassplat.train.run_directory import RunDirectory
@@ -41,6 +42,7 @@ class Dereflect:
         """Refuses what is no run, and an output that holds something else; imports what renders."""
         RunDirectory(self.run_directory).check_begun()
         check_claim(self.output, "dereflect")
+        say_scene(self.run_directory)
         import_now("glassplat.commands.publishing.reflections_off")
 
     def run(self, console: Console) -> None:

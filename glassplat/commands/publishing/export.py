@@ -12,7 +12,7 @@ from rich.console import Console
 from glassplat.commands.console.importing import import_now
 from glassplat.commands.runs.output_folder import check_claim
 from glassplat.commands.runs.scene_edits import SceneEdits
-from glassplat.commands.runs.scene_place import check_scene
+from glassplat.commands.runs.scene_place import check_scene, say_scene
 from glassplat.data.errors import InputError
 from glassplat.kernels.devices import DeviceName
 
@@ -56,6 +56,7 @@ class Export:
             raise InputError("--layer transmission has no reflections to bake; give one of the two")
         check_scene(self.run_directory)
         check_claim(self.output, "export")
+        say_scene(self.run_directory)
         import_now("glassplat.commands.publishing.exporting")
 
     def run(self, console: Console) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from glassplat.commands.console.messages import message_console, say
 from glassplat.data.errors import input_checked
 from glassplat.files.reading import reading
 from glassplat.train.run_directory import RunDirectory
@@ -20,6 +21,25 @@ def check_scene(path: Path) -> None:
         RunDirectory(path).check_begun()
     else:
         check_file(path)
+
+
+def say_scene(path: Path) -> None:
+    """Says what the records of a run tell, or how large a file is: the first that is known of a scene.
+
+    Raises:
+        InputError: the records are damaged.
+    """
+    say(message_console(), f"{path}: {_in_words(path)}")
+
+
+def _in_words(path: Path) -> str:
+    if path.is_file():
+        return f"a splat file of {path.stat().st_size / 1e6:.1f} MB"
+    directory = RunDirectory(path)
+    if directory.imported.is_file():
+        return "an imported scene"
+    recipe, settings = directory.recipe(), directory.settings()
+    return f"a {recipe.method} run of {settings.iterations} iterations on {settings.data}"
 
 
 def check_file(path: Path) -> None:

@@ -152,6 +152,12 @@ FIRST_WORDS = {
     "bench seconds --data SCENE --output new": "a COLMAP capture of 96 photographs",
     "info SCENE": "a capture format: COLMAP points: 6048",
     "info run": "a planar run capture: gone iterations: 3000",
+    "eval run": "run: a planar run of 3000 iterations on gone",
+    "render run --output new": "run: a planar run of 3000 iterations on gone",
+    "dereflect run --output new": "run: a planar run of 3000 iterations on gone",
+    "export run --output new": "run: a planar run of 3000 iterations on gone",
+    "video run --output film.gif": "run: a planar run of 3000 iterations on gone",
+    "view splats.ply": "splats.ply: a splat file of 0.0 MB",
     "info splats.ply": "a splat file bytes: 0",
 }
 """Command lines, and what each says before it needs PyTorch."""
