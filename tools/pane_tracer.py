@@ -18,6 +18,7 @@ from tools.scene_surfaces import INK, solid_noise
 Array = NDArray[np.float64]
 
 TEXTURE_WAVES = 16
+GLASS_WAVES = 6
 REFLECTIONS = 3
 """How many reflections one after the other are followed."""
 SELF = 1e-6
@@ -159,6 +160,42 @@ class Meeting(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Waves:
+    """Unevenness of glass, which turns its normals: a sum of plane waves of one length.
+
+    Attributes:
+        slope_rad: root of the mean square of the angle between a normal and that of the even pane.
+        length: of the waves, world units.
+        seed: chooses their directions and phases.
+    """
+
+    slope_rad: float
+    length: float = 0.6
+    seed: int = 0
+
+    def slopes(self, places: Array) -> Array:
+        """Gradients [N, 2] of the height at places [N, 2] on the pane, world units."""
+        generator = np.random.default_rng(self.seed)
+        angles, phases = generator.uniform(0, 2 * np.pi, (2, GLASS_WAVES))
+        along = np.stack([np.cos(angles), np.sin(angles)])
+        heights = np.sin(2 * np.pi / self.length * places @ along + phases)
+        return self.slope_rad * np.sqrt(2 / GLASS_WAVES) * heights @ along.T
+
+
+@dataclass(frozen=True)
+class SecondPane:
+    """The other pane of double glazing, which mirrors as the first one does.
+
+    Attributes:
+        gap: how far behind the first one it is, seen from the side to which the normal points, world units.
+        tilt_rad: by which it is turned about the pane's tangent.
+    """
+
+    gap: float
+    tilt_rad: float
+
+
+@dataclass(frozen=True)
 class Pane:
     """A flat rectangle of glass, or a mirror on both sides.
 
@@ -170,6 +207,8 @@ class Pane:
         half_sizes: half the lengths of the sides.
         refraction: refractive index; None for a mirror.
         tint: share of red, green and blue light that gets through of what is not reflected.
+        waves: in the glass; None where it is even.
+        second: pane of double glazing; None for a single pane.
     """
 
     label: int
@@ -179,6 +218,8 @@ class Pane:
     half_sizes: tuple[float, float]
     refraction: float | None = 1.5
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    waves: Waves | None = None
+    second: SecondPane | None = None
 
     @property
     def bitangent(self) -> Array:
@@ -212,11 +253,40 @@ class Pane:
         along = (inside - self.refraction * cosines) / (inside + self.refraction * cosines)
         return (2 * across**2 / (1 + across**2) + 2 * along**2 / (1 + along**2)) / 2
 
+    def normals(self, points: Array) -> Array:
+        """Unit normals [N, 3] at points on it."""
+        if self.waves is None:
+            return np.broadcast_to(self.normal, points.shape)
+        offset, axes = points - self.center, np.stack([self.tangent, self.bitangent])
+        turned = self.normal - self.waves.slopes(offset @ axes.T) @ axes
+        return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
     def meeting(self, origins: Array, directions: Array, distances: Array) -> Meeting:
         """What happens at the pane to rays that meet it after distances [N]."""
-        along = directions @ self.normal
-        mirrored = directions - 2 * np.outer(along, self.normal)
-        return Meeting(origins + distances[:, None] * directions, mirrored, self.reflectances(np.abs(along)))
+        points = origins + distances[:, None] * directions
+        normals = self.normals(points)
+        mirrored = directions - 2 * (directions * normals).sum(axis=1, keepdims=True) * normals
+        return Meeting(points, mirrored, self.reflectances(np.abs(directions @ self.normal)))
+
+    def meetings(self, origins: Array, directions: Array, distances: Array) -> list[Meeting]:
+        """The same for each pane of double glazing; light that goes to and fro between the two is left out."""
+        first = self.meeting(origins, directions, distances)
+        if self.second is None:
+            return [first]
+        other = self.second_pane(self.second)
+        to_other = ((other.center - origins) @ other.normal) / (directions @ other.normal)
+        behind = other.meeting(origins, directions, to_other)
+        passed = first.share * (1 - first.share) ** 2
+        in_front = directions @ self.normal < 0
+        return [
+            first._replace(share=np.where(in_front, first.share, passed)),
+            behind._replace(share=np.where(in_front, passed, first.share)),
+        ]
+
+    def second_pane(self, second: SecondPane) -> Pane:
+        """The other one by itself."""
+        turned = np.cos(second.tilt_rad) * self.normal + np.sin(second.tilt_rad) * self.bitangent
+        return replace(self, center=self.center - second.gap * self.normal, normal=turned, second=None)
 
 
 class Seen(NamedTuple):
@@ -343,12 +413,19 @@ class Place:
             strength, label = np.zeros(len(end)), np.zeros(len(end), dtype=np.uint8)
             for number, pane in enumerate(self.panes):
                 hit = (order[place] == number) & (distances[number] < np.inf)
-                met = pane.meeting(origins[hit], directions[hit], distances[number, hit])
-                reflection[hit] = mirrored.radiance(met.points, met.mirrored, reflections - 1)
-                strength[hit], label[hit] = met.share, pane.label
+                label[hit] = pane.label
                 transmission[hit] *= pane.tint
+                reflection[hit], strength[hit] = mirrored.mirrored_in(
+                    pane.meetings(origins[hit], directions[hit], distances[number, hit]), reflections - 1
+                )
             radiance = (1 - strength[:, None]) * transmission + strength[:, None] * reflection
         return Seen(radiance, transmission, reflection, strength, label, self.silver_normals(origins, directions))
+
+    def mirrored_in(self, meetings: Sequence[Meeting], reflections: int) -> tuple[Array, Array]:
+        """What a pane mirrors [N, 3], as if it mirrored all light, and the share [N] of the light that it does."""
+        strength = np.sum([met.share for met in meetings], axis=0)
+        seen = [met.share[:, None] * self.radiance(met.points, met.mirrored, reflections) for met in meetings]
+        return np.sum(seen, axis=0) / np.maximum(strength, np.finfo(float).tiny)[:, None], strength
 
 
 def painted(points: Array, seed: int) -> Array:
