@@ -228,8 +228,10 @@ class Pane:
 
     @property
     def base_reflectance(self) -> float:
-        """Share of the light that comes back at normal incidence."""
-        return float(self.reflectances(np.ones(1))[0])
+        """Share of the light that comes back at normal incidence, of both panes of double glazing."""
+        towards = -self.normal[None]
+        met = self.meetings(self.center - towards, towards, np.ones(1))
+        return float(sum(meeting.share[0] for meeting in met))
 
     def distances(self, origins: Array, directions: Array) -> Array:
         """How far [N] rays go until they meet it; infinite where they do not."""

@@ -106,6 +106,8 @@ def test_double_glazing_mirrors_twice_as_much() -> None:
     one, two = (Place((ROOM,), (replace(WINDOW, second=s),)).seen(*rays) for s in (None, SecondPane(0.0, 0.0)))
     np.testing.assert_allclose(two.strength, one.strength + one.strength * (1 - one.strength) ** 2)
     np.testing.assert_allclose(two.reflection, one.reflection, atol=1e-9)
+    once = WINDOW.base_reflectance
+    assert replace(WINDOW, second=SecondPane(0.0, 0.0)).base_reflectance == pytest.approx(once * (1 + (1 - once) ** 2))
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
