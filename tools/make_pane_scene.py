@@ -28,8 +28,9 @@ from tools.case_place import case_place, case_poses
 from tools.make_demo_scene import TEST_EVERY, srgb_from_linear
 from tools.make_scenes import GOLDEN_ANGLE_RAD, as_bytes
 from tools.pane_draws import DrawnPlace, draw_place, standing_pane, world_from_cam
-from tools.pane_tracer import Array, Ball, Box, Pane, Place, SecondPane, Seen, Waves
+from tools.pane_tracer import Ball, Box, Place, Seen
 from tools.photographer_body import passer_by, photographer
+from tools.tracer_panes import Array, Pane, SecondPane, Waves
 from tools.window_place import window_place, window_poses
 
 LOOKED_AT = np.array([0.0, 0.1, 0.8])

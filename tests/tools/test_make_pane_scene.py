@@ -19,8 +19,9 @@ from glassplat.kernels.blend_panes.reference import two_surfaces
 from glassplat.kernels.pane_hits.reference import pane_hits
 from glassplat.kernels.panes import Panes
 from tools.make_pane_scene import Arguments, main, make_place, with_glass
-from tools.pane_tracer import Ball, Box, Carried, Pane, Place, SecondPane, Silver, Waves
+from tools.pane_tracer import Ball, Box, Carried, Place, Silver
 from tools.photographer_body import passer_by, photographer, upright_frame
+from tools.tracer_panes import Pane, SecondPane, Waves
 
 ROOM = Box((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), seed=1, room=True)
 X, Y = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
