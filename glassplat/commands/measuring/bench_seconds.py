@@ -15,6 +15,7 @@ from rich.text import Text
 from glassplat.commands.console.messages import say
 from glassplat.commands.measuring.bench_runs import RUNS, PlannedRun, scene_names
 from glassplat.commands.measuring.seconds_chart import Curve, chart
+from glassplat.commands.runs.output_folder import check_targets
 from glassplat.commands.training.train import Train
 from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
@@ -94,6 +95,7 @@ class BenchSeconds:
 
     def _check(self) -> None:
         check_folder(self.output)
+        check_targets(self.output, [self.output / name for name in (RUNS, "seconds.md", "seconds.json")], [])
         if not self.methods or not self.seconds:
             raise InputError("--methods or --seconds names nothing; expected at least one of each")
 

@@ -10,7 +10,9 @@ from rich.console import Console
 from glassplat.commands.console.messages import say
 from glassplat.commands.console.signals import held_signals
 from glassplat.commands.measuring.beside import beside
+from glassplat.commands.runs.output_folder import check_targets
 from glassplat.commands.training.train import Train
+from glassplat.data.errors import InputError
 from glassplat.data.ranges import Seed, Several
 from glassplat.files.folders import check_folder
 from glassplat.kernels.devices import DeviceName
@@ -19,6 +21,8 @@ from glassplat.train.run_directory import RunDirectory
 from glassplat.train.splat_recipe import SplatRecipe
 
 SCENE = Path(__file__).parents[2] / "demo_scene"
+LEAST_ITERATIONS = 8
+"""Of which each stage of `planar` gets one."""
 
 
 @dataclass(frozen=True)
@@ -38,23 +42,34 @@ class Demo:
     device: DeviceName = "auto"
 
     def ready(self) -> None:
-        """Refuses an output that cannot be written."""
+        """Refuses an output that cannot be written, and a run that is too short for the stages of `planar`."""
         check_folder(self.output)
+        check_targets(self.output, [self.log, *self.folders], [])
+        if self.iterations < LEAST_ITERATIONS:
+            raise InputError(f"--iterations is {self.iterations}; expected at least {LEAST_ITERATIONS}")
+
+    @property
+    def folders(self) -> list[Path]:
+        """Of the two runs."""
+        return [self.output / method for method in (PlanarRecipe.method, SplatRecipe.method)]
+
+    @property
+    def log(self) -> Path:
+        """What the training beside this one says."""
+        return self.output / "splat.log"
 
     def run(self, console: Console) -> None:
         """Trains both methods, each in a process of its own, evaluates them and says where the pictures are."""
-        folders = [self.output / method for method in (PlanarRecipe.method, SplatRecipe.method)]
-        log = self.output / "splat.log"
-        with beside(self._arguments(SplatRecipe.method), log) as splat:
-            say(console, f"planar is trained here, and splat beside it: {log}")
-            here = Train(PlanarRecipe(), SCENE, folders[0], self.iterations, seed=self.seed, device=self.device)
-            self._trained(here.resuming(begun(folders[0])), console)
+        with beside(self._arguments(SplatRecipe.method), self.log) as splat:
+            say(console, f"planar is trained here, and splat beside it: {self.log}")
+            here = Train(PlanarRecipe(), SCENE, self.folders[0], self.iterations, seed=self.seed, device=self.device)
+            self._trained(here.resuming(begun(self.folders[0])), console)
             with console.status("waiting for splat"):
                 splat.wait()
         from glassplat.commands.measuring.evaluation import evaluate_run, print_results
         from glassplat.commands.runs.stored_run import open_run
 
-        print_results(console, *(evaluate_run(open_run(folder, self.device)) for folder in folders))
+        print_results(console, *(evaluate_run(open_run(folder, self.device)) for folder in self.folders))
         say(console, f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
 
     @staticmethod
