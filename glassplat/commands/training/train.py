@@ -59,6 +59,7 @@ class Train(Generic[RecipeKind]):
         check_output(RunDirectory(self.output), resume=self.resume)
         say(message_console(), self.files)
         import_now("glassplat.commands.training.training_run")
+        self.recipe.renderer()  # Imports what this method trains with, too, before anything is written.
 
     @cached_property
     def files(self) -> CaptureFiles:
