@@ -39,10 +39,10 @@ def _place_backward(real: type) -> Callable[..., Any]:
         for first in range(0, shown, LANES):
             last = min(first + LANES, shown) - 1
             gather_shapes(columns, listed, first, last, means, quats, log_scales, logit_opacities)
-            gather(columns, 13, listed, first, last, g_conics[c])
-            gather(columns, 18, listed, first, last, conics[c])
             for i in range(LANES):
                 n = listed[min(first + i, last)]
+                for k in range(3):
+                    columns[(13 + k) * LANES + i], columns[(18 + k) * LANES + i] = g_conics[c, n, k], conics[c, n, k]
                 columns[11 * LANES + i], columns[12 * LANES + i] = g_means2d[c, n, 0], g_means2d[c, n, 1]
                 columns[16 * LANES + i], columns[17 * LANES + i] = g_depths[c, n], g_opacities[c, n]
             own, shared = place_gradient(columns, c, cam_from_world, intrinsics, lens)

@@ -68,10 +68,10 @@ def gather(columns, at, listed, first, last, array):
 @inlined
 def gather_shapes(columns, listed, first, last, means, quats, log_scales, logit_opacities):
     """Puts all raw parameters but coefficients into columns, as `place` takes them."""
-    gather(columns, 0, listed, first, last, means)
-    gather(columns, 7, listed, first, last, log_scales)
     for i in range(LANES):
         n = listed[min(first + i, last)]
+        for k in range(3):
+            columns[k * LANES + i], columns[(7 + k) * LANES + i] = means[n, k], log_scales[n, k]
         for k in range(4):
             columns[(3 + k) * LANES + i] = quats[n, k]
         columns[10 * LANES + i] = logit_opacities[n]
