@@ -96,14 +96,14 @@ def channel_with(take: Callable[..., Any]) -> Callable[..., Any]:
     def channel(sh, n, c, degree, b):
         value = b[0] * take(sh, n, 0, c)
         if degree > 0:
-            value = value + (b[1] * take(sh, n, 1, c) + b[2] * take(sh, n, 2, c) + b[3] * take(sh, n, 3, c))
+            value = value + b[1] * take(sh, n, 1, c) + b[2] * take(sh, n, 2, c) + b[3] * take(sh, n, 3, c)
         if degree > 1:
-            value = value + (b[4] * take(sh, n, 4, c) + b[5] * take(sh, n, 5, c) + b[6] * take(sh, n, 6, c))
-            value = value + (b[7] * take(sh, n, 7, c) + b[8] * take(sh, n, 8, c))
+            value = value + b[4] * take(sh, n, 4, c) + b[5] * take(sh, n, 5, c) + b[6] * take(sh, n, 6, c)
+            value = value + b[7] * take(sh, n, 7, c) + b[8] * take(sh, n, 8, c)
         if degree > 2:
-            value = value + (b[9] * take(sh, n, 9, c) + b[10] * take(sh, n, 10, c) + b[11] * take(sh, n, 11, c))
-            value = value + (b[12] * take(sh, n, 12, c) + b[13] * take(sh, n, 13, c))
-            value = value + (b[14] * take(sh, n, 14, c) + b[15] * take(sh, n, 15, c))
+            value = value + b[9] * take(sh, n, 9, c) + b[10] * take(sh, n, 10, c) + b[11] * take(sh, n, 11, c)
+            value = value + b[12] * take(sh, n, 12, c) + b[13] * take(sh, n, 13, c)
+            value = value + b[14] * take(sh, n, 14, c) + b[15] * take(sh, n, 15, c)
         return value
 
     return channel
