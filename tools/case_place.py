@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from tools.pane_draws import world_from_cam
-from tools.pane_tracer import Array, Ball, Box, Pane, Place, Silver
+from tools.pane_tracer import Ball, Box, Place, Silver
+from tools.tracer_panes import Array, Pane
 
 SHELF, TOP = 0.7, 1.6
 """Heights of what the case stands on, and of its upper edge; it is open above and at the sides."""

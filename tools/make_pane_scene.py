@@ -28,8 +28,9 @@ from tools.case_place import case_place, case_poses
 from tools.make_demo_scene import TEST_EVERY, srgb_from_linear
 from tools.make_scenes import GOLDEN_ANGLE_RAD, as_bytes
 from tools.pane_draws import DrawnPlace, draw_place, standing_pane, world_from_cam
-from tools.pane_tracer import Array, Ball, Box, Place, Seen
+from tools.pane_tracer import Ball, Box, Place, Seen
 from tools.photographer_body import passer_by, photographer
+from tools.tracer_panes import Array, Pane, SecondPane, Waves
 from tools.window_place import window_place, window_poses
 
 LOOKED_AT = np.array([0.0, 0.1, 0.8])
@@ -43,6 +44,8 @@ SUBPIXELS = 3
 """Rays per pixel and axis."""
 POINT_NOISE = 0.005
 """Standard deviation of the sparse points about the surfaces, world units."""
+GAP = 0.02
+"""Between the two panes of double glazing, world units."""
 PASSERS = 77
 """Keeps what is drawn for those who walk by apart from all else."""
 VIRTUAL_IN_GLASS, VIRTUAL_IN_MIRROR = 0.4, 1.0
@@ -77,6 +80,10 @@ class Arguments:
     """Somebody stands behind the camera with a phone before the face, and is seen in panes and mirrors."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Share of red, green and blue light that panes of glass let through of what they do not reflect."""
+    waves: float = 0.0
+    """Unevenness of the glass: root of the mean square of the angles by which its normals are turned, degrees."""
+    second_pane: float | None = None
+    """Make the glass double: behind each pane is another, tilted by so many degrees against it."""
 
 
 def make_place() -> Place:
@@ -323,9 +330,17 @@ def chosen_place(arguments: Arguments) -> DrawnPlace:
     return DrawnPlace(make_place(), camera_poses(arguments.views, arguments.seed))
 
 
-def tinted(place: Place, tint: tuple[float, float, float]) -> Place:
-    """The place with such panes of glass; mirrors stay as they are."""
-    return replace(place, panes=tuple(replace(p, tint=tint) if p.refraction else p for p in place.panes))
+def with_glass(place: Place, arguments: Arguments) -> Place:
+    """The place with such panes of glass as are asked for; mirrors stay as they are."""
+    return replace(place, panes=tuple(flawed(p, arguments) if p.refraction else p for p in place.panes))
+
+
+def flawed(pane: Pane, arguments: Arguments) -> Pane:
+    """A pane in the tint, with the waves, and doubled as it is asked for."""
+    waves = Waves(math.radians(arguments.waves), seed=pane.label) if arguments.waves else None
+    tilt = arguments.second_pane
+    second = None if tilt is None else SecondPane(GAP, math.radians(tilt))
+    return replace(pane, tint=arguments.tint, waves=waves, second=second)
 
 
 def main(arguments: Arguments) -> None:
@@ -336,7 +351,7 @@ def main(arguments: Arguments) -> None:
     for part in ("images", "masks", "sparse/0", "gt/strength"):
         (folder / part).mkdir(parents=True)
     drawn = chosen_place(arguments)
-    place, poses = tinted(drawn.place, arguments.tint), drawn.poses
+    place, poses = with_glass(drawn.place, arguments), drawn.poses
     write_model(folder / "sparse/0", arguments, poses, place)
     write_planes(folder / "gt/planes.json", place)
     if arguments.case:

@@ -13,7 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tools.make_scenes import GOLDEN_ANGLE_RAD, world_from_opengl
-from tools.pane_tracer import Array, Ball, Box, Lamp, Pane, Place, Thing
+from tools.pane_tracer import Ball, Box, Lamp, Place, Thing
+from tools.tracer_panes import Array, Pane
 
 Generator = np.random.Generator
 

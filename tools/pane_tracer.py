@@ -14,14 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tools.scene_surfaces import INK, solid_noise
-
-Array = NDArray[np.float64]
+from tools.tracer_panes import SELF, Array, Meeting, Pane
 
 TEXTURE_WAVES = 16
 REFLECTIONS = 3
 """How many reflections one after the other are followed."""
-SELF = 1e-6
-"""A ray does not meet the pane from which it starts: distances below this do not count, world units."""
 
 
 class Thing(Protocol):
@@ -150,75 +147,6 @@ class Silver:
         return gradients / np.linalg.norm(gradients, axis=1, keepdims=True)
 
 
-class Meeting(NamedTuple):
-    """Where rays meet a pane, where they go on to after a reflection, and the share of the light that does."""
-
-    points: Array
-    mirrored: Array
-    share: Array
-
-
-@dataclass(frozen=True)
-class Pane:
-    """A flat rectangle of glass, or a mirror on both sides.
-
-    Attributes:
-        label: its number, from 1.
-        center: world units.
-        normal: unit.
-        tangent: unit, along the first side.
-        half_sizes: half the lengths of the sides.
-        refraction: refractive index; None for a mirror.
-        tint: share of red, green and blue light that gets through of what is not reflected.
-    """
-
-    label: int
-    center: Array
-    normal: Array
-    tangent: Array
-    half_sizes: tuple[float, float]
-    refraction: float | None = 1.5
-    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-
-    @property
-    def bitangent(self) -> Array:
-        """Unit, along the second side."""
-        return np.cross(self.normal, self.tangent)
-
-    @property
-    def base_reflectance(self) -> float:
-        """Share of the light that comes back at normal incidence."""
-        return float(self.reflectances(np.ones(1))[0])
-
-    def distances(self, origins: Array, directions: Array) -> Array:
-        """How far [N] rays go until they meet it; infinite where they do not."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            distance = ((self.center - origins) @ self.normal) / (directions @ self.normal)
-            offset = origins + distance[:, None] * directions - self.center
-            inside = (np.abs(offset @ self.tangent) <= self.half_sizes[0]) & (
-                np.abs(offset @ self.bitangent) <= self.half_sizes[1]
-            )
-        return np.where(inside & (distance > SELF), distance, np.inf)
-
-    def reflectances(self, cosines: Array) -> Array:
-        """Share [N] of unpolarised light that comes back, by the cosine between ray and normal.
-
-        Fresnel's law for each polarisation, r; between the two surfaces light goes to and fro, 2 r / (1 + r) in all.
-        """
-        if self.refraction is None:
-            return np.ones_like(cosines)
-        inside = np.sqrt(1 - (1 - cosines**2) / self.refraction**2)
-        across = (cosines - self.refraction * inside) / (cosines + self.refraction * inside)
-        along = (inside - self.refraction * cosines) / (inside + self.refraction * cosines)
-        return (2 * across**2 / (1 + across**2) + 2 * along**2 / (1 + along**2)) / 2
-
-    def meeting(self, origins: Array, directions: Array, distances: Array) -> Meeting:
-        """What happens at the pane to rays that meet it after distances [N]."""
-        along = directions @ self.normal
-        mirrored = directions - 2 * np.outer(along, self.normal)
-        return Meeting(origins + distances[:, None] * directions, mirrored, self.reflectances(np.abs(along)))
-
-
 class Seen(NamedTuple):
     """What rays see.
 
@@ -343,12 +271,19 @@ class Place:
             strength, label = np.zeros(len(end)), np.zeros(len(end), dtype=np.uint8)
             for number, pane in enumerate(self.panes):
                 hit = (order[place] == number) & (distances[number] < np.inf)
-                met = pane.meeting(origins[hit], directions[hit], distances[number, hit])
-                reflection[hit] = mirrored.radiance(met.points, met.mirrored, reflections - 1)
-                strength[hit], label[hit] = met.share, pane.label
+                label[hit] = pane.label
                 transmission[hit] *= pane.tint
+                reflection[hit], strength[hit] = mirrored.mirrored_in(
+                    pane.meetings(origins[hit], directions[hit], distances[number, hit]), reflections - 1
+                )
             radiance = (1 - strength[:, None]) * transmission + strength[:, None] * reflection
         return Seen(radiance, transmission, reflection, strength, label, self.silver_normals(origins, directions))
+
+    def mirrored_in(self, meetings: Sequence[Meeting], reflections: int) -> tuple[Array, Array]:
+        """What a pane mirrors [N, 3], as if it mirrored all light, and the share [N] of the light that it does."""
+        strength = np.sum([met.share for met in meetings], axis=0)
+        seen = [met.share[:, None] * self.radiance(met.points, met.mirrored, reflections) for met in meetings]
+        return np.sum(seen, axis=0) / np.maximum(strength, np.finfo(float).tiny)[:, None], strength
 
 
 def painted(points: Array, seed: int) -> Array:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tools.pane_tracer import Array, Ball, Box, Carried, Thing
+from tools.pane_tracer import Ball, Box, Carried, Thing
+from tools.tracer_panes import Array
 
 PHONE = Box((-0.08, -0.04, -0.02), (0.08, 0.04, -0.01), seed=70, shade=0.1)
 # In dark clothes, as most people are; face and hands are bright.

@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from tools.pane_draws import world_from_cam
-from tools.pane_tracer import Array, Ball, Box, Pane, Place
+from tools.pane_tracer import Ball, Box, Place
+from tools.tracer_panes import Array, Pane
 
 WINDOW_HEIGHT = 1.25
 """Of the middle of the pane."""

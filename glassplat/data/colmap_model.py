@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from glassplat.data.capture import PointCloud
 from glassplat.data.errors import InputError, input_checked
 from glassplat.data.lens import make_lens
+from glassplat.data.options import shown
 from glassplat.files.reading import reading
 from glassplat.scene.pose import rotation_from_quat
 
@@ -124,17 +125,19 @@ class _Bytes:
         self.offset = 0
 
     def take(self, layout: str) -> tuple[Any, ...]:
-        values = struct.unpack_from(f"<{layout}", self.data, self.offset)
-        self.offset += struct.calcsize(f"<{layout}")
-        return values
+        start = self.offset
+        self.skip(struct.calcsize(f"<{layout}"))
+        return struct.unpack_from(f"<{layout}", self.data, start)
 
     def skip(self, count: int) -> None:
         self.offset += count
         if self.offset > len(self.data):
-            raise EOFError("the file ends too early")
+            raise EOFError("it ends too early")
 
     def text(self) -> str:
-        end = self.data.index(b"\0", self.offset)
+        end = self.data.find(b"\0", self.offset)
+        if end < 0:
+            raise EOFError("it ends within a name")
         start, self.offset = self.offset, end + 1
         return self.data[start:end].decode()
 
@@ -176,15 +179,27 @@ def _records(stream: Iterator[str]) -> Iterator[str]:
     return (line for line in stripped if line and not line.startswith("#"))
 
 
+def _at_least(count: int, fields: list[str]) -> list[str]:
+    """The fields of a line, if they are so many.
+
+    Raises:
+        ValueError: there are fewer; repeats them.
+    """
+    if len(fields) < count:
+        line = " ".join(fields)
+        raise ValueError(f"the line {shown(line)}; expected at least {count} values, separated by spaces")
+    return fields
+
+
 def _text_cameras(stream: Iterator[str]) -> Iterator[tuple[int, Any]]:
     for line in _records(stream):
-        camera_id, model, width, height, *parameters = line.split()
+        camera_id, model, width, height, *parameters = _at_least(4, line.split())
         yield int(camera_id), make_lens(model, [float(value) for value in parameters], (int(width), int(height)))
 
 
 def _text_images(stream: Iterator[str]) -> Iterator[ModelImage]:
     for line in _records(stream):
-        fields = line.split(maxsplit=9)
+        fields = _at_least(10, line.split(maxsplit=9))
         numbers = tuple(float(value) for value in fields[1:8])
         name = fields[9]
         _check_observations(next(stream, ""), name)
@@ -205,8 +220,7 @@ def _check_observations(line: str, name: str) -> None:
 
 def _text_points(stream: Iterator[str]) -> Iterator[tuple[float, ...]]:
     for line in _records(stream):
-        fields = line.split(maxsplit=7)
-        _, x, y, z, red, green, blue = fields[:7]
+        _, x, y, z, red, green, blue = _at_least(7, line.split(maxsplit=7))[:7]
         yield (float(x), float(y), float(z), float(int(red)), float(int(green)), float(int(blue)))
 
 

@@ -13,7 +13,8 @@ from uuid import uuid4
 def atomic_write(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path next to `path`; on success it replaces `path` in one step.
 
-    The temporary file keeps the suffix, so writers that pick a format by suffix work unchanged. When the body raises (a
+    The temporary file has the suffix of `path`, which may be a link to a file without it, so writers that pick a format
+    by suffix work unchanged. When the body raises (a
     full disk, Ctrl-C), the temporary file is removed and an older file at `path` keeps its contents. Missing parent
     folders are created.
 
@@ -26,7 +27,7 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
     """
     target = Path(os.path.realpath(path))
     # Shortened, because a name that is as long as names may be leaves no room for more.
-    temporary = target.with_name(f".{target.stem[:32]}.{uuid4().hex[:12]}.tmp{target.suffix[:32]}")
+    temporary = target.with_name(f".{target.stem[:32]}.{uuid4().hex[:12]}.tmp{Path(path).suffix[:32]}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
@@ -35,7 +36,7 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
     except OSError as error:
         reason = error.strerror or str(error)
         message = f"could not write {path} ({reason}); whatever was there before is unchanged"
-        raise OSError(error.errno, message) from error
+        raise (OSError(message) if error.errno is None else OSError(error.errno, message)) from error
     finally:
         with suppress(OSError):  # never hide the error above behind one from the clean-up
             temporary.unlink()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from contextlib import suppress
 from pathlib import Path
 
 SCENE = "scene.json"
@@ -41,7 +42,7 @@ def check_capture_folder(path: Path) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder, with those above it, where there is none.
+    """Make a folder, with those above it, where there is none; where that fails, none of them is left.
 
     Raises:
         NotADirectoryError: something that is no folder is in the way, or it cannot have that name.
@@ -49,9 +50,13 @@ def make_folder(path: Path) -> None:
         OSError: the disk is full, or fails.
     """
     check_folder(path)
+    missing = [folder for folder in (path, *path.parents) if not os.path.lexists(folder)]
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
+        for folder in missing:
+            with suppress(OSError):
+                folder.rmdir()
         if error.errno not in IN_THE_WAY:
             raise
         raise NotADirectoryError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ from glassplat.files.json_text import parse_json
 from glassplat.files.reading import reading
 
 HEADER_KEY = "glassplat"
+LONGEST_REASON = 200
 
 
 class TensorsFile(NamedTuple):
@@ -61,11 +63,28 @@ def opened_tensors(path: Path, file_format: str, what: str) -> Iterator[TensorsF
         ValueError: the file cannot be read, is truncated or foreign; also if that shows while it is open.
     """
     try:
-        with reading(path), safe_open(path, framework="pt") as file:
+        with reading(path), _unicode_name(path) as name, safe_open(name, framework="pt") as file:
             header = parse_json((file.metadata() or {}).get(HEADER_KEY, "{}"), f"the header of {path}")
             if not isinstance(header, dict) or header.get("format") != file_format:
                 found = header.get("format") if isinstance(header, dict) else header
                 raise ValueError(f"{path} has format {found!r}; expected {file_format!r}, as glassplat writes it")
             yield TensorsFile(header, file)
     except SafetensorError as error:
-        raise ValueError(f"{path} is truncated or not {what} ({error}); expected a whole file") from error
+        reason = str(error)[:LONGEST_REASON]  # It may repeat all of the header.
+        raise ValueError(f"{path} is truncated or not {what} ({reason}); expected a whole file") from error
+
+
+@contextmanager
+def _unicode_name(path: Path) -> Iterator[Path]:
+    """A name that the library opens: of a path with bytes that are no text, which it refuses, a link to it."""
+    if _is_unicode(path):
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        link = Path(folder) / "link.safetensors"
+        link.symlink_to(path.absolute())
+        yield link
+
+
+def _is_unicode(path: Path) -> bool:
+    return not any("\ud800" <= letter <= "\udfff" for letter in str(path))

@@ -144,7 +144,7 @@ def test_missing_folder_of_images(capture) -> None:
 def test_cut_off_binary_file_is_named(capture, name: str, share: float) -> None:
     path = capture.write_colmap() / f"{name}.bin"
     os.truncate(path, int(path.stat().st_size * share))
-    with pytest.raises(InputError, match=rf"{name}\.bin is cut off or damaged"):
+    with pytest.raises(InputError, match=rf"{name}\.bin is cut off or damaged \(it ends "):
         load_dataset(capture.root)
 
 
@@ -180,6 +180,9 @@ def test_cut_off_binary_file_is_named(capture, name: str, share: float) -> None:
         ("points3D", "1 0 0 0 256 2 3 0", "colour value 256; expected 0 to 255"),
         ("points3D", "1 0 0 0 1 2 -3 0", "colour value -3; expected 0 to 255"),
         ("points3D", "1 1e38 0 0 1 2 3 0", r"no point of the capture is finite and within 1e\+12"),
+        ("cameras", "1 PINHOLE 32", r"damaged \(the line '1 PINHOLE 32'; expected at least 4 values"),
+        ("images", "1 1 0 0 0 0 0 0 1", "expected at least 10 values"),
+        ("points3D", "1 0 0 0 1 2", "expected at least 7 values"),
         ("points3D", "1 0.5 0.5 zero 1 2 3 0", r"points3D\.txt is cut off or damaged"),
     ],
 )

@@ -60,3 +60,19 @@ def test_a_name_may_be_as_long_as_names_may_be(tmp_path: Path) -> None:
     with atomic_write(target) as temporary:
         temporary.write_text("content")
     assert target.read_text() == "content"
+
+
+def test_writers_that_pick_a_format_see_the_suffix_of_a_link(tmp_path: Path) -> None:
+    (tmp_path / "film.gif").symlink_to(tmp_path / "disk" / "film")
+    with atomic_write(tmp_path / "film.gif") as temporary:
+        assert temporary.suffix == ".gif"
+        temporary.write_text("new")
+    assert (tmp_path / "disk" / "film").read_text() == "new"
+
+
+def test_an_error_without_a_number_is_told_without_one(tmp_path: Path) -> None:
+    with (
+        pytest.raises(OSError, match=r"^could not write .* \(a library said so\); whatever"),
+        atomic_write(tmp_path / "a"),
+    ):
+        raise OSError("a library said so")

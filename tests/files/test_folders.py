@@ -31,6 +31,12 @@ def test_what_is_in_the_way_is_named_once(name: str, tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "loop", "nowhere"]
 
 
+def test_where_a_name_is_too_long_no_folder_above_it_is_left(tmp_path: Path) -> None:
+    with pytest.raises(NotADirectoryError, match="too long"):
+        make_folder(tmp_path / "new" / ("x" * 300))
+    assert not (tmp_path / "new").exists()
+
+
 def test_a_folder_that_may_not_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     with pytest.raises(PermissionError, match="nothing may be written"):

@@ -150,3 +150,9 @@ def test_images_that_cannot_be_written(tmp_path: Path, name: str, image, error: 
         write_image(tmp_path / name, image)
     assert (tmp_path / name).read_text() == "old"
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_what_the_system_says_of_a_file_is_quoted_alone(tmp_path: Path) -> None:
+    (tmp_path / "a.png").mkdir()
+    with pytest.raises(ValueError, match=r"^cannot read .*a\.png as an image \(Is a directory\); replace"):
+        read_image(tmp_path / "a.png")

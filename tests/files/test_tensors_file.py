@@ -89,3 +89,21 @@ def test_what_is_no_file_is_named(tmp_path: Path) -> None:
         pass
     with pytest.raises(ValueError, match="cannot be read"), opened_tensors(tmp_path, "x-1", "an x"):
         pass
+
+
+def test_a_long_reason_is_cut_short(tmp_path: Path) -> None:
+    header = b'{"a": {"dtype": "F32", "shape": "%s"}}' % (b"x" * 5000)
+    (tmp_path / "a.safetensors").write_bytes(len(header).to_bytes(8, "little") + header)
+    with (
+        pytest.raises(ValueError, match=r"truncated or not a test .*; expected a whole") as caught,
+        opened_tensors(tmp_path / "a.safetensors", "x", "a test"),
+    ):
+        pass
+    assert len(str(caught.value)) < 500 + len(str(tmp_path))
+
+
+def test_a_folder_whose_name_is_no_text_is_read_again(tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"caf\xe9")
+    write_tensors(folder / "a.safetensors", {"a": torch.ones(2)}, {"format": "x"})
+    with opened_tensors(folder / "a.safetensors", "x", "a test") as opened:
+        assert opened.tensors()["a"].tolist() == [1, 1]

@@ -18,9 +18,10 @@ from glassplat.files.images import read_image
 from glassplat.kernels.blend_panes.reference import two_surfaces
 from glassplat.kernels.pane_hits.reference import pane_hits
 from glassplat.kernels.panes import Panes
-from tools.make_pane_scene import Arguments, main
-from tools.pane_tracer import Ball, Box, Carried, Pane, Place, Silver
+from tools.make_pane_scene import Arguments, main, make_place, with_glass
+from tools.pane_tracer import Ball, Box, Carried, Place, Silver
 from tools.photographer_body import passer_by, photographer, upright_frame
+from tools.tracer_panes import Pane, SecondPane, Waves
 
 ROOM = Box((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), seed=1, room=True)
 X, Y = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
@@ -75,6 +76,61 @@ def test_mirrors_have_no_tint(tmp_path: Path) -> None:
     main(Arguments(tmp_path / "scene", width=16, views=8, masks=1, points=10, tint=(0.5, 0.8, 0.6)))
     planes = json.loads((tmp_path / "scene/gt/planes.json").read_text())
     assert [plane["tint"] for plane in planes] == [[0.5, 0.8, 0.6], [0.5, 0.8, 0.6], [1.0, 1.0, 1.0]]
+
+
+def test_waves_turn_normals_by_as_much_as_they_are_told_to() -> None:
+    places = np.random.default_rng(3).uniform(-3, 3, (20000, 2))
+    points = places @ np.stack([X, [0.0, 0.0, 1.0]])
+    normals = replace(WINDOW, waves=Waves(np.radians(0.5))).normals(points)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
+    turned = np.degrees(np.arccos(np.clip(normals @ Y, -1, 1)))
+    assert np.sqrt((turned**2).mean()) == pytest.approx(0.5, rel=0.05)
+
+
+def test_waves_are_smooth() -> None:
+    waves, places = Waves(0.01, length=0.6), np.random.default_rng(3).uniform(-1, 1, (100, 2))
+    step = 1e-4
+    shifted = np.abs(waves.slopes(places + np.array([step, 0])) - waves.slopes(places)).max()
+    assert 0 < shifted < 3 * 0.01 * 2 * np.pi / 0.6 * step
+
+
+def test_waves_move_what_is_mirrored_and_leave_what_comes_through() -> None:
+    rays = towards_window()
+    even, waved = (Place((ROOM,), (replace(WINDOW, waves=waves),)).seen(*rays) for waves in (None, Waves(0.02)))
+    np.testing.assert_array_equal(waved.transmission, even.transmission)
+    np.testing.assert_array_equal(waved.strength, even.strength)
+    assert np.abs(waved.reflection - even.reflection).max() > 0.01
+
+
+def test_double_glazing_mirrors_twice_as_much() -> None:
+    rays = towards_window()
+    one, two = (Place((ROOM,), (replace(WINDOW, second=s),)).seen(*rays) for s in (None, SecondPane(0.0, 0.0)))
+    np.testing.assert_allclose(two.strength, one.strength + one.strength * (1 - one.strength) ** 2)
+    np.testing.assert_allclose(two.reflection, one.reflection, atol=1e-9)
+    once = WINDOW.base_reflectance
+    assert replace(WINDOW, second=SecondPane(0.0, 0.0)).base_reflectance == pytest.approx(once * (1 + (1 - once) ** 2))
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_the_second_pane_mirrors_what_lies_twice_the_gap_farther(side: float) -> None:
+    gap, origins = 0.1, np.array([[0.0, -side, 0.0]])
+    near, far = replace(WINDOW, second=SecondPane(gap, 0.0)).meetings(origins, side * Y[None], np.array([1.0]))
+    np.testing.assert_allclose(near.points, [[0, 0, 0]], atol=1e-12)
+    # The normal points along y, so that the second pane lies at smaller y: nearer, for who stands there.
+    np.testing.assert_allclose(far.points, [[0, -gap, 0]], atol=1e-12)
+    assert (near.share < far.share).item() == (side > 0)
+
+
+def test_tilted_double_glazing_mirrors_two_directions() -> None:
+    pane = replace(WINDOW, second=SecondPane(0.0, np.radians(0.25)))
+    near, far = pane.meetings(np.array([[0.0, -1.0, 0.0]]), Y[None], np.array([1.0]))
+    between = np.degrees(np.arccos((near.mirrored * far.mirrored).sum()))
+    assert between == pytest.approx(0.5, abs=1e-3)
+
+
+def test_only_glass_gets_waves_and_a_second_pane() -> None:
+    place = with_glass(make_place(), Arguments(Path(), waves=0.2, second_pane=0.1))
+    assert [(p.waves is None, p.second is None) for p in place.panes] == [(False, False), (False, False), (True, True)]
 
 
 def test_a_mirror_shows_what_a_mirrored_camera_sees() -> None:

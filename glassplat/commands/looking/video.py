@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -65,7 +66,7 @@ class Video:
             raise InputError(
                 f"{self.output.suffix} needs OpenCV ({error}); pip install 'glassplat[video]', or end --output in .webp"
             ) from error
-        if self.output.exists() and not self.force:
+        if os.path.lexists(self.output) and not self.force:
             raise InputError(f"{self.output} is already there; pass --force to replace it, or choose another --output")
         if self.resume and not kept.is_there:
             raise InputError(f"no film was interrupted at {self.output}; begin without --resume")

@@ -26,6 +26,7 @@ from glassplat.commands.measuring.bench_tables import (
     plain_rows,
     values_of,
 )
+from glassplat.commands.runs.output_folder import check_targets
 from glassplat.commands.training.train import Train
 from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
@@ -37,6 +38,7 @@ from glassplat.train.run_directory import write_text
 
 Strategy = Literal["default", "mcmc"]
 FULL = "full"
+TABLES = ("scenes.md", "scenes.json", "ablation.md", "ablation.json")
 SPREAD_NOTE = "Means over the seeds ± their standard deviation."
 COMPARED_NOTE = (
     "Seed against equal seed; counts and times as quotients. `mean` is over the scenes that have a value. "
@@ -239,6 +241,7 @@ def unique(choices: Sequence[Any], option: str) -> list[Any]:
 def planned_runs(bench: BenchScenes | BenchAblation, recipes: dict[str, Any]) -> list[PlannedRun]:
     """A run per capture, variant and seed; the paths are absolute, so that a bench goes on from any folder."""
     check_folder(bench.output)
+    check_targets(bench.output, [bench.output / RUNS, *(bench.output / name for name in TABLES)], [])
     captures = zip(scene_names(bench.data), bench.data, strict=True)
     seeds = unique(bench.seeds, "seeds")
     return [

@@ -186,10 +186,10 @@ def execute(
         run.check()
         check_length(run.train.recipe.stages(run.train.seed, run.train.iterations), run.train.iterations)
     finished = _finished(runs)
+    _check_captures([run for run in runs if run.results() is None])
     after_each(finished)
     if finished:
         say(console, f"{len(finished)} of {len(runs)} runs are finished already")
-    _check_captures([run for run in runs if run.results() is None])
     clock, failures = RunClock(finished), []
     for number, run in enumerate(runs, start=1):
         if run.results() is not None:

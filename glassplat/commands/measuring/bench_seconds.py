@@ -15,6 +15,7 @@ from rich.text import Text
 from glassplat.commands.console.messages import say
 from glassplat.commands.measuring.bench_runs import RUNS, PlannedRun, scene_names, train_and_evaluate
 from glassplat.commands.measuring.seconds_chart import Curve, chart
+from glassplat.commands.runs.output_folder import check_targets
 from glassplat.commands.training.train import Train
 from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
@@ -81,6 +82,7 @@ class BenchSeconds:
     def run(self, console: Console) -> None:
         """Runs what is missing and writes `seconds.md`, `seconds.json` and a chart for each scene."""
         check_folder(self.output)
+        check_targets(self.output, [self.output / name for name in (RUNS, "seconds.md", "seconds.json")], [])
         if not self.methods or not self.seconds:
             raise InputError("--methods or --seconds names nothing; expected at least one of each")
         finished: list[Timed] = []

@@ -8,6 +8,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from glassplat.files.folders import make_folder
+
 PATIENCE = 60.0
 """Seconds that a command has to end in after it was asked to; a checkpoint takes less."""
 
@@ -22,7 +24,7 @@ class Beside:
     def __init__(self, arguments: Sequence[str], log: Path) -> None:
         self.log = log
         self._named = f"glassplat {arguments[0]}"
-        log.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(log.parent)
         # A session of its own: Ctrl-C reaches this process alone, which then asks the other one to end.
         with log.open("w", encoding="utf-8") as stream:
             self._process = subprocess.Popen(

@@ -10,6 +10,7 @@ from rich.console import Console
 from glassplat.commands.console.loading import load
 from glassplat.commands.console.messages import say
 from glassplat.commands.measuring.beside import beside
+from glassplat.commands.runs.output_folder import check_targets
 from glassplat.data.ranges import Seed, Several
 from glassplat.files.folders import check_folder
 from glassplat.kernels.devices import DeviceName
@@ -37,8 +38,23 @@ class Demo:
     def ready(self) -> None:
         """Refuses an output that cannot be written, and imports what trains and renders."""
         check_folder(self.output)
+        check_targets(self.output, [self.log, *self.folders], [])
         load("glassplat.commands.training.train")
         load("glassplat.commands.measuring.evaluation")
+        from glassplat.train.planar_recipe import PlanarRecipe
+        from glassplat.train.stage import check_length
+
+        check_length(PlanarRecipe().stages(self.seed, self.iterations), self.iterations)
+
+    @property
+    def folders(self) -> list[Path]:
+        """Of the two runs."""
+        return [self.output / "planar", self.output / "splat"]
+
+    @property
+    def log(self) -> Path:
+        """What the training beside this one says."""
+        return self.output / "splat.log"
 
     def run(self, console: Console) -> None:
         """Trains both methods, each in a process of its own, evaluates them and says where the pictures are."""
@@ -48,15 +64,13 @@ class Demo:
         from glassplat.train.planar_recipe import PlanarRecipe
         from glassplat.train.splat_recipe import SplatRecipe
 
-        folders = [self.output / method for method in (PlanarRecipe.method, SplatRecipe.method)]
-        log = self.output / "splat.log"
-        with beside(self._arguments(SplatRecipe.method), log) as splat:
-            say(console, f"planar is trained here, and splat beside it: {log}")
-            here = Train(PlanarRecipe(), SCENE, folders[0], self.iterations, seed=self.seed, device=self.device)
-            here.resuming(begun(folders[0])).run(console)
+        with beside(self._arguments(SplatRecipe.method), self.log) as splat:
+            say(console, f"planar is trained here, and splat beside it: {self.log}")
+            here = Train(PlanarRecipe(), SCENE, self.folders[0], self.iterations, seed=self.seed, device=self.device)
+            here.resuming(begun(self.folders[0])).run(console)
             with console.status("waiting for splat"):
                 splat.wait()
-        print_results(console, *(evaluate_run(open_run(folder, self.device)) for folder in folders))
+        print_results(console, *(evaluate_run(open_run(folder, self.device)) for folder in self.folders))
         say(console, f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
 
     def _arguments(self, method: str) -> list[str]:

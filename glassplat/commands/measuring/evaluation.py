@@ -26,7 +26,7 @@ def evaluate_run(stored: StoredRun, panes: PaneSource = "auto", *, align: Align 
     Raises:
         InputError: the capture does not say where its panes are in this way.
     """
-    regions = pane_regions(stored.dataset, panes)
+    seconds, regions = train_seconds(stored), pane_regions(stored.dataset, panes)
     aligned = align == "always" or (align == "auto" and len(stored.scene.poses) > 0)
     if aligned:
         photographed = with_photographer(stored.renderer, "present")
@@ -46,7 +46,7 @@ def evaluate_run(stored: StoredRun, panes: PaneSource = "auto", *, align: Align 
         "iterations": stored.iterations,
         "seed": settings.seed,
         "downscale": settings.downscale,
-        "train_seconds": train_seconds(stored),
+        "train_seconds": seconds,
         "test_cameras": "aligned with their photographs" if aligned else "as the capture has them",
         **evaluation.results,
     }

@@ -36,6 +36,8 @@ def write_files(command: Export, console: Console) -> None:
     """Writes the files."""
     model = load(command.run_directory, device=command.device)
     model = model.with_scene(_chosen(command, command.edits.applied(model.scene)))
+    if command.bake_reflections and not len(model.scene.planes):
+        raise InputError(f"{model.path} has no panes whose reflections could be baked")
     targets = [
         command.output / name
         for name in (
@@ -70,8 +72,6 @@ def _chosen(command: Export, scene: Scene) -> Scene:
 
 
 def _baked(command: Export, model: Model, console: Console) -> Gaussians:
-    if not len(model.scene.planes):
-        raise InputError(f"{model.path} has no panes whose reflections could be baked")
     say(console, "rendering the panes to bake what they reflect")
     gaussians = baked(model.scene, model.renderer, cameras_of(model, "train"))
     before, after = baking_errors(model, gaussians)

@@ -51,11 +51,11 @@ def check_targets(folder: Path, targets: Sequence[Path], photographs: Sequence[P
 
     Args:
         folder: what the pictures are written into.
-        targets: the files to write, in it.
+        targets: the files to write, in it, and folders that they go into.
         photographs: what must stay whatever happens.
 
     Raises:
-        InputError: names the file and where it leads; nothing has been written.
+        InputError: names the file and where it leads, or what is in its place; nothing has been written.
     """
     inside, kept = _real(folder), {_real(path) for path in photographs}
     for target in (folder / RECORD, *targets):
@@ -63,6 +63,11 @@ def check_targets(folder: Path, targets: Sequence[Path], photographs: Sequence[P
         if real in kept or not real.is_relative_to(inside):
             what = "is a photograph of the capture" if real in kept else f"leads out of {folder}, to {real}"
             raise InputError(f"{target} {what}; nothing was written. Choose a new folder for --output")
+        if os.path.lexists(real) and not (os.path.isfile(real) or os.path.isdir(real)):
+            raise InputError(
+                f"{target} is a pipe, a device or a link to nothing; nothing was written. Choose a new folder for "
+                "--output"
+            )
 
 
 def _real(path: Path) -> Path:

@@ -147,3 +147,14 @@ def test_what_makes_no_sense_is_refused_before_anything_is_rendered(
     assert main(["video", str(run), *options.split()]) == 2
     assert words in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "film.webp").exists() and (tmp_path / "there.webp").read_text() == "mine"
+
+
+def test_a_link_to_nothing_is_in_the_way_of_a_film_until_it_is_forced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, film = write_run(tmp_path / "run"), tmp_path / "film.gif"
+    film.symlink_to(tmp_path / "elsewhere")
+    assert main(["video", str(run), "--output", str(film), *SHORT]) == 2
+    assert "is already there; pass --force" in capsys.readouterr().err
+    assert main(["video", str(run), "--output", str(film), *SHORT, "--force"]) == 0
+    assert (tmp_path / "elsewhere").read_bytes()[:3] == b"GIF"

@@ -277,3 +277,22 @@ def test_the_recipes_of_the_papers_are_compared_by_name(capture: Path) -> None:
     assert [run["variant"] for run in runs] == ["splat", "splat-paper"]
     recorded = [json.loads((Path(run["directory"]) / "recipe.json").read_text()) for run in runs]
     assert [recipe["densify"]["split_by"] for recipe in recorded] == ["pull", "gradient"]
+
+
+def test_a_capture_that_cannot_be_read_leaves_no_tables(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (capture / "transforms.json").write_text("[]")
+    assert bench_scenes(capture) == 2
+    assert "transforms.json" in capsys.readouterr().err
+    assert not (capture.parent / "bench").exists()
+
+
+@pytest.mark.parametrize("name", ["runs", "scenes.md"])
+def test_nothing_is_written_where_links_lead_out_of_the_output(
+    name: str, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bench").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "bench" / name).symlink_to(tmp_path / "elsewhere")
+    assert bench_scenes(capture) == 2
+    assert "leads out of" in capsys.readouterr().err
+    assert not list((tmp_path / "elsewhere").iterdir())
