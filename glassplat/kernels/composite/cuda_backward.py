@@ -235,12 +235,8 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
                     if covered < alpha_max:
                         dx, dy = x - geometry[0, MEAN_X], y - geometry[0, MEAN_Y]
                         gain_x, gain_y = gain * dx, gain * dy
-                        g_0 += gain
-                        g_x += gain_x
-                        g_y += gain_y
-                        g_xx += gain_x * dx
-                        g_xy += gain_x * dy
-                        g_yy += gain_y * dy
+                        g_0, g_x, g_y = g_0 + gain, g_x + gain_x, g_y + gain_y
+                        g_xx, g_xy, g_yy = g_xx + gain_x * dx, g_xy + gain_x * dy, g_yy + gain_y * dy
                         if probed:
                             pull_x += abs(xx * gain_x + xy * gain_y)
                             pull_y += abs(xy * gain_x + yy * gain_y)
