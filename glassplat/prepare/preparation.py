@@ -9,6 +9,7 @@ from typing import Any
 from glassplat import __version__
 from glassplat.data.colmap_library import quiet_pycolmap
 from glassplat.data.errors import InputError
+from glassplat.files.folders import missing_folders, remove_empty
 from glassplat.prepare.capture_writer import write_capture
 from glassplat.prepare.messages import Listener
 from glassplat.prepare.photographs import Photograph, photographs_in
@@ -65,8 +66,13 @@ def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force:
     _check_places(task)
     quiet_pycolmap()
     workplace = Workplace(task.output)
+    made = missing_folders(workplace.folder.parent)
     workplace.begin(task.record(), resume=resume, force=force)
-    photographs = _photographs(task, workplace, listen)
+    try:
+        photographs = _photographs(task, workplace, listen)
+    except InputError:
+        remove_empty(made)
+        raise
     solution = best_solution(photographs, workplace.folder, task.settings, listen)
     report = report_of(solution)
     _check_enough(report, task)
