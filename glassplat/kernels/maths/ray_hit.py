@@ -82,20 +82,32 @@ def _ellipsoid(real: type) -> RayHitMaths:
         return a * v[0] + b * w[0], a * v[1] + b * w[1], a * v[2] + b * w[2]
 
     @inlined
+    def across(q, f, length):  # type: ignore[no-untyped-def]
+        """What of q is at right angles to the ray: all of it, but for rounding.
+
+        Across a thin ellipsoid q is a difference of numbers as large as the inverse of its thickness, and gradients
+        multiply what rounding leaves of it by as much again.
+        """
+        return blend(one, q, -dot(q, f) / length, f)
+
+    @inlined
     def meet(offset, d, frame):  # type: ignore[no-untyped-def]
         e, f = along(offset, frame[0], frame[1], frame[2]), along(d, frame[0], frame[1], frame[2])
         length = dot(f, f)
         if not length > zero:
             return nowhere, (zero, zero, zero), nowhere
         t = dot(e, f) / length
-        q = blend(t, f, -one, e)
+        q = across(blend(t, f, -one, e), f, length)
         return t, q, dot(q, q)
 
     @inlined
     def meet_gradient(offset, d, frame, t, q, v_t, v_squared):  # type: ignore[no-untyped-def]
         e, f = along(offset, frame[0], frame[1], frame[2]), along(d, frame[0], frame[1], frame[2])
+        length = dot(f, f)
+        # The first time leaves what is rounded of the rest itself.
+        q = across(q, f, length)
         # |q| does not change with t, which is where it is least.
-        by_t = v_t / dot(f, f)
+        by_t = v_t / length
         v_e = blend(-two * v_squared, q, by_t, f)
         v_f = blend(two * v_squared * t, q, by_t, (e[0] - two * t * f[0], e[1] - two * t * f[1], e[2] - two * t * f[2]))
         v_offset = scaled_sum(v_e, frame[0], frame[1], frame[2])

@@ -126,6 +126,9 @@ def _lanes(real: type, flat: bool) -> Scalar:
         length = f0 * f0 + f1 * f1 + f2 * f2
         t = (e0 * f0 + e1 * f1 + e2 * f2) / length
         u, v, w = t * f0 - e0, t * f1 - e1, t * f2 - e2
+        # What rounding leaves along the ray, see `maths/ray_hit.py`.
+        rest = (u * f0 + v * f1 + w * f2) / length
+        u, v, w = u - rest * f0, v - rest * f1, w - rest * f2
         squared = u * u + v * v + w * w
         store(ts, 0, t)
         store(squares, 0, squared)
