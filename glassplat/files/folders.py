@@ -73,3 +73,8 @@ def remove_empty(folders: Sequence[Path]) -> None:
     for folder in folders:
         with suppress(OSError):
             folder.rmdir()
+
+
+def real_path(path: Path) -> Path:
+    """Where a path leads through links; one that goes round in circles stays what it is, unlike in `Path.resolve`."""
+    return Path(os.path.realpath(path))

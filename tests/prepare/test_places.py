@@ -72,3 +72,10 @@ def test_photographs_that_cannot_be_used_leave_no_folder(tmp_path: Path) -> None
     output = tmp_path / "new" / "below" / "capture"
     assert main(["prepare", str(tmp_path / "photographs"), "--output", str(output)]) == 2
     assert not (tmp_path / "new").exists()
+
+
+def test_a_link_to_itself_is_no_place_for_a_capture(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    assert "expected a folder" in refused(photographs, tmp_path / "loop", capsys)
