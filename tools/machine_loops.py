@@ -116,10 +116,15 @@ def blocks_of(lines: list[str]) -> list[Block]:
 
 
 def following(body: list[Instruction], number: int, starts: dict[str, int], count: int) -> list[int]:
-    """The blocks that may run after one: where it jumps, and the next unless it always leaves."""
+    """The blocks that may run after one: where it jumps, and the next unless it always leaves.
+
+    Where threads of a warp wait for each other, they are taken to be together: BRA.DIV, which jumps where they are not,
+    never does, and BRA.CONV, which jumps where they are, always does.
+    """
     last = body[-1] if body else None
     leaves = last is not None and not last.guarded and last.name.startswith(("BRA", "EXIT", "RET"))
-    leaves = leaves and last is not None and not last.name.startswith("BRA.CONV")
+    if last is not None and last.name.startswith("BRA.DIV"):
+        return [number + 1]
     after = [] if leaves or number + 1 == count else [number + 1]
     return [starts[last.target], *after] if last is not None and last.target in starts else after
 

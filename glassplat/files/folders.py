@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -50,15 +51,30 @@ def make_folder(path: Path) -> None:
         OSError: the disk is full, or fails.
     """
     check_folder(path)
-    missing = [folder for folder in (path, *path.parents) if not os.path.lexists(folder)]
+    missing = missing_folders(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        for folder in missing:
-            with suppress(OSError):
-                folder.rmdir()
+        remove_empty(missing)
         if error.errno not in IN_THE_WAY:
             raise
         raise NotADirectoryError(
             f"there can be no folder {path} ({error.strerror}); choose another folder for the output"
         ) from error
+
+
+def missing_folders(path: Path) -> list[Path]:
+    """A folder and those above it, as far as they are not there, the innermost first."""
+    return [folder for folder in (path, *path.parents) if not os.path.lexists(folder)]
+
+
+def remove_empty(folders: Sequence[Path]) -> None:
+    """Removes those folders that hold nothing, the first one first."""
+    for folder in folders:
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def real_path(path: Path) -> Path:
+    """Where a path leads through links; one that goes round in circles stays what it is, unlike in `Path.resolve`."""
+    return Path(os.path.realpath(path))

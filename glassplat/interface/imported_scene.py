@@ -10,6 +10,7 @@ import torch
 from glassplat.data.errors import InputError
 from glassplat.data.ranges import Up
 from glassplat.files.cameras_json import read_cameras
+from glassplat.files.folders import real_path
 from glassplat.files.planes_json import read_planes
 from glassplat.files.ply import read_gaussians
 from glassplat.files.splat_files import drawable, read_splats
@@ -52,7 +53,7 @@ def imported_scene(file: Path, planes_file: Path | None = None, up: Up = "-y") -
         raise InputError(f"{file} holds no Gaussians; expected a trained splat")
     planes = _planes(file, planes_file)
     glass = _glass(
-        file, planes, own=planes_file is None or planes_file.resolve() == file.with_name("planes.json").resolve()
+        file, planes, own=planes_file is None or real_path(planes_file) == real_path(file.with_name("planes.json"))
     )
     cameras = _cameras(file, gaussians, up)
     scene = Scene(with_intensity(gaussians), extent_of(gaussians, cameras), glass=glass, planes=planes)

@@ -9,6 +9,7 @@ from typing import Any
 from glassplat import __version__
 from glassplat.data.colmap_library import quiet_pycolmap
 from glassplat.data.errors import InputError
+from glassplat.files.folders import missing_folders, real_path, remove_empty
 from glassplat.prepare.capture_writer import write_capture
 from glassplat.prepare.messages import Listener
 from glassplat.prepare.photographs import Photograph, photographs_in
@@ -42,7 +43,7 @@ class Preparation:
         """What the work depends on: an interrupted one goes on with the same only."""
         placing = {"lens": self.settings.lens, "mapper": self.settings.mapper}
         return {
-            "input": str(self.source.resolve()),
+            "input": str(real_path(self.source)),
             "max-size": self.max_size,
             "frames": self.frames,
             **placing,
@@ -65,8 +66,13 @@ def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force:
     check_places(task)
     quiet_pycolmap()
     workplace = Workplace(task.output)
+    missing = missing_folders(workplace.folder.parent)
     workplace.begin(task.record(), resume=resume, force=force)
-    photographs = _photographs(task, workplace, listen)
+    try:
+        photographs = _photographs(task, workplace, listen)
+    except InputError:
+        remove_empty(missing)
+        raise
     solution = best_solution(photographs, workplace.folder, task.settings, listen)
     report = report_of(solution)
     _check_enough(report, task)
@@ -87,7 +93,7 @@ def check_places(task: Preparation) -> None:
     Raises:
         InputError: says what to choose instead.
     """
-    source, output = task.source.resolve(), task.output.resolve()
+    source, output = real_path(task.source), real_path(task.output)
     if source.is_file() and not is_video(source):
         known = ", ".join(VIDEO_SUFFIXES)
         raise InputError(f"{task.source} is a file; expected a folder of photographs, or a video ({known})")

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.bin_tiles import bin_tiles
+from glassplat.kernels.color_and_depth import mean_depth
 from glassplat.kernels.composite import composite
 from glassplat.kernels.cube_lookup import cube_lookup
 from glassplat.kernels.shade_environment import shade_environment
@@ -22,7 +23,6 @@ from glassplat.render.rasterize import (
     check_ellipsoids,
     joined_probe,
     joined_splats,
-    mean_depth,
     over_background,
     project_gaussians,
     screen_pass,

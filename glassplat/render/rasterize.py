@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.discs import ProjectedDiscs
 from glassplat.kernels.project import GradientSum, project
-from glassplat.kernels.splats import LEAST_ALPHA, CameraBatch, Projected, RawGaussians, Splats
+from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians, Splats
 from glassplat.render.frame import ScreenPass
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
@@ -106,11 +106,6 @@ class _OverBackground(torch.autograd.Function):
     def backward(ctx: Any, v_image: Tensor) -> tuple[Tensor, Tensor, None]:
         (background,) = ctx.saved_tensors
         return v_image, -(v_image @ background), None
-
-
-def mean_depth(depth_sum: Tensor, alpha: Tensor) -> Tensor:
-    """Blended depth (TR-Gaussians, Eq. 4): weighted depth sum over total weight; 0 where nothing is."""
-    return torch.where(alpha > LEAST_ALPHA, depth_sum / alpha.clamp(min=LEAST_ALPHA), 0)
 
 
 def check_ellipsoids(gaussians: Gaussians) -> None:

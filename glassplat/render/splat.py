@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from glassplat.kernels.bin_tiles import bin_tiles
+from glassplat.kernels.color_and_depth import mean_depth
 from glassplat.kernels.composite import composite
 from glassplat.render.discs import blended_discs, disc_layers, projected_discs
 from glassplat.render.frame import Frame
@@ -15,7 +16,6 @@ from glassplat.render.rasterize import (
     check_colored,
     joined_probe,
     joined_splats,
-    mean_depth,
     over_background,
     project_gaussians,
     screen_pass,

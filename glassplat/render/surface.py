@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.bin_tiles import bin_tiles
+from glassplat.kernels.color_and_depth import mean_depth
 from glassplat.kernels.composite import composite
 from glassplat.kernels.pane_hits.reference import ray_grid
 from glassplat.kernels.shade_environment.shaded import NORMAL_AT, NORMAL_MIN, STRENGTH_AT, SURFACE_CHANNELS
@@ -20,7 +21,6 @@ from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
     joined_probe,
     joined_splats,
-    mean_depth,
     over_background,
     project_gaussians,
     screen_pass,

@@ -14,6 +14,7 @@ from torch import Tensor
 from glassplat.kernels.color_and_depth import color_and_depth
 from glassplat.kernels.color_and_depth.reference import color_and_depth as color_and_depth_twin
 from glassplat.kernels.harmonic_energy import harmonic_energy
+from glassplat.kernels.harmonic_energy.operation import _EnergyOnGpu
 from glassplat.kernels.harmonic_energy.reference import harmonic_energy as harmonic_energy_twin
 from glassplat.kernels.join_channels import join_channels
 from glassplat.kernels.join_channels.reference import join_channels as join_channels_twin
@@ -104,9 +105,12 @@ def test_layers_of_panes(size: tuple[int, int]) -> None:
 @pytest.mark.parametrize("shape", [(2500, 16), (3, 1), (3, 0), (0, 4)])
 def test_energy_of_harmonics(shape: tuple[int, int], dtype: torch.dtype, tolerance: float) -> None:
     sh = draw(*shape, 3, dtype=dtype) - 0.3
-    found, expected = (with_gradients(f, (sh,)) for f in (harmonic_energy, harmonic_energy_twin))
-    for own, wanted in zip(found, expected, strict=True):
+    found, on_gpu, expected = (
+        with_gradients(f, (sh,)) for f in (harmonic_energy, _EnergyOnGpu.apply, harmonic_energy_twin)
+    )
+    for own, of_gpu, wanted in zip(found, on_gpu, expected, strict=True):
         torch.testing.assert_close(own, wanted, rtol=tolerance, atol=tolerance)
+        torch.testing.assert_close(of_gpu, wanted, rtol=tolerance, atol=tolerance)
     with one_thread():
         again = with_gradients(harmonic_energy, (sh,))
     assert all(torch.equal(a, b) for a, b in zip(found, again, strict=True))

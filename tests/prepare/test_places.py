@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from glassplat.cli import main
 
@@ -63,3 +64,18 @@ def test_too_little_texture_says_what_to_do(tmp_path: Path, capsys: pytest.Captu
     message = refused(tmp_path / "in", tmp_path / "capture", capsys)
     assert "5 of 5 photographs show fewer than 50 places" in message
     assert not (tmp_path / "capture").exists()
+
+
+def test_photographs_that_cannot_be_used_leave_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "photographs").mkdir()
+    Image.new("RGB", (40, 28)).save(tmp_path / "photographs" / "a.png")
+    output = tmp_path / "new" / "below" / "capture"
+    assert main(["prepare", str(tmp_path / "photographs"), "--output", str(output)]) == 2
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_link_to_itself_is_no_place_for_a_capture(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    assert "expected a folder" in refused(photographs, tmp_path / "loop", capsys)

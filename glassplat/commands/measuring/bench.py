@@ -39,7 +39,7 @@ from glassplat.commands.training.train import Train
 from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
 from glassplat.data.ranges import Downscale, Seed, Several
-from glassplat.files.folders import check_folder
+from glassplat.files.folders import check_folder, real_path
 from glassplat.train.ablations import ABLATIONS, Ablated, Ablation, Switch
 from glassplat.train.recipe import RECIPES, Preset, recipe_of
 from glassplat.train.run_directory import write_text
@@ -280,7 +280,7 @@ def planned_runs(bench: BenchScenes | BenchAblation, recipes: dict[str, Any]) ->
             variant,
             Train(
                 recipe,
-                data.resolve(),
+                real_path(data),
                 bench.output / RUNS / scene / f"{variant}-seed{seed}",
                 iterations=bench.iterations,
                 downscale=bench.downscale,

@@ -13,6 +13,7 @@ from rich.console import Console
 from glassplat.commands.console.messages import say
 from glassplat.commands.training.train import Train
 from glassplat.data.errors import InputError, first_names
+from glassplat.files.folders import real_path
 from glassplat.files.json_text import read_json
 from glassplat.train.background import with_background
 from glassplat.train.run_directory import RunDirectory
@@ -97,7 +98,7 @@ def scene_names(captures: Sequence[Path]) -> list[str]:
     Raises:
         InputError: a capture is given twice, or none is given.
     """
-    folders = [path.resolve() for path in captures]
+    folders = [real_path(path) for path in captures]
     twice = [str(path) for path, count in Counter(folders).items() if count > 1]
     if twice or not folders:
         raise InputError(
@@ -123,11 +124,11 @@ def earlier_runs(output: Path, recipes: Mapping[str, Any], planned: Sequence[Pla
         InputError: one of them cannot stand in a table with those that are planned, because its length, scale or
             recipe is another.
     """
-    own, like = {run.directory.path.resolve() for run in planned}, planned[0].train
+    own, like = {real_path(run.directory.path) for run in planned}, planned[0].train
     found = []
     for path in sorted((output / RUNS).glob("*/*-seed*")):
         variant, _, seed = path.name.rpartition("-seed")
-        if variant not in recipes or not seed.isdecimal() or path.resolve() in own:
+        if variant not in recipes or not seed.isdecimal() or real_path(path) in own:
             continue
         recorded = RunDirectory(path).settings()
         train = replace(

@@ -20,7 +20,7 @@ from glassplat.commands.training.train import Train
 from glassplat.data.errors import InputError
 from glassplat.data.masks import Polarity
 from glassplat.data.ranges import Downscale, Range, Seed, Several
-from glassplat.files.folders import check_folder
+from glassplat.files.folders import check_folder, real_path
 from glassplat.files.markdown_table import Table
 from glassplat.train.recipe import recipe_of
 from glassplat.train.run_directory import write_text
@@ -133,7 +133,7 @@ class BenchSeconds:
         folder = self.output / RUNS / scene / f"{method}-{name.replace(' ', '')}"
         train = Train(
             recipe_of(method),
-            data.resolve(),
+            real_path(data),
             folder,
             iterations=iterations_for(asked, [(run.iterations, run.seconds) for run in found]) if found else self.pilot,
             downscale=self.downscale,

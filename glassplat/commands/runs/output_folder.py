@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from glassplat.data.errors import InputError, first_names
-from glassplat.files.folders import check_folder, make_folder
+from glassplat.files.folders import check_folder, make_folder, real_path
 from glassplat.files.json_text import read_json
 from glassplat.train.run_directory import write_text
 
@@ -57,9 +57,9 @@ def check_targets(folder: Path, targets: Sequence[Path], photographs: Sequence[P
     Raises:
         InputError: names the file and where it leads, or what is in its place; nothing has been written.
     """
-    inside, kept = _real(folder), {_real(path) for path in photographs}
+    inside, kept = real_path(folder), {real_path(path) for path in photographs}
     for target in (folder / RECORD, *targets):
-        real = _real(target)
+        real = real_path(target)
         if real in kept or not real.is_relative_to(inside):
             what = "is a photograph of the capture" if real in kept else f"leads out of {folder}, to {real}"
             raise InputError(f"{target} {what}; nothing was written. Choose a new folder for --output")
@@ -68,11 +68,6 @@ def check_targets(folder: Path, targets: Sequence[Path], photographs: Sequence[P
                 f"{target} is a pipe, a device or a link to nothing; nothing was written. Choose a new folder for "
                 "--output"
             )
-
-
-def _real(path: Path) -> Path:
-    """Where a path leads through links; one that goes round in circles stays what it is."""
-    return Path(os.path.realpath(path))
 
 
 def _recorded_command(record: Path) -> str | None:

@@ -15,4 +15,9 @@ def color_and_depth(image: Tensor, alpha: Tensor, background: tuple[float, ...])
         # Filled in on the device: a tensor of numbers that came from here would make a GPU wait.
         behind = torch.stack([torch.full_like(alpha, value) for value in background], dim=-1)
         colors = colors + (1 - alpha)[..., None] * behind
-    return colors, torch.where(alpha > LEAST_ALPHA, total / alpha.clamp(min=LEAST_ALPHA), 0)
+    return colors, mean_depth(total, alpha)
+
+
+def mean_depth(depth_sum: Tensor, alpha: Tensor) -> Tensor:
+    """Blended depth (TR-Gaussians, Eq. 4): weighted depth sum over total weight; 0 where nothing is."""
+    return torch.where(alpha > LEAST_ALPHA, depth_sum / alpha.clamp(min=LEAST_ALPHA), 0)

@@ -133,7 +133,7 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
     reciprocal = reciprocal_maths(real)
     zero, one = real(0.0), real(1.0)
     alpha_min, alpha_max = real(ALPHA_MIN), real(ALPHA_MAX)
-    behinds, lasts, glass_ts, glass_behinds, glass_lasts = BEHIND, LAST, T_GLASS, BEHIND_GLASS, LAST_GLASS
+    behinds, lasts, glass_lasts, glass_state, above = BEHIND, LAST, LAST_GLASS, 3 * SLOTS, BUCKET // TILE
     shown, spread, middle, _, _ = _planes(num_channels)
     enter, write = _enter(real, num_channels), _write(num_channels, probed)
 
@@ -173,15 +173,15 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
                 at(warp * PIXELS + pixel), tile_pulls + pixel, entry + pixel, bucket * PIXELS + pixel,
                 (real(own_last), real(own_glass)), channel, has_glass, pulls, kept, kept_spread, state,
             )  # fmt: skip
-        order, tile, place_in_bucket = first + lane, np.uint32(n), real(np.int32(lane))
-        inside, glass, mark, apart, own_lasts = order < looked_at[n], False, zero, zero, lasts
+        order, place_in_bucket = first + lane, real(np.int32(lane))
+        inside, glass, mark, apart = order < looked_at[n], False, zero, zero
         xx, xy, yy, pull_x, pull_y, reached = zero, zero, zero, zero, zero, np.int32(0)
         if inside:
             s = pair_splats[start + order]
             reached = load(geometry, 0, s, means, conics, opacities, x0, y0, rows)
             xx, xy, yy, glass = conics[s, 0], conics[s, 1], conics[s, 2], s >= first_glass
             if glass:
-                mark, own_lasts = marks[camera, s - first_glass], glass_lasts
+                mark = marks[camera, s - first_glass]
             else:
                 apart = channels[s, max(channel, 0)]
                 for d in range(num_channels):
@@ -189,33 +189,37 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
         for d in range(num_channels):
             v_value[d] = zero
         g_x, g_y, g_xx, g_xy, g_yy, g_0, v_mark, v_apart = zero, zero, zero, zero, zero, zero, zero, zero
-        own_pulls, step = at(tile) * at((num_channels + PULLS) * PIXELS), np.int32(0)
-        while step < PIXELS + BUCKET - 1:
+        # A pixel's number counts from ABOVE rows above the tile, so that before a lane's first pixel and after its last
+        # one it is in rows that no splat reaches; so is a splat that is not there.
+        reached, own_pulls = np.int32(reached << above), tile_pulls - above * TILE
+        own_state = np.int32(warp * PIXELS + (glass_state if glass else 0) - above * TILE)
+        p, end = np.int32(above * TILE - lane), np.int32(above * TILE + PIXELS + BUCKET - 1 - lane)
+        while p < end:
             # The lanes of a warp wait for each other; the simulator knows no warps, but blocks.
             if SIMULATED:
                 cuda.syncthreads()
             else:
                 cuda.syncwarp()
-            p = np.int32(step - lane)
-            step = np.int32(step + 1)
-            # A splat that is not there reaches no row, and none was blended where the tile reaches beyond the image.
-            if 0 <= p < PIXELS and np.int32(reached & np.int32(1 << (p >> 4))) != 0:
-                x, y = real(np.int32(p & (TILE - 1))), real(np.int32(p >> 4))
-                covered, mine = coverage(geometry, 0, x, y), at(warp * PIXELS + p)
-                if covered >= alpha_min and place_in_bucket <= state[mine + own_lasts]:
+            row = np.int32(p >> 4)
+            if np.int32(reached & np.int32(1 << row)) != 0:
+                x, y = real(np.int32(p & (TILE - 1))), real(np.int32(row - above))
+                covered, mine = coverage(geometry, 0, x, y), at(own_state + p)
+                if covered >= alpha_min and place_in_bucket <= state[mine + lasts]:
                     a = min(covered, alpha_max)
-                    pulled, t, inverse = own_pulls + at(np.uint32(p)), state[mine], reciprocal(one - a)
+                    # In 32 bits, which hold the places of any pulls that a GPU's memory does (16 GiB).
+                    pulled, inverse = at(np.uint32(own_pulls + p)), reciprocal(one - a)
                     if glass:
-                        t_glass = state[mine + glass_ts]
-                        pull = pulls[pulled + at(shown)] * t * t_glass
+                        t_glass, of_all = state[mine], mine - at(glass_state)
+                        pull = pulls[pulled + at(shown)] * state[of_all] * t_glass
                         weight = a * pull
-                        of_glass = state[mine + glass_behinds] - weight * mark
+                        of_glass = state[mine + behinds] - weight * mark
                         gain = (pull * mark - of_glass * inverse) * a
                         v_mark += weight
-                        state[mine + glass_ts], state[mine + glass_behinds] = t_glass - a * t_glass, of_glass
-                        state[mine + behinds] -= weight * mark
+                        state[mine], state[mine + behinds] = t_glass - a * t_glass, of_glass
+                        state[of_all + behinds] -= weight * mark
                     else:
-                        weight, dot = a * t, zero
+                        t, dot = state[mine], zero
+                        weight = a * t
                         for d in range(num_channels):
                             pull = pulls[pulled + at(d * PIXELS)]
                             dot += pull * value[d]
@@ -230,15 +234,13 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
                         state[mine], state[mine + behinds] = t - weight, behind
                     if covered < alpha_max:
                         dx, dy = x - geometry[0, MEAN_X], y - geometry[0, MEAN_Y]
-                        g_0 += gain
-                        g_x += gain * dx
-                        g_y += gain * dy
-                        g_xx += gain * dx * dx
-                        g_xy += gain * dx * dy
-                        g_yy += gain * dy * dy
+                        gain_x, gain_y = gain * dx, gain * dy
+                        g_0, g_x, g_y = g_0 + gain, g_x + gain_x, g_y + gain_y
+                        g_xx, g_xy, g_yy = g_xx + gain_x * dx, g_xy + gain_x * dy, g_yy + gain_y * dy
                         if probed:
-                            pull_x += abs(gain * (xx * dx + xy * dy))
-                            pull_y += abs(gain * (xy * dx + yy * dy))
+                            pull_x += abs(xx * gain_x + xy * gain_y)
+                            pull_y += abs(xy * gain_x + yy * gain_y)
+            p = np.int32(p + 1)
         if inside:
             write(
                 out, start + order, g_x, g_y, g_xx, g_xy, g_yy, g_0, v_value, channel, v_apart,

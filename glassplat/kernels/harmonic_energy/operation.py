@@ -24,20 +24,17 @@ def harmonic_energy(sh: Tensor) -> Tensor:
         TypeError: it is neither float32 nor float64, or not where there are kernels.
     """
     check_tensors({"sh": (sh, (sh.shape[0], *sh.shape[1:2], 3))})
-    energy: Tensor = _HarmonicEnergy.apply(sh)
+    node = _EnergyOnCpu if sh.device.type == "cpu" else _EnergyOnGpu
+    energy: Tensor = node.apply(sh)
     return energy
 
 
-class _HarmonicEnergy(torch.autograd.Function):
-    """One node also on a GPU: autograd would fill and add a gradient of the slice."""
-
+class _EnergyOnCpu(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, sh: Tensor) -> Tensor:
         sh = sh.detach().contiguous()
         ctx.save_for_backward(sh)
-        if sh.device.type != "cpu":
-            return reference.harmonic_energy(sh)
-        sums = torch.empty(-(-sh.shape[0] // CHUNK), dtype=torch.float64, device=sh.device)
+        sums = torch.empty(-(-sh.shape[0] // CHUNK), dtype=torch.float64)
         energy_forward(REAL_OF[sh.dtype])(sh.numpy(), sums.numpy())
         return sums.sum().to(sh.dtype)
 
@@ -45,10 +42,23 @@ class _HarmonicEnergy(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, v_energy: Tensor) -> Tensor:
         (sh,) = ctx.saved_tensors
-        if sh.device.type != "cpu":
-            gradient = (2 * v_energy) * sh
-            gradient[:, :1].zero_()
-            return gradient
         gradient, real = torch.empty_like(sh), REAL_OF[sh.dtype]
         energy_backward(real)(sh.numpy(), real(2 * v_energy.item()), gradient.numpy())
+        return gradient
+
+
+class _EnergyOnGpu(torch.autograd.Function):
+    """PyTorch's operations as one node: autograd would fill and add a gradient of the slice."""
+
+    @staticmethod
+    def forward(ctx: Any, sh: Tensor) -> Tensor:
+        ctx.save_for_backward(sh)
+        return reference.harmonic_energy(sh)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_energy: Tensor) -> Tensor:
+        (sh,) = ctx.saved_tensors
+        gradient = (2 * v_energy) * sh
+        gradient[:, :1].zero_()
         return gradient

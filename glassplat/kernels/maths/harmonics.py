@@ -85,20 +85,79 @@ def harmonic_basis(real: type) -> Callable[..., Any]:
     return basis
 
 
-def _color(basis: Callable[..., Any]) -> Callable[..., Any]:
+def channel_with(take: Callable[..., Any]) -> Callable[..., Any]:
+    """One of three colours from harmonics, of numbers or of vectors.
+
+    `take(sh, n, k, c)` reads colour c of coefficient k.
+    """
+
     # Tuples are indexed by constants only: a variable index compiles to a switch.
     @inlined
     def channel(sh, n, c, degree, b):
-        value = b[0] * sh[n, 0, c]
+        value = b[0] * take(sh, n, 0, c)
         if degree > 0:
-            value += b[1] * sh[n, 1, c] + b[2] * sh[n, 2, c] + b[3] * sh[n, 3, c]
+            value = value + b[1] * take(sh, n, 1, c) + b[2] * take(sh, n, 2, c) + b[3] * take(sh, n, 3, c)
         if degree > 1:
-            value += b[4] * sh[n, 4, c] + b[5] * sh[n, 5, c] + b[6] * sh[n, 6, c] + b[7] * sh[n, 7, c]
-            value += b[8] * sh[n, 8, c]
+            value = value + b[4] * take(sh, n, 4, c) + b[5] * take(sh, n, 5, c) + b[6] * take(sh, n, 6, c)
+            value = value + b[7] * take(sh, n, 7, c) + b[8] * take(sh, n, 8, c)
         if degree > 2:
-            value += b[9] * sh[n, 9, c] + b[10] * sh[n, 10, c] + b[11] * sh[n, 11, c] + b[12] * sh[n, 12, c]
-            value += b[13] * sh[n, 13, c] + b[14] * sh[n, 14, c] + b[15] * sh[n, 15, c]
+            value = value + b[9] * take(sh, n, 9, c) + b[10] * take(sh, n, 10, c) + b[11] * take(sh, n, 11, c)
+            value = value + b[12] * take(sh, n, 12, c) + b[13] * take(sh, n, 13, c)
+            value = value + b[14] * take(sh, n, 14, c) + b[15] * take(sh, n, 15, c)
         return value
+
+    return channel
+
+
+def color_gradient_with(real: type, put: Callable[..., Any], pull: Callable[..., Any]) -> Callable[..., Any]:
+    """The adjoint of three colours, of numbers or of vectors; it returns the gradient of the direction.
+
+    `put(g_sh, at, k, b, g)` takes the gradient of coefficient k, whose harmonic is b, for gradients g of the colours;
+    `pull(sh, n, k, g)` is the gradient of that harmonic.
+    """
+    first, second, third = _direction_gradients(real)
+
+    @inlined
+    def color_gradient(sh, n, degree, x, y, z, b, g, g_sh, at, none):
+        put(g_sh, at, 0, b[0], g)
+        gx, gy, gz = none, none, none
+        if degree > 0:
+            put(g_sh, at, 1, b[1], g)
+            put(g_sh, at, 2, b[2], g)
+            put(g_sh, at, 3, b[3], g)
+            gx, gy, gz = first(pull(sh, n, 1, g), pull(sh, n, 2, g), pull(sh, n, 3, g))
+        if degree > 1:
+            put(g_sh, at, 4, b[4], g)
+            put(g_sh, at, 5, b[5], g)
+            put(g_sh, at, 6, b[6], g)
+            put(g_sh, at, 7, b[7], g)
+            put(g_sh, at, 8, b[8], g)
+            h = (pull(sh, n, 4, g), pull(sh, n, 5, g), pull(sh, n, 6, g), pull(sh, n, 7, g), pull(sh, n, 8, g))
+            more = second(x, y, z, h)
+            gx, gy, gz = gx + more[0], gy + more[1], gz + more[2]
+        if degree > 2:
+            put(g_sh, at, 9, b[9], g)
+            put(g_sh, at, 10, b[10], g)
+            put(g_sh, at, 11, b[11], g)
+            put(g_sh, at, 12, b[12], g)
+            put(g_sh, at, 13, b[13], g)
+            put(g_sh, at, 14, b[14], g)
+            put(g_sh, at, 15, b[15], g)
+            low = (pull(sh, n, 9, g), pull(sh, n, 10, g), pull(sh, n, 11, g), pull(sh, n, 12, g))
+            high = (pull(sh, n, 13, g), pull(sh, n, 14, g), pull(sh, n, 15, g))
+            more = third(x, y, z, low, high)
+            gx, gy, gz = gx + more[0], gy + more[1], gz + more[2]
+        return gx, gy, gz
+
+    return color_gradient
+
+
+def _color(basis: Callable[..., Any]) -> Callable[..., Any]:
+    @inlined
+    def take(sh, n, k, c):
+        return sh[n, k, c]
+
+    channel = channel_with(take)
 
     @inlined
     def color(sh, n, degree, x, y, z):
@@ -109,49 +168,10 @@ def _color(basis: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _color_gradient(real: type, basis: Callable[..., Any]) -> Callable[..., Any]:
-    add_row, pull = _rows()
-    pulls = direction_gradients(real)
-    first, second, third = pulls
+    zero = real(0.0)
 
     @inlined
-    def color_gradient(sh, n, degree, x, y, z, g, g_sh):
-        b = basis(x, y, z)
-        add_row(g_sh, n, 0, b[0], g)
-        gx = gy = gz = b[0] - b[0]
-        if degree > 0:
-            add_row(g_sh, n, 1, b[1], g)
-            add_row(g_sh, n, 2, b[2], g)
-            add_row(g_sh, n, 3, b[3], g)
-            gx, gy, gz = first(pull(sh, n, 1, g), pull(sh, n, 2, g), pull(sh, n, 3, g))
-        if degree > 1:
-            add_row(g_sh, n, 4, b[4], g)
-            add_row(g_sh, n, 5, b[5], g)
-            add_row(g_sh, n, 6, b[6], g)
-            add_row(g_sh, n, 7, b[7], g)
-            add_row(g_sh, n, 8, b[8], g)
-            h = (pull(sh, n, 4, g), pull(sh, n, 5, g), pull(sh, n, 6, g), pull(sh, n, 7, g), pull(sh, n, 8, g))
-            more = second(x, y, z, h)
-            gx, gy, gz = gx + more[0], gy + more[1], gz + more[2]
-        if degree > 2:
-            add_row(g_sh, n, 9, b[9], g)
-            add_row(g_sh, n, 10, b[10], g)
-            add_row(g_sh, n, 11, b[11], g)
-            add_row(g_sh, n, 12, b[12], g)
-            add_row(g_sh, n, 13, b[13], g)
-            add_row(g_sh, n, 14, b[14], g)
-            add_row(g_sh, n, 15, b[15], g)
-            low = (pull(sh, n, 9, g), pull(sh, n, 10, g), pull(sh, n, 11, g), pull(sh, n, 12, g))
-            high = (pull(sh, n, 13, g), pull(sh, n, 14, g), pull(sh, n, 15, g))
-            more = third(x, y, z, low, high)
-            gx, gy, gz = gx + more[0], gy + more[1], gz + more[2]
-        return gx, gy, gz
-
-    return color_gradient
-
-
-def _rows() -> tuple[Callable[..., Any], Callable[..., Any]]:
-    @inlined
-    def add_row(g_sh, n, k, b, g):
+    def add(g_sh, n, k, b, g):
         g_sh[n, k, 0] += b * g[0]
         g_sh[n, k, 1] += b * g[1]
         g_sh[n, k, 2] += b * g[2]
@@ -160,10 +180,16 @@ def _rows() -> tuple[Callable[..., Any], Callable[..., Any]]:
     def pull(sh, n, k, g):
         return sh[n, k, 0] * g[0] + sh[n, k, 1] * g[1] + sh[n, k, 2] * g[2]
 
-    return add_row, pull
+    adjoint = color_gradient_with(real, add, pull)
+
+    @inlined
+    def color_gradient(sh, n, degree, x, y, z, g, g_sh):
+        return adjoint(sh, n, degree, x, y, z, basis(x, y, z), g, g_sh, n, zero)
+
+    return color_gradient
 
 
-def direction_gradients(real: type) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
+def _direction_gradients(real: type) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
     """Gradients of the direction, degree by degree, from the gradients h of the harmonics."""
     _, c1, c_xy, c_zz, c_xx, c_yxx, c_xyz, c_yzz, c_zzz, c_zxx = (real(c) for c in SH_CONSTANTS)
     two, three, four, six, eight = real(2.0), real(3.0), real(4.0), real(6.0), real(8.0)

@@ -33,6 +33,7 @@ class VectorMaths(NamedTuple):
         scaled_sum: x a + y b + z c for coefficients (x, y, z): a matrix of columns a, b, c times a vector.
         along: (a . v, b . v, c . v): the transpose of that matrix times a vector.
         cross_squared: |a x b|^2.
+        tangential: s (v - (v . u) u), what of a vector v is across a unit vector u, scaled.
     """
 
     dot: Scalar
@@ -40,6 +41,7 @@ class VectorMaths(NamedTuple):
     scaled_sum: Scalar
     along: Scalar
     cross_squared: Scalar
+    tangential: Scalar
 
 
 def vector_maths() -> VectorMaths:
@@ -70,7 +72,12 @@ def vector_maths() -> VectorMaths:
         x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
         return x * x + y * y + z * z
 
-    return VectorMaths(dot, blend, scaled_sum, along, cross_squared)
+    @inlined
+    def tangential(s, v, u):
+        radial = dot(v, u)
+        return s * (v[0] - radial * u[0]), s * (v[1] - radial * u[1]), s * (v[2] - radial * u[2])
+
+    return VectorMaths(dot, blend, scaled_sum, along, cross_squared, tangential)
 
 
 class ShapeMaths(NamedTuple):

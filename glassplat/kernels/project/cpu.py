@@ -21,7 +21,7 @@ from glassplat.kernels.cpu.vector import absolute, bits_of, lowest_bit, maximum,
 from glassplat.kernels.cpu.vector_rows import store_all
 from glassplat.kernels.maths.projection import screen_maths
 from glassplat.kernels.project.cpu_backward import project_backward
-from glassplat.kernels.project.cpu_lanes import COLUMNS, LANES, lane_steps
+from glassplat.kernels.project.cpu_lanes import COLUMNS, LANES, gather, gather_shapes, lane_steps
 from glassplat.kernels.project.cpu_view import CHUNK, LENS_VALUES, view_steps
 from glassplat.kernels.project.steps import culling
 from glassplat.kernels.tensor_checks import REAL_OF
@@ -106,13 +106,7 @@ def placing_listed(real: type) -> Callable[..., Any]:
         shown = 0
         for first in range(0, found, LANES):
             last = min(first + LANES, found) - 1
-            for i in range(LANES):
-                n = listed[min(first + i, last)]
-                for k in range(3):
-                    columns[k * LANES + i], columns[(7 + k) * LANES + i] = means[n, k], log_scales[n, k]
-                for k in range(4):
-                    columns[(3 + k) * LANES + i] = quats[n, k]
-                columns[10 * LANES + i] = logit_opacities[n]
+            gather_shapes(columns, listed, first, last, means, quats, log_scales, logit_opacities)
             values, bits = place(columns, c, cam_from_world, intrinsics, lens)
             store_all(columns, 0, values)
             bits &= (np.int64(1) << (last + 1 - first)) - 1
@@ -143,7 +137,6 @@ def coloring(real: type) -> Callable[..., Any]:
     *_, tabulate, color = lane_steps(real)
     cull, full = culling(real)[0], vector_kind(real, LANES).full
     zero, half, largest = real(0.0), real(0.5), real(np.finfo(real).max)
-    whole = COLUMNS * LANES
 
     @inlined
     def color_listed(
@@ -152,20 +145,10 @@ def coloring(real: type) -> Callable[..., Any]:
     ):  # fmt: skip
         """`sh` is flat, with rows of `row_size`; columns, table and positions are scratch."""
         terms = (degree + 1) * (degree + 1)
-        read = (3 * terms + LANES - 1) // LANES * LANES
         for first in range(0, shown, LANES):
             last = min(first + LANES, shown) - 1
-            inside = listed[last] * row_size + read <= sh.size
-            for i in range(LANES):
-                n = listed[min(first + i, last)]
-                positions[i] = n * row_size
-                for k in range(3):
-                    columns[k * LANES + i] = means[n, k]
-                if not inside:
-                    for k in range(3 * terms):
-                        table[whole + i * COLUMNS + k] = sh[n * row_size + k]
-                    positions[i] = whole + i * COLUMNS
-            tabulate(sh if inside else table, positions, terms, table, 0)
+            gather(columns, 0, listed, first, last, means)
+            tabulate(table, listed, first, last, terms, sh, row_size, positions)
             red, green, blue = color(table, columns, 0, degree, lens, c)
             bits = bits_of(absolute(red) + absolute(green) + absolute(blue) <= largest)
             none = full(zero)

@@ -18,7 +18,7 @@ from glassplat.kernels.cpu.schedule import even_stride
 from glassplat.kernels.cpu.vector import store, vector_kind
 from glassplat.kernels.cpu.vector_rows import row_loader, store_all, transposed
 from glassplat.kernels.project.cpu_backward_lanes import gradient_steps
-from glassplat.kernels.project.cpu_lanes import COLUMNS, LANES, lane_steps
+from glassplat.kernels.project.cpu_lanes import COLUMNS, LANES, gather, gather_shapes, lane_steps
 from glassplat.kernels.project.cpu_view import CHUNK, LENS_VALUES, view_steps
 from glassplat.kernels.project.gradient_steps import camera_sums
 
@@ -38,14 +38,11 @@ def _place_backward(real: type) -> Callable[..., Any]:
         """Adds to all gradients but that of the colour, of those listed; `columns` is scratch."""
         for first in range(0, shown, LANES):
             last = min(first + LANES, shown) - 1
+            gather_shapes(columns, listed, first, last, means, quats, log_scales, logit_opacities)
             for i in range(LANES):
                 n = listed[min(first + i, last)]
                 for k in range(3):
-                    columns[k * LANES + i], columns[(7 + k) * LANES + i] = means[n, k], log_scales[n, k]
                     columns[(13 + k) * LANES + i], columns[(18 + k) * LANES + i] = g_conics[c, n, k], conics[c, n, k]
-                for k in range(4):
-                    columns[(3 + k) * LANES + i] = quats[n, k]
-                columns[10 * LANES + i] = logit_opacities[n]
                 columns[11 * LANES + i], columns[12 * LANES + i] = g_means2d[c, n, 0], g_means2d[c, n, 1]
                 columns[16 * LANES + i], columns[17 * LANES + i] = g_depths[c, n], g_opacities[c, n]
             own, shared = place_gradient(columns, c, cam_from_world, intrinsics, lens)
@@ -109,21 +106,12 @@ def _color_backward(real: type) -> Callable[..., Any]:
                 listed[touched] = n
                 touched += 1
         terms = (degree + 1) * (degree + 1)
-        read = (3 * terms + LANES - 1) // LANES * LANES
         sum_x, sum_y, sum_z = 0.0, 0.0, 0.0
         for first in range(0, touched, LANES):
             last = min(first + LANES, touched) - 1
-            inside = listed[last] * row_size + read <= sh.size
-            for i in range(LANES):
-                n = listed[min(first + i, last)]
-                positions[i] = n * row_size
-                for k in range(3):
-                    columns[k * LANES + i], columns[(3 + k) * LANES + i] = means[n, k], g_colors[c, n, k]
-                if not inside:
-                    for k in range(3 * terms):
-                        table[whole + i * COLUMNS + k] = sh[n * row_size + k]
-                    positions[i] = whole + i * COLUMNS
-            tabulate(sh if inside else table, positions, terms, table, 0)
+            gather(columns, 0, listed, first, last, means)
+            gather(columns, 3, listed, first, last, g_colors[c])
+            tabulate(table, listed, first, last, terms, sh, row_size, positions)
             x, y, z = color_gradient(table, whole, columns, degree, lens, c)
             store(columns, 0, x)
             store(columns, LANES, y)

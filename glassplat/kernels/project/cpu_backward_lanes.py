@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from glassplat.kernels.cpu.jit import inlined
 from glassplat.kernels.cpu.vector import select, square_root, store, vector_kind
-from glassplat.kernels.maths.harmonics import direction_gradients, harmonic_basis
+from glassplat.kernels.maths.harmonics import color_gradient_with, harmonic_basis
 from glassplat.kernels.maths.projection import shape_maths, vector_maths
 from glassplat.kernels.project.cpu_lanes import LANES, channel_of, shapes, views
 from glassplat.kernels.project.cpu_view import view_steps
@@ -87,20 +87,20 @@ def _place_gradient(real: type) -> Step:
 
 def _color_gradient(real: type) -> Step:
     (full, load), basis, channel = vector_kind(real, LANES), harmonic_basis(real), channel_of(real)
-    first, second, third = direction_gradients(real)
-    zero, half, one = real(0.0), real(0.5), real(1.0)
+    tangential, zero, half, one = vector_maths().tangential, real(0.0), real(0.5), real(1.0)
 
     @inlined
     def put(table, at, k, b, g):
-        """Puts the gradients of coefficient k."""
         store(table, at + 3 * k * LANES, b * g[0])
         store(table, at + (3 * k + 1) * LANES, b * g[1])
         store(table, at + (3 * k + 2) * LANES, b * g[2])
 
     @inlined
-    def pull(table, k, g):
-        at = 3 * k * LANES
-        return load(table, at) * g[0] + load(table, at + LANES) * g[1] + load(table, at + 2 * LANES) * g[2]
+    def pull(table, at, k, g):
+        begin = at + 3 * k * LANES
+        return load(table, begin) * g[0] + load(table, begin + LANES) * g[1] + load(table, begin + 2 * LANES) * g[2]
+
+    adjoint = color_gradient_with(real, put, pull)
 
     @inlined
     def color_gradient(table, at, columns, degree, lens, c):
@@ -111,42 +111,10 @@ def _color_gradient(real: type) -> Step:
         x, y, z = x * inverse_length, y * inverse_length, z * inverse_length
         b = basis(x, y, z)
         g = (
-            select(channel(table, 0, degree, b) + half > zero, load(columns, 3 * LANES), none),
-            select(channel(table, LANES, degree, b) + half > zero, load(columns, 4 * LANES), none),
-            select(channel(table, 2 * LANES, degree, b) + half > zero, load(columns, 5 * LANES), none),
+            select(channel(table, 0, 0, degree, b) + half > zero, load(columns, 3 * LANES), none),
+            select(channel(table, 0, 1, degree, b) + half > zero, load(columns, 4 * LANES), none),
+            select(channel(table, 0, 2, degree, b) + half > zero, load(columns, 5 * LANES), none),
         )
-        gx, gy, gz = none, none, none
-        put(table, at, 0, b[0], g)
-        if degree > 0:
-            put(table, at, 1, b[1], g)
-            put(table, at, 2, b[2], g)
-            put(table, at, 3, b[3], g)
-            gx, gy, gz = first(pull(table, 1, g), pull(table, 2, g), pull(table, 3, g))
-        if degree > 1:
-            put(table, at, 4, b[4], g)
-            put(table, at, 5, b[5], g)
-            put(table, at, 6, b[6], g)
-            put(table, at, 7, b[7], g)
-            put(table, at, 8, b[8], g)
-            h = pull(table, 4, g), pull(table, 5, g), pull(table, 6, g), pull(table, 7, g), pull(table, 8, g)
-            more = second(x, y, z, h)
-            gx, gy, gz = gx + more[0], gy + more[1], gz + more[2]
-        if degree > 2:
-            put(table, at, 9, b[9], g)
-            put(table, at, 10, b[10], g)
-            put(table, at, 11, b[11], g)
-            put(table, at, 12, b[12], g)
-            put(table, at, 13, b[13], g)
-            put(table, at, 14, b[14], g)
-            put(table, at, 15, b[15], g)
-            low = pull(table, 9, g), pull(table, 10, g), pull(table, 11, g), pull(table, 12, g)
-            more = third(x, y, z, low, (pull(table, 13, g), pull(table, 14, g), pull(table, 15, g)))
-            gx, gy, gz = gx + more[0], gy + more[1], gz + more[2]
-        radial = gx * x + gy * y + gz * z
-        return (
-            inverse_length * (gx - radial * x),
-            inverse_length * (gy - radial * y),
-            inverse_length * (gz - radial * z),
-        )
+        return tangential(inverse_length, adjoint(table, 0, degree, x, y, z, b, g, table, at, none), (x, y, z))
 
     return color_gradient

@@ -25,7 +25,7 @@ from glassplat.kernels.cpu.vector import (
     vector_kind,
 )
 from glassplat.kernels.cpu.vector_rows import row_loader, store_all, thirds, transposed
-from glassplat.kernels.maths.harmonics import harmonic_basis
+from glassplat.kernels.maths.harmonics import channel_with, harmonic_basis
 from glassplat.kernels.maths.projection import LOW_PASS, shape_maths, vector_maths
 from glassplat.kernels.project.cpu_view import view_steps, view_with
 from glassplat.kernels.project.steps import MOST_DEVIATIONS
@@ -45,7 +45,7 @@ class LaneSteps(NamedTuple):
         may_show: bits of those that are on the kept sides of a camera, and come near its window: safe, not exact.
         place: (means on screen x and y, conic xx, xy and yy, depth, opacity, covariance xx and yy), and bits of those
             that have finite ones; from columns of means (3), quaternions (4), log scales (3) and logits of opacities.
-        tabulate: puts the first coefficients of Gaussians whose rows begin at positions of an array into columns.
+        tabulate: puts the first coefficients of listed Gaussians, in columns, into the first half of a table.
         color: (red, green, blue) of such columns, before offset and clamp, for columns of means.
     """
 
@@ -54,6 +54,27 @@ class LaneSteps(NamedTuple):
     place: Step
     tabulate: Step
     color: Step
+
+
+@inlined
+def gather(columns, at, listed, first, last, array):
+    """Puts triples of the Gaussians listed from `first` on into three columns; the one at `last` stands in for more."""
+    for i in range(LANES):
+        n = listed[min(first + i, last)]
+        for k in range(3):
+            columns[(at + k) * LANES + i] = array[n, k]
+
+
+@inlined
+def gather_shapes(columns, listed, first, last, means, quats, log_scales, logit_opacities):
+    """Puts all raw parameters but coefficients into columns, as `place` takes them."""
+    for i in range(LANES):
+        n = listed[min(first + i, last)]
+        for k in range(3):
+            columns[k * LANES + i], columns[(7 + k) * LANES + i] = means[n, k], log_scales[n, k]
+        for k in range(4):
+            columns[(3 + k) * LANES + i] = quats[n, k]
+        columns[10 * LANES + i] = logit_opacities[n]
 
 
 def lane_steps(real: type) -> LaneSteps:
@@ -188,38 +209,37 @@ def _place(real: type) -> Step:
 
 
 def channel_of(real: type) -> Step:
-    """The step that gives one colour from harmonics and a table, whose columns of it begin at an index."""
-    load, step = vector_kind(real, LANES).load, 3 * LANES
+    """The step that gives one colour from harmonics and a table, whose columns begin at an index."""
+    load = vector_kind(real, LANES).load
 
     @inlined
-    def channel(table, at, degree, b):
-        value = b[0] * load(table, at)
-        if degree > 0:
-            value = value + b[1] * load(table, at + step) + b[2] * load(table, at + 2 * step)
-            value = value + b[3] * load(table, at + 3 * step)
-        if degree > 1:
-            value = value + b[4] * load(table, at + 4 * step) + b[5] * load(table, at + 5 * step)
-            value = value + b[6] * load(table, at + 6 * step) + b[7] * load(table, at + 7 * step)
-            value = value + b[8] * load(table, at + 8 * step)
-        if degree > 2:
-            value = value + b[9] * load(table, at + 9 * step) + b[10] * load(table, at + 10 * step)
-            value = value + b[11] * load(table, at + 11 * step) + b[12] * load(table, at + 12 * step)
-            value = value + b[13] * load(table, at + 13 * step) + b[14] * load(table, at + 14 * step)
-            value = value + b[15] * load(table, at + 15 * step)
-        return value
+    def take(table, at, k, c):
+        return load(table, at + (3 * k + c) * LANES)
 
-    return channel
+    return channel_with(take)
 
 
 def _color(real: type) -> tuple[Step, Step]:
     load_rows, load, basis = row_loader(real, LANES), vector_kind(real, LANES).load, harmonic_basis(real)
-    channel, one = channel_of(real), real(1.0)
+    channel, one, whole = channel_of(real), real(1.0), COLUMNS * LANES
 
     @inlined
-    def tabulate(sh, positions, terms, target, at):
-        """Of the first `terms` coefficients, three numbers each."""
-        for first in range(0, 3 * terms, LANES):
-            store_all(target, at + first * LANES, transposed(load_rows(sh, positions, first)))
+    def tabulate(table, listed, first, last, terms, sh, row_size, positions):
+        """Of the first `terms` coefficients, three numbers each; `sh` is flat, with rows of `row_size`.
+
+        The second half of the table is scratch, for rows so near the end of `sh` that whole vectors would reach beyond.
+        """
+        inside = listed[last] * row_size + (3 * terms + LANES - 1) // LANES * LANES <= sh.size
+        for i in range(LANES):
+            n = listed[min(first + i, last)]
+            positions[i] = n * row_size
+            if not inside:
+                for k in range(3 * terms):
+                    table[whole + i * COLUMNS + k] = sh[n * row_size + k]
+                positions[i] = whole + i * COLUMNS
+        source = sh if inside else table
+        for begin in range(0, 3 * terms, LANES):
+            store_all(table, begin * LANES, transposed(load_rows(source, positions, begin)))
 
     @inlined
     def color(table, means, at, degree, lens, c):
@@ -228,9 +248,9 @@ def _color(real: type) -> tuple[Step, Step]:
         inverse_length = one / square_root(x * x + y * y + z * z)
         b = basis(x * inverse_length, y * inverse_length, z * inverse_length)
         return (
-            channel(table, at, degree, b),
-            channel(table, at + LANES, degree, b),
-            channel(table, at + 2 * LANES, degree, b),
+            channel(table, at, 0, degree, b),
+            channel(table, at, 1, degree, b),
+            channel(table, at, 2, degree, b),
         )
 
     return tabulate, color

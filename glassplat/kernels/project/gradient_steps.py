@@ -84,7 +84,7 @@ def camera_sums(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
 def view_gradients(real: type) -> Callable[..., Any]:
     """The colour of one Gaussian in one camera."""
-    direction = view_steps(real).direction
+    direction, tangential = view_steps(real).direction, vector_maths().tangential
     color, color_gradient = color_maths(real)
     zero, half = real(0.0), real(0.5)
 
@@ -98,13 +98,7 @@ def view_gradients(real: type) -> Callable[..., Any]:
             g_color[1] if green + half > zero else zero,
             g_color[2] if blue + half > zero else zero,
         )
-        gx, gy, gz = color_gradient(sh, n, degree, x, y, z, passed, g_sh)
-        radial = gx * x + gy * y + gz * z
-        return (
-            inverse_length * (gx - radial * x),
-            inverse_length * (gy - radial * y),
-            inverse_length * (gz - radial * z),
-        )
+        return tangential(inverse_length, color_gradient(sh, n, degree, x, y, z, passed, g_sh), (x, y, z))
 
     return view_gradient
 
