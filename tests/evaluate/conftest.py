@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from glassplat.data.point_cloud import PointCloud
 from PIL import Image
 from torch import Tensor
 
 from glassplat.data.dataset import Dataset
+from glassplat.data.point_cloud import PointCloud
 from glassplat.data.view import View
 from glassplat.render.frame import Frame
 from glassplat.scene.camera import Camera

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from glassplat.data.point_cloud import PointCloud
 
+from glassplat.data.point_cloud import PointCloud
 from glassplat.init.surroundings import (
     copied_surroundings,
     joined,

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from glassplat.data.point_cloud import PointCloud
 
 from glassplat.cli import main
 from glassplat.data.dataset import load_dataset
 from glassplat.data.errors import InputError
+from glassplat.data.point_cloud import PointCloud
 from glassplat.files.planes_json import read_planes, write_planes
 from glassplat.init.plane_options import PlaneFit, PlaneFitError
 from glassplat.scene.plane import Planes

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from glassplat.data.point_cloud import PointCloud
 
 from glassplat.data.dataset import Dataset, View
+from glassplat.data.point_cloud import PointCloud
 from glassplat.scene.pose import rotation_from_quat
 from glassplat.scene.scene import Scene
 from glassplat.train.planar_recipe import PlanarRecipe

@@ -8,10 +8,10 @@ from functools import cache
 from pathlib import Path
 
 import torch
-from glassplat.data.point_cloud import PointCloud
 from PIL import Image
 
 from glassplat.data.dataset import Dataset, View
+from glassplat.data.point_cloud import PointCloud
 from glassplat.files.ply_table import write_table
 from glassplat.render.planar import Planar
 from glassplat.scene.plane import Planes
