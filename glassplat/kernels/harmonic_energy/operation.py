@@ -34,7 +34,7 @@ class _EnergyOnCpu(torch.autograd.Function):
     def forward(ctx: Any, sh: Tensor) -> Tensor:
         sh = sh.detach().contiguous()
         ctx.save_for_backward(sh)
-        sums = torch.empty(-(-sh.shape[0] // CHUNK), dtype=torch.float64)
+        sums = torch.empty(-(-sh.shape[0] // CHUNK), dtype=torch.float64, device=sh.device)
         energy_forward(REAL_OF[sh.dtype])(sh.numpy(), sums.numpy())
         return sums.sum().to(sh.dtype)
 
