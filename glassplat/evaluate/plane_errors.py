@@ -20,7 +20,7 @@ def plane_table(
 
     `normal_error_deg` is the angle between the normals, whose sign does not matter; `offset_error` the
     distance of the true centre from the fitted plane over `extent`; `base_reflectance_error` an absolute
-    difference. Without a true pane of that label they are None, with a reason beside each.
+    difference. Tinted glass has its `transmittance` of red, green and blue. Without a true pane of that label they are None, with a reason beside each.
     `normal_drift_deg` and `offset_drift` compare in the same way with the plane that the masks led to, where known.
 
     Args:
@@ -31,7 +31,7 @@ def plane_table(
     """
     true_planes = {} if truth is None else {plane.label: plane for plane in truth.planes}
     missing = "the data set has no ground truth" if truth is None else "the ground truth has no pane of this label"
-    table = []
+    table, transmittances = [], planes.transmittances
     for index, label in enumerate(planes.labels):
         entry: dict[str, Any] = {
             "label": label,
@@ -39,6 +39,8 @@ def plane_table(
             "normal": planes.normals[index].tolist(),
             "base_reflectance": planes.base_reflectances[index].item(),
         }
+        if transmittances is not None:
+            entry["transmittance"] = transmittances[index].tolist()
         if label in true_planes:
             entry |= _errors(entry, true_planes[label], extent)
         else:

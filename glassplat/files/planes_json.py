@@ -37,6 +37,7 @@ LEAST_ANGLE = 1e-3
 LEAST_HALF_SIZE = 1e-9
 GLASS_REFLECTANCE = 0.2
 """That learning starts at, where nobody says."""
+LEAST_TRANSMITTANCE = 1e-6
 HIGHEST_LABEL = 255
 VECTOR = Items(COORDINATE, 3)
 LOGIT = Number(-1e3, 1e3)
@@ -50,6 +51,8 @@ PLANE: dict[str, Field] = {
     "base_reflectance": Optional(Number(0, 1), default=GLASS_REFLECTANCE),
     "raw_normal": Optional(VECTOR),
     "logit_reflectance": Optional(LOGIT),
+    "transmittance": Optional(Items(Number(LEAST_TRANSMITTANCE, 1), 3)),
+    "log_transmittance": Optional(Items(LOGIT, 3)),
 }
 
 
@@ -58,7 +61,8 @@ def write_planes(path: Path | str, planes: Planes) -> None:
 
     Each entry has label, mirror, center, normal (unit), tangent, half_sizes and base_reflectance for people
     and other programs (world units, the capture's frame), and the raw values raw_normal and
-    logit_reflectance that training continues from.
+    logit_reflectance that training continues from; where glass may be tinted also transmittance, of red, green and
+    blue, and its raw log_transmittance.
 
     Raises:
         ValueError: a plane holds a value that is not finite.
@@ -77,8 +81,8 @@ def write_planes(path: Path | str, planes: Planes) -> None:
 def read_planes(path: Path | str) -> Planes:
     """Reads planes as float32 tensors.
 
-    A file edited by hand works as expected: where `normal` or `base_reflectance` no longer agrees with
-    its raw value, or the raw value is missing, the readable one is taken.
+    A file edited by hand works as expected: where `normal`, `base_reflectance` or `transmittance` no longer agrees
+    with its raw value, or the raw value is missing, the readable one is taken.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -99,12 +103,14 @@ def read_planes(path: Path | str) -> Planes:
         half_sizes=_column(entries, "half_sizes"),
         labels=labels,
         mirrors=tuple(entry["label"] for entry in entries if entry["mirror"]),
+        log_transmittances=_log_transmittances(entries),
     )
 
 
 def _entry(planes: Planes, index: int) -> dict[str, Any]:
     """One plane as plain numbers; a float32 survives the way through a decimal double unchanged."""
-    return {
+    tint = {} if planes.transmittances is None else _tint(planes, index)
+    return tint | {
         "label": int(planes.labels[index]),
         "mirror": planes.labels[index] in planes.mirrors,
         "center": planes.centers[index].tolist(),
@@ -115,6 +121,13 @@ def _entry(planes: Planes, index: int) -> dict[str, Any]:
         "raw_normal": planes.raw_normals[index].tolist(),
         "logit_reflectance": planes.logit_reflectances[index].item(),
     }
+
+
+def _tint(planes: Planes, index: int) -> dict[str, Any]:
+    assert planes.transmittances is not None
+    assert planes.log_transmittances is not None
+    readable = planes.transmittances[index].clamp(min=LEAST_TRANSMITTANCE)
+    return {"transmittance": readable.tolist(), "log_transmittance": planes.log_transmittances[index].tolist()}
 
 
 def _finite(value: float | list[float]) -> bool:
@@ -163,3 +176,19 @@ def _logit_reflectance(entry: Mapping[str, Any]) -> Tensor:
         if (torch.sigmoid(logit) - readable).abs() <= EDIT_TOLERANCE:
             return logit
     return torch.logit(readable, eps=REFLECTANCE_MARGIN)
+
+
+def _log_transmittances(entries: list[dict[str, Any]]) -> Tensor | None:
+    """[K, 3], zeros for panes that say nothing of it; None if none does."""
+    if all(entry["transmittance"] is None for entry in entries):
+        return None
+    return torch.stack([_log_transmittance(entry) for entry in entries])
+
+
+def _log_transmittance(entry: Mapping[str, Any]) -> Tensor:
+    readable = torch.tensor(entry["transmittance"] or (1.0, 1.0, 1.0), dtype=torch.float32)
+    if entry["log_transmittance"] is not None:
+        raw = torch.tensor(entry["log_transmittance"], dtype=torch.float32)
+        if (raw.clamp(max=0).exp() - readable).abs().max() <= EDIT_TOLERANCE:
+            return raw
+    return readable.log()

@@ -38,3 +38,12 @@ def intensity_departure(frame: Frame, view: View, scene: Scene) -> Tensor:
     apart by little; this decides where they do not (not in the paper).
     """
     return scene.primary.channels["log_intensity"].square().mean()
+
+
+def tint_departure(frame: Frame, view: View, scene: Scene) -> Tensor | None:
+    """Mean square of the logarithms of the panes' transmittances: how far the glass is from clear (not in the paper).
+
+    Where all that is behind a pane is seen through it, its tint may as well be that of the things.
+    """
+    logarithms = scene.planes.log_transmittances
+    return None if logarithms is None else logarithms.square().mean()

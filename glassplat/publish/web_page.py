@@ -198,6 +198,7 @@ def described_pane(planes: Planes, index: int) -> dict[str, Any]:
         "bitangent": in_page(bitangents[index]),
         "half": planes.half_sizes[index].tolist(),
         "reflectance": float(planes.base_reflectances[index]),
+        "transmittance": [1, 1, 1] if planes.transmittances is None else planes.transmittances[index].tolist(),
     }
 
 

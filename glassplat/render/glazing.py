@@ -43,6 +43,8 @@ def glazed(
 ) -> Glazed:  # fmt: skip
     """Applies Eq. 1 of TR-Gaussians for each pane on a ray, C_t being what all panes behind it make of the image.
 
+    Tinted glass, which the paper does not have, lets through a share of each primary of C_t.
+
     Args:
         image: [H, W, 3] without panes.
         seen: the K panes, and their order.
@@ -55,7 +57,10 @@ def glazed(
     """
     normals = seen.planes.normals @ camera.cam_from_world[:3, :3].T
     laid = []
+    transmittances = seen.planes.transmittances
     for mask, pane in zip(reversed(masks), reversed(seen.order), strict=True):
+        if transmittances is not None:
+            image = tinted(image, mask, pane, transmittances, blend)
         result = blend_panes(
             image,
             mask,
@@ -80,6 +85,23 @@ def glazed(
         layers = _joined_layers(layers, behind, farther, faint & (farther.strength > 0), blend)
         faint = faint & (mask < FAINT)
     return Glazed(image, *layers, share)
+
+
+def tinted(image: Tensor, mask: Tensor, pane: Tensor, transmittances: Tensor, blend: Blend) -> Tensor:
+    """[H, W, 3] what gets through panes of the transmittances [K, 3].
+
+    Args:
+        image: [H, W, 3] what is behind them.
+        mask: [H, W] visibility of the pane in each pixel.
+        pane: [H, W] which one it is, -1 where there is none.
+        transmittances: of all panes.
+        blend: the space in which light is let through.
+    """
+    decode, encode = curves(blend)
+    # An embedding's gradient has the same bits for any number of threads, that of an index has not.
+    through = torch.nn.functional.embedding(pane.clamp(min=0).long(), transmittances)
+    shown = (mask > 0) & (pane >= 0)
+    return torch.where(shown[..., None], encode(decode(image) * (1 - mask[..., None] * (1 - through))), image)
 
 
 def _all_of_them(strengths: Sequence[Tensor]) -> Tensor:

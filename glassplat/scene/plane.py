@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from glassplat.scene.transfer import constant
 
 LEAST_SINE = 1e-6
 """Of the angle between a pane's normal and its tangent."""
-TRAINABLE = ("centers", "raw_normals", "logit_reflectances")
+TRAINABLE = ("centers", "raw_normals", "logit_reflectances", "log_transmittances")
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,8 @@ class Planes:
         half_sizes: [K, 2] half the side lengths along tangent and bitangent; world units.
         labels: pane label of each plane, as found in the masks.
         mirrors: labels of the planes that transmit nothing; their base reflectance gets no gradient.
+        log_transmittances: [K, 3] logarithm of the share of red, green and blue light that gets through what does not
+            come back; what is above 0 counts as 0. None where all panes are clear.
     """
 
     centers: Tensor
@@ -40,6 +42,7 @@ class Planes:
     half_sizes: Tensor
     labels: tuple[int, ...]
     mirrors: tuple[int, ...] = ()
+    log_transmittances: Tensor | None = None
 
     def __post_init__(self) -> None:
         for name, tensor in self.tensors().items():
@@ -67,6 +70,17 @@ class Planes:
             logits = torch.where(fixed, logits.detach(), logits)
         return torch.sigmoid(logits)
 
+    @property
+    def transmittances(self) -> Tensor | None:
+        """[K, 3] share of red, green and blue light, in (0, 1], that gets through; None where all panes are clear."""
+        logarithms = self.log_transmittances
+        return None if logarithms is None else logarithms.clamp(max=0).exp()
+
+    def that_may_tint(self) -> Planes:
+        """The same planes, still clear where they were, with transmittances that can be learnt."""
+        clear = self.centers.new_zeros(len(self), 3)
+        return self if self.log_transmittances is not None else replace(self, log_transmittances=clear)
+
     def axes(self) -> tuple[Tensor, Tensor]:
         """Unit in-plane axes (tangent, bitangent), each [K, 3]; right-handed with the normal."""
         normals = self.normals
@@ -76,7 +90,8 @@ class Planes:
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name."""
-        return {name: getattr(self, name) for name in (*TRAINABLE, "tangents", "half_sizes")}
+        named = {name: getattr(self, name) for name in (*TRAINABLE, "tangents", "half_sizes")}
+        return {name: tensor for name, tensor in named.items() if tensor is not None}
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Planes:
         """The same planes with some tensors replaced by name."""
@@ -94,6 +109,8 @@ class Planes:
 
     def joined(self, other: Planes) -> Planes:
         """These planes and others, in the order of their labels."""
+        if (self.log_transmittances is None) != (other.log_transmittances is None):
+            return self.that_may_tint().joined(other.that_may_tint())
         mine, theirs = self.tensors(), other.tensors()
         together = Planes(
             **{name: torch.cat([mine[name], theirs[name]]) for name in mine},

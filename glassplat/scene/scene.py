@@ -64,7 +64,7 @@ class Scene:
         The environment (`environment.raw`), the exposures and the poses are among them where there are any.
         """
         found = {f"{part}.{name}": t for part, g in self.gaussian_sets().items() for name, t in g.tensors().items()}
-        found |= {f"planes.{name}": getattr(self.planes, name) for name in TRAINABLE}
+        found |= {f"planes.{name}": t for name, t in self.planes.tensors().items() if name in TRAINABLE}
         distant = {} if self.environment.is_empty else self.environment.tensors()
         found |= {f"environment.{name}": tensor for name, tensor in distant.items()}
         exposed = self.exposures.tensors() if len(self.exposures) else {}

@@ -118,6 +118,7 @@ PLANAR: dict[Switch, Ablation] = {
     "bright-reflections": Ablation("a(u) left free (the paper's)", _without("intensity")),
     "calm-colors": Ablation("harmonics left free (the paper's)", lambda r: replace(r, view_dependence_weight=0.0)),
     "averaging": Ablation("last step, not the mean of a pass", _without_averaging),
+    "tint": Ablation("with a transmittance of each pane for red, green and blue", lambda r: replace(r, tint=True)),
     "short-run-rates": Ablation("learning rates as published, however short the run", _with_published_rates),
 }
 """The first seven are the rows of TR-Gaussians' Table IV, the others are parts that the paper does not ablate."""

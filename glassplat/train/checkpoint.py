@@ -55,6 +55,7 @@ PLANE_SHAPES = {
     "tangents": (3,),
     "half_sizes": (2,),
 }
+TINT_SHAPES = {"log_transmittances": (3,)}
 SCALE_SHAPES = [(DISC_SCALES,), (DISC_SCALES + 1,)]
 SH_SHAPES = [(count, 3) for count in (0, 1, 4, 9, 16)]
 
@@ -215,7 +216,7 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
         for part, degree in header["active_sh_degree"].items()
     }
     planes = under(tensors, "scene/planes/")
-    check_shapes(planes, PLANE_SHAPES, "planes")
+    check_shapes(planes, PLANE_SHAPES | (TINT_SHAPES if TINT_SHAPES.keys() <= planes.keys() else {}), "planes")
     distant = under(tensors, "scene/environment/")
     check_shapes(distant, {"raw": None} if distant else {}, "environment")
     environment = Environment(**distant, region=header["region"]) if distant else empty.environment

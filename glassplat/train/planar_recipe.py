@@ -90,6 +90,9 @@ class PlanarRecipe:
         fixed_mirrors: mirrors keep their reflectance, and what the first stage built behind them moves to their front;
             if not, they only start at that reflectance, as in the paper.
         seed_reflections: start what no photograph shows directly from the virtual points behind the panes.
+        tint: panes may be tinted: each learns what share of red, green and blue light gets through, which the paper does
+            not have.
+        tint_weight: of the mean square of the logarithm of that share in the objective.
         glass_count: glass Gaussians placed on each pane.
         weights: of the loss terms; zero switches a term off (ablation).
         perturbation: of opacities; amplitude zero switches it off (ablation).
@@ -129,6 +132,8 @@ class PlanarRecipe:
     detect_mirrors: Annotated[bool, ESSENTIAL] = True
     fixed_mirrors: bool = True
     seed_reflections: bool = True
+    tint: Annotated[bool, ESSENTIAL] = False
+    tint_weight: NotNegative = 0.01
     glass_count: Annotated[int, Range(1, 1_000_000)] = 1000
     weights: ReflectionWeights = field(default_factory=ReflectionWeights)
     moving_mean: bool = False

@@ -8,7 +8,7 @@ from glassplat.data.backgrounds import BLACK
 from glassplat.data.dataset import Dataset
 from glassplat.init.plane_options import PlaneFitError
 from glassplat.losses.geometry import depth_deviation_loss
-from glassplat.losses.reflection import gradient_conflict, intensity_departure, mask_loss
+from glassplat.losses.reflection import gradient_conflict, intensity_departure, mask_loss, tint_departure
 from glassplat.losses.term import LossTerm, weighted
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
@@ -77,6 +77,7 @@ def stages_of(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERA
         detect_mirrors=recipe.detect_mirrors,
         fixed_mirrors=recipe.fixed_mirrors,
         seed_reflections=recipe.seed_reflections,
+        tint=recipe.tint,
     )
     initialisation = Stage(
         name="1 initialisation",
@@ -147,7 +148,8 @@ def _joint(recipe: PlanarRecipe, share: float) -> Stage:
 
 def _joint_terms(recipe: PlanarRecipe, population: Population) -> tuple[LossTerm, ...]:
     image = image_terms(recipe.ssim_weight, recipe.view_dependence_weight)
-    return (*image, *reflection_terms(recipe.weights), *population.terms)
+    tint = weighted(LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, tint_departure))
+    return (*image, *reflection_terms(recipe.weights), *tint, *population.terms)
 
 
 def planar_population(recipe: PlanarRecipe) -> Population:

@@ -43,6 +43,7 @@ class PlaneEntry:
         fixed_mirrors: mirrors keep their reflectance, and what is behind them moves to their front; if not, they only
             start at that reflectance.
         seed_reflections: start what no photograph shows directly from the virtual points behind the panes.
+        tint: whether panes may be tinted.
     """
 
     fit: PlaneFit
@@ -51,6 +52,7 @@ class PlaneEntry:
     detect_mirrors: bool = True
     fixed_mirrors: bool = True
     seed_reflections: bool = True
+    tint: bool = False
 
     def __call__(self, state: TrainState, dataset: Dataset) -> Work:
         """Edits `state`, and tells how far it is."""
@@ -62,7 +64,7 @@ class PlaneEntry:
             planes = yield from self._with_mirrors_found(scene, dataset)
         if not self.fixed_mirrors:
             planes = replace(planes, mirrors=())
-        state.scene = replace(scene, planes=planes)
+        state.scene = replace(scene, planes=planes.that_may_tint() if self.tint else planes)
         state.statistics.clear()
         for mirrors in surfaces(planes, mirrors=True):
             yield Working(f"moving what was built behind {named(mirrors, 'mirror')}", 0, 1)

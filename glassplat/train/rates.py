@@ -98,6 +98,7 @@ class PlaneRates:
         normal: plane normal in stage 2.
         reflectance: logit of R0.
         mark: logit of the glass mark.
+        transmittance: its logarithm, where panes may be tinted.
         joint_factor: factor on `center` and `normal` in stage 3 (paper: 0.1).
     """
 
@@ -105,6 +106,7 @@ class PlaneRates:
     normal: LearningRate = 1e-4
     reflectance: LearningRate = 1e-2
     mark: LearningRate = 5e-2
+    transmittance: LearningRate = 5e-3
     joint_factor: Share = 0.1
 
     def of(self, factor: float) -> dict[str, Rate]:
@@ -113,6 +115,7 @@ class PlaneRates:
             "planes.centers": Rate(self.center * factor, per_extent=True),
             "planes.raw_normals": Rate(self.normal * factor),
             "planes.logit_reflectances": Rate(self.reflectance),
+            "planes.log_transmittances": Rate(self.transmittance),
             "glass.logit_mark": Rate(self.mark),
         }
 

@@ -8,6 +8,7 @@ uniform sampler2DArray masks, reflections, gains;
 uniform vec3 centers[PANES], normals[PANES], tangents[PANES], bitangents[PANES];  // in the camera
 uniform vec2 halfSizes[PANES];
 uniform float reflectances[PANES];
+uniform vec3 transmittances[PANES];
 uniform bool present[PANES];
 #endif
 uniform vec4 intrinsics;
@@ -64,7 +65,8 @@ void glaze(int k, vec3 ray, inout vec3 seen, inout vec4 mirror) {
   float gain = gained ? texture(gains, vec3(there, float(k))).r + 1.0 - reflected.a : 1.0;
   vec3 light = decoded(color) * gain;
   float strength = strengthOf(reflectances[k], abs(dot(normalize(ray), normals[k]))) * mask;
-  seen = encoded(mix(decoded(seen), light, strength));
+  vec3 through = decoded(seen) * (1.0 - mask * (1.0 - transmittances[k]));
+  seen = encoded(mix(through, light, strength));
   mirror = vec4(light, strength);
 }
 #endif

@@ -110,6 +110,7 @@ function makeRenderer(canvas, scene) {
       }
       gl.uniform2fv(at('halfSizes'), panes.flatMap((pane) => pane.half));
       gl.uniform1fv(at('reflectances'), view.reflectances);
+      gl.uniform3fv(at('transmittances'), panes.flatMap((pane) => pane.transmittance));
       gl.uniform1iv(at('present'), panes.map((_, k) => (seen.includes(k) ? 1 : 0)));
     }
     gl.uniform4fv(at('intrinsics'), intrinsics);

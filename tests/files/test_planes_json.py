@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -32,12 +33,17 @@ def edit(path: Path, **changes: object) -> None:
     path.write_text(json.dumps(entries))
 
 
-@pytest.mark.parametrize("count", [0, 1, 3])
-def test_planes_survive_bit_for_bit(tmp_path: Path, count: int) -> None:
-    planes = random_planes(count)
+def tinted_planes() -> Planes:
+    logarithms = -torch.rand(3, 3, generator=torch.Generator().manual_seed(6))
+    return replace(random_planes(), log_transmittances=logarithms)
+
+
+@pytest.mark.parametrize("planes", [random_planes(0), random_planes(1), random_planes(3), tinted_planes()])
+def test_planes_survive_bit_for_bit(tmp_path: Path, planes: Planes) -> None:
     write_planes(tmp_path / "planes.json", planes)
     read = read_planes(tmp_path / "planes.json")
     assert read.labels == planes.labels and read.mirrors == planes.mirrors
+    assert read.tensors().keys() == planes.tensors().keys()
     for name, tensor in planes.tensors().items():
         assert torch.equal(read.tensors()[name], tensor), name
 
@@ -64,6 +70,19 @@ def test_an_edit_by_hand_wins_over_the_raw_value(tmp_path: Path) -> None:
     assert read.normals[0].tolist() == [0.0, 1.0, 0.0]
     assert read.base_reflectances[0].item() == pytest.approx(0.25)
     assert torch.equal(read.raw_normals[1:], random_planes().raw_normals[1:])
+
+
+def test_a_transmittance_may_be_edited_or_given_to_one_pane_alone(tmp_path: Path) -> None:
+    write_planes(tmp_path / "planes.json", tinted_planes())
+    edit(tmp_path / "planes.json", transmittance=[0.5, 1.0, 0.25])
+    edited = read_planes(tmp_path / "planes.json").transmittances
+    assert edited is not None and edited[0].tolist() == pytest.approx([0.5, 1.0, 0.25])
+    torch.testing.assert_close(edited[1:], tinted_planes().log_transmittances[1:].exp())
+    write_planes(tmp_path / "planes.json", random_planes())
+    edit(tmp_path / "planes.json", transmittance=[0.5, 1.0, 0.25])
+    given = read_planes(tmp_path / "planes.json").transmittances
+    assert given is not None and given[0].tolist() == pytest.approx([0.5, 1.0, 0.25])
+    assert bool((given[1:] == 1).all())
 
 
 def test_raw_values_may_be_left_out(tmp_path: Path) -> None:
@@ -95,6 +114,8 @@ def test_raw_values_may_be_left_out(tmp_path: Path) -> None:
         ({"mirror": "yes"}, "mirror of plane 1 in .* is 'yes'; expected true or false"),
         ({"base_reflectance": 1.5}, "base_reflectance of plane 1 in .* is 1.5; expected a finite number from 0 to 1"),
         ({"logit_reflectance": "much"}, "logit_reflectance of plane 1 in .* is 'much'; expected a finite number"),
+        ({"transmittance": [1, 1]}, r"transmittance of plane 1 in .* is \[1, 1\]; expected a list of 3 values"),
+        ({"transmittance": [1, 1, 2]}, "entry 3 of transmittance of plane 1 in .* is 2; expected a finite number from"),
         ({"raw_normal": [[0], 1, 2]}, r"entry 1 of raw_normal of plane 1 in .* is \[0\]; expected a finite number"),
     ],
 )

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
+import pytest
 import torch
+from torch import Tensor
 
+from glassplat.data.view import View
 from glassplat.kernels.pane_layers import pane_layers
 from glassplat.losses.geometry import depth_deviation_loss
-from glassplat.losses.reflection import gradient_conflict, intensity_departure, mask_loss
+from glassplat.losses.reflection import gradient_conflict, intensity_departure, mask_loss, tint_departure
 from glassplat.render.frame import Frame
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.plane import Planes
+from glassplat.scene.scene import Scene
 
 
 def frame_with(**layers: torch.Tensor) -> Any:
@@ -85,3 +92,15 @@ def test_depth_deviation_loss_does_not_depend_on_the_unit_of_length() -> None:
         frame_with(deviation=1000 * deviation, hit=hit), SimpleNamespace(), SimpleNamespace(extent=2000.0)
     )
     torch.testing.assert_close(metres, millimetres)
+
+
+def test_the_tint_term_is_zero_for_clear_glass_and_its_mean_square_otherwise() -> None:
+    def term(planes: Planes) -> Tensor | None:
+        return tint_departure(frame_with(), cast(View, None), Scene(Gaussians.empty(), 1.0, planes=planes))
+
+    clear = Planes.rectangle((0, 0, 0), (0, 0, 1), (1, 1))
+    assert term(clear) is None
+    still_clear = term(clear.that_may_tint())
+    assert still_clear is not None and float(still_clear) == 0
+    tinted = term(replace(clear, log_transmittances=torch.tensor([[-0.3, 0.0, 0.3]])))
+    assert tinted is not None and float(tinted) == pytest.approx(0.06)

@@ -231,7 +231,9 @@ def test_nothing_is_asked_for_and_nothing_complained_of(opened: Browser) -> None
 
 @needs_browser
 def test_panes_behind_panes_and_scenes_without_any(tmp_path: Path) -> None:
-    two = in_single_precision(showcase(joined(pane(2.0, half=0.8), pane(3.0, half=0.9, label=2))))
+    panes = joined(pane(2.0, half=0.8), pane(3.0, half=0.9, label=2))
+    tint = torch.tensor([[-0.6, -0.1, -0.4], [0.0, -0.5, 0.0]], dtype=torch.float64)
+    two = in_single_precision(showcase(replace(panes, log_transmittances=tint)))
     for name, scene, renderer in (("two", two, Planar()), ("none", Scene(two.primary, two.extent), Splat())):
         write_page(tmp_path / f"{name}.html", scene, renderer, CAMERAS, name)
         with Browser(tmp_path / f"{name}.html", 320, 240) as browser:

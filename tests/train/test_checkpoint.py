@@ -69,6 +69,15 @@ def test_a_state_survives(checkpoint: Path) -> None:
         assert torch.equal(read.optimizer.moments[name][1], torch.ones_like(tensor)), name
 
 
+def test_tinted_panes_survive(tmp_path: Path) -> None:
+    state = trained_state()
+    logarithms = torch.tensor([[-0.1, -0.2, 0.01]])
+    state.scene = replace(state.scene, planes=replace(state.scene.planes, log_transmittances=logarithms))
+    save_checkpoint(tmp_path / "tinted.safetensors", state)
+    read = load_checkpoint(tmp_path / "tinted.safetensors").scene.planes.log_transmittances
+    assert read is not None and torch.equal(read, logarithms)
+
+
 def test_surroundings_survive(tmp_path: Path) -> None:
     scene = true_scene()
     around = replace(scene.primary, channels={}, active_sh_degree=0)

@@ -1,0 +1,111 @@
+"""Glass that lets through a share of red, green and blue."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from glassplat.kernels.color_space import linear_from_srgb
+from glassplat.render.choices import Blend
+from glassplat.render.glazing import tinted
+from glassplat.render.planar import Planar
+from glassplat.scene.plane import Planes
+from glassplat.scene.scene import Scene
+from tests.render.tiny_scene import camera_at, joined, pane, showcase
+
+CAMERA = camera_at(0.0, 0.0, -0.2)
+GREENISH = torch.tensor([[0.6, 0.9, 0.7]], dtype=torch.float64)
+
+
+def of_glass(planes: Planes, transmittances: Tensor = GREENISH) -> Planes:
+    return replace(planes, log_transmittances=transmittances.log().expand(len(planes), 3).clone())
+
+
+def tinted_showcase() -> Scene:
+    return replace(showcase(), planes=of_glass(showcase().planes))
+
+
+@pytest.mark.parametrize("blend", ["srgb", "linear"])
+def test_clear_glass_changes_nothing(blend: Blend) -> None:
+    plain = Planar(blend=blend)(showcase(), CAMERA)
+    clear = Planar(blend=blend)(replace(showcase(), planes=showcase().planes.that_may_tint()), CAMERA)
+    torch.testing.assert_close(clear.rgb, plain.rgb, atol=1e-6, rtol=0)
+    for name, layer in plain.layers.items():
+        torch.testing.assert_close(clear.layers[name], layer, atol=1e-6, rtol=0)
+
+
+def test_logarithms_above_zero_are_clear() -> None:
+    brighter = replace(showcase().planes, log_transmittances=torch.full((1, 3), 0.3, dtype=torch.float64))
+    assert brighter.transmittances is not None and bool((brighter.transmittances == 1).all())
+
+
+def test_what_is_behind_is_darker_by_the_transmittance_and_nothing_else_changes() -> None:
+    plain, frame = Planar()(showcase(), CAMERA), Planar()(tinted_showcase(), CAMERA)
+    whole = (plain.layers["mask"] > 0.999) & (plain.layers["hit"] > 0)
+    assert int(whole.sum()) > 50
+    behind, through = (linear_from_srgb(f.layers["transmission"][whole]) for f in (plain, frame))
+    shown = behind.min(dim=1).values > 0.01
+    torch.testing.assert_close((through / behind)[shown], GREENISH.expand(int(shown.sum()), 3), atol=2e-3, rtol=0)
+    for name in ("reflection", "strength", "without_panes", "mask", "depth"):
+        assert torch.equal(frame.layers[name], plain.layers[name]), name
+    outside = plain.layers["mask"] == 0
+    assert torch.equal(frame.rgb[outside], plain.rgb[outside])
+
+
+def test_layers_recombine_to_the_image() -> None:
+    layers = (frame := Planar(blend="srgb")(tinted_showcase(), CAMERA)).layers
+    strength = layers["strength"][..., None]
+    torch.testing.assert_close((1 - strength) * layers["transmission"] + strength * layers["reflection"], frame.rgb)
+
+
+def test_light_goes_through_one_pane_after_the_other() -> None:
+    """Through two panes that mirror nothing what is behind them is darkened twice."""
+    dull = joined(pane(2.0, base_reflectance=1e-9), pane(3.0, label=2, base_reflectance=1e-9))
+    renderer = Planar(blend="srgb", fresnel="none")
+    plain = renderer(showcase(dull), CAMERA)
+    once, twice = (renderer(showcase(of_glass(planes)), CAMERA) for planes in (pane(2.0, base_reflectance=1e-9), dull))
+    whole = (once.layers["mask"] > 0.999) & (plain.rgb.min(dim=2).values > 0.05)
+    assert int(whole.sum()) > 20
+    torch.testing.assert_close((once.rgb / plain.rgb)[whole], GREENISH.expand(int(whole.sum()), 3), atol=2e-3, rtol=0)
+    assert bool((twice.rgb[whole] <= once.rgb[whole] + 1e-9).all())
+    assert float((once.rgb - twice.rgb)[whole].max()) > 0.01
+
+
+def test_gradients_of_one_pane_match_finite_differences() -> None:
+    generator = torch.Generator().manual_seed(3)
+    image = torch.rand(4, 5, 3, generator=generator, dtype=torch.float64) + 0.1
+    mask = 0.9 * torch.rand(4, 5, generator=generator, dtype=torch.float64) + 0.05
+    shares = torch.tensor([[0.6, 0.9, 0.7], [0.5, 0.4, 0.8]], dtype=torch.float64)
+    which = torch.randint(-1, 2, (4, 5), generator=generator)
+    for blend in ("srgb", "linear"):
+        inputs = tuple(tensor.clone().requires_grad_() for tensor in (image, mask, shares))
+        assert torch.autograd.gradcheck(lambda i, m, t, b=blend: tinted(i, m, which, t, b), inputs)
+    unshown = which < 0
+    assert torch.equal(tinted(image, mask, which, shares, "linear")[unshown], image[unshown])
+
+
+def test_gradients_match_finite_differences_through_the_whole_renderer() -> None:
+    scene, renderer = tinted_showcase(), Planar()
+    weights = torch.randn(28, 40, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+
+    def objective(values: Tensor) -> Tensor:
+        return (renderer(scene.with_parameters({"planes.log_transmittances": values}), CAMERA).rgb * weights).sum()
+
+    values = scene.parameters()["planes.log_transmittances"].clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(objective(values), values)
+    for channel in range(3):
+        step = torch.zeros_like(values)
+        step[0, channel] = 1e-6
+        with torch.no_grad():
+            numerical = (objective(values + step) - objective(values - step)) / 2e-6
+        torch.testing.assert_close(gradient[0, channel], numerical, rtol=1e-4, atol=1e-5)
+
+
+def test_clear_and_tinted_panes_join() -> None:
+    both = of_glass(pane(2.0, label=2)).joined(pane(3.0, label=1))
+    assert both.labels == (1, 2) and both.transmittances is not None
+    torch.testing.assert_close(both.transmittances, torch.cat([torch.ones_like(GREENISH), GREENISH]))
+    assert pane(2.0, label=2).joined(pane(3.0, label=1)).transmittances is None
