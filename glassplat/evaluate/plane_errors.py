@@ -20,7 +20,8 @@ def plane_table(
 
     `normal_error_deg` is the angle between the normals, whose sign does not matter; `offset_error` the
     distance of the true centre from the fitted plane over `extent`; `base_reflectance_error` an absolute
-    difference. Tinted glass has its `transmittance` of red, green and blue. Without a true pane of that label they are None, with a reason beside each.
+    difference. Without a true pane of that label they are None, with a reason beside each.
+    Glass that may be tinted has its `transmittance` of red, green and blue.
     `normal_drift_deg` and `offset_drift` compare in the same way with the plane that the masks led to, where known.
 
     Args:

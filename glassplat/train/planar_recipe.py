@@ -90,8 +90,7 @@ class PlanarRecipe:
         fixed_mirrors: mirrors keep their reflectance, and what the first stage built behind them moves to their front;
             if not, they only start at that reflectance, as in the paper.
         seed_reflections: start what no photograph shows directly from the virtual points behind the panes.
-        tint: panes may be tinted: each learns what share of red, green and blue light gets through, which the paper does
-            not have.
+        tint: panes may be tinted: each learns what share of red, green and blue light gets through (not in the paper).
         tint_weight: of the mean square of the logarithm of that share in the objective.
         glass_count: glass Gaussians placed on each pane.
         weights: of the loss terms; zero switches a term off (ablation).
