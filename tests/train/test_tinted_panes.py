@@ -1,0 +1,80 @@
+"""Panes that may be tinted begin clear, learn what gets through them, and keep it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import torch
+
+from glassplat.data.dataset import Dataset
+from glassplat.data.view import View
+from glassplat.files.scene_folder import read_scene, write_scene
+from glassplat.render.planar import Planar
+from glassplat.scene.scene import Scene
+from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.plane_entry import PlaneEntry
+from glassplat.train.stage import Stage
+from glassplat.train.state import TrainState
+from glassplat.train.trainer import train
+from tests.render.tiny_scene import in_single_precision, pane, showcase
+from tests.train.tiny_capture import tiny_capture
+
+TRUTH = (0.6, 0.9, 0.7)
+GLASS = replace(pane(2.0, half=0.8), log_transmittances=torch.tensor([TRUTH], dtype=torch.float64).log())
+
+
+@cache
+def tinted_capture() -> Dataset:
+    """The tiny capture through coloured glass."""
+    scene, views = in_single_precision(showcase(GLASS)), []
+    for view in tiny_capture().train:
+        with torch.no_grad():
+            photo = (255 * Planar()(scene, view.camera).rgb.clamp(0, 1)).to(torch.uint8)
+        views.append(View.in_memory(view.name, view.camera, photo=photo, pane_labels=view.pane_labels))
+    return replace(tiny_capture(), train=tuple(views))
+
+
+def panes_alone(stage: Stage) -> Stage:
+    """A stage in which only the colour of the panes learns, from the photographs."""
+    rates = {"planes.log_transmittances": replace(stage.rates["planes.log_transmittances"], start=0.02)}
+    losses = tuple(term for term in stage.losses if term.name in ("l1", "photometric", "tint")) or stage.losses[:1]
+    return replace(stage, rates=rates, losses=losses, entry=None, actions=(), motions=())
+
+
+def clear_state() -> TrainState:
+    scene = in_single_precision(showcase(replace(GLASS, log_transmittances=None)))
+    return TrainState(replace(scene, planes=scene.planes.that_may_tint()), 0)
+
+
+def transmittances(scene: Scene) -> torch.Tensor:
+    found = scene.planes.transmittances
+    assert found is not None
+    return found
+
+
+def test_the_colour_is_found_where_the_rest_is_known(tmp_path: Path) -> None:
+    state = clear_state()
+    stage = panes_alone(PlanarRecipe(tint=True, tint_weight=0.0).stages(0)[-1])
+    for _ in train((stage,), tinted_capture(), state, 120):
+        pass
+    torch.testing.assert_close(transmittances(state.scene)[0], torch.tensor(TRUTH), atol=0.03, rtol=0)
+    write_scene(tmp_path / "scene", state.scene)
+    assert torch.equal(transmittances(read_scene(tmp_path / "scene")), transmittances(state.scene))
+
+
+def test_clear_glass_stays_clear() -> None:
+    state = clear_state()
+    stage = panes_alone(PlanarRecipe(tint=True).stages(0)[-1])
+    for _ in train((stage,), tiny_capture(), state, 60):
+        pass
+    assert float((1 - transmittances(state.scene)).max()) < 0.01
+
+
+def test_only_recipes_with_tint_know_of_it() -> None:
+    for recipe in (PlanarRecipe(), PlanarRecipe(tint=True)):
+        stages = recipe.stages(0)
+        entries = [stage.entry for stage in stages if isinstance(stage.entry, PlaneEntry)]
+        assert [entry.tint for entry in entries] == [recipe.tint]
+        assert any(term.name == "tint" for stage in stages for term in stage.losses) == recipe.tint
