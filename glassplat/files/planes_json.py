@@ -37,7 +37,7 @@ LEAST_ANGLE = 1e-3
 LEAST_HALF_SIZE = 1e-9
 GLASS_REFLECTANCE = 0.2
 """That learning starts at, where nobody says."""
-LEAST_TRANSMITTANCE = 1e-6
+LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE = 1e-6, 10.0
 HIGHEST_LABEL = 255
 VECTOR = Items(COORDINATE, 3)
 LOGIT = Number(-1e3, 1e3)
@@ -51,7 +51,7 @@ PLANE: dict[str, Field] = {
     "base_reflectance": Optional(Number(0, 1), default=GLASS_REFLECTANCE),
     "raw_normal": Optional(VECTOR),
     "logit_reflectance": Optional(LOGIT),
-    "transmittance": Optional(Items(Number(LEAST_TRANSMITTANCE, 1), 3)),
+    "transmittance": Optional(Items(Number(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE), 3)),
     "log_transmittance": Optional(Items(LOGIT, 3)),
 }
 
@@ -126,7 +126,7 @@ def _entry(planes: Planes, index: int) -> dict[str, Any]:
 def _tint(planes: Planes, index: int) -> dict[str, Any]:
     assert planes.transmittances is not None
     assert planes.log_transmittances is not None
-    readable = planes.transmittances[index].clamp(min=LEAST_TRANSMITTANCE)
+    readable = planes.transmittances[index].clamp(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE)
     return {"transmittance": readable.tolist(), "log_transmittance": planes.log_transmittances[index].tolist()}
 
 
@@ -189,6 +189,6 @@ def _log_transmittance(entry: Mapping[str, Any]) -> Tensor:
     readable = torch.tensor(entry["transmittance"] or (1.0, 1.0, 1.0), dtype=torch.float32)
     if entry["log_transmittance"] is not None:
         raw = torch.tensor(entry["log_transmittance"], dtype=torch.float32)
-        if (raw.clamp(max=0).exp() - readable).abs().max() <= EDIT_TOLERANCE:
+        if (raw.exp() - readable).abs().max() <= EDIT_TOLERANCE:
             return raw
     return readable.log()

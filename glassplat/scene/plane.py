@@ -31,8 +31,8 @@ class Planes:
         half_sizes: [K, 2] half the side lengths along tangent and bitangent; world units.
         labels: pane label of each plane, as found in the masks.
         mirrors: labels of the planes that transmit nothing; their base reflectance gets no gradient.
-        log_transmittances: [K, 3] logarithm of the share of red, green and blue light that gets through what does not
-            come back; what is above 0 counts as 0. None where all panes are clear.
+        log_transmittances: [K, 3] logarithm of the share of red, green and blue light that gets through of what does not
+            come back. None where all panes are clear.
     """
 
     centers: Tensor
@@ -72,9 +72,11 @@ class Planes:
 
     @property
     def transmittances(self) -> Tensor | None:
-        """[K, 3] share of red, green and blue light, in (0, 1], that gets through; None where all panes are clear."""
-        logarithms = self.log_transmittances
-        return None if logarithms is None else logarithms.clamp(max=0).exp()
+        """[K, 3] share of red, green and blue light that gets through; None where all panes are clear.
+
+        Nothing holds it below 1: a bound would take the gradient, and learning passes by it on its way.
+        """
+        return None if self.log_transmittances is None else self.log_transmittances.exp()
 
     def that_may_tint(self) -> Planes:
         """The same planes, still clear where they were, with transmittances that can be learnt."""

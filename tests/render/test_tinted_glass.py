@@ -14,7 +14,7 @@ from glassplat.render.glazing import tinted
 from glassplat.render.planar import Planar
 from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
-from tests.render.tiny_scene import camera_at, joined, pane, showcase
+from tests.render.tiny_scene import camera_at, pane, showcase
 
 CAMERA = camera_at(0.0, 0.0, -0.2)
 GREENISH = torch.tensor([[0.6, 0.9, 0.7]], dtype=torch.float64)
@@ -37,18 +37,14 @@ def test_clear_glass_changes_nothing(blend: Blend) -> None:
         torch.testing.assert_close(clear.layers[name], layer, atol=1e-6, rtol=0)
 
 
-def test_logarithms_above_zero_are_clear() -> None:
-    brighter = replace(showcase().planes, log_transmittances=torch.full((1, 3), 0.3, dtype=torch.float64))
-    assert brighter.transmittances is not None and bool((brighter.transmittances == 1).all())
-
-
 def test_what_is_behind_is_darker_by_the_transmittance_and_nothing_else_changes() -> None:
     plain, frame = Planar()(showcase(), CAMERA), Planar()(tinted_showcase(), CAMERA)
-    whole = (plain.layers["mask"] > 0.999) & (plain.layers["hit"] > 0)
-    assert int(whole.sum()) > 50
-    behind, through = (linear_from_srgb(f.layers["transmission"][whole]) for f in (plain, frame))
-    shown = behind.min(dim=1).values > 0.01
-    torch.testing.assert_close((through / behind)[shown], GREENISH.expand(int(shown.sum()), 3), atol=2e-3, rtol=0)
+    shown = (plain.layers["mask"] > 0.2) & (plain.layers["hit"] > 0)
+    assert int(shown.sum()) > 50
+    behind, through = (linear_from_srgb(f.layers["transmission"][shown]) for f in (plain, frame))
+    left = 1 - plain.layers["mask"][shown][:, None] * (1 - GREENISH)
+    torch.testing.assert_close(through, left * behind, atol=1e-4, rtol=0)
+    assert float((behind - through).max()) > 0.02
     for name in ("reflection", "strength", "without_panes", "mask", "depth"):
         assert torch.equal(frame.layers[name], plain.layers[name]), name
     outside = plain.layers["mask"] == 0
@@ -59,19 +55,6 @@ def test_layers_recombine_to_the_image() -> None:
     layers = (frame := Planar(blend="srgb")(tinted_showcase(), CAMERA)).layers
     strength = layers["strength"][..., None]
     torch.testing.assert_close((1 - strength) * layers["transmission"] + strength * layers["reflection"], frame.rgb)
-
-
-def test_light_goes_through_one_pane_after_the_other() -> None:
-    """Through two panes that mirror nothing what is behind them is darkened twice."""
-    dull = joined(pane(2.0, base_reflectance=1e-9), pane(3.0, label=2, base_reflectance=1e-9))
-    renderer = Planar(blend="srgb", fresnel="none")
-    plain = renderer(showcase(dull), CAMERA)
-    once, twice = (renderer(showcase(of_glass(planes)), CAMERA) for planes in (pane(2.0, base_reflectance=1e-9), dull))
-    whole = (once.layers["mask"] > 0.999) & (plain.rgb.min(dim=2).values > 0.05)
-    assert int(whole.sum()) > 20
-    torch.testing.assert_close((once.rgb / plain.rgb)[whole], GREENISH.expand(int(whole.sum()), 3), atol=2e-3, rtol=0)
-    assert bool((twice.rgb[whole] <= once.rgb[whole] + 1e-9).all())
-    assert float((once.rgb - twice.rgb)[whole].max()) > 0.01
 
 
 def test_gradients_of_one_pane_match_finite_differences() -> None:
