@@ -31,8 +31,8 @@ class Planes:
         half_sizes: [K, 2] half the side lengths along tangent and bitangent; world units.
         labels: pane label of each plane, as found in the masks.
         mirrors: labels of the planes that transmit nothing; their base reflectance gets no gradient.
-        log_transmittances: [K, 3] logarithm of the share of red, green and blue light that gets through of what does not
-            come back. None where all panes are clear.
+        log_transmittances: [K, 3] logarithm of the share of red, green and blue light that gets through, of what does
+            not come back. None where all panes are clear.
     """
 
     centers: Tensor

@@ -48,14 +48,14 @@ HEADER: dict[str, Field] = {
 }
 """What is `Optional` was added after the first checkpoints were written."""
 GAUSSIAN_SHAPES = {"means": (3,), "quats": (4,), "log_scales": None, "logit_opacities": ()}
-PLANE_SHAPES = {
+PLANE_SHAPES: dict[str, tuple[int, ...]] = {
     "centers": (3,),
     "raw_normals": (3,),
     "logit_reflectances": (),
     "tangents": (3,),
     "half_sizes": (2,),
 }
-TINT_SHAPES = {"log_transmittances": (3,)}
+TINT_SHAPES: dict[str, tuple[int, ...]] = {"log_transmittances": (3,)}
 SCALE_SHAPES = [(DISC_SCALES,), (DISC_SCALES + 1,)]
 SH_SHAPES = [(count, 3) for count in (0, 1, 4, 9, 16)]
 

@@ -26,12 +26,13 @@ GLASS = replace(pane(2.0, half=0.8), log_transmittances=torch.tensor([TRUTH], dt
 
 
 @cache
-def tinted_capture() -> Dataset:
-    """The tiny capture through coloured glass."""
-    scene, views = in_single_precision(showcase(GLASS)), []
+def captured(*, tinted: bool) -> Dataset:
+    """The tiny capture through coloured or clear glass, rounded, not cut off: the scene is dark."""
+    planes = GLASS if tinted else replace(GLASS, log_transmittances=None)
+    scene, views = in_single_precision(showcase(planes)), []
     for view in tiny_capture().train:
         with torch.no_grad():
-            photo = (255 * Planar()(scene, view.camera).rgb.clamp(0, 1)).to(torch.uint8)
+            photo = (255 * Planar()(scene, view.camera).rgb.clamp(0, 1)).round().to(torch.uint8)
         views.append(View.in_memory(view.name, view.camera, photo=photo, pane_labels=view.pane_labels))
     return replace(tiny_capture(), train=tuple(views))
 
@@ -39,7 +40,7 @@ def tinted_capture() -> Dataset:
 def panes_alone(stage: Stage) -> Stage:
     """A stage in which only the colour of the panes learns, from the photographs."""
     rates = {"planes.log_transmittances": replace(stage.rates["planes.log_transmittances"], start=0.02)}
-    losses = tuple(term for term in stage.losses if term.name in ("l1", "photometric", "tint")) or stage.losses[:1]
+    losses = tuple(term for term in stage.losses if term.name in ("photometric", "tint"))
     return replace(stage, rates=rates, losses=losses, entry=None, actions=(), motions=())
 
 
@@ -57,9 +58,9 @@ def transmittances(scene: Scene) -> torch.Tensor:
 def test_the_colour_is_found_where_the_rest_is_known(tmp_path: Path) -> None:
     state = clear_state()
     stage = panes_alone(PlanarRecipe(tint=True, tint_weight=0.0).stages(0)[-1])
-    for _ in train((stage,), tinted_capture(), state, 120):
+    for _ in train((stage,), captured(tinted=True), state, 120):
         pass
-    torch.testing.assert_close(transmittances(state.scene)[0], torch.tensor(TRUTH), atol=0.03, rtol=0)
+    torch.testing.assert_close(transmittances(state.scene)[0], torch.tensor(TRUTH), atol=0.05, rtol=0)
     write_scene(tmp_path / "scene", state.scene)
     assert torch.equal(transmittances(read_scene(tmp_path / "scene")), transmittances(state.scene))
 
@@ -67,9 +68,9 @@ def test_the_colour_is_found_where_the_rest_is_known(tmp_path: Path) -> None:
 def test_clear_glass_stays_clear() -> None:
     state = clear_state()
     stage = panes_alone(PlanarRecipe(tint=True).stages(0)[-1])
-    for _ in train((stage,), tiny_capture(), state, 60):
+    for _ in train((stage,), captured(tinted=False), state, 60):
         pass
-    assert float((1 - transmittances(state.scene)).max()) < 0.01
+    assert float((1 - transmittances(state.scene)).abs().max()) < 0.02
 
 
 def test_only_recipes_with_tint_know_of_it() -> None:
