@@ -74,7 +74,7 @@ class Planes:
     def transmittances(self) -> Tensor | None:
         """[K, 3] share of red, green and blue light that gets through; None where all panes are clear.
 
-        Nothing holds it below 1: a bound would take the gradient, and learning passes by it on its way.
+        Training keeps it in (0, 1]. There is no bound here, which would take the gradient of what lies beyond it.
         """
         return None if self.log_transmittances is None else self.log_transmittances.exp()
 

@@ -18,11 +18,11 @@ from glassplat.train.curved_mirrors import curved_mirrors_learnt, with_curved_mi
 from glassplat.train.photo_exposure import exposures_begun, exposures_learnt
 from glassplat.train.photographer_entry import photographer_learnt
 from glassplat.train.planar_recipe import PlanarRecipe, ReflectionWeights
-from glassplat.train.plane_entry import PlaneEntry, fitted_planes
+from glassplat.train.plane_entry import PlaneEntry, fitted_planes, glass_only_darkens
 from glassplat.train.pose_refinement import poses_begun, poses_learnt
 from glassplat.train.rates import PUBLISHED_ITERATIONS, Rate
 from glassplat.train.splat_stages import image_terms
-from glassplat.train.stage import Every, Stage
+from glassplat.train.stage import Every, Motion, Stage
 from glassplat.train.strategy import Population, population_of
 
 
@@ -114,7 +114,7 @@ def _adjustment(recipe: PlanarRecipe, share: float, entry: PlaneEntry) -> Stage:
             *_early_resets(recipe, population),
             *_clearing(recipe),
         ),
-        motions=population.motions,
+        motions=(*_glass_motions(recipe), *population.motions),
         entry=entry,
         densify_until=recipe.densify.stop,
     )
@@ -141,9 +141,14 @@ def _joint(recipe: PlanarRecipe, share: float) -> Stage:
             *_clearing(recipe),
             PerturbOpacity(beat, recipe.perturbation.amplitude, recipe.perturbation.bounds),
         ),
-        motions=population.motions,
+        motions=(*_glass_motions(recipe), *population.motions),
         densify_until=recipe.densify.stop,
     )
+
+
+def _glass_motions(recipe: PlanarRecipe) -> tuple[Motion, ...]:
+    """What keeps transmittances possible; before the means of the last passes are taken."""
+    return (glass_only_darkens,) if recipe.tint else ()
 
 
 def _joint_terms(recipe: PlanarRecipe, population: Population) -> tuple[LossTerm, ...]:

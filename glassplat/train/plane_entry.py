@@ -22,7 +22,7 @@ from glassplat.scene.mirrored import mirrored_gaussians
 from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
 from glassplat.train.messages import Working
-from glassplat.train.stage import Work
+from glassplat.train.stage import Clock, Work
 from glassplat.train.state import TrainState
 
 log = logging.getLogger("glassplat.train")
@@ -83,6 +83,13 @@ class PlaneEntry:
         mirrors = tuple(label for label in found if label not in told)
         log.info("mirrors among the panes: %s", ", ".join(map(str, mirrors)) or "none")
         return with_mirrors(scene.planes, (*given.mirrors, *mirrors), self.fit.mirror_reflectance)
+
+
+def glass_only_darkens(state: TrainState, clock: Clock, visible: Tensor | None) -> None:
+    """Takes logarithms of transmittances that a step has led above 0 back to it: glass adds no light."""
+    logarithms = state.scene.planes.log_transmittances
+    if logarithms is not None:
+        logarithms.detach().clamp_(max=0)
 
 
 def fitted_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Planes:

@@ -115,7 +115,7 @@ def test_raw_values_may_be_left_out(tmp_path: Path) -> None:
         ({"base_reflectance": 1.5}, "base_reflectance of plane 1 in .* is 1.5; expected a finite number from 0 to 1"),
         ({"logit_reflectance": "much"}, "logit_reflectance of plane 1 in .* is 'much'; expected a finite number"),
         ({"transmittance": [1, 1]}, r"transmittance of plane 1 in .* is \[1, 1\]; expected a list of 3 values"),
-        ({"transmittance": [1, 1, 0]}, "entry 3 of transmittance of plane 1 in .* is 0; expected a finite number from"),
+        ({"transmittance": [1, 1, 2]}, "entry 3 of transmittance of plane 1 in .* is 2; expected a finite number from"),
         ({"raw_normal": [[0], 1, 2]}, r"entry 1 of raw_normal of plane 1 in .* is \[0\]; expected a finite number"),
     ],
 )
