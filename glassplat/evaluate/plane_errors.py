@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,6 +10,7 @@ import torch
 
 from glassplat.evaluate.truth import GroundTruth, TruePlane
 from glassplat.scene.plane import Planes
+from glassplat.scene.uneven import mean_square_slopes
 
 ERRORS = ("normal_error_deg", "offset_error", "base_reflectance_error")
 
@@ -21,7 +23,8 @@ def plane_table(
     `normal_error_deg` is the angle between the normals, whose sign does not matter; `offset_error` the
     distance of the true centre from the fitted plane over `extent`; `base_reflectance_error` an absolute
     difference. Without a true pane of that label they are None, with a reason beside each.
-    Glass that may be tinted has its `transmittance` of red, green and blue.
+    Glass that may be tinted has its `transmittance` of red, green and blue, glass that may be uneven `waves_deg`,
+    root of the mean square of the angle by which its normals are turned.
     `normal_drift_deg` and `offset_drift` compare in the same way with the plane that the masks led to, where known.
 
     Args:
@@ -32,7 +35,7 @@ def plane_table(
     """
     true_planes = {} if truth is None else {plane.label: plane for plane in truth.planes}
     missing = "the data set has no ground truth" if truth is None else "the ground truth has no pane of this label"
-    table, transmittances = [], planes.transmittances
+    table, transmittances, heights = [], planes.transmittances, planes.level_heights
     for index, label in enumerate(planes.labels):
         entry: dict[str, Any] = {
             "label": label,
@@ -42,6 +45,9 @@ def plane_table(
         }
         if transmittances is not None:
             entry["transmittance"] = transmittances[index].tolist()
+        if heights is not None:
+            turn = mean_square_slopes(heights, planes.half_sizes)[index].sqrt()
+            entry["waves_deg"] = math.degrees(turn.item())
         if label in true_planes:
             entry |= _errors(entry, true_planes[label], extent)
         else:

@@ -27,6 +27,7 @@ from glassplat.files.fields import (
 )
 from glassplat.files.json_text import read_json
 from glassplat.scene.plane import Planes
+from glassplat.scene.uneven import LEAST_HEIGHTS
 
 EDIT_TOLERANCE = 1e-5
 """Above this difference the readable value has been edited by hand, and wins over the raw one."""
@@ -53,6 +54,7 @@ PLANE: dict[str, Field] = {
     "logit_reflectance": Optional(LOGIT),
     "transmittance": Optional(Items(Number(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE), 3)),
     "log_transmittance": Optional(Items(LOGIT, 3)),
+    "heights": Optional(Items(Items(COORDINATE))),
 }
 
 
@@ -62,7 +64,7 @@ def write_planes(path: Path | str, planes: Planes) -> None:
     Each entry has label, mirror, center, normal (unit), tangent, half_sizes and base_reflectance for people
     and other programs (world units, the capture's frame), and the raw values raw_normal and
     logit_reflectance that training continues from; where glass may be tinted also transmittance, of red, green and
-    blue, and its raw log_transmittance.
+    blue, and its raw log_transmittance, and where it may be uneven its heights (see `Planes`).
 
     Raises:
         ValueError: a plane holds a value that is not finite.
@@ -104,23 +106,29 @@ def read_planes(path: Path | str) -> Planes:
         labels=labels,
         mirrors=tuple(entry["label"] for entry in entries if entry["mirror"]),
         log_transmittances=_log_transmittances(entries),
+        heights=_heights(entries, path),
     )
 
 
 def _entry(planes: Planes, index: int) -> dict[str, Any]:
     """One plane as plain numbers; a float32 survives the way through a decimal double unchanged."""
     tint = {} if planes.transmittances is None else _tint(planes, index)
-    return tint | {
-        "label": int(planes.labels[index]),
-        "mirror": planes.labels[index] in planes.mirrors,
-        "center": planes.centers[index].tolist(),
-        "normal": planes.normals[index].tolist(),
-        "tangent": planes.tangents[index].tolist(),
-        "half_sizes": planes.half_sizes[index].tolist(),
-        "base_reflectance": planes.base_reflectances[index].item(),
-        "raw_normal": planes.raw_normals[index].tolist(),
-        "logit_reflectance": planes.logit_reflectances[index].item(),
-    }
+    waves = {} if planes.heights is None else {"heights": planes.heights[index].tolist()}
+    return (
+        tint
+        | waves
+        | {
+            "label": int(planes.labels[index]),
+            "mirror": planes.labels[index] in planes.mirrors,
+            "center": planes.centers[index].tolist(),
+            "normal": planes.normals[index].tolist(),
+            "tangent": planes.tangents[index].tolist(),
+            "half_sizes": planes.half_sizes[index].tolist(),
+            "base_reflectance": planes.base_reflectances[index].item(),
+            "raw_normal": planes.raw_normals[index].tolist(),
+            "logit_reflectance": planes.logit_reflectances[index].item(),
+        }
+    )
 
 
 def _tint(planes: Planes, index: int) -> dict[str, Any]:
@@ -130,8 +138,8 @@ def _tint(planes: Planes, index: int) -> dict[str, Any]:
     return {"transmittance": readable.tolist(), "log_transmittance": planes.log_transmittances[index].tolist()}
 
 
-def _finite(value: float | list[float]) -> bool:
-    return all(math.isfinite(number) for number in (value if isinstance(value, list) else [value]))
+def _finite(value: Any) -> bool:
+    return all(_finite(one) for one in value) if isinstance(value, list) else math.isfinite(value)
 
 
 def _load_entries(path: Path) -> list[Any]:
@@ -192,3 +200,18 @@ def _log_transmittance(entry: Mapping[str, Any]) -> Tensor:
         if (raw.exp() - readable).abs().max() <= EDIT_TOLERANCE:
             return raw
     return readable.log()
+
+
+def _heights(entries: list[dict[str, Any]], path: Path) -> Tensor | None:
+    """[K, R, C], zeros for panes that say nothing of them; None if none does."""
+    given = {tuple(map(len, entry["heights"])) for entry in entries if entry["heights"] is not None}
+    if not given:
+        return None
+    rows = max(given)
+    if len(given) > 1 or len(set(rows)) > 1 or min(len(rows), *rows) < LEAST_HEIGHTS:
+        raise ValueError(
+            f"{path} has heights of {sorted(map(list, given))} values in their rows; expected as many in each row, "
+            f"{LEAST_HEIGHTS} rows of {LEAST_HEIGHTS} at least, and the same of every pane"
+        )
+    even = [[0.0] * rows[0]] * len(rows)
+    return torch.tensor([entry["heights"] or even for entry in entries], dtype=torch.float32)

@@ -48,14 +48,15 @@ HEADER: dict[str, Field] = {
 }
 """What is `Optional` was added after the first checkpoints were written."""
 GAUSSIAN_SHAPES = {"means": (3,), "quats": (4,), "log_scales": None, "logit_opacities": ()}
-PLANE_SHAPES: dict[str, tuple[int, ...]] = {
+PLANE_SHAPES: dict[str, tuple[int, ...] | None] = {
     "centers": (3,),
     "raw_normals": (3,),
     "logit_reflectances": (),
     "tangents": (3,),
     "half_sizes": (2,),
 }
-TINT_SHAPES: dict[str, tuple[int, ...]] = {"log_transmittances": (3,)}
+FURTHER_PLANE_SHAPES: dict[str, tuple[int, ...] | None] = {"log_transmittances": (3,), "heights": None}
+"""Of panes that are tinted or uneven."""
 SCALE_SHAPES = [(DISC_SCALES,), (DISC_SCALES + 1,)]
 SH_SHAPES = [(count, 3) for count in (0, 1, 4, 9, 16)]
 
@@ -216,7 +217,8 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
         for part, degree in header["active_sh_degree"].items()
     }
     planes = under(tensors, "scene/planes/")
-    check_shapes(planes, PLANE_SHAPES | (TINT_SHAPES if TINT_SHAPES.keys() <= planes.keys() else {}), "planes")
+    further = {name: shape for name, shape in FURTHER_PLANE_SHAPES.items() if name in planes}
+    check_shapes(planes, PLANE_SHAPES | further, "planes")
     distant = under(tensors, "scene/environment/")
     check_shapes(distant, {"raw": None} if distant else {}, "environment")
     environment = Environment(**distant, region=header["region"]) if distant else empty.environment

@@ -8,7 +8,13 @@ from glassplat.data.backgrounds import BLACK
 from glassplat.data.dataset import Dataset
 from glassplat.init.plane_options import PlaneFitError
 from glassplat.losses.geometry import depth_deviation_loss
-from glassplat.losses.reflection import gradient_conflict, intensity_departure, mask_loss, tint_departure
+from glassplat.losses.reflection import (
+    gradient_conflict,
+    intensity_departure,
+    mask_loss,
+    tint_departure,
+    unevenness,
+)
 from glassplat.losses.term import LossTerm, weighted
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
@@ -78,6 +84,7 @@ def stages_of(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERA
         fixed_mirrors=recipe.fixed_mirrors,
         seed_reflections=recipe.seed_reflections,
         tint=recipe.tint,
+        heights=recipe.waves.heights if recipe.waves.learn else 0,
     )
     initialisation = Stage(
         name="1 initialisation",
@@ -132,7 +139,8 @@ def _joint(recipe: PlanarRecipe, share: float) -> Stage:
         rates=recipe.rates.of("primary")
         | recipe.rates.of("glass")
         | recipe.plane_rates.of(recipe.plane_rates.joint_factor)
-        | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {}),
+        | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {})
+        | ({"planes.heights": Rate(recipe.waves.rate, per_extent=True)} if recipe.waves.learn else {}),
         actions=(
             *population.edits,
             GrowSh(Every(recipe.rhythm.sh)),
@@ -153,8 +161,11 @@ def _glass_motions(recipe: PlanarRecipe) -> tuple[Motion, ...]:
 
 def _joint_terms(recipe: PlanarRecipe, population: Population) -> tuple[LossTerm, ...]:
     image = image_terms(recipe.ssim_weight, recipe.view_dependence_weight)
-    tint = weighted(LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, tint_departure))
-    return (*image, *reflection_terms(recipe.weights), *tint, *population.terms)
+    glass = weighted(
+        LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, tint_departure),
+        LossTerm("waves", recipe.waves.weight if recipe.waves.learn else 0.0, unevenness),
+    )
+    return (*image, *reflection_terms(recipe.weights), *glass, *population.terms)
 
 
 def planar_population(recipe: PlanarRecipe) -> Population:

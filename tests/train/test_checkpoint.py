@@ -69,13 +69,15 @@ def test_a_state_survives(checkpoint: Path) -> None:
         assert torch.equal(read.optimizer.moments[name][1], torch.ones_like(tensor)), name
 
 
-def test_tinted_panes_survive(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "glass", [{"log_transmittances": -torch.rand(1, 3)}, {"heights": torch.randn(1, 6, 6)}], ids=["tinted", "uneven"]
+)
+def test_what_glass_has_learnt_survives(tmp_path: Path, glass: dict[str, Tensor]) -> None:
     state = trained_state()
-    logarithms = torch.tensor([[-0.1, -0.2, 0.01]])
-    state.scene = replace(state.scene, planes=replace(state.scene.planes, log_transmittances=logarithms))
-    save_checkpoint(tmp_path / "tinted.safetensors", state)
-    read = load_checkpoint(tmp_path / "tinted.safetensors").scene.planes.log_transmittances
-    assert read is not None and torch.equal(read, logarithms)
+    state.scene = replace(state.scene, planes=replace(state.scene.planes, **glass))
+    save_checkpoint(tmp_path / "checkpoint.safetensors", state)
+    read = load_checkpoint(tmp_path / "checkpoint.safetensors").scene.planes.tensors()
+    assert all(torch.equal(read[name], tensor) for name, tensor in glass.items())
 
 
 def test_surroundings_survive(tmp_path: Path) -> None:
