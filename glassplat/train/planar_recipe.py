@@ -150,7 +150,7 @@ class PlanarRecipe:
     detect_mirrors: Annotated[bool, ESSENTIAL] = True
     fixed_mirrors: bool = True
     seed_reflections: bool = True
-    tint: Annotated[bool, ESSENTIAL] = False
+    tint: bool = False
     tint_weight: NotNegative = 0.01
     waves: UnevenGlass = field(default_factory=UnevenGlass)
     glass_count: Annotated[int, Range(1, 1_000_000)] = 1000
