@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from glassplat.evaluate.truth import GroundTruth, TruePlane
 from glassplat.scene.plane import Planes
@@ -35,19 +35,14 @@ def plane_table(
     """
     true_planes = {} if truth is None else {plane.label: plane for plane in truth.planes}
     missing = "the data set has no ground truth" if truth is None else "the ground truth has no pane of this label"
-    table, transmittances, heights = [], planes.transmittances, planes.level_heights
+    glass, table = _glass(planes), []
     for index, label in enumerate(planes.labels):
         entry: dict[str, Any] = {
             "label": label,
             "center": planes.centers[index].tolist(),
             "normal": planes.normals[index].tolist(),
             "base_reflectance": planes.base_reflectances[index].item(),
-        }
-        if transmittances is not None:
-            entry["transmittance"] = transmittances[index].tolist()
-        if heights is not None:
-            turn = mean_square_slopes(heights, planes.half_sizes)[index].sqrt()
-            entry["waves_deg"] = math.degrees(turn.item())
+        } | {name: values[index].tolist() for name, values in glass.items()}
         if label in true_planes:
             entry |= _errors(entry, true_planes[label], extent)
         else:
@@ -56,6 +51,16 @@ def plane_table(
             entry |= _drift(entry, marked, marked.labels.index(label), extent)
         table.append(entry)
     return table
+
+
+def _glass(planes: Planes) -> dict[str, Tensor]:
+    """What is known of the panes' glass beside its reflectance, a row for each pane."""
+    glass = {}
+    if planes.transmittances is not None:
+        glass["transmittance"] = planes.transmittances
+    if planes.level_heights is not None:
+        glass["waves_deg"] = mean_square_slopes(planes.level_heights, planes.half_sizes).sqrt().rad2deg()
+    return glass
 
 
 def missing_panes(planes: Planes, truth: GroundTruth | None) -> list[int]:

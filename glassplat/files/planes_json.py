@@ -112,30 +112,28 @@ def read_planes(path: Path | str) -> Planes:
 
 def _entry(planes: Planes, index: int) -> dict[str, Any]:
     """One plane as plain numbers; a float32 survives the way through a decimal double unchanged."""
-    tint = {} if planes.transmittances is None else _tint(planes, index)
-    waves = {} if planes.heights is None else {"heights": planes.heights[index].tolist()}
-    return (
-        tint
-        | waves
-        | {
-            "label": int(planes.labels[index]),
-            "mirror": planes.labels[index] in planes.mirrors,
-            "center": planes.centers[index].tolist(),
-            "normal": planes.normals[index].tolist(),
-            "tangent": planes.tangents[index].tolist(),
-            "half_sizes": planes.half_sizes[index].tolist(),
-            "base_reflectance": planes.base_reflectances[index].item(),
-            "raw_normal": planes.raw_normals[index].tolist(),
-            "logit_reflectance": planes.logit_reflectances[index].item(),
-        }
-    )
+    return {
+        "label": int(planes.labels[index]),
+        "mirror": planes.labels[index] in planes.mirrors,
+        "center": planes.centers[index].tolist(),
+        "normal": planes.normals[index].tolist(),
+        "tangent": planes.tangents[index].tolist(),
+        "half_sizes": planes.half_sizes[index].tolist(),
+        "base_reflectance": planes.base_reflectances[index].item(),
+        "raw_normal": planes.raw_normals[index].tolist(),
+        "logit_reflectance": planes.logit_reflectances[index].item(),
+    } | {name: values[index].tolist() for name, values in _glass(planes).items()}
 
 
-def _tint(planes: Planes, index: int) -> dict[str, Any]:
-    assert planes.transmittances is not None
-    assert planes.log_transmittances is not None
-    readable = planes.transmittances[index].clamp(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE)
-    return {"transmittance": readable.tolist(), "log_transmittance": planes.log_transmittances[index].tolist()}
+def _glass(planes: Planes) -> dict[str, Tensor]:
+    """What panes have if their glass may be tinted or uneven, a row for each."""
+    glass = {}
+    if planes.transmittances is not None and planes.log_transmittances is not None:
+        glass["transmittance"] = planes.transmittances.clamp(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE)
+        glass["log_transmittance"] = planes.log_transmittances
+    if planes.heights is not None:
+        glass["heights"] = planes.heights
+    return glass
 
 
 def _finite(value: Any) -> bool:

@@ -49,7 +49,7 @@ def tint_departure(frame: Frame, view: View, scene: Scene) -> Tensor | None:
     Where all that is behind a pane is seen through it, its tint may as well be that of the things.
     """
     logarithms = scene.planes.log_transmittances
-    return None if logarithms is None else logarithms.square().mean()
+    return None if logarithms is None or not len(logarithms) else logarithms.square().mean()
 
 
 def unevenness(frame: Frame, view: View, scene: Scene) -> Tensor | None:
