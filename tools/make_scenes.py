@@ -22,8 +22,10 @@ import tyro
 from numpy.typing import NDArray
 from PIL import Image
 
+from glassplat.data.normal_maps import FOLDER
 from glassplat.data.random_points import points_in_box
 from glassplat.files.ply_table import write_table
+from tools.estimated_normals import estimated_normals
 from tools.make_demo_scene import srgb_from_linear
 from tools.scene_draws import MATTE, Body, DrawnScene, draw_scene
 from tools.scene_environment import make_environment
@@ -85,6 +87,8 @@ class Arguments:
     """Random grey points to write beside the images; 0 leaves them to whoever reads the scene (glassplat: 100,000)."""
     environment_height: int = 512
     """Height of the equirectangular environment, pixels."""
+    estimated_normals: float | None = None
+    """Normals as estimated from single photographs beside those for training, off by so many degrees on average."""
     variant: Variant = "llvm_ad_rgb"
     """Mitsuba's backend: CPU or NVIDIA GPU."""
 
@@ -296,6 +300,17 @@ def write_truth(studio: Studio, pose: Array, stem: Path) -> None:
     Image.fromarray(as_bytes(strength)).save(f"{stem}_strength.png", optimize=True)
 
 
+def write_estimate(studio: Studio, pose: Array, stem: Path, error_deg: float, seed: int) -> None:
+    """Writes `normals/<name>.png` beside a photograph, in the camera's axes: x right, y up, z towards the camera."""
+    seen, _ = visible_surfaces(studio, pose)
+    in_camera = seen[..., :3] @ pose[:3, :3]
+    normals = estimated_normals(in_camera, seen[..., 3], error_deg, np.random.default_rng(seed))
+    encoded = np.concatenate([(normals + 1) / 2, normals.any(axis=-1, keepdims=True)], axis=-1)
+    folder = stem.parent / FOLDER
+    folder.mkdir(exist_ok=True)
+    Image.fromarray(as_bytes(encoded)).save(folder / f"{stem.name}.png", optimize=True)
+
+
 def write_views(studio: Studio, folder: Path, part: Literal["train", "test"], arguments: Arguments) -> None:
     """Renders one part of the split and writes its `transforms_<part>.json` when all of it is there."""
     count, azimuth_rad = (arguments.train, 0.0) if part == "train" else (arguments.test, TEST_AZIMUTH_RAD)
@@ -310,6 +325,8 @@ def write_views(studio: Studio, folder: Path, part: Literal["train", "test"], ar
         Image.fromarray(pixels).save(f"{stem}.png", optimize=True)
         if part == "test":
             write_truth(studio, pose, stem)
+        elif arguments.estimated_normals is not None:
+            write_estimate(studio, pose, stem, arguments.estimated_normals, seed)
         frames.append({"file_path": f"./{part}/r_{number}", "transform_matrix": pose.tolist()})
         print(f"\r{folder.name} {part} {number + 1}/{count}, {time.monotonic() - started:.0f} s", end="", flush=True)
     print()
