@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
+from glassplat.data.normal_maps import estimated_normals
 from glassplat.data.view import View
 from glassplat.densify.options import MirrorSearch
 from glassplat.densify.reflectors import LEAST_SHOWN, evenly, in_region, residual_spreads
@@ -23,9 +24,11 @@ from glassplat.render.depth_normals import cell_side, depth_normals
 from glassplat.render.frame import Renderer
 from glassplat.render.surface import seen_surface, view_directions
 from glassplat.scene.activations import logit
+from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.pose import quat_product, rotation_from_quat
 from glassplat.scene.scene import Scene
+from glassplat.scene.transfer import moved
 
 COLOR_NEIGHBOURS, NORMAL_NEIGHBOURS = 16, 4
 """Gaussians, itself among them, over which the spread of colours and the normals are averaged."""
@@ -61,12 +64,13 @@ def mirror_lookalikes(
 
 @torch.no_grad()
 def made_mirrors(options: MirrorSearch, scene: Scene, views: Sequence[View], chosen: Tensor) -> Gaussians:
-    """The primary Gaussians, the chosen [N] ones as mirrors whose normals are those of the depths around them.
+    """The primary Gaussians, the chosen [N] ones as mirrors that face as the views say (`seen_normals`).
 
     Their colours stay, but for what turns with the view: what the reflection explains, it takes from them.
     """
     gaussians = scene.primary
-    normals = seen_normals(scene, evenly(views, options.views))
+    looked_at = evenly(views, options.views)
+    normals = seen_normals(scene, looked_at, options.estimated_normals)
     turned = chosen & (normals.norm(dim=1) > FACING)
     rows = turned.nonzero().squeeze(1)
     near = neighbours(gaussians.means[rows], NORMAL_NEIGHBOURS)
@@ -97,20 +101,32 @@ def neighbours(points: Tensor, count: int) -> Tensor:
     return torch.from_numpy(rows).to(points.device)
 
 
-def seen_normals(scene: Scene, views: Sequence[View]) -> Tensor:
-    """[N, 3] normals of the views' depth maps, summed over the pixels of each primary Gaussian, world axes.
+def seen_normals(scene: Scene, views: Sequence[View], estimated: bool = False) -> Tensor:
+    """[N, 3] normals that the views show, summed over the pixels of each primary Gaussian, world axes.
 
     A surface that is seen at a grazing angle counts by the cosine.
+
+    Args:
+        scene: with primary Gaussians.
+        views: those that are looked at.
+        estimated: take normals that were estimated from a photograph where they lie beside it; all others are those of
+            the depth maps.
     """
     normals = torch.zeros_like(scene.primary.means)
     for view in views:
         camera = view.camera.to(normals.device)
-        surface = seen_surface(scene, camera, background=(0.0, 0.0, 0.0))
-        cells, trusted = depth_normals(surface.depth, surface.alpha, camera)
-        image = _whole_size(cells * trusted[..., None], cell_side(camera), surface.depth.shape)
+        known = estimated_normals(view) if estimated else None
+        image = slopes_of_depths(scene, camera) if known is None else moved(known, normals.device)
         cosines = -(image * normalize(view_directions(camera), dim=-1)).sum(-1, keepdim=True)
         normals += gathered(scene, camera, image * cosines.clamp(min=0))
     return normals
+
+
+def slopes_of_depths(scene: Scene, camera: Camera) -> Tensor:
+    """[H, W, 3] normals of a camera's depth map, world axes; zero where they cannot be trusted."""
+    surface = seen_surface(scene, camera, background=(0.0, 0.0, 0.0))
+    cells, trusted = depth_normals(surface.depth, surface.alpha, camera)
+    return _whole_size(cells * trusted[..., None], cell_side(camera), surface.depth.shape)
 
 
 def _whole_size(cells: Tensor, side: int, size: Sequence[int]) -> Tensor:

@@ -146,6 +146,8 @@ class MirrorSearch:
         strength: reflection strength of what was found.
         least_opacity: opacities of what was found are raised to this.
         flatness: of what was found, the shortest axis as a share of the middle one, at most.
+        estimated_normals: turn what was found as the normals say that lie in `normals/` beside the photographs, and
+            only where there are none as the depths say.
     """
 
     begin_found: bool = True
@@ -154,6 +156,7 @@ class MirrorSearch:
     strength: InnerShare = 0.73
     least_opacity: InnerShare = 0.9
     flatness: InnerShare = 0.37
+    estimated_normals: bool = True
 
 
 @dataclass(frozen=True)

@@ -102,6 +102,10 @@ def _without_search(recipe: TracedRecipe) -> TracedRecipe:
     return replace(recipe, search=replace(recipe.search, begin_found=False))
 
 
+def _without_estimated_normals(recipe: TracedRecipe) -> TracedRecipe:
+    return replace(recipe, monocular_weight=0.0, search=replace(recipe.search, estimated_normals=False))
+
+
 def _spread_over_the_box(recipe: TracedRecipe) -> TracedRecipe:
     start = replace(recipe.surroundings.start, source="box")
     return replace(recipe, surroundings=replace(recipe.surroundings, start=start))
@@ -141,7 +145,7 @@ DEFERRED: dict[Switch, Ablation] = {
 
 TRACED: dict[Switch, Ablation] = {
     "joint": Ablation("w/o joint optimization", lambda r: replace(r, joint=False), -0.58),
-    "monocular-normals": Ablation("w/o mono normal loss", lambda r: replace(r, monocular_weight=0.0), -0.51),
+    "monocular-normals": Ablation("w/o mono normals", _without_estimated_normals, -0.51),
     "surroundings": Ablation("w/ environment map alone", lambda r: replace(r, mirrors="environment"), -0.47),
     "sabotage": Ablation("w/o color sabotage", _without_sabotage, -0.35),
     "propagation": Ablation("w/o normal propagation", _without_propagation, -0.43),

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from glassplat.data.normal_maps import CAMERA_FROM_PICTURE, FOLDER
 from glassplat.data.view import View
 from glassplat.densify.mirrors import FACING, facing, made_mirrors, mirror_lookalikes, neighbours, seen_normals
 from glassplat.densify.options import MirrorSearch
@@ -108,6 +111,20 @@ def test_depths_tell_which_way_a_surface_faces(discs: bool) -> None:
     normals = normalize(sums[told], dim=1)
     assert float(told.float().mean()) > 0.8
     assert float((normals @ true_normal()).mean()) > math.cos(math.radians(4))
+
+
+@pytest.mark.parametrize("estimated", [True, False])
+def test_estimated_normals_say_it_before_depths_do(tmp_path: Path, estimated: bool) -> None:
+    scene, elsewhere = slope(), torch.tensor([0.6, 0.0, -0.8])
+    (tmp_path / FOLDER).mkdir()
+    in_picture = (elsewhere * torch.tensor(CAMERA_FROM_PICTURE)).expand(SIZE, SIZE, 3)
+    np.save(tmp_path / FOLDER / "0.npy", in_picture.numpy())
+    (view,) = views(0.0)
+    view = replace(view, image_path=tmp_path / "0.png")
+    chosen = inner(scene)
+    made = made_mirrors(replace(SEARCH, estimated_normals=estimated), scene, [view], chosen).select(chosen)
+    expected = elsewhere if estimated else true_normal()
+    assert float((normal_axes(made) @ expected).abs().min()) > math.cos(math.radians(8))
 
 
 def test_what_was_found_becomes_a_flat_mirror_and_nothing_else_changes() -> None:
