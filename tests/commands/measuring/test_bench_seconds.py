@@ -28,7 +28,7 @@ def test_no_run_is_shorter_than_the_pilot() -> None:
 
 
 def test_times_that_contradict_any_law_do_not_run_away() -> None:
-    assert iterations_for(200.0, [(300, 100.0), (600, 100.0)]) == round(600 * 2 ** (1 / 0.8), -1)
+    assert iterations_for(200.0, [(300, 100.0), (600, 100.0)]) == 1200
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 240.0), (31.2, 37.9), (20.0, 20.0), (0.0, 0.7), (-3.0, 4000.0)])
