@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -15,6 +16,8 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
 
+log = logging.getLogger("glassplat.init")
+
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 MIRROR_SLOPE, MIRROR_CORRELATION = 0.5, 0.25
 """Above these values a pane is taken for a mirror; glass shows slopes near its reflectance, a tenth."""
@@ -22,16 +25,16 @@ LEAST_COVERAGE = 0.95
 """Coverage of the mirrored image from which a pixel counts; a rough first scene has holes, which are no dark things."""
 WINDOW = 0.15
 """Side of the window whose mean is taken off, as a share of the image width: it removes differences in brightness."""
-FEWEST_PIXELS = 200
+FEWEST_PIXELS, LEAST_SHARE = 200, 0.03
+"""Of a pane's annotated pixels, how many must be covered by what it would mirror for it to be judged: by a hundredth
+of a glass front, chosen by what is known of its surroundings, it may well look like a mirror."""
 
 
-@dataclass(frozen=True)
-class Likeness:
+class Likeness(NamedTuple):
     """How the photographs of a pane depend on what the plane would mirror there.
 
-    Attributes:
-        slope: change of the photograph per change of the mirrored image; 1 for a mirror, R0 for glass.
-        correlation: of the two, over pixels and channels.
+    slope: change of the photograph per change of the mirrored image; 1 for a mirror, R0 for glass.
+    correlation: of the two, over pixels and channels.
     """
 
     slope: float
@@ -56,32 +59,47 @@ def mirror_labels(scene: Scene, views: Sequence[View]) -> tuple[int, ...]:
     return mirrors_among(scene.planes.labels, [pane_pixels(scene, view) for view in views if view.is_annotated])
 
 
-def mirrors_among(labels: Sequence[int], pairs: Sequence[PanePixels]) -> tuple[int, ...]:
+def mirrors_among(labels: Sequence[int], views: Sequence[Mapping[int, PanePixels]]) -> tuple[int, ...]:
     """Labels of the panes that are mirrors, by the `pane_pixels` of the annotated views."""
     found = []
     for label in labels:
-        mirrored, photographed = (torch.cat([pair[label][side] for pair in pairs]) for side in (0, 1))
-        if len(mirrored) >= FEWEST_PIXELS and likeness(mirrored, photographed).is_mirror:
+        mirrored = torch.cat([view[label].mirrored for view in views])
+        like = likeness(mirrored, torch.cat([view[label].photographed for view in views]))
+        share = len(mirrored) / max(sum(view[label].shown for view in views), 1)
+        log.info("pane %d: slope %.2f, correlation %.2f, of %.1f %% of it", label, *like, 100 * share)
+        if len(mirrored) >= FEWEST_PIXELS and share >= LEAST_SHARE and like.is_mirror:
             found.append(label)
     return tuple(found)
 
 
-PanePixels = Mapping[int, tuple[Tensor, Tensor]]
+class PanePixels(NamedTuple):
+    """What is known of a pane in one view.
+
+    mirrored, photographed [P, 3]: colours about their local means, where what would be mirrored is known; shown: how
+    many pixels show the pane.
+    """
+
+    mirrored: Tensor
+    photographed: Tensor
+    shown: int
 
 
 @torch.no_grad()
-def pane_pixels(scene: Scene, view: View) -> PanePixels:
-    """Mirrored and photographed colours [P, 3] of each pane's pixels in one view, by label, about their local means."""
-    mirrored, coverage, _ = mirrored_image(scene, view.camera)
+def pane_pixels(scene: Scene, view: View) -> Mapping[int, PanePixels]:
+    """The pixels of each pane in one view, by label."""
+    mirrored, coverage, seen = mirrored_image(scene, view.camera)
     photo = scene.exposures.undone(view.photo.to(mirrored.device).to(mirrored.dtype) / 255, view.name)
     labels = None if view.pane_labels is None else view.pane_labels.to(mirrored.device)
-    known = coverage > LEAST_COVERAGE
-    if view.ignored is not None:
-        known &= ~view.ignored.to(known.device)
+    told = torch.ones_like(seen) if view.ignored is None else ~view.ignored.to(seen.device)
     pixels = {}
     for label in scene.planes.labels:
-        region = known if labels is None else known & (labels == label)
-        pixels[label] = (about_local_mean(mirrored, region)[region], about_local_mean(photo, region)[region])
+        pane = told & (seen if labels is None else labels == label)
+        region = pane & (coverage > LEAST_COVERAGE)
+        pixels[label] = PanePixels(
+            mirrored=about_local_mean(mirrored, region)[region],
+            photographed=about_local_mean(photo, region)[region],
+            shown=int(pane.sum()),
+        )
     return pixels
 
 

@@ -11,7 +11,17 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from glassplat.data.dataset import View
 from glassplat.init.glass import glass_gaussians
-from glassplat.init.material import WINDOW, about_local_mean, likeness, mirror_labels, window_sums
+from glassplat.init.material import (
+    FEWEST_PIXELS,
+    LEAST_SHARE,
+    WINDOW,
+    about_local_mean,
+    likeness,
+    mirror_labels,
+    mirrors_among,
+    pane_pixels,
+    window_sums,
+)
 from glassplat.render.planar import Planar
 from glassplat.scene.exposure import Exposures
 from glassplat.scene.scene import Scene
@@ -61,6 +71,17 @@ def test_an_exposure_does_not_turn_a_mirror_into_glass() -> None:
     ]  # fmt: skip
     assert mirror_labels(scene_with(0.2), dark) == ()
     assert mirror_labels(replace(scene_with(0.2), exposures=exposures), dark) == (1,)
+
+
+def test_a_pane_of_which_hardly_anything_is_known_stays_glass() -> None:
+    """Of a glass front that mirrors what no photograph shows, some spots may well agree with it."""
+    scene = scene_with(0.2)
+    known = [pane_pixels(scene, view) for view in photographs(scene_with(0.995))]
+    assert mirrors_among((1,), known) == (1,)
+    count = sum(len(view[1].mirrored) for view in known)
+    assert count >= FEWEST_PIXELS
+    larger = round(1.05 * count / LEAST_SHARE / len(known))
+    assert mirrors_among((1,), [{1: view[1]._replace(shown=larger)} for view in known]) == ()
 
 
 def test_views_without_masks_say_nothing() -> None:
