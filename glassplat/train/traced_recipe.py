@@ -78,7 +78,7 @@ class TracedRecipe:
         consistency_weight: weight of the difference between normals and the slope of the depths.
         consistency_to_end: keep that term after propagation (paper).
         monocular_weight: of the difference between normals and those that lie in `normals/` beside the photographs;
-            nothing where there are none.
+            nothing where there are none (paper: 0.01).
         propagation: how normals spread and colours are sabotaged.
         schedule: when they do.
         hurry_matte: raise the learning rates to those of `splat` for the rest of a run in which nothing was found that
@@ -122,7 +122,7 @@ class TracedRecipe:
     tint_weight: NotNegative = 2e-4
     consistency_weight: NotNegative = 0.3
     consistency_to_end: bool = False
-    monocular_weight: NotNegative = 0.01
+    monocular_weight: NotNegative = 0.5
     propagation: NormalPropagation = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
     hurry_matte: bool = True
@@ -164,11 +164,12 @@ class TracedRecipe:
                 ),
                 reset=True,
             ),
-            search=MirrorSearch(begin_found=False),
+            search=MirrorSearch(begin_found=False, estimated_normals=False),
             find_region=False,
             strength_weight=0.0,
             consistency_weight=0.04,
             consistency_to_end=True,
+            monocular_weight=0.01,
             propagation=NormalPropagation(sabotage=0.4 * SH_ZERO),
             schedule=PropagationSchedule(end="fixed", stop=18_000 / CODE_ITERATIONS, pause=200, last_reset=False),
             hurry_matte=False,
