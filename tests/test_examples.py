@@ -6,12 +6,18 @@ import contextlib
 import io
 import re
 import runpy
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
+import torch
+
+import glassplat
+from glassplat.data.normal_maps import estimated_normals
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
+DEMO = Path(glassplat.__file__).parent / "demo_scene"
 
 
 def said_by(example: str, *options: str, folder: Path) -> str:
@@ -34,7 +40,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_examples_are_numbered_and_explained() -> None:
-    assert [path.name[:2] for path in sorted(EXAMPLES.glob("*.py"))] == ["1_", "2_", "3_", "4_"]
+    assert [path.name[:2] for path in sorted(EXAMPLES.glob("*.py"))] == ["1_", "2_", "3_", "4_", "5_"]
     for path in EXAMPLES.glob("*.py"):
         assert f"\npython examples/{path.name} " in path.read_text()
 
@@ -57,3 +63,42 @@ def test_gradients_lead_back(place: Path) -> None:
     said = said_by("4_gradients.py", "runs/place", "--downscale", "4", "--steps", "21", folder=place)
     losses = [float(number) for number in re.findall(r"loss (0\.\d+)", said)]
     assert losses[-1] < losses[0]
+
+
+HUB = """
+import torch
+
+dependencies = ["torch"]
+
+
+class Slope(torch.nn.Module):
+    def inference(self, data):
+        height, width = data["input"].shape[2:]
+        # Half as large, in axes with y down and z forward: faces the camera and, the lower half, up.
+        normals = torch.zeros(1, 4, height // 2, width // 2)
+        normals[:, 2] = -0.8
+        normals[:, 1, height // 4 :] = -0.6
+        normals[:, 0, : height // 4] = 0.6
+        return None, None, {"prediction_normal": normals}
+
+
+def slope(pretrain):
+    assert pretrain
+    return Slope()
+"""
+
+
+def test_estimated_normals_lie_where_they_are_read(tmp_path: Path) -> None:
+    capture, hub = shutil.copytree(DEMO, tmp_path / "capture"), tmp_path / "hub"
+    hub.mkdir()
+    (hub / "hubconf.py").write_text(HUB)
+    options = ["--repository", str(hub), "--model", "slope", "--height", "64", "--width", "128", "--device", "cpu"]
+    said_by("5_estimated_normals.py", "--data", str(capture), *options, folder=tmp_path)
+    views = glassplat.load_dataset(capture).train
+    for view in (views[0], views[-1]):
+        normals = estimated_normals(view)
+        assert normals is not None
+        in_camera = normals @ view.camera.cam_from_world[:3, :3].T
+        height, width = in_camera.shape[:2]
+        for row, expected in ((height // 4, [0.6, 0.0, -0.8]), (3 * height // 4, [0.0, -0.6, -0.8])):
+            torch.testing.assert_close(in_camera[row, width // 2], torch.tensor(expected), atol=0.01, rtol=0)
