@@ -68,6 +68,8 @@ class DeferredRecipe:
         tint: reflections may have a colour, as those of gold and copper do, which the paper does not have.
         tint_weight: of the mean square of what gives them one in the objective.
         consistency_weight: weight of the difference between normals and the slope of the depths, while normals spread.
+        monocular_weight: of the difference between normals and those that lie in `normals/` beside the photographs;
+            nothing where there are none (not in the paper).
         propagation: how normals spread and colours are sabotaged.
         schedule: when they do.
         least_iterations: of the shortest run in which anything reflects. A shorter one would be over before the colours
@@ -108,6 +110,7 @@ class DeferredRecipe:
     tint: Annotated[bool, ESSENTIAL] = False
     tint_weight: NotNegative = 2e-4
     consistency_weight: NotNegative = 0.3
+    monocular_weight: NotNegative = 0.5
     propagation: NormalPropagation = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
     least_iterations: Several = 6000
@@ -129,12 +132,13 @@ class DeferredRecipe:
         published = DefaultDensify.published()
         return cls(
             bootstrap=3000 / CODE_ITERATIONS,
-            search=MirrorSearch(begin_found=False),
+            search=MirrorSearch(begin_found=False, estimated_normals=False),
             texels=128,
             first_texels=128,
             find_region=False,
             strength_weight=0.0,
             consistency_weight=0.0,
+            monocular_weight=0.0,
             propagation=NormalPropagation(sabotage=0.4 * SH_ZERO),
             schedule=PropagationSchedule(end="fixed", stop=24_000 / CODE_ITERATIONS, pause=200, last_reset=False),
             least_iterations=1,

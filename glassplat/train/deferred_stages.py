@@ -10,6 +10,7 @@ import torch
 from glassplat.data.backgrounds import BLACK
 from glassplat.data.dataset import Dataset
 from glassplat.losses.geometry import normal_consistency
+from glassplat.losses.monocular import MonocularNormals
 from glassplat.losses.reflectors import mean_strength, mean_tint, strength_outside
 from glassplat.losses.term import LossTerm, weighted
 from glassplat.render.deferred import INVISIBLE, Deferred
@@ -79,6 +80,7 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         LossTerm("strength", recipe.strength_weight, mean_strength),
         LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, mean_tint),
         LossTerm("consistency", recipe.consistency_weight, normal_consistency),
+        LossTerm("monocular normals", recipe.monocular_weight, MonocularNormals()),
     )
     reflection = Stage(
         name="2 reflection",

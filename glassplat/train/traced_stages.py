@@ -7,8 +7,6 @@ from dataclasses import replace
 from glassplat.data.backgrounds import BLACK
 from glassplat.data.dataset import Dataset
 from glassplat.init.points import as_discs
-from glassplat.losses.monocular import MonocularNormals
-from glassplat.losses.term import LossTerm, weighted
 from glassplat.render.deferred import Deferred
 from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene.scene import Scene
@@ -44,8 +42,6 @@ def stages_of(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHED_ITERA
         distant, refinement = _rendered(recipe, distant), _rendered(recipe, refinement)
     if recipe.consistency_to_end:
         refinement = replace(refinement, losses=distant.losses, renderer=distant.renderer)
-    guided = weighted(LossTerm("monocular normals", recipe.monocular_weight, MonocularNormals()))
-    distant, refinement = (replace(s, losses=(*s.losses, *guided)) for s in (distant, refinement))
     if recipe.mirrors == "environment":
         return bootstrap, distant, refinement
     entry = first_reflections(recipe.distant())
