@@ -429,3 +429,13 @@ def test_propagation_ends_in_runs_of_any_length(iterations: int) -> None:
 
 def test_the_recipe_survives_json() -> None:
     assert recipe_from_json(recipe_to_json(RECIPE)) == RECIPE
+
+
+@pytest.mark.parametrize("recipe", [DeferredRecipe(), TracedRecipe()], ids=["deferred", "traced"])
+def test_estimated_normals_count_from_when_things_reflect(recipe: DeferredRecipe | TracedRecipe) -> None:
+    def weights(one: DeferredRecipe | TracedRecipe) -> list[list[float]]:
+        terms = [stage.losses for stage in one.stages(0, 7000)]
+        return [[term.weight for term in losses if term.name == "monocular normals"] for losses in terms]
+
+    assert weights(recipe) == [[], [0.5], [0.5]]
+    assert weights(replace(recipe, monocular_weight=0.0)) == [[], [], []]
