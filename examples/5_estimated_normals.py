@@ -1,4 +1,4 @@
-"""Estimate normals from each photograph by itself, which `traced` learns shapes from where they lie beside it.
+"""Estimate normals from each photograph by itself, which `traced` and `deferred` learn shapes from.
 
 python examples/5_estimated_normals.py --data CAPTURE
 

@@ -102,7 +102,7 @@ def _without_search(recipe: TracedRecipe) -> TracedRecipe:
     return replace(recipe, search=replace(recipe.search, begin_found=False))
 
 
-def _without_estimated_normals(recipe: TracedRecipe) -> TracedRecipe:
+def _without_estimated_normals(recipe: Reflective) -> Reflective:
     return replace(recipe, monocular_weight=0.0, search=replace(recipe.search, estimated_normals=False))
 
 
@@ -137,6 +137,7 @@ DEFERRED: dict[Switch, Ablation] = {
     "propagation": Ablation("w/o normal propagation", _without_propagation, -5.81),
     "sabotage": Ablation("w/o colour sabotage", _without_sabotage, -3.66),
     "deferred-shading": Ablation("forward shading", lambda r: replace(r, shading="forward"), -6.02),
+    "monocular-normals": Ablation("w/o estimated normals", _without_estimated_normals),
     "coarse-to-fine": Ablation("w/o coarse-to-fine environment", lambda r: replace(r, first_texels=r.texels)),
     "tint": Ablation("with a strength for each of red, green and blue", lambda r: replace(r, tint=True)),
     "strength-price": Ablation("strength without a price (the paper's)", lambda r: replace(r, strength_weight=0.0)),
@@ -145,7 +146,7 @@ DEFERRED: dict[Switch, Ablation] = {
 
 TRACED: dict[Switch, Ablation] = {
     "joint": Ablation("w/o joint optimization", lambda r: replace(r, joint=False), -0.58),
-    "monocular-normals": Ablation("w/o mono normals", _without_estimated_normals, -0.51),
+    "monocular-normals": Ablation("w/o mono normals (in the paper, their loss)", _without_estimated_normals, -0.51),
     "surroundings": Ablation("w/ environment map alone", lambda r: replace(r, mirrors="environment"), -0.47),
     "sabotage": Ablation("w/o color sabotage", _without_sabotage, -0.35),
     "propagation": Ablation("w/o normal propagation", _without_propagation, -0.43),
