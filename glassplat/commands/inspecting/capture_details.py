@@ -9,6 +9,7 @@ from glassplat.commands.inspecting.finding import FEW_VIEWS, Finding
 from glassplat.data.capture_files import CaptureFiles
 from glassplat.data.dataset import Dataset, dataset_of, load_dataset
 from glassplat.data.errors import InputError
+from glassplat.data.normal_maps import normals_path
 from glassplat.init.plane_options import PlaneFit, PlaneFitError
 from glassplat.init.virtual_scene import virtual_points
 from glassplat.prepare.report_page import PAGE, write_page
@@ -60,6 +61,8 @@ def _marked(path: Path, dataset: Dataset) -> Finding:
     finding = Finding()
     if ignoring := sum(view.read_ignored is not None for view in (*dataset.train, *dataset.test)):
         finding.facts["ignored"] = f"parts of {ignoring} photographs, marked in ignore/"
+    if estimated := sum(normals_path(view.image_path) is not None for view in dataset.train):
+        finding.facts["normals"] = f"estimated for {estimated} training photographs; deferred and traced heed them"
     annotated = sum(view.is_annotated for view in dataset.train)
     if not dataset.pane_labels and dataset.planes is None:
         finding.facts["panes"] = "none marked"

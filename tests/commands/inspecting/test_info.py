@@ -47,6 +47,15 @@ def test_a_capture_without_masks_is_to_be_annotated(tmp_path: Path, capsys: pyte
     assert any("glassplat annotate" in line for line in found["next"])
 
 
+def test_estimated_normals_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture = shutil.copytree(SCENE, tmp_path / "capture", ignore=shutil.ignore_patterns("masks", "gt"))
+    (capture / "normals").mkdir()
+    for photograph in sorted((capture / "images").iterdir())[1:4]:
+        (capture / "normals" / photograph.with_suffix(".npy").name).touch()
+    assert "normals" not in told(SCENE, capsys)["facts"]
+    assert told(capture, capsys)["facts"]["normals"].startswith("estimated for 3 training photographs")
+
+
 def test_photographs_are_to_be_prepared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(SCENE / "images", tmp_path / "photographs")
     found = told(tmp_path / "photographs", capsys)
