@@ -17,9 +17,9 @@ from bench.kernels import HEIGHT, WIDTH
 from bench.scene import bench_camera, room
 from bench.timing import Work
 from glassplat.files.markdown_table import Table
-from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
-from glassplat.kernels.splats import Splats
+from glassplat.kernels.records import Splats
+from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.discs import blended_discs, projected_discs
 from glassplat.render.rasterize import joined_splats, project_gaussians
 from glassplat.scene.camera import Camera

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import torch
 
-from glassplat.kernels.devices import cuda_problem
+from glassplat.kernels.backend.devices import cuda_problem
 
 ROOT = Path(__file__).parent.parent
 COUNT = 560_000

@@ -11,7 +11,7 @@ import torch
 from numba import cuda
 
 from bench.gpu_roofline import Peaks
-from glassplat.kernels.cuda.launch import Kernel, kernel
+from glassplat.kernels.backend.cuda import Kernel, kernel
 
 THREADS, CHAINS, ROUNDS = 256, 8, 4096
 

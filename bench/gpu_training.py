@@ -14,7 +14,7 @@ from glassplat.commands.measuring.evaluation import evaluate_run
 from glassplat.commands.runs.stored_run import open_run
 from glassplat.commands.training.train import Train
 from glassplat.files.markdown_table import Table
-from glassplat.kernels.devices import DeviceName
+from glassplat.kernels.backend.devices import DeviceName
 from glassplat.train.planar_recipe import PlanarRecipe
 
 METRICS = ("psnr", "ssim", "lpips", "pane_psnr", "transmission_psnr", "reflection_psnr")

@@ -13,8 +13,7 @@ from bench.peak import peak_multiply_adds
 from bench.scene import bench_camera, room
 from bench.timing import Work, interleaved_seconds, median_seconds, paired_ratio
 from glassplat.files.markdown_table import Table
-from glassplat.kernels import bin_tiles as bin_tiles_module
-from glassplat.kernels.bin_tiles import bin_tiles
+from glassplat.kernels import tiles as bin_tiles_module
 from glassplat.kernels.composite import composite
 from glassplat.kernels.composite import reference as composite_twin
 from glassplat.kernels.composite.cpu import composite as blend_on_cpu
@@ -23,7 +22,8 @@ from glassplat.kernels.photometric import photometric
 from glassplat.kernels.photometric import reference as photometric_twin
 from glassplat.kernels.project import project
 from glassplat.kernels.project import reference as project_twin
-from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians, Splats, TileBins
+from glassplat.kernels.records import CameraBatch, Projected, RawGaussians, Splats, TileBins
+from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.rasterize import joined_splats
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians

@@ -13,8 +13,8 @@ from bench.scene import bench_camera, bench_scene, glossy_scene
 from bench.timing import Work, interleaved_seconds, median_seconds, paired_ratio
 from glassplat.data.dataset import View
 from glassplat.files.markdown_table import Table
-from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
+from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.deferred import INVISIBLE, Deferred
 from glassplat.render.frame import Renderer
 from glassplat.render.mirror_images import half_spaces_of

@@ -21,7 +21,7 @@ import torch
 from glassplat.commands.measuring.demo import SCENE
 from glassplat.data.dataset import load_dataset
 from glassplat.files.markdown_table import Table
-from glassplat.kernels.cpu.jit import Kernel
+from glassplat.kernels.backend.cpu import Kernel
 from glassplat.train.background import photo_background, settled
 from glassplat.train.messages import Message, StageEntered, StepDone
 from glassplat.train.recipe import RECIPES, recipe_of

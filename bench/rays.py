@@ -25,12 +25,9 @@ from bench.kernels import backward
 from bench.timing import Work
 from bench.twin import compiled_library
 from glassplat.files.markdown_table import Table
-from glassplat.kernels.build_bvh import build_bvh
-from glassplat.kernels.morton import morton_codes
-from glassplat.kernels.splats import RawGaussians
-from glassplat.kernels.trace import Bvh, Rays, cpu, trace
-from glassplat.kernels.trace.records import Shapes
-from glassplat.kernels.trace.shapes import reach, shapes_of
+from glassplat.kernels.records import Bvh, RawGaussians, Rays, Shapes
+from glassplat.kernels.trace import build_bvh, cpu, reach, shapes_of, trace
+from glassplat.kernels.trace.bvh import morton_codes
 
 SOURCE = Path(__file__).with_name("trace_embree.cpp")
 COUNTS = (10_000, 100_000, 300_000, 1_000_000)

@@ -21,7 +21,7 @@ from unittest import mock
 
 import numpy as np
 
-from glassplat.kernels.cuda.toolchain import has_library
+from glassplat.kernels.backend.devices import has_library
 from tools.machine_loops import Loops, loops_of
 
 CAPABILITIES = ((8, 0), (9, 0), (12, 0))

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from glassplat.densify.edit import Edit
-from glassplat.kernels.morton import morton_codes
+from glassplat.kernels.trace.bvh import morton_codes
 
 
 def in_morton_order(means: Tensor) -> Edit:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from glassplat.files.atomic import atomic_write
 from glassplat.files.images import read_image_float, write_image
-from glassplat.kernels.color_space import linear_from_srgb, srgb_from_linear
+from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
 
 EXR, PNG = ".exr", ".png"
 

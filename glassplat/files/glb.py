@@ -22,7 +22,7 @@ from glassplat.files.fields import Choice, Field, Optional, checked
 from glassplat.files.glb_container import NODE, PRIMITIVE, SCENE, GltfReader, GltfWriter
 from glassplat.files.glb_placement import Placement, placed, placement_of
 from glassplat.files.ply import CHANNEL_PREFIXES, is_channel
-from glassplat.kernels.color_space import linear_from_srgb
+from glassplat.kernels.maths.color import linear_from_srgb
 from glassplat.scene.activations import SH_ZERO
 from glassplat.scene.gaussians import DISC_SCALES, Gaussians
 

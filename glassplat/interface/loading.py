@@ -11,7 +11,7 @@ from glassplat.data.errors import InputError, input_checked
 from glassplat.files.cameras_json import read_cameras
 from glassplat.interface.imported_scene import imported_scene
 from glassplat.interface.model import Model, by_name
-from glassplat.kernels.devices import DeviceName, chosen_device
+from glassplat.kernels.backend.devices import DeviceName, chosen_device
 from glassplat.train.background import with_background
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.run_directory import RunDirectory

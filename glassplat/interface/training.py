@@ -10,7 +10,7 @@ from typing import Any
 from glassplat.data.dataset import Dataset
 from glassplat.data.errors import InputError
 from glassplat.interface.model import Model
-from glassplat.kernels.devices import DeviceName, chosen_device
+from glassplat.kernels.backend.devices import DeviceName, chosen_device
 from glassplat.train.background import settled
 from glassplat.train.messages import Message, Working
 from glassplat.train.recipe import RECIPES, Recipe

@@ -5,8 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from glassplat.kernels.maths.harmonics import check_sh_degree
-from glassplat.kernels.splats import CameraBatch, RawGaussians
-from glassplat.kernels.tensor_checks import check_tensors
+from glassplat.kernels.records import CameraBatch, RawGaussians, check_tensors
 
 
 def projection_inputs(

@@ -7,9 +7,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
-from glassplat.kernels.splats import Projected
+from glassplat.kernels.records import Projected
+from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.discs import blended_discs, projected_discs
 from glassplat.render.mirror_images import project_mirrored
 from glassplat.render.planar import detached

@@ -7,14 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.color_and_depth import mean_depth
 from glassplat.kernels.composite import composite
-from glassplat.kernels.cube_lookup import cube_lookup
-from glassplat.kernels.shade_environment import shade_environment
-from glassplat.kernels.shade_environment.shaded import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
-from glassplat.kernels.splats import Projected
-from glassplat.kernels.surface_channels import surface_channels
+from glassplat.kernels.environment import cube_lookup, shade_environment, surface_channels
+from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS, Projected
+from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.choices import Shading
 from glassplat.render.frame import Frame
 from glassplat.render.rasterize import (

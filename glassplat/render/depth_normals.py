@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from glassplat.kernels.pane_hits.reference import ray_grid
+from glassplat.kernels.panes.reference import ray_grid
 from glassplat.scene.camera import Camera
 
 CELLS_ACROSS = 32

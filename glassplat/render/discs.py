@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.color_and_depth import mean_depth
 from glassplat.kernels.composite_discs import BlendedDiscs, composite_discs
-from glassplat.kernels.discs import Discs, ProjectedDiscs
 from glassplat.kernels.project_discs import project_discs
+from glassplat.kernels.records import Discs, ProjectedDiscs
+from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.frame import ScreenPass
 from glassplat.render.rasterize import camera_batch, joined_probe, raw_gaussians
 from glassplat.scene.camera import Camera

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from glassplat.kernels.cube_lookup import cube_lookup
+from glassplat.kernels.environment import cube_lookup
 from glassplat.scene.environment import FACES, Environment
 
 COLOR_MARGIN = 1e-3

@@ -8,13 +8,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from glassplat.kernels.bin_tiles import TILE, bin_tiles
-from glassplat.kernels.blend_panes import blend_panes
-from glassplat.kernels.color_space import linear_from_srgb, srgb_from_linear
 from glassplat.kernels.composite import composite
 from glassplat.kernels.fresnel import Fresnel
-from glassplat.kernels.panes import BlendedPanes
-from glassplat.kernels.splats import Splats
+from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
+from glassplat.kernels.panes import blend_panes
+from glassplat.kernels.records import TILE, BlendedPanes, Splats
+from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.choices import Blend
 from glassplat.render.seen_panes import SeenPanes
 from glassplat.scene.camera import Camera

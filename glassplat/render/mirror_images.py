@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.project import GradientSum
-from glassplat.kernels.splats import Projected
+from glassplat.kernels.records import Projected
 from glassplat.render.rasterize import project_gaussians
 from glassplat.render.seen_panes import SeenPanes
 from glassplat.scene.camera import Camera

@@ -9,17 +9,15 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.color_and_depth import color_and_depth
 from glassplat.kernels.composite import composite
 from glassplat.kernels.fresnel import Fresnel
 from glassplat.kernels.join_channels import join_channels
 from glassplat.kernels.layer_slopes import layer_slopes, slopes_at
 from glassplat.kernels.pane_layers import pane_layers
-from glassplat.kernels.panes import PaneHits, Panes
 from glassplat.kernels.project import GradientSum
-from glassplat.kernels.shade_environment.shaded import SURFACE_CHANNELS
-from glassplat.kernels.splats import Deviation, Projected, Splats
+from glassplat.kernels.records import SURFACE_CHANNELS, Deviation, PaneHits, Panes, Projected, Splats
+from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.choices import Blend
 from glassplat.render.curved import (
     Shades,
@@ -120,7 +118,7 @@ class Planar:
     Attributes:
         background: colour behind everything, sRGB.
         fresnel: how R_k rises from R0 at normal incidence: as that of a pane with its two surfaces, by Schlick's curve
-            of one surface (Eq. 6), or not at all; see `glassplat.kernels.blend_panes`.
+            of one surface (Eq. 6), or not at all; see `glassplat.kernels.panes`.
         intensity: use the learned intensity a(u); False sets C_r = C_raw.
         reflection_gradient: what the reflection image's gradient reaches: everything, or the planes alone.
         deviation: also compute the depth deviation where a pane is hit (Eq. 14), for training.

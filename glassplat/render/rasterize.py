@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from glassplat.kernels.discs import ProjectedDiscs
 from glassplat.kernels.project import GradientSum, project
-from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians, Splats
+from glassplat.kernels.records import CameraBatch, Projected, ProjectedDiscs, RawGaussians, Splats
 from glassplat.render.frame import ScreenPass
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from glassplat.kernels.pane_hits import pane_hits
-from glassplat.kernels.panes import PaneHits, Panes
+from glassplat.kernels.panes import pane_hits
+from glassplat.kernels.records import PaneHits, Panes
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
-from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import composite
-from glassplat.kernels.shade_environment.shaded import NORMAL_AT, STRENGTH_AT
-from glassplat.kernels.surface_channels import surface_channels
+from glassplat.kernels.environment import surface_channels
+from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT
+from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.frame import Frame, Renderer
 from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, project_gaussians
 from glassplat.scene.camera import Camera

@@ -8,13 +8,12 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.color_and_depth import mean_depth
 from glassplat.kernels.composite import composite
-from glassplat.kernels.pane_hits.reference import ray_grid
-from glassplat.kernels.shade_environment.shaded import NORMAL_AT, NORMAL_MIN, STRENGTH_AT, SURFACE_CHANNELS
-from glassplat.kernels.splats import Projected
-from glassplat.kernels.surface_channels import surface_channels
+from glassplat.kernels.environment import surface_channels
+from glassplat.kernels.panes.reference import ray_grid
+from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, STRENGTH_AT, SURFACE_CHANNELS, Projected
+from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.discs import blended_discs, disc_layers, projected_discs
 from glassplat.render.frame import ScreenPass
 from glassplat.render.rasterize import (

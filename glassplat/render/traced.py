@@ -8,12 +8,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from glassplat.kernels.build_bvh import build_bvh
-from glassplat.kernels.cube_lookup import cube_lookup
-from glassplat.kernels.splats import RawGaussians
-from glassplat.kernels.trace import Rays, trace
-from glassplat.kernels.trace.records import Traced as Found
-from glassplat.kernels.trace.shapes import FLAT, shapes_of
+from glassplat.kernels.environment import cube_lookup
+from glassplat.kernels.records import FLAT, RawGaussians, Rays
+from glassplat.kernels.records import Traced as Found
+from glassplat.kernels.trace import build_bvh, shapes_of, trace
 from glassplat.render.deferred import INVISIBLE
 from glassplat.render.frame import Frame, SpacePass
 from glassplat.render.rasterize import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from glassplat.kernels.splats import Projected
+from glassplat.kernels.records import Projected
 from glassplat.render.seen_panes import SeenPanes, panes_in_camera
 from glassplat.scene.camera import Camera
 from glassplat.scene.uneven import slopes_at

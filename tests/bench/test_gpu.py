@@ -17,7 +17,7 @@ import torch
 from bench import gpu
 from bench.gpu_roofline import Counts, Peaks, backward_demand, forward_demand
 from bench.gpu_training import beside_the_cpu
-from glassplat.kernels.devices import SIMULATED
+from glassplat.kernels.backend.devices import SIMULATED
 
 ROOT = Path(__file__).parents[2]
 WITHOUT_NUMBA_CUDA = """

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 
 from bench.parts import BEFORE, BETWEEN, STEPS, TOTAL, costs_of, parts_table
-from glassplat.kernels.cpu.jit import Kernel
+from glassplat.kernels.backend.cpu import Kernel
 from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone, Working
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from glassplat.densify.order import in_morton_order
-from glassplat.kernels.morton import BITS, morton_codes
+from glassplat.kernels.trace.bvh import BITS, morton_codes
 
 
 def test_the_corners_of_a_cube_come_in_the_order_of_the_curve() -> None:

@@ -20,7 +20,7 @@ from glassplat.densify.outlines import (
     reflection_error,
     surface_gaussians,
 )
-from glassplat.kernels.surface_channels import surface_channels
+from glassplat.kernels.environment import surface_channels
 from glassplat.render.planar import Planar
 from glassplat.render.traced import traced_colors
 from glassplat.scene.camera import Camera

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from glassplat.files.environment_image import read_equirect, write_equirect
-from glassplat.kernels.color_space import linear_from_srgb
+from glassplat.kernels.maths.color import linear_from_srgb
 
 
 def panorama(height: int = 6) -> torch.Tensor:

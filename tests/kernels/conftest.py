@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.splats import Splats
+from glassplat.kernels.records import Splats
 
 MakeSplats = Callable[..., Splats]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians, Splats
+from glassplat.kernels.records import CameraBatch, Projected, RawGaussians, Splats
 
 WIDTH, HEIGHT = 44, 36
 

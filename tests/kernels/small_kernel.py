@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 FORMULA = """
-from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.backend.cpu import inlined
 
 OFFSET = 0
 
@@ -29,7 +29,7 @@ import sys
 
 import numpy as np
 
-from glassplat.kernels.cpu.jit import kernel
+from glassplat.kernels.backend.cpu import kernel
 
 from formula import scaling
 

@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.bin_tiles import TILE, bin_tiles, tile_grid
-from glassplat.kernels.bin_tiles.reference import bin_tiles as reference_bin_tiles
 from glassplat.kernels.project import project
-from glassplat.kernels.splats import Splats, TileBins
+from glassplat.kernels.records import TILE, Splats, TileBins
+from glassplat.kernels.tiles import bin_tiles, tile_grid
+from glassplat.kernels.tiles.reference import bin_tiles as reference_bin_tiles
 from tests.kernels.gaussians_and_cameras import HEIGHT, WIDTH, as_splats, draw, random_cameras, random_gaussians
 
 

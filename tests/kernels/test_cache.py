@@ -9,7 +9,7 @@ from typing import Any
 import numba
 import pytest
 
-from glassplat.kernels.cpu.cache import fingerprint
+from glassplat.kernels.backend.cpu_cache import fingerprint
 from tests.kernels.small_kernel import FORMULA, SMALL_KERNEL, printed_by
 
 OPERATIONS = """
@@ -18,19 +18,19 @@ import gc
 import torch
 
 from glassplat.kernels.adam import Update, adam
-from glassplat.kernels.bin_tiles import bin_tiles
-from glassplat.kernels.blend_panes import blend_panes
+from glassplat.kernels.tiles import bin_tiles
+from glassplat.kernels.panes import blend_panes
 from glassplat.kernels.composite import composite
-from glassplat.kernels.cpu.jit import Kernel
-from glassplat.kernels.cube_lookup import cube_lookup
+from glassplat.kernels.backend.cpu import Kernel
+from glassplat.kernels.environment import cube_lookup
 from glassplat.kernels.gradient_conflict import gradient_conflict
-from glassplat.kernels.pane_hits import pane_hits
-from glassplat.kernels.panes import Panes
+from glassplat.kernels.panes import pane_hits
+from glassplat.kernels.records import Panes
 from glassplat.kernels.project import project
-from glassplat.kernels.shade_environment import shade_environment
-from glassplat.kernels.splats import CameraBatch, Deviation, RawGaussians, Splats
+from glassplat.kernels.environment import shade_environment
+from glassplat.kernels.records import CameraBatch, Deviation, RawGaussians, Splats
 from glassplat.kernels.photometric import photometric
-from glassplat.kernels.surface_channels import surface_channels
+from glassplat.kernels.environment import surface_channels
 
 means = torch.tensor([[0.0, 0.0, 2.0], [0.1, 0.0, 3.0]])
 raw = RawGaussians(means, torch.randn(2, 4), torch.full((2, 3), -2.0), torch.zeros(2), torch.zeros(2, 1, 3))
@@ -193,7 +193,7 @@ def test_whatever_a_kernel_is_made_from_changes_its_fingerprint(old: str, new: s
 
 VECTOR_SOURCE = """
 import numpy as np
-from glassplat.kernels.cpu.vector import constant, store, vector_kind
+from glassplat.kernels.backend.cpu_vector import constant, store, vector_kind
 
 def factory(real, lanes):
     load, offsets = vector_kind(real, lanes).load, constant(real, (1.0,) * lanes)

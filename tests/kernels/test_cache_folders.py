@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 from numba.core.caching import IndexDataCacheFile
 
-from glassplat.kernels.cpu import cache_folders
+from glassplat.kernels.backend import cpu_cache as cache_folders
 
 KERNEL = """
-from glassplat.kernels.cpu.jit import kernel
+from glassplat.kernels.backend.cpu import kernel
 
 def made(real):
     @kernel("scale", real, parallel=False)

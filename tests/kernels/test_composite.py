@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.bin_tiles import bin_tiles
 from glassplat.kernels.composite import Composite, composite
 from glassplat.kernels.composite.reference import composite as composite_twin
-from glassplat.kernels.splats import Deviation, Splats, TileBins
+from glassplat.kernels.records import Deviation, Splats, TileBins
+from glassplat.kernels.tiles import bin_tiles
 
 MakeSplats = Callable[..., Splats]
 INPUTS = ("means2d", "conics", "opacities", "channels", "marks", "probe")

@@ -11,17 +11,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.bin_tiles import bin_tiles
-from glassplat.kernels.build_bvh import build_bvh
 from glassplat.kernels.composite_discs import BlendedDiscs, composite_discs
 from glassplat.kernels.composite_discs.reference import composite_discs as twin
-from glassplat.kernels.discs import Discs, ProjectedDiscs
 from glassplat.kernels.maths.disc import LOW_PASS
-from glassplat.kernels.pane_hits.reference import ray_grid
+from glassplat.kernels.panes.reference import ray_grid
 from glassplat.kernels.project_discs import project_discs
-from glassplat.kernels.splats import CameraBatch, RawGaussians, TileBins
-from glassplat.kernels.trace import Rays, trace
-from glassplat.kernels.trace.shapes import shapes_of
+from glassplat.kernels.records import CameraBatch, Discs, ProjectedDiscs, RawGaussians, Rays, TileBins
+from glassplat.kernels.tiles import bin_tiles
+from glassplat.kernels.trace import build_bvh, shapes_of, trace
 from tests.kernels.gaussians_and_cameras import draw
 
 NEAR = 0.3

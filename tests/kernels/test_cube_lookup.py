@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.cube_lookup import cube_lookup
-from glassplat.kernels.cube_lookup.reference import cube_lookup as twin
+from glassplat.kernels.environment import cube_lookup
+from glassplat.kernels.environment.reference import cube_lookup as twin
 
 EDGES = [d for d in itertools.product((-1, 0, 1), repeat=3) if d.count(0) == 1]
 CORNERS = list(itertools.product((-1, 1), repeat=3))

@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.kernels import devices
-from glassplat.kernels.cuda import toolchain
-from glassplat.kernels.devices import CudaUnavailableError, chosen_device, cuda_problem, kernels_for
+from glassplat.kernels.backend import devices
+from glassplat.kernels.backend.devices import CudaUnavailableError, chosen_device, cuda_problem, kernels_for
 
 
 @pytest.fixture
@@ -25,8 +24,8 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "A GPU")
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     for name, value in {"has_numba_cuda": True, "bindings_major": 13, "driver_version": 13000}.items():
-        monkeypatch.setattr(toolchain, name, lambda value=value: value)
-    monkeypatch.setattr(toolchain, "has_library", lambda name: True)
+        monkeypatch.setattr(devices, name, lambda value=value: value)
+    monkeypatch.setattr(devices, "has_library", lambda name: True)
     return monkeypatch
 
 
@@ -66,7 +65,7 @@ def test_a_driver_that_is_too_old_is_explained(gpu: pytest.MonkeyPatch) -> None:
 
 
 def test_missing_kernels_are_explained(gpu: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    gpu.setattr(toolchain, "has_numba_cuda", lambda: False)
+    gpu.setattr(devices, "has_numba_cuda", lambda: False)
     with pytest.raises(CudaUnavailableError, match=r"pip install 'glassplat\[cuda\]'"):
         chosen_device("cuda")
     with caplog.at_level(logging.INFO):
@@ -82,7 +81,7 @@ def test_a_gpu_that_is_too_old_is_explained(gpu: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("driver", [13000, 13040, 14010])
 def test_a_driver_of_the_compilers_version_or_newer_will_do(gpu: pytest.MonkeyPatch, driver: int) -> None:
-    gpu.setattr(toolchain, "driver_version", lambda: driver)
+    gpu.setattr(devices, "driver_version", lambda: driver)
     assert cuda_problem() is None
 
 
@@ -90,14 +89,14 @@ def test_a_compiler_newer_than_the_driver_is_explained(
     gpu: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     gpu.setattr(torch.version, "cuda", "12.8")
-    gpu.setattr(toolchain, "driver_version", lambda: 12040)
+    gpu.setattr(devices, "driver_version", lambda: 12040)
     with pytest.raises(CudaUnavailableError, match=r"knows CUDA 12\.4, but the kernels' compiler is that of CUDA 13"):
         chosen_device("cuda")
     assert "pip install 'glassplat[cuda12]'" in str(cuda_problem())
     with caplog.at_level(logging.INFO):
         assert chosen_device("auto") == torch.device("cpu")
     assert "the NVIDIA driver knows CUDA 12.4" in caplog.text
-    gpu.setattr(toolchain, "bindings_major", lambda: 12)
+    gpu.setattr(devices, "bindings_major", lambda: 12)
     assert cuda_problem() is None
 
 
@@ -106,22 +105,22 @@ def test_a_compiler_newer_than_the_driver_is_explained(
 def test_a_library_that_the_compiler_lacks_is_named(
     gpu: pytest.MonkeyPatch, absent: str, major: int, extra: str
 ) -> None:
-    gpu.setattr(toolchain, "bindings_major", lambda: major)
-    gpu.setattr(toolchain, "has_library", lambda name: name != absent)
+    gpu.setattr(devices, "bindings_major", lambda: major)
+    gpu.setattr(devices, "has_library", lambda name: name != absent)
     problem = str(cuda_problem())
     assert f"the kernels' compiler lacks lib{absent}; " in problem
     assert f"pip install '{extra}'" in problem
 
 
 def test_missing_bindings_are_explained(gpu: pytest.MonkeyPatch) -> None:
-    gpu.setattr(toolchain, "bindings_major", lambda: None)
+    gpu.setattr(devices, "bindings_major", lambda: None)
     assert "not cuda-bindings" in str(cuda_problem())
 
 
 @pytest.mark.skipif(importlib.util.find_spec("numba_cuda") is None, reason="numba-cuda is not installed")
 def test_what_is_installed_is_seen() -> None:
-    assert toolchain.bindings_major() in (12, 13)
-    assert not toolchain.has_library("nvfatbin") or toolchain.has_library("nvvm")
+    assert devices.bindings_major() in (12, 13)
+    assert not devices.has_library("nvfatbin") or devices.has_library("nvvm")
 
 
 def test_the_extras_are_bounded_and_pair_each_pytorch_with_its_cuda() -> None:
@@ -145,23 +144,26 @@ def test_tensors_on_a_gpu_without_its_kernels_are_refused(monkeypatch: pytest.Mo
 
 @pytest.mark.skipif(importlib.util.find_spec("numba_cuda") is None, reason="numba-cuda is not installed")
 @pytest.mark.parametrize(
-    "name",
+    "operation",
     [
-        "adam",
-        "bin_tiles",
-        "blend_panes",
-        "composite",
-        "cube_lookup",
-        "pane_hits",
-        "photometric",
-        "project",
-        "shade_environment",
-        "surface_channels",
+        "adam.adam",
+        "composite.composite",
+        "environment.cube_lookup",
+        "environment.shade_environment",
+        "environment.surface_channels",
+        "panes.blend_panes",
+        "panes.pane_hits",
+        "photometric.photometric",
+        "project.project",
+        "tiles.bin_tiles",
+        "trace.build_bvh",
+        "trace.trace",
     ],
 )
-def test_every_operation_has_the_same_functions_on_both_devices(name: str) -> None:
-    cpu, cuda = (kernels_for(name, torch.device(kind)) for kind in ("cpu", "cuda"))
-    own = {key for key, value in vars(cpu).items() if getattr(value, "__module__", "") == cpu.__name__}
+def test_every_operation_has_the_same_functions_on_both_devices(operation: str) -> None:
+    folder, _, name = operation.partition(".")
+    cpu, cuda = (kernels_for(folder, torch.device(kind)) for kind in ("cpu", "cuda"))
+    own = {key for key, value in vars(cpu).items() if getattr(value, "__module__", "").startswith(cpu.__package__)}
     shared = {key for key in own if key == name or key in (f"{name}_gradient", f"{name}_gradients")}
     assert name in shared
     assert all(hasattr(cuda, key) for key in shared)

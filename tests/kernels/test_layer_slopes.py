@@ -7,10 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.color_space import linear_from_srgb, srgb_from_linear
 from glassplat.kernels.layer_slopes import layer_slopes, slopes_at
 from glassplat.kernels.layer_slopes.reference import layer_slopes as reference_layer_slopes
 from glassplat.kernels.layer_slopes.reference import slopes_at as reference_slopes_at
+from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
 
 
 def grey_layers(height: int = 5, width: int = 7) -> tuple[Tensor, Tensor, Tensor]:

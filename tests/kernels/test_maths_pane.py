@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.blend_panes import blend_panes
-from glassplat.kernels.blend_panes.reference import two_surfaces
 from glassplat.kernels.fresnel import Fresnel
 from glassplat.kernels.maths.pane import LAWS
+from glassplat.kernels.panes import blend_panes
+from glassplat.kernels.panes.reference import two_surfaces
 
 BASES = (1e-6, 1e-4, 1e-2, 0.077, 0.3, 0.7, 0.9, 0.99, 0.999)
 COSINES = (1e-4, 1e-3, 0.01, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 0.999)

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from glassplat.kernels.cpu.memory import CHOSEN_BY_USER, keep_freed_memory
+from glassplat.kernels.backend.cpu import CHOSEN_BY_USER, keep_freed_memory
 
 ROUNDS = """
 import resource, numpy
@@ -41,7 +41,7 @@ def pages_again(prepare: str, **environment: str) -> int:
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
 def test_freed_memory_is_used_again() -> None:
-    kept = "from glassplat.kernels.cpu import jit"
+    kept = "from glassplat.kernels.backend import cpu"
     assert pages_again(kept) < PAGES / 20
     assert pages_again("") > PAGES / 2
     assert pages_again(kept, MALLOC_TRIM_THRESHOLD_="1000000") > PAGES / 2

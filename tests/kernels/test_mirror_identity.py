@@ -8,7 +8,7 @@ from torch import Tensor
 
 from glassplat.kernels.project import project
 from glassplat.kernels.project.reference import sh_basis
-from glassplat.kernels.splats import CameraBatch, RawGaussians
+from glassplat.kernels.records import CameraBatch, RawGaussians
 from tests.kernels.gaussians_and_cameras import draw, random_cameras, random_gaussians
 
 NEAR = 0.1

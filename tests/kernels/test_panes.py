@@ -10,13 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.blend_panes import blend_panes
-from glassplat.kernels.blend_panes.reference import blend_panes as blend_twin
 from glassplat.kernels.fresnel import Fresnel
 from glassplat.kernels.maths.pane import LAWS
-from glassplat.kernels.pane_hits import pane_hits
-from glassplat.kernels.pane_hits.reference import pane_hits as hits_twin
-from glassplat.kernels.panes import BlendedPanes, PaneHits, Panes
+from glassplat.kernels.panes import blend_panes, pane_hits
+from glassplat.kernels.panes.reference import blend_panes as blend_twin
+from glassplat.kernels.panes.reference import pane_hits as hits_twin
+from glassplat.kernels.records import BlendedPanes, PaneHits, Panes
 
 WIDTH, HEIGHT = 53, 37
 INPUTS = ("transmission", "mask", "reflections", "normals", "base_reflectances")

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from glassplat.kernels.project import GradientSum, project
 from glassplat.kernels.project.reference import project as reference_project
-from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians
+from glassplat.kernels.records import CameraBatch, Projected, RawGaussians
 from tests.kernels.gaussians_and_cameras import HEIGHT, WIDTH, draw, random_cameras, random_gaussians
 
 NEAR = 0.2

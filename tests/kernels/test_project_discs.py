@@ -9,10 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.discs import ProjectedDiscs
 from glassplat.kernels.project_discs import project_discs
 from glassplat.kernels.project_discs.reference import project_discs as twin
-from glassplat.kernels.splats import CameraBatch, RawGaussians
+from glassplat.kernels.records import CameraBatch, ProjectedDiscs, RawGaussians
 from tests.kernels.gaussians_and_cameras import HEIGHT, WIDTH, draw, random_cameras, random_gaussians
 
 NEAR = 0.2

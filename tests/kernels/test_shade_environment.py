@@ -9,10 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.cube_lookup import cube_lookup
-from glassplat.kernels.shade_environment import shade_environment
-from glassplat.kernels.shade_environment.reference import shade_environment as twin
-from glassplat.kernels.shade_environment.shaded import NORMAL_MIN, Shaded
+from glassplat.kernels.environment import cube_lookup, shade_environment
+from glassplat.kernels.environment.reference import shade_environment as twin
+from glassplat.kernels.records import NORMAL_MIN, Shaded
 
 INPUTS = ("blended", "alpha", "texels", "world_from_cam")
 WIDTH, HEIGHT = 29, 23

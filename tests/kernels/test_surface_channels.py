@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.shade_environment.shaded import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
-from glassplat.kernels.surface_channels import surface_channels
-from glassplat.kernels.surface_channels.reference import surface_channels as twin
+from glassplat.kernels.environment import surface_channels
+from glassplat.kernels.environment.reference import surface_channels as twin
+from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
 
 COLORS, RADII, QUATS, LOG_SCALES, MEANS, STRENGTHS, EYE, EXTRA = range(8)
 DIFFERENTIABLE = (COLORS, QUATS, STRENGTHS, EXTRA)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from glassplat.kernels.cpu import threads
+from glassplat.kernels.backend import cpu as threads
 
 PARALLEL_KERNEL = """
 import logging
@@ -21,7 +21,7 @@ import threading
 import numba
 import numpy as np
 
-from glassplat.kernels.cpu.jit import kernel
+from glassplat.kernels.backend.cpu import kernel
 
 logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
 

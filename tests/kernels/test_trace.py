@@ -10,12 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.build_bvh import build_bvh
-from glassplat.kernels.build_bvh.hilbert import hilbert_codes
-from glassplat.kernels.splats import RawGaussians
-from glassplat.kernels.trace import Bvh, Rays, Traced, trace
+from glassplat.kernels.records import Bvh, RawGaussians, Rays, Traced
+from glassplat.kernels.trace import build_bvh, shapes_of, trace
+from glassplat.kernels.trace.bvh import hilbert_codes
 from glassplat.kernels.trace.reference import trace as twin
-from glassplat.kernels.trace.shapes import shapes_of
 
 DISCS, ELLIPSOIDS = 2, 3
 DTYPES = [(torch.float32, 1e-4), (torch.float64, 1e-11)]

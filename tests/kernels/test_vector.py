@@ -9,10 +9,19 @@ import pytest
 from numba.core.errors import TypingError
 from numpy.typing import NDArray
 
-from glassplat.kernels.cpu import vector
-from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
-from glassplat.kernels.cpu.pixel_rows import ROW, interleaved, sorted_apart, with_fourths, without_fourths
-from glassplat.kernels.cpu.vector import constant, item, store, vector_kind
+from glassplat.kernels.backend import cpu_vector as vector
+from glassplat.kernels.backend.cpu import Kernel, inlined, kernel
+from glassplat.kernels.backend.cpu_vector import (
+    ROW,
+    constant,
+    interleaved,
+    item,
+    sorted_apart,
+    store,
+    vector_kind,
+    with_fourths,
+    without_fourths,
+)
 
 REALS = [np.float32, np.float64]
 LANES = [4, 8, 16]

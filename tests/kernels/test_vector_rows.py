@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from glassplat.kernels.cpu.jit import Kernel, kernel
-from glassplat.kernels.cpu.vector import store, vector_kind
-from glassplat.kernels.cpu.vector_rows import row_loader, store_all, thirds, transposed, triples
+from glassplat.kernels.backend.cpu import Kernel, kernel
+from glassplat.kernels.backend.cpu_vector import row_loader, store, store_all, thirds, transposed, triples, vector_kind
 
 kinds = pytest.mark.parametrize(
     ("real", "lanes"), [(real, lanes) for real in (np.float32, np.float64) for lanes in (4, 16)]

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from glassplat.kernels.cube_lookup.reference import cube_lookup
+from glassplat.kernels.environment.reference import cube_lookup
 from glassplat.render.choices import Shading
 from glassplat.render.deferred import Deferred, view_directions
 from glassplat.render.splat import Splat

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from glassplat.kernels.color_space import linear_from_srgb, srgb_from_linear
+from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
 from glassplat.render.choices import Blend
 from glassplat.render.dereflect import as_mirror_image, dereflected_photo
 from glassplat.render.frame import Frame

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.cube_lookup import cube_lookup
+from glassplat.kernels.environment import cube_lookup
 from glassplat.render.environment import (
     environment_from_equirect,
     equirect_from_environment,

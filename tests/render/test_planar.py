@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from glassplat.kernels.blend_panes.reference import REFLECTANCE
-from glassplat.kernels.color_space import linear_from_srgb
 from glassplat.kernels.fresnel import Fresnel
+from glassplat.kernels.maths.color import linear_from_srgb
 from glassplat.kernels.maths.pane import LAWS
+from glassplat.kernels.panes.reference import REFLECTANCE
 from glassplat.render.choices import Blend
 from glassplat.render.planar import Planar, detached
 from glassplat.render.splat import Splat

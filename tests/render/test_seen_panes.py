@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.color_space import linear_from_srgb
+from glassplat.kernels.maths.color import linear_from_srgb
 from glassplat.losses.reflection import gradient_conflict
 from glassplat.render.choices import Blend
 from glassplat.render.contribution import contributions

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.splats import Projected
+from glassplat.kernels.records import Projected
 from glassplat.render.planar import Planar
 from glassplat.render.seen_panes import SeenPanes, nearest_hits, panes_in_camera, seen_panes
 from glassplat.render.uneven_glass import in_uneven_glass

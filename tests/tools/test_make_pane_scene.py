@@ -15,9 +15,8 @@ from glassplat.data.dataset import load_dataset
 from glassplat.evaluate.surface_truth import true_surface
 from glassplat.evaluate.truth import load_truth
 from glassplat.files.images import read_image
-from glassplat.kernels.blend_panes.reference import two_surfaces
-from glassplat.kernels.pane_hits.reference import pane_hits
-from glassplat.kernels.panes import Panes
+from glassplat.kernels.panes.reference import pane_hits, two_surfaces
+from glassplat.kernels.records import Panes
 from tools.make_pane_scene import Arguments, main, make_place, with_glass
 from tools.pane_tracer import Ball, Box, Carried, Place, Silver
 from tools.photographer_body import passer_by, photographer, upright_frame

@@ -15,7 +15,7 @@ import torch
 from glassplat import cli
 from glassplat.commands.measuring.demo import SCENE
 from glassplat.densify.options import DefaultDensify, McmcDensify
-from glassplat.kernels.color_space import linear_from_srgb
+from glassplat.kernels.maths.color import linear_from_srgb
 from glassplat.render.planar import Planar
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, Explore, PerturbOpacity, Relocate, ResetOpacity

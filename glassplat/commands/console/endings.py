@@ -16,7 +16,7 @@ from glassplat import __version__
 from glassplat.data.errors import InputError
 
 BAD_INPUT_CODE, FAILURE_CODE = 2, 1
-BAD_INPUT = ("glassplat.init.plane_options.PlaneFitError", "glassplat.kernels.devices.CudaUnavailableError")
+BAD_INPUT = ("glassplat.init.plane_options.PlaneFitError", "glassplat.kernels.backend.devices.CudaUnavailableError")
 FAILURES = ("glassplat.train.trainer.TrainingDivergedError",)
 GPU_IS_FULL = ("torch.OutOfMemoryError",)
 """By name: this module is loaded before PyTorch, and also where PyTorch is what cannot be loaded."""

@@ -15,7 +15,7 @@ from glassplat.commands.runs.scene_edits import SceneEdits
 from glassplat.commands.runs.scene_place import say_scene
 from glassplat.commands.runs.splits import Split
 from glassplat.interface.layers import Layer
-from glassplat.kernels.devices import DeviceName
+from glassplat.kernels.backend.devices import DeviceName
 from glassplat.train.run_directory import RunDirectory
 
 

@@ -16,7 +16,7 @@ from glassplat.commands.runs.scene_place import check_file, check_scene, say_sce
 from glassplat.data.errors import InputError, input_checked
 from glassplat.data.ranges import Range
 from glassplat.interface.layers import Layer
-from glassplat.kernels.devices import DeviceName
+from glassplat.kernels.backend.devices import DeviceName
 from glassplat.publish.film import check_encoder
 from glassplat.publish.kept_pictures import KeptPictures
 

@@ -14,7 +14,7 @@ from glassplat.commands.runs.scene_edits import SceneEdits
 from glassplat.commands.runs.scene_place import check_scene, say_scene
 from glassplat.data.ranges import Range
 from glassplat.files.folders import check_folder
-from glassplat.kernels.devices import DeviceName
+from glassplat.kernels.backend.devices import DeviceName
 from glassplat.viewer.ports import LOCAL, check_port
 
 

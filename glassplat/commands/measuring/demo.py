@@ -15,7 +15,7 @@ from glassplat.commands.training.train import Train
 from glassplat.data.errors import InputError
 from glassplat.data.ranges import Seed, Several
 from glassplat.files.folders import check_folder
-from glassplat.kernels.devices import DeviceName
+from glassplat.kernels.backend.devices import DeviceName
 from glassplat.train.planar_recipe import PlanarRecipe
 from glassplat.train.run_directory import RunDirectory
 from glassplat.train.splat_recipe import SplatRecipe

@@ -12,7 +12,7 @@ from rich.console import Console
 from glassplat.commands.console.importing import import_now
 from glassplat.commands.console.messages import say
 from glassplat.commands.runs.scene_place import say_scene
-from glassplat.kernels.devices import DeviceName
+from glassplat.kernels.backend.devices import DeviceName
 from glassplat.train.run_directory import RunDirectory
 
 PaneSource = Literal["auto", "truth", "masks", "rendered"]

@@ -13,7 +13,7 @@ from glassplat.commands.console.importing import import_now
 from glassplat.commands.runs.output_folder import check_claim
 from glassplat.commands.runs.scene_place import say_scene
 from glassplat.commands.runs.splits import Split
-from glassplat.kernels.devices import DeviceName
+from glassplat.kernels.backend.devices import DeviceName
 from glassplat.train.run_directory import RunDirectory
 
 

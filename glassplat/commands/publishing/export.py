@@ -14,7 +14,7 @@ from glassplat.commands.runs.output_folder import check_claim
 from glassplat.commands.runs.scene_edits import SceneEdits
 from glassplat.commands.runs.scene_place import check_scene, say_scene
 from glassplat.data.errors import InputError
-from glassplat.kernels.devices import DeviceName
+from glassplat.kernels.backend.devices import DeviceName
 
 Format = Literal["ply", "spz", "glb", "html"]
 

@@ -15,7 +15,7 @@ from glassplat.data.errors import InputError, first_names, input_checked
 from glassplat.data.point_cloud import PointCloud
 from glassplat.files.cameras_json import read_cameras
 from glassplat.files.picture_paths import picture_paths
-from glassplat.kernels.devices import DeviceName, chosen_device
+from glassplat.kernels.backend.devices import DeviceName, chosen_device
 from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
 from glassplat.train.background import photo_background, settled

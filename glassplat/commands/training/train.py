@@ -15,7 +15,7 @@ from glassplat.commands.console.messages import message_console, say
 from glassplat.data.capture_files import CaptureFiles, read_capture
 from glassplat.data.masks import Polarity
 from glassplat.data.ranges import Downscale, Positive, Seed, Several
-from glassplat.kernels.devices import DeviceName, chosen_device
+from glassplat.kernels.backend.devices import DeviceName, chosen_device
 from glassplat.train.recipe import Preset, Recipe
 from glassplat.train.run_directory import CHECKPOINT_SECONDS, RunDirectory, RunSettings, check_output
 

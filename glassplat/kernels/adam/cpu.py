@@ -10,10 +10,9 @@ import numpy as np
 from numba import prange
 from torch import Tensor
 
-from glassplat.kernels.adam.update import Update
-from glassplat.kernels.cpu.addresses import array_at
-from glassplat.kernels.cpu.jit import Kernel, kernel
-from glassplat.kernels.tensor_checks import REAL_OF
+from glassplat.kernels.adam import Update
+from glassplat.kernels.backend.cpu import Kernel, array_at, kernel
+from glassplat.kernels.records import REAL_OF
 
 BLOCK = 4096
 """Elements per task, about: whole rows of a tensor whose columns have rates of their own."""

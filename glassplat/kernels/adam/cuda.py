@@ -10,9 +10,9 @@ import torch
 from numba import cuda
 from torch import Tensor
 
-from glassplat.kernels.adam.update import Update
-from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
-from glassplat.kernels.tensor_checks import REAL_OF
+from glassplat.kernels.adam import Update
+from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
+from glassplat.kernels.records import REAL_OF
 
 THREADS = 256
 

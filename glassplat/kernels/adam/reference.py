@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from glassplat.kernels.adam.update import Update
+from glassplat.kernels.adam import Update
 
 
 @torch.no_grad()

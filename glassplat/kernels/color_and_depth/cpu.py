@@ -6,8 +6,8 @@ from functools import cache
 
 from numba import prange
 
-from glassplat.kernels.cpu.jit import Kernel, kernel
-from glassplat.kernels.splats import LEAST_ALPHA
+from glassplat.kernels.backend.cpu import Kernel, kernel
+from glassplat.kernels.records import LEAST_ALPHA
 
 
 @cache

@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.color_and_depth import reference as reference
 from glassplat.kernels.color_and_depth.cpu import color_and_depth_backward, color_and_depth_forward
-from glassplat.kernels.tensor_checks import REAL_OF, check_tensors
+from glassplat.kernels.records import REAL_OF, check_tensors
 
 CHANNELS = 4
 

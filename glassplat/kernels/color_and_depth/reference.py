@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from glassplat.kernels.splats import LEAST_ALPHA
+from glassplat.kernels.records import LEAST_ALPHA
 
 
 def color_and_depth(image: Tensor, alpha: Tensor, background: tuple[float, ...]) -> tuple[Tensor, Tensor]:

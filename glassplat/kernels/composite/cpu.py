@@ -14,7 +14,7 @@ from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.composite.cpu_backward import composite_backward
 from glassplat.kernels.composite.cpu_forward import composite_forward
 from glassplat.kernels.composite.cpu_pair_rows import new_pair_rows, sum_pair_rows
-from glassplat.kernels.splats import Deviation, Splats, TileBins
+from glassplat.kernels.records import Deviation, Splats, TileBins
 
 
 class Saved(NamedTuple):

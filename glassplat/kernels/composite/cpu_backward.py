@@ -14,25 +14,25 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from glassplat.kernels.composite import cpu_tile as tile
-from glassplat.kernels.composite.cpu_pair_rows import PAIR_VALUES
-from glassplat.kernels.composite.cpu_tile import exponent, lane_of
-from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
-from glassplat.kernels.cpu.pixel_rows import sorted_apart, with_fourths
-from glassplat.kernels.cpu.schedule import even_stride
-from glassplat.kernels.cpu.vector import (
+from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
+from glassplat.kernels.backend.cpu_vector import (
     absolute,
     item,
     lowest_bit,
     maximum,
     minimum,
     select,
+    sorted_apart,
     store,
     sums_of,
     vector_kind,
-)  # fmt: skip
+    with_fourths,
+)
+from glassplat.kernels.composite import cpu_tile as tile
+from glassplat.kernels.composite.cpu_pair_rows import PAIR_VALUES
+from glassplat.kernels.composite.cpu_tile import exponent, lane_of
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar
-from glassplat.kernels.splats import LEAST_ALPHA
+from glassplat.kernels.records import LEAST_ALPHA
 
 # Planes of the backward pass; V_IMAGE has one per channel. T and T_GLASS are transmittances in front of the current
 # splat, BEHIND and BEHIND_GLASS what lies behind it, weighted by the incoming gradients, WEIGHT how much of it shows.

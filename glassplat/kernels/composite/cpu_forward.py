@@ -9,15 +9,23 @@ from typing import Any
 import numpy as np
 from numba import prange
 
+from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
+from glassplat.kernels.backend.cpu_vector import (
+    absolute,
+    bits_of,
+    interleaved,
+    item,
+    minimum,
+    select,
+    store,
+    vector_kind,
+    without_fourths,
+)
 from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.composite.cpu_pair_rows import CHUNK as SPLATS
 from glassplat.kernels.composite.cpu_tile import exponent, lane_of, list_block, list_plain_block
-from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
-from glassplat.kernels.cpu.pixel_rows import interleaved, without_fourths
-from glassplat.kernels.cpu.schedule import even_stride
-from glassplat.kernels.cpu.vector import absolute, bits_of, item, minimum, select, store, vector_kind
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
-from glassplat.kernels.splats import LEAST_ALPHA
+from glassplat.kernels.records import LEAST_ALPHA
 
 # Planes of a tile's results; SUMS has one per channel. T_AGAIN, CENTER, DEVIATION and LEAN belong to the second
 # traversal, which sums distances from the mean that the first one has found.

@@ -12,11 +12,10 @@ from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
+from glassplat.kernels.backend.cpu import Kernel, even_stride, kernel
+from glassplat.kernels.backend.cpu_vector import item, store, vector_kind
 from glassplat.kernels.composite import cpu_tile as tile
-from glassplat.kernels.cpu.jit import Kernel, kernel
-from glassplat.kernels.cpu.schedule import even_stride
-from glassplat.kernels.cpu.vector import item, store, vector_kind
-from glassplat.kernels.splats import Splats, TileBins
+from glassplat.kernels.records import Splats, TileBins
 
 CHUNK = 512
 """Splats per task."""

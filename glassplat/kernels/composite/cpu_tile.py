@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from glassplat.kernels.cpu.jit import inlined
-from glassplat.kernels.cpu.vector import (
+from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.backend.cpu_vector import (
     absolute,
     bits_of,
     constant,
@@ -28,7 +28,7 @@ from glassplat.kernels.cpu.vector import (
     vector_kind,
 )
 from glassplat.kernels.maths.blending import ALPHA_MIN, EXP2_COEFFICIENTS, Scalar, blend_maths
-from glassplat.kernels.splats import TILE, Splats
+from glassplat.kernels.records import TILE, Splats
 
 PIXELS = TILE * TILE
 BLOCK = 4

@@ -14,13 +14,12 @@ import torch
 from numba import cuda
 from torch import Tensor
 
+from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.composite.cuda_backward import PULLS, THREADS, WARPS, composite_backward, composite_pulls
 from glassplat.kernels.composite.cuda_pair_rows import new_pair_rows, sum_pair_rows
 from glassplat.kernels.composite.cuda_tile import ALIGNMENT, BUCKET, COLUMNS, PIXELS, at, tile_steps
-from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from glassplat.kernels.splats import LEAST_ALPHA, TILE, Deviation, Splats, TileBins
-from glassplat.kernels.tensor_checks import REAL_OF
+from glassplat.kernels.records import LEAST_ALPHA, REAL_OF, TILE, Deviation, Splats, TileBins
 
 
 class Saved(NamedTuple):

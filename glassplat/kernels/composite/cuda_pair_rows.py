@@ -12,9 +12,8 @@ from functools import cache
 from numba import cuda
 from torch import Tensor
 
-from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
-from glassplat.kernels.splats import Splats, TileBins
-from glassplat.kernels.tensor_checks import REAL_OF
+from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
+from glassplat.kernels.records import REAL_OF, Splats, TileBins
 
 THREADS = 256
 MOMENTS = 6

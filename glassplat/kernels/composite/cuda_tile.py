@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.backend.devices import SIMULATED
 from glassplat.kernels.composite.cpu_tile import tile_functions
-from glassplat.kernels.cpu.jit import inlined
-from glassplat.kernels.cuda.fast_maths import exp2_maths, fused_maths
-from glassplat.kernels.devices import SIMULATED
 from glassplat.kernels.maths.blending import Scalar, blend_maths
-from glassplat.kernels.splats import TILE
+from glassplat.kernels.maths.fast_maths import exp2_maths, fused_maths
+from glassplat.kernels.records import TILE
 
 PIXELS = TILE * TILE
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from glassplat.kernels.splats import Splats, TileBins
-from glassplat.kernels.tensor_checks import check_tensors
+from glassplat.kernels.records import Splats, TileBins, check_tensors
 
 
 def check_splats(splats: Splats, bins: TileBins) -> None:

@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from glassplat.kernels.backend.devices import kernels_for
 from glassplat.kernels.composite.inputs import check_splats, primary_count
-from glassplat.kernels.devices import kernels_for
-from glassplat.kernels.splats import MOST_CHANNELS, Deviation, Splats, TileBins
-from glassplat.kernels.tensor_checks import check_tensors
+from glassplat.kernels.records import MOST_CHANNELS, Deviation, Splats, TileBins, check_tensors
 
 PROBE = 7
 """Which argument of the operation the probe is."""

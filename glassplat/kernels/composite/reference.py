@@ -10,7 +10,7 @@ from torch import Tensor
 
 from glassplat.kernels.composite import Composite
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from glassplat.kernels.splats import LEAST_ALPHA, Deviation, Splats, TileBins
+from glassplat.kernels.records import LEAST_ALPHA, Deviation, Splats, TileBins
 
 TILE = 16
 

@@ -12,6 +12,8 @@ from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
+from glassplat.kernels.backend.cpu import Kernel, even_stride, kernel
+from glassplat.kernels.backend.cpu_vector import store, vector_kind
 from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.composite_discs import cpu_tile
 from glassplat.kernels.composite_discs.cpu_backward import (
@@ -26,13 +28,8 @@ from glassplat.kernels.composite_discs.cpu_backward import (
     composite_discs_backward,
 )
 from glassplat.kernels.composite_discs.cpu_forward import SPLATS, composite_discs_forward
-from glassplat.kernels.cpu.jit import Kernel, kernel
-from glassplat.kernels.cpu.schedule import even_stride
-from glassplat.kernels.cpu.vector import store, vector_kind
-from glassplat.kernels.discs import Discs
 from glassplat.kernels.maths.disc import MAP
-from glassplat.kernels.splats import TileBins
-from glassplat.kernels.tensor_checks import REAL_OF
+from glassplat.kernels.records import REAL_OF, Discs, TileBins
 
 
 class Saved(NamedTuple):

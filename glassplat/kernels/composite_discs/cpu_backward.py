@@ -13,12 +13,8 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from glassplat.kernels.composite import cpu_tile as tile
-from glassplat.kernels.composite.cpu_tile import lane_of
-from glassplat.kernels.composite_discs import cpu_tile as discs
-from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
-from glassplat.kernels.cpu.schedule import even_stride
-from glassplat.kernels.cpu.vector import (
+from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
+from glassplat.kernels.backend.cpu_vector import (
     absolute,
     item,
     lowest_bit,
@@ -27,7 +23,10 @@ from glassplat.kernels.cpu.vector import (
     store,
     sums_of,
     vector_kind,
-)  # fmt: skip
+)
+from glassplat.kernels.composite import cpu_tile as tile
+from glassplat.kernels.composite.cpu_tile import lane_of
+from glassplat.kernels.composite_discs import cpu_tile as discs
 from glassplat.kernels.maths.blending import ALPHA_MAX, Scalar
 from glassplat.kernels.maths.disc import meet_maths
 

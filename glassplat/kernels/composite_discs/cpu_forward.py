@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 from numba import prange
 
+from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
+from glassplat.kernels.backend.cpu_vector import absolute, bits_of, item, minimum, select, store, vector_kind
 from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.composite.cpu_tile import lane_of, list_block
 from glassplat.kernels.composite_discs import cpu_tile as discs
-from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
-from glassplat.kernels.cpu.schedule import even_stride
-from glassplat.kernels.cpu.vector import absolute, bits_of, item, minimum, select, store, vector_kind
 from glassplat.kernels.maths.blending import ALPHA_MAX, TRANSMITTANCE_MIN, Scalar
 
 # Planes of a tile's results; SUMS has one per channel.

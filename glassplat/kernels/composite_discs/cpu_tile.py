@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.backend.cpu_vector import item, select, vector_kind
 from glassplat.kernels.composite import cpu_tile as tile
-from glassplat.kernels.cpu.jit import inlined
-from glassplat.kernels.cpu.vector import item, select, vector_kind
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
 from glassplat.kernels.maths.disc import meet_maths
 from glassplat.kernels.maths.ray_hit import MOST_DEVIATIONS

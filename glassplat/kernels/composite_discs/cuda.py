@@ -11,6 +11,7 @@ import torch
 from numba import cuda
 from torch import Tensor
 
+from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.composite.cuda_tile import BUCKET, PIXELS, at, tile_steps
 from glassplat.kernels.composite_discs.cuda_backward import (
     AROUND,
@@ -39,12 +40,9 @@ from glassplat.kernels.composite_discs.cuda_tile import (
 )
 from glassplat.kernels.composite_discs.cuda_tile import DEPTH as Z
 from glassplat.kernels.composite_discs.cuda_tile import INVERSE_DEPTH as INVERSE
-from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
-from glassplat.kernels.discs import Discs
 from glassplat.kernels.maths.blending import ALPHA_MAX, TRANSMITTANCE_MIN
 from glassplat.kernels.maths.disc import MAP
-from glassplat.kernels.splats import TILE, TileBins
-from glassplat.kernels.tensor_checks import REAL_OF
+from glassplat.kernels.records import REAL_OF, TILE, Discs, TileBins
 
 SUM_THREADS = 256
 

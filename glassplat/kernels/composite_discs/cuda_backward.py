@@ -11,6 +11,9 @@ from functools import cache
 import numpy as np
 from numba import cuda
 
+from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.backend.cuda import Kernel, kernel
+from glassplat.kernels.backend.devices import SIMULATED
 from glassplat.kernels.composite.cuda_tile import BUCKET, PIXELS, at, tile_steps
 from glassplat.kernels.composite_discs.cuda_tile import (
     COLUMNS,
@@ -27,13 +30,10 @@ from glassplat.kernels.composite_discs.cuda_tile import (
     disc_tile_steps,
 )
 from glassplat.kernels.composite_discs.cuda_tile import DEPTH as Z
-from glassplat.kernels.cpu.jit import inlined
-from glassplat.kernels.cuda.fast_maths import reciprocal_maths
-from glassplat.kernels.cuda.launch import Kernel, kernel
-from glassplat.kernels.devices import SIMULATED
 from glassplat.kernels.maths.blending import ALPHA_MAX, Scalar
 from glassplat.kernels.maths.disc import meet_maths
-from glassplat.kernels.splats import TILE
+from glassplat.kernels.maths.fast_maths import reciprocal_maths
+from glassplat.kernels.records import TILE
 
 WARPS = 2
 """Buckets of a block; they have nothing to do with each other."""

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.composite.cuda_tile import PIXELS
-from glassplat.kernels.cpu.jit import inlined
-from glassplat.kernels.cuda.fast_maths import exp2_maths, fused_maths, reciprocal_maths
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar, blend_maths
+from glassplat.kernels.maths.fast_maths import exp2_maths, fused_maths, reciprocal_maths
 from glassplat.kernels.maths.ray_hit import MOST_DEVIATIONS
 
 CENTER_X, CENTER_Y, U_X, U_Y, V_X, V_Y, W_X, W_Y, OPACITY, DEPTH, INVERSE_DEPTH, COLUMNS = range(12)

@@ -9,11 +9,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from glassplat.kernels.devices import kernels_for
-from glassplat.kernels.discs import Discs
+from glassplat.kernels.backend.devices import kernels_for
 from glassplat.kernels.maths.disc import LOW_PASS, MAP
-from glassplat.kernels.splats import MOST_CHANNELS, Splats, TileBins
-from glassplat.kernels.tensor_checks import check_tensors
+from glassplat.kernels.records import MOST_CHANNELS, Discs, Splats, TileBins, check_tensors
 
 
 class BlendedDiscs(NamedTuple):

@@ -9,11 +9,10 @@ from torch import Tensor
 
 from glassplat.kernels.composite.reference import _MovePerPixel, active_pixels
 from glassplat.kernels.composite_discs.operation import BlendedDiscs
-from glassplat.kernels.discs import Discs
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from glassplat.kernels.maths.disc import LOW_PASS
 from glassplat.kernels.maths.ray_hit import MOST_DEVIATIONS
-from glassplat.kernels.splats import TileBins
+from glassplat.kernels.records import Discs, TileBins
 
 
 class _Layer(NamedTuple):

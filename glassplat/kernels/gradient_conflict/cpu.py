@@ -9,7 +9,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from glassplat.kernels.cpu.jit import Kernel, kernel
+from glassplat.kernels.backend.cpu import Kernel, kernel
 
 CHANNELS = 3
 

@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.gradient_conflict import reference as reference
 from glassplat.kernels.gradient_conflict.cpu import conflict_backward, conflict_forward
-from glassplat.kernels.tensor_checks import REAL_OF, check_tensors
+from glassplat.kernels.records import REAL_OF, check_tensors
 
 
 def gradient_conflict(transmission: Tensor, reflection: Tensor, hit: Tensor) -> Tensor:

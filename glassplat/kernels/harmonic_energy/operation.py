@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.harmonic_energy import reference as reference
 from glassplat.kernels.harmonic_energy.cpu import CHUNK, energy_backward, energy_forward
-from glassplat.kernels.tensor_checks import REAL_OF, check_tensors
+from glassplat.kernels.records import REAL_OF, check_tensors
 
 
 def harmonic_energy(sh: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ from functools import cache
 
 from numba import prange
 
-from glassplat.kernels.cpu.jit import Kernel, kernel
+from glassplat.kernels.backend.cpu import Kernel, kernel
 
 CHUNK = 4096
 """Splats per task."""

@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.join_channels import reference as reference
 from glassplat.kernels.join_channels.cpu import join_channels_backward, join_channels_forward
-from glassplat.kernels.tensor_checks import REAL_OF, check_tensors
+from glassplat.kernels.records import REAL_OF, check_tensors
 
 
 def join_channels(colors: Tensor, values: Tensor, more: int = 0) -> Tensor:

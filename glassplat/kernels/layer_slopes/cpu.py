@@ -9,8 +9,8 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from glassplat.kernels.cpu.jit import Kernel, kernel
-from glassplat.kernels.maths.color_space import color_space_maths
+from glassplat.kernels.backend.cpu import Kernel, kernel
+from glassplat.kernels.maths.color import color_space_maths
 
 CHUNK = 4096
 """Splats per task."""

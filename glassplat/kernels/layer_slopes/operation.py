@@ -7,7 +7,7 @@ from torch import Tensor
 
 from glassplat.kernels.layer_slopes import reference as reference
 from glassplat.kernels.layer_slopes.cpu import layer_slopes_kernel, slopes_at_kernel
-from glassplat.kernels.tensor_checks import REAL_OF, check_device, check_tensors
+from glassplat.kernels.records import REAL_OF, check_device, check_tensors
 
 
 @torch.no_grad()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from glassplat.kernels.color_space import linear_from_srgb, srgb_from_linear
+from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
 
 GREY = 0.5
 """Any strength and light at which the derivatives are finite, in place of what is left out."""

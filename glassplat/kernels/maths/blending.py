@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.backend.cpu import inlined
 
 ALPHA_MIN = 1.0 / 255.0
 """Coverage below this is ignored."""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import Scalar, blend_maths
 from glassplat.kernels.maths.projection import vector_maths
 

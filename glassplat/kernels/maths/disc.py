@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
 from glassplat.kernels.maths.projection import vector_maths
 from glassplat.kernels.maths.ray_hit import EDGE_ON, MOST_DEVIATIONS

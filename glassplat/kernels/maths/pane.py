@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple, get_args
 
-from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.fresnel import Fresnel
 from glassplat.kernels.maths.blending import Scalar
 

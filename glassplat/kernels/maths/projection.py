@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.backend.cpu import inlined
 
 LOW_PASS = 0.3
 """Variance in px^2 added to every splat, so that none falls between pixel centres (3DGS)."""

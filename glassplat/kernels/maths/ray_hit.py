@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.projection import vector_maths
 
 EDGE_ON = 1e-3
 """Cosine between ray and normal below which a disc is seen from its edge and not met."""
+MOST_LOG_SCALE = 40.0
+"""Beyond, squares of deviations and of their inverses leave the range of float32."""
 MOST_DEVIATIONS = 3.0
 """Distance from its centre, in standard deviations, at which a Gaussian ends (EnvGS, Section 4.2)."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import Scalar
 
 RADIUS = 5

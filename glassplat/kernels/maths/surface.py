@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.projection import shape_maths, vector_maths
-from glassplat.kernels.shade_environment.shaded import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
+from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
 
 
 class SurfaceMaths(NamedTuple):

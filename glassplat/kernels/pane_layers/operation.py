@@ -7,7 +7,7 @@ from torch import Tensor
 
 from glassplat.kernels.pane_layers import reference as reference
 from glassplat.kernels.pane_layers.cpu import pane_layers_kernel
-from glassplat.kernels.tensor_checks import REAL_OF, check_device, check_tensors
+from glassplat.kernels.records import REAL_OF, check_device, check_tensors
 
 
 @torch.no_grad()

@@ -18,10 +18,10 @@ from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
+from glassplat.kernels.backend.cpu import Kernel, inlined, kernel
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.ssim import RADIUS, ssim_maths
-from glassplat.kernels.tensor_checks import REAL_OF
+from glassplat.kernels.records import REAL_OF
 
 CHANNELS = 3
 MARGIN = RADIUS * CHANNELS

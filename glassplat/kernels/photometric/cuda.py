@@ -12,12 +12,11 @@ import torch
 from numba import cuda
 from torch import Tensor
 
-from glassplat.kernels.cpu.jit import inlined
-from glassplat.kernels.cuda.launch import Kernel, kernel
+from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.backend.cuda import Kernel, kernel
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.ssim import RADIUS, ssim_maths
-from glassplat.kernels.splats import TILE
-from glassplat.kernels.tensor_checks import REAL_OF
+from glassplat.kernels.records import REAL_OF, TILE
 
 CHANNELS = 3
 PIXELS = TILE * TILE

@@ -15,16 +15,14 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
-from glassplat.kernels.cpu.schedule import even_stride
-from glassplat.kernels.cpu.vector import absolute, bits_of, lowest_bit, maximum, store, vector_kind
-from glassplat.kernels.cpu.vector_rows import store_all
+from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
+from glassplat.kernels.backend.cpu_vector import absolute, bits_of, lowest_bit, maximum, store, store_all, vector_kind
 from glassplat.kernels.maths.projection import screen_maths
 from glassplat.kernels.project.cpu_backward import project_backward
 from glassplat.kernels.project.cpu_lanes import COLUMNS, LANES, gather, gather_shapes, lane_steps
 from glassplat.kernels.project.cpu_view import CHUNK, LENS_VALUES, view_steps
 from glassplat.kernels.project.steps import culling
-from glassplat.kernels.tensor_checks import REAL_OF
+from glassplat.kernels.records import REAL_OF
 
 
 def project(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, near: float) -> tuple[Tensor, ...]:

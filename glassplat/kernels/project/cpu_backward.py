@@ -13,10 +13,8 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
-from glassplat.kernels.cpu.schedule import even_stride
-from glassplat.kernels.cpu.vector import store, vector_kind
-from glassplat.kernels.cpu.vector_rows import row_loader, store_all, transposed
+from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
+from glassplat.kernels.backend.cpu_vector import row_loader, store, store_all, transposed, vector_kind
 from glassplat.kernels.project.cpu_backward_lanes import gradient_steps
 from glassplat.kernels.project.cpu_lanes import COLUMNS, LANES, gather, gather_shapes, lane_steps
 from glassplat.kernels.project.cpu_view import CHUNK, LENS_VALUES, view_steps

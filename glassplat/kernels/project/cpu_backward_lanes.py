@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from glassplat.kernels.cpu.jit import inlined
-from glassplat.kernels.cpu.vector import select, square_root, store, vector_kind
+from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.backend.cpu_vector import select, square_root, store, vector_kind
 from glassplat.kernels.maths.harmonics import color_gradient_with, harmonic_basis
 from glassplat.kernels.maths.projection import shape_maths, vector_maths
 from glassplat.kernels.project.cpu_lanes import LANES, channel_of, shapes, views

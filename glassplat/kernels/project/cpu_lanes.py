@@ -11,20 +11,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from glassplat.kernels.cpu.jit import inlined
-from glassplat.kernels.cpu.vector import (
+from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.backend.cpu_vector import (
     absolute,
     bits_of,
     exp,
     fraction,
     maximum,
     minimum,
+    row_loader,
     select,
     square_root,
+    store_all,
+    thirds,
     times_power_of_2,
+    transposed,
     vector_kind,
 )
-from glassplat.kernels.cpu.vector_rows import row_loader, store_all, thirds, transposed
 from glassplat.kernels.maths.harmonics import channel_with, harmonic_basis
 from glassplat.kernels.maths.projection import LOW_PASS, shape_maths, vector_maths
 from glassplat.kernels.project.cpu_view import view_steps, view_with

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.projection import screen_maths, shape_maths, vector_maths
 
 CHUNK = 512

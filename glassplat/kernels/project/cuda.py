@@ -10,7 +10,7 @@ import torch
 from numba import cuda
 from torch import Tensor
 
-from glassplat.kernels.cuda.launch import Kernel, blocks_for, kernel
+from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.maths.projection import shape_maths, vector_maths
 from glassplat.kernels.project.cpu_view import LENS_VALUES, view_steps
@@ -22,7 +22,7 @@ from glassplat.kernels.project.gradient_steps import (
     view_gradients,
 )
 from glassplat.kernels.project.steps import culling, placing
-from glassplat.kernels.tensor_checks import REAL_OF
+from glassplat.kernels.records import REAL_OF
 
 THREADS = 128
 POSE = 12

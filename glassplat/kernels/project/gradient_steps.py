@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.maths.projection import screen_maths, shape_maths, vector_maths
 from glassplat.kernels.project.cpu_view import view_steps

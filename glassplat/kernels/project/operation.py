@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from glassplat.kernels.devices import kernels_for
-from glassplat.kernels.discs import SOLID
+from glassplat.kernels.backend.devices import kernels_for
 from glassplat.kernels.projection_inputs import projection_inputs
-from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians
+from glassplat.kernels.records import SOLID, CameraBatch, Projected, RawGaussians
 
 
 @dataclass

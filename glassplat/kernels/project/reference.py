@@ -9,7 +9,7 @@ from torch import Tensor
 
 from glassplat.kernels.maths.harmonics import SH_CONSTANTS
 from glassplat.kernels.maths.projection import ALPHA_MIN, LOW_PASS, TANGENT_MARGIN
-from glassplat.kernels.splats import CameraBatch, Projected, RawGaussians
+from glassplat.kernels.records import CameraBatch, Projected, RawGaussians
 
 
 class _Ellipses(NamedTuple):

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.projection import ALPHA_MIN, LOW_PASS, screen_maths, shape_maths, vector_maths
 from glassplat.kernels.project.cpu_view import view_steps
 

@@ -14,8 +14,7 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
-from glassplat.kernels.cpu.schedule import even_stride
+from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.disc import MAP
 from glassplat.kernels.maths.harmonics import color_maths
@@ -24,7 +23,7 @@ from glassplat.kernels.project.cpu_view import CHUNK, LENS_VALUES, view_steps
 from glassplat.kernels.project.gradient_steps import camera_sums, view_gradients
 from glassplat.kernels.project.steps import culling
 from glassplat.kernels.project_discs.steps import disc_steps
-from glassplat.kernels.tensor_checks import REAL_OF
+from glassplat.kernels.records import REAL_OF
 
 WIDTHS = ((2,), (MAP,), (), (), (3,), (3,), (2,), (3,), (2,))
 """Trailing dimensions of the fields of `ProjectedDiscs`."""

@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from glassplat.kernels.devices import kernels_for
-from glassplat.kernels.discs import FLAT, ProjectedDiscs
+from glassplat.kernels.backend.devices import kernels_for
 from glassplat.kernels.projection_inputs import projection_inputs
-from glassplat.kernels.splats import CameraBatch, RawGaussians
+from glassplat.kernels.records import FLAT, CameraBatch, ProjectedDiscs, RawGaussians
 
 SMOOTH = 6
 """Outputs with a gradient; they come first."""

@@ -5,13 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from glassplat.kernels.discs import ProjectedDiscs
 from glassplat.kernels.maths.blending import ALPHA_MIN
 from glassplat.kernels.maths.disc import LOW_PASS, SLACK
-from glassplat.kernels.maths.ray_hit import EDGE_ON, MOST_DEVIATIONS
+from glassplat.kernels.maths.ray_hit import EDGE_ON, MOST_DEVIATIONS, MOST_LOG_SCALE
 from glassplat.kernels.project.reference import rotations, sh_basis
-from glassplat.kernels.splats import CameraBatch, RawGaussians
-from glassplat.kernels.trace.shapes import MOST_LOG_SCALE
+from glassplat.kernels.records import CameraBatch, ProjectedDiscs, RawGaussians
 
 SMOOTH = ("means2d", "maps", "depths", "opacities", "colors", "normals")
 

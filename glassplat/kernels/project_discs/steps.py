@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
 from glassplat.kernels.maths.disc import MAP, disc_maths, outline_maths
 from glassplat.kernels.maths.projection import shape_maths, vector_maths
+from glassplat.kernels.maths.ray_hit import MOST_LOG_SCALE
 from glassplat.kernels.project.cpu_view import view_steps
-from glassplat.kernels.trace.shapes import MOST_LOG_SCALE
 
 
 class DiscSteps(NamedTuple):

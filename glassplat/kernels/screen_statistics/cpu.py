@@ -7,7 +7,7 @@ import math
 
 from numba import prange
 
-from glassplat.kernels.cpu.jit import Kernel, kernel
+from glassplat.kernels.backend.cpu import Kernel, kernel
 
 CHUNK = 1024
 """Gaussians per task."""

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from glassplat.kernels.records import REAL_OF, check_tensors
 from glassplat.kernels.screen_statistics import reference as reference
 from glassplat.kernels.screen_statistics.views import Sums, Views
-from glassplat.kernels.tensor_checks import REAL_OF, check_tensors
 
 
 @torch.no_grad()

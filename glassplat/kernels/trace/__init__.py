@@ -1,6 +1,152 @@
-"""Traces rays through Gaussians."""
+"""Rays through Gaussians, front to back, with gradients to both, and the hierarchy of boxes that finds these."""
 
-from glassplat.kernels.trace.operation import trace
-from glassplat.kernels.trace.records import Bvh, Rays, Traced
+from __future__ import annotations
 
-__all__ = ["Bvh", "Rays", "Traced", "trace"]
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from glassplat.kernels.backend.devices import kernels_for
+from glassplat.kernels.maths.blending import ALPHA_MIN
+from glassplat.kernels.maths.harmonics import check_sh_degree
+from glassplat.kernels.maths.ray_hit import MOST_DEVIATIONS, MOST_LOG_SCALE
+from glassplat.kernels.project.reference import rotations
+from glassplat.kernels.records import FLAT, SOLID, Bvh, RawGaussians, Rays, Shapes, Traced, check_tensors
+
+
+def shapes_of(gaussians: RawGaussians) -> Shapes:
+    """Activated shapes; differentiable. With `log_scales` [N, 2] they are discs, with [N, 3] ellipsoids.
+
+    What has no size, no orientation or something that is not finite becomes invisible and gets no gradient.
+    """
+    usable = _usable(gaussians)
+    # Harmless stand-ins: a NaN masked afterwards would still reach the gradients, as NaN times zero.
+    tensors = (torch.where(_over(usable, x), x, torch.ones_like(x)) for x in gaussians)
+    means, quats, log_scales, logit_opacities, sh = tensors
+    inverse = torch.exp(-log_scales)
+    if log_scales.shape[1] == FLAT:
+        inverse = torch.cat([inverse, torch.ones_like(inverse[:, :1])], dim=1)
+    opacities = torch.where(usable, torch.sigmoid(logit_opacities), torch.zeros_like(logit_opacities))
+    return Shapes(means, rotations(quats).mT * inverse[:, :, None], opacities, sh)
+
+
+@torch.no_grad()
+def _usable(gaussians: RawGaussians) -> Tensor:
+    """[N] whether a Gaussian has a place, a size and an orientation."""
+    everything = torch.cat([tensor.flatten(1) if tensor.dim() > 1 else tensor[:, None] for tensor in gaussians], dim=1)
+    norm = gaussians.quats.square().sum(-1)
+    sized = (gaussians.log_scales.abs() <= MOST_LOG_SCALE).all(dim=1)
+    return everything.isfinite().all(dim=1) & norm.isfinite() & (norm > 0) & sized
+
+
+def _over(mask: Tensor, tensor: Tensor) -> Tensor:
+    return mask.reshape(mask.shape + (1,) * (tensor.dim() - 1))
+
+
+def reach(opacities: Tensor) -> Tensor:
+    """[N] distance in standard deviations up to which Gaussians are met; 0 where they are met nowhere."""
+    squared = 2 * torch.log(opacities / ALPHA_MIN)
+    return squared.clamp(min=0, max=MOST_DEVIATIONS**2).sqrt().nan_to_num()
+
+
+@torch.no_grad()
+def build_bvh(shapes: Shapes, *, flat: bool, order: Tensor | None = None) -> Bvh:
+    """Orders Gaussians along a curve through space, and puts boxes around eight of them, around eight boxes, and so on.
+
+    A Gaussian that rays meet nowhere gets an empty box: its opacity is too low, or something of it is not finite.
+
+    Args:
+        shapes: activated Gaussians, float32 or float64.
+        flat: whether they are discs.
+        order: [N] int32, of an earlier hierarchy: refits its boxes, which stays exact however far Gaussians have moved,
+            and fast to search while the order still holds.
+    """
+    return kernels_for("trace", shapes.means.device).build_bvh(shapes, flat=flat, order=order)
+
+
+def trace(gaussians: RawGaussians, rays: Rays, bvh: Bvh, *, sh_degree: int, near: float) -> Traced:
+    """Blends what each ray meets, nearest first (EnvGS, Section 4.2 and Eq. 2).
+
+    Gaussians are discs (2DGS) where `log_scales` is [N, 2], met where the ray crosses their plane, and ellipsoids
+    (3DGS) where it is [N, 3], met where their density along the ray is largest. A Gaussian covers with its opacity
+    times the falloff there, up to 3 standard deviations from its centre and 0.99, not at all below 1/255. A ray ends
+    before the Gaussian that would take its transmittance below 1e-4. Colours are seen along the ray, offset by 0.5 and
+    clamped at 0; equal distances keep the Gaussians' order.
+
+    A disc that is seen from its edge (cosine below 1e-3), a Gaussian of which something is not finite and one whose hit
+    lies at or before `near` are not met; a ray without length, or that is not finite, meets nothing. None of them gets
+    a gradient.
+
+    Differentiable in all tensors of `gaussians`, in origins and in directions (Eqs. 13 and 14, and the colour's turn
+    with the direction besides); the same bits for any number of threads.
+
+    Args:
+        gaussians: raw tensors, float32 or float64.
+        rays: of the same floating-point type.
+        bvh: `build_bvh` of these Gaussians.
+        sh_degree: highest degree of the spherical harmonics to evaluate; `gaussians.sh` may hold more, or none at all,
+            which makes all colours zero.
+        near: smallest distance of a hit, in lengths of the ray's direction, at least 0.
+
+    Raises:
+        ValueError: a shape, the degree or `near` is out of range, or the hierarchy is of other Gaussians.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
+    """
+    _check(gaussians, rays, bvh, sh_degree, near)
+    shapes = shapes_of(gaussians)
+    flat = gaussians.log_scales.shape[1] == FLAT
+    return Traced(*_Trace.apply(*shapes, *rays, bvh, flat, sh_degree if gaussians.sh.shape[1] else -1, near))
+
+
+def _check(gaussians: RawGaussians, rays: Rays, bvh: Bvh, sh_degree: int, near: float) -> None:
+    count, num_rays = gaussians.means.shape[0], rays.origins.shape[0]
+    coefficients = gaussians.sh.shape[1] if gaussians.sh.dim() == 3 else 0
+    scales = gaussians.log_scales.shape[1] if gaussians.log_scales.dim() == 2 else 0
+    check_tensors(
+        {
+            "means": (gaussians.means, (count, 3)),
+            "quats": (gaussians.quats, (count, 4)),
+            "log_scales": (gaussians.log_scales, (count, FLAT if scales == FLAT else SOLID)),
+            "logit_opacities": (gaussians.logit_opacities, (count,)),
+            "sh": (gaussians.sh, (count, coefficients, 3)),
+            "origins": (rays.origins, (num_rays, 3)),
+            "directions": (rays.directions, (num_rays, 3)),
+            "boxes": (bvh.boxes, tuple(bvh.boxes.shape)),
+        }
+    )
+    if bvh.order.shape[0] != count:
+        raise ValueError(
+            f"bvh is over {bvh.order.shape[0]} Gaussians and there are {count}; build it again with build_bvh"
+        )
+    check_sh_degree(sh_degree, coefficients)
+    if not near >= 0:
+        raise ValueError(f"near is {near}; expected a distance of at least 0")
+
+
+class _Trace(torch.autograd.Function):
+    """The kernels as one node of the autograd graph."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, frames: Tensor, opacities: Tensor, sh: Tensor, origins: Tensor, directions: Tensor,
+        bvh: Bvh, flat: bool, degree: int, near: float,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        tensors = [tensor.detach().contiguous() for tensor in (means, frames, opacities, sh, origins, directions)]
+        kernels = kernels_for("trace", means.device)
+        outputs: tuple[Tensor, ...] = kernels.trace(tensors[:4], tensors[4:], bvh, flat=flat, degree=degree, near=near)
+        ctx.save_for_backward(*tensors, *bvh, *outputs)
+        ctx.options = {"flat": flat, "degree": degree, "near": near}
+        ctx.mark_non_differentiable(outputs[3])
+        return outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        saved = ctx.saved_tensors
+        shapes, rays, bvh, outputs = saved[:4], saved[4:6], saved[6:9], saved[9:]
+        cotangents = [gradient.contiguous() for gradient in gradients[:3]]
+        kernels = kernels_for("trace", shapes[0].device)
+        found = kernels.trace_gradients(shapes, rays, bvh, outputs, cotangents, **ctx.options)
+        return (*found, None, None, None, None)

@@ -1,28 +1,297 @@
-"""Ray tracing on the CPU: blocks of neighbouring rays, each ray in chunks of its nearest hits.
+"""Ray tracing on the CPU: the hierarchy of boxes, the rays, and their gradients.
 
-Blocks have a fixed size, whatever the number of threads.
+Boxes are fitted one level after the other, from the lowest up. Rays are traced in blocks of neighbouring ones, each ray
+in chunks of its nearest hits. Blocks have a fixed size, whatever the number of threads.
+
+Gradients have the same bits for any number of threads, without atomics. Rays are traced again, and what they meet is
+written down, ray by ray. Then every block of rays keeps a row of sums for each Gaussian that it has met, and in the end
+each Gaussian adds up its rows, in the order of the blocks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from typing import Any
 
+import numba
 import numpy as np
 import torch
 from numba import prange
+from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.kernels.cpu.jit import Kernel, kernel
-from glassplat.kernels.cpu.schedule import even_stride
-from glassplat.kernels.maths.blending import TRANSMITTANCE_MIN
+from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
+from glassplat.kernels.maths.blending import ALPHA_MAX, TRANSMITTANCE_MIN, Scalar, blend_maths
 from glassplat.kernels.maths.harmonics import color_maths
-from glassplat.kernels.tensor_checks import REAL_OF
-from glassplat.kernels.trace.cpu_backward import trace_gradients
+from glassplat.kernels.maths.ray_hit import ray_hit_maths
+from glassplat.kernels.records import REAL_OF, Bvh, Shapes
+from glassplat.kernels.trace import reach
+from glassplat.kernels.trace.bvh import half_widths_maths, hilbert_codes, level_offsets
 from glassplat.kernels.trace.cpu_traversal import arrays_of, packed_leaves, traversal
-from glassplat.kernels.trace.steps import CHUNK, STACK, WIDTH
+from glassplat.kernels.trace.steps import CHUNK, STACK, WIDTH, coverage_maths, shape_reader
 
-__all__ = ["trace", "trace_gradients"]
+
+def build_bvh(shapes: Shapes, *, flat: bool, order: Tensor | None) -> Bvh:
+    """As the operation."""
+    count, real = shapes.means.shape[0], REAL_OF[shapes.means.dtype]
+    if order is None:
+        order = torch.argsort(hilbert_codes(shapes.means.detach()), stable=True).to(torch.int32)
+    offsets = torch.tensor(level_offsets(count))
+    boxes = shapes.means.new_empty(int(offsets[-1]), 6, WIDTH)
+    extents = reach(shapes.opacities)
+    inputs = (tensor.detach().contiguous().numpy() for tensor in (shapes.means, shapes.frames, extents, order, offsets))
+    fit_boxes(real, flat)(*inputs, boxes.numpy())
+    return Bvh(order, boxes, offsets)
+
+
+@cache
+def fit_boxes(real: type, flat: bool) -> Kernel:
+    """Fills the boxes of all nodes."""
+    zero, nowhere, half_widths = real(0.0), real("inf"), half_widths_maths(real, flat)
+
+    @kernel("fit_boxes_discs" if flat else "fit_boxes_ellipsoids", real)
+    def fit(means, frames, extents, order, offsets, boxes):
+        for level in range(offsets.size - 1):
+            first, last = offsets[level], offsets[level + 1]
+            members = order.size if level == 0 else first - offsets[level - 1]
+            for node in prange(first, last):
+                for k in range(WIDTH):
+                    member = (node - first) * WIDTH + k
+                    for j in range(3):
+                        boxes[node, j, k], boxes[node, 3 + j, k] = nowhere, -nowhere
+                    if member >= members:
+                        continue
+                    if level > 0:
+                        below = offsets[level - 1] + member
+                        for j in range(3):
+                            low, high = nowhere, -nowhere
+                            for i in range(WIDTH):
+                                low, high = min(low, boxes[below, j, i]), max(high, boxes[below, 3 + j, i])
+                            boxes[node, j, k], boxes[node, 3 + j, k] = low, high
+                        continue
+                    g = order[member]
+                    if not extents[g] > zero:
+                        continue
+                    half = half_widths(frames, g, extents[g])
+                    for j in range(3):
+                        # NaN and infinity fail the comparison, which leaves the box empty.
+                        if abs(means[g, j]) + half[j] < nowhere:
+                            boxes[node, j, k], boxes[node, 3 + j, k] = means[g, j] - half[j], means[g, j] + half[j]
+
+    return fit
+
+
+GRADIENT_BLOCK = 256
+"""Rays per task of the backward pass, whose sums share rows."""
+FRAME_AT, OPACITY_AT, GEOMETRY = 3, 12, 13
+"""Columns of a row: gradients of mean (3), frame (9) and opacity; harmonics have rows of their own."""
+SUM_CHUNK = 512
+"""Gaussians per task of the last sum."""
+
+
+def trace_gradients(
+    shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor], outputs: Sequence[Tensor],
+    cotangents: Sequence[Tensor], *, flat: bool, degree: int, near: float,
+) -> tuple[Tensor, ...]:  # fmt: skip
+    """Gradients of means, frames, opacities, sh, origins and directions; `outputs` are those of the forward pass."""
+    means, sh, hits = shapes[0], shapes[3], outputs[3]
+    real, count = REAL_OF[means.dtype], means.shape[0]
+    hit_offsets = torch.cat([hits.new_zeros(1, dtype=torch.int64), hits.cumsum(0)])
+    met = torch.empty(int(hit_offsets[-1]), dtype=torch.int32)
+    num_blocks = -(-hits.shape[0] // GRADIENT_BLOCK)
+    distinct = torch.zeros(num_blocks, dtype=torch.int64)
+    places = np.full((numba.get_num_threads(), 2, count), -1, np.int32)
+    inputs = tuple(tensor.numpy() for tensor in (*shapes[:3], *rays))
+    trace_collect(real, flat)(
+        packed_leaves(shapes, bvh[0]), *inputs[3:], *arrays_of(bvh), real(near), hit_offsets.numpy(), places,
+        met.numpy(), distinct.numpy(),
+    )  # fmt: skip
+    row_offsets = torch.cat([distinct.new_zeros(1), distinct.cumsum(0)])
+    num_rows = int(row_offsets[-1])
+    owners = torch.empty(num_rows, dtype=torch.int32)
+    rows, sh_rows = np.zeros((num_rows, GEOMETRY), real), np.zeros((num_rows, *sh.shape[1:]), real)
+    v_rays = tuple(torch.zeros_like(ray) for ray in rays)
+    places[...] = -1
+    trace_backward(real, flat)(
+        *inputs, sh.numpy(), degree, hit_offsets.numpy(), met.numpy(), row_offsets.numpy(), places,
+        *(tensor.numpy() for tensor in (*outputs[:3], *cotangents)),
+        owners.numpy(), rows, sh_rows, *(tensor.numpy() for tensor in v_rays),
+    )  # fmt: skip
+    return (*_summed(rows, sh_rows, owners, count, real), *v_rays)
+
+
+def _summed(rows: NDArray[Any], sh_rows: NDArray[Any], owners: Tensor, count: int, real: type) -> tuple[Tensor, ...]:
+    """Gradients per Gaussian from rows per (block, Gaussian)."""
+    order = torch.argsort(owners, stable=True)
+    offsets = torch.cat([owners.new_zeros(1, dtype=torch.int64), torch.bincount(owners, minlength=count).cumsum(0)])
+    sums, sh_sums = np.zeros((count, GEOMETRY), real), np.zeros((count, *sh_rows.shape[1:]), real)
+    sum_block_rows(real)(rows, sh_rows, order.numpy(), offsets.numpy(), sums, sh_sums)
+    found, v_sh = torch.from_numpy(sums), torch.from_numpy(sh_sums)
+    return found[:, :FRAME_AT], found[:, FRAME_AT:OPACITY_AT].reshape(-1, 3, 3), found[:, OPACITY_AT], v_sh
+
+
+@cache
+def trace_collect(real: type, flat: bool) -> Kernel:
+    """Fills `met`, each ray's Gaussians from the nearest on, and the number of different ones in each block."""
+    next_hits, ray = traversal(real, flat)
+
+    @kernel("trace_collect_discs" if flat else "trace_collect_ellipsoids", real)
+    def collect(leaves, origins, directions, order, boxes, offsets, near, hit_offsets, places, met, distinct):
+        count, num_blocks = origins.shape[0], distinct.size
+        stride = even_stride(num_blocks)
+        for task in prange(num_blocks):
+            block = task * stride % num_blocks
+            seen = places[numba.get_thread_id(), 0]
+            ts, alphas, ids = np.empty((CHUNK,), real), np.empty((CHUNK,), real), np.empty((CHUNK,), np.int32)
+            entries, squares = np.empty((WIDTH,), real), np.empty((WIDTH,), real)
+            stack, waiting = np.empty((STACK,), np.int64), np.empty((STACK,), real)
+            different = 0
+            for r in range(block * GRADIENT_BLOCK, min(count, (block + 1) * GRADIENT_BLOCK)):
+                o, d, inverse, _, _ = ray(origins, directions, r)
+                first, first_id, place = near, 2147483647, hit_offsets[r]
+                while place < hit_offsets[r + 1]:
+                    known = next_hits(
+                        o, d, inverse, leaves, order, boxes, offsets, first, first_id,
+                        ts, ids, alphas, entries, squares, stack, waiting,
+                    )  # fmt: skip
+                    for k in range(min(known, hit_offsets[r + 1] - place)):
+                        g = ids[k]
+                        met[place + k] = g
+                        if seen[g] != block:
+                            seen[g] = block
+                            different += 1
+                    first, first_id, place = ts[CHUNK - 1], ids[CHUNK - 1], place + CHUNK
+            distinct[block] = different
+
+    return collect
+
+
+def _pull(real: type, flat: bool) -> Scalar:
+    """Adds one hit's gradients to its Gaussian's row and to its ray."""
+    meet_gradient, half, most = ray_hit_maths(real, flat).meet_gradient, real(0.5), real(ALPHA_MAX)
+    zero = real(0.0)
+
+    @inlined
+    def pull(offset, d, frame, hit, opacity, v_alpha, v_t, row, v_origin, v_direction):
+        t, q, covered = hit
+        v_covered = v_alpha if covered < most else zero
+        row[OPACITY_AT] += v_covered * covered / opacity
+        v_o, v_d, v_frame = meet_gradient(offset, d, frame, t, q, v_t, -half * covered * v_covered)
+        for j in range(3):
+            row[j] -= v_o[j]
+            row[FRAME_AT + j] += v_frame[0][j]
+            row[FRAME_AT + 3 + j] += v_frame[1][j]
+            row[FRAME_AT + 6 + j] += v_frame[2][j]
+            v_origin[j] += v_o[j]
+            v_direction[j] += v_d[j]
+
+    return pull
+
+
+def _shade(real: type) -> Scalar:
+    """The value of one hit's colour to the objective; adds the gradients of its harmonics and of the unit direction."""
+    color, color_gradient = color_maths(real)
+    zero, half = real(0.0), real(0.5)
+
+    @inlined
+    def shade(sh, degree, unit, v_color, weight, v_sh, v_unit):
+        if degree < 0:
+            return zero
+        x, y, z = unit[0], unit[1], unit[2]
+        red, green, blue = color(sh, 0, degree, x, y, z)
+        red, green, blue = red + half, green + half, blue + half
+        v_red = v_color[0] if red > zero else zero
+        v_green = v_color[1] if green > zero else zero
+        v_blue = v_color[2] if blue > zero else zero
+        pulls = color_gradient(sh, 0, degree, x, y, z, (weight * v_red, weight * v_green, weight * v_blue), v_sh)
+        for j in range(3):
+            v_unit[j] += pulls[j]
+        return v_red * red + v_green * green + v_blue * blue
+
+    return shade
+
+
+@cache
+def trace_backward(real: type, flat: bool) -> Kernel:
+    """Fills each block's rows and their owners, and the gradients of the rays, which are zero beforehand."""
+    shape, coverage, pull = shape_reader(real), coverage_maths(real, blend_maths(real).exp2), _pull(real, flat)
+    meet, shade = ray_hit_maths(real, flat).meet, _shade(real)
+    zero, half, one, nowhere = real(0.0), real(0.5), real(1.0), real("inf")
+
+    @kernel("trace_backward_discs" if flat else "trace_backward_ellipsoids", real)
+    def backward(
+        means, frames, opacities, origins, directions, sh, degree, hit_offsets, met, row_offsets, places,
+        colors, alphas, depths, v_colors, v_alphas, v_depths, owners, rows, sh_rows, v_origins, v_directions,
+    ):  # fmt: skip
+        count, num_blocks = origins.shape[0], row_offsets.size - 1
+        stride = even_stride(num_blocks)
+        for task in prange(num_blocks):
+            block = task * stride % num_blocks
+            seen, own = places[numba.get_thread_id(), 0], places[numba.get_thread_id(), 1]
+            free = row_offsets[block]
+            unit, v_unit = np.empty((3,), real), np.empty((3,), real)
+            for r in range(block * GRADIENT_BLOCK, min(count, (block + 1) * GRADIENT_BLOCK)):
+                o = origins[r, 0], origins[r, 1], origins[r, 2]
+                d = directions[r, 0], directions[r, 1], directions[r, 2]
+                length = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) ** half
+                # What is still to come, of the objective: all of it at first.
+                behind = v_depths[r] * depths[r]
+                for j in range(3):
+                    unit[j], v_unit[j] = d[j] / length, zero
+                    behind += v_colors[r, j] * colors[r, j]
+                left, end, v_length = one, v_alphas[r] * (one - alphas[r]), zero
+                for place in range(hit_offsets[r], hit_offsets[r + 1]):
+                    g = met[place]
+                    if seen[g] != block:
+                        seen[g], own[g], owners[free] = block, free, g
+                        free += 1
+                    row = own[g]
+                    offset, frame = shape(means, frames, g, o)
+                    t, q, squared = meet(offset, d, frame)
+                    # On a threshold, what the search has met may be missed by other roundings.
+                    if not t < nowhere:
+                        continue
+                    covered, alpha = coverage(opacities[g], squared)
+                    weight = alpha * left
+                    value = shade(sh[g : g + 1], degree, unit, v_colors[r], weight, sh_rows[row : row + 1], v_unit)
+                    value += v_depths[r] * (t * length)
+                    behind -= weight * value
+                    v_alpha, v_t = left * value + (end - behind) / (one - alpha), weight * v_depths[r]
+                    v_length += v_t * t
+                    pull(
+                        offset, d, frame, (t, q, covered), opacities[g], v_alpha, v_t * length, rows[row],
+                        v_origins[r], v_directions[r],
+                    )  # fmt: skip
+                    left *= one - alpha
+                if hit_offsets[r] < hit_offsets[r + 1]:
+                    along = unit[0] * v_unit[0] + unit[1] * v_unit[1] + unit[2] * v_unit[2]
+                    for j in range(3):
+                        v_directions[r, j] += v_length * unit[j] + (v_unit[j] - unit[j] * along) / length
+
+    return backward
+
+
+@cache
+def sum_block_rows(real: type) -> Kernel:
+    """Adds up each Gaussian's rows."""
+
+    @kernel("trace_sum_rows", real)
+    def total(rows, sh_rows, order, offsets, sums, sh_sums):
+        count = offsets.size - 1
+        num_chunks = (count + SUM_CHUNK - 1) // SUM_CHUNK
+        for chunk in prange(num_chunks):
+            for g in range(chunk * SUM_CHUNK, min(count, (chunk + 1) * SUM_CHUNK)):
+                for k in range(offsets[g], offsets[g + 1]):
+                    row = order[k]
+                    for j in range(rows.shape[1]):
+                        sums[g, j] += rows[row, j]
+                    for i in range(sh_rows.shape[1]):
+                        for j in range(3):
+                            sh_sums[g, i, j] += sh_rows[row, i, j]
+
+    return total
+
 
 BLOCK = 64
 """Rays per task."""

@@ -14,11 +14,11 @@ from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.kernels.cpu.jit import Kernel, inlined, kernel
-from glassplat.kernels.cpu.vector import bits_of, lowest_bit, maximum, minimum, store, vector_kind
+from glassplat.kernels.backend.cpu import Kernel, inlined, kernel
+from glassplat.kernels.backend.cpu_vector import bits_of, lowest_bit, maximum, minimum, store, vector_kind
 from glassplat.kernels.maths.blending import Scalar, blend_maths
 from glassplat.kernels.maths.ray_hit import EDGE_ON, MOST_DEVIATIONS
-from glassplat.kernels.tensor_checks import REAL_OF
+from glassplat.kernels.records import REAL_OF
 from glassplat.kernels.trace.steps import (
     CHUNK,
     LEVEL_BITS,

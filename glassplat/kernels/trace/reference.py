@@ -10,9 +10,8 @@ from torch import Tensor
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from glassplat.kernels.maths.ray_hit import EDGE_ON, MOST_DEVIATIONS
 from glassplat.kernels.project.reference import sh_basis
-from glassplat.kernels.splats import RawGaussians
-from glassplat.kernels.trace.records import Bvh, Rays, Shapes, Traced
-from glassplat.kernels.trace.shapes import FLAT, shapes_of
+from glassplat.kernels.records import FLAT, Bvh, RawGaussians, Rays, Shapes, Traced
+from glassplat.kernels.trace import shapes_of
 
 
 class _Hits(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from glassplat.kernels.cpu.jit import inlined
+from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar
 from glassplat.kernels.maths.ray_hit import MOST_DEVIATIONS
 

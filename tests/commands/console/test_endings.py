@@ -18,7 +18,7 @@ from glassplat.commands.console.endings import LONGEST_QUOTE
 from glassplat.commands.measuring.evaluate import Evaluate
 from glassplat.data.errors import InputError
 from glassplat.init.plane_options import PlaneFitError
-from glassplat.kernels.devices import CudaUnavailableError
+from glassplat.kernels.backend.devices import CudaUnavailableError
 from glassplat.train.trainer import TrainingDivergedError
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.devices import SIMULATED, cuda_problem
+from glassplat.kernels.backend.devices import SIMULATED, cuda_problem
 from tests.kernels.gaussians_and_cameras import draw
 
 if SIMULATED and hasattr(os, "sched_setaffinity"):

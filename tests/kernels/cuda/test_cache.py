@@ -17,10 +17,11 @@ pytest.importorskip("numba_cuda", reason="numba-cuda is not installed; `make set
 
 from numba import config
 
-from glassplat.kernels.cuda import cache, launch
-from glassplat.kernels.cuda.cache import ImageCache
-from glassplat.kernels.cuda.fast_maths import exp2_maths, reciprocal_maths
-from glassplat.kernels.devices import SIMULATED
+from glassplat.kernels.backend import cuda as launch
+from glassplat.kernels.backend import cuda_code as cache
+from glassplat.kernels.backend.cuda_code import ImageCache
+from glassplat.kernels.backend.devices import SIMULATED
+from glassplat.kernels.maths.fast_maths import exp2_maths, reciprocal_maths
 from tests.kernels.test_cache import printed_by
 from tools.compile_kernels import without_device
 
@@ -35,8 +36,8 @@ import sys
 
 import numpy as np
 
-from glassplat.kernels.cpu.jit import inlined
-from glassplat.kernels.cuda.launch import kernel
+from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.backend.cuda import kernel
 from tools.compile_kernels import without_device
 
 

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("numba_cuda", reason="numba-cuda is not installed; `make setup` installs it")
 
-from glassplat.kernels.devices import SIMULATED
+from glassplat.kernels.backend.devices import SIMULATED
 from tools.compile_kernels import CAPABILITIES, all_kernels, linked, loop_cells, ptx_of, read_report
 from tools.machine_loops import Loop, Loops, disassembler, loops_of, read_loops
 

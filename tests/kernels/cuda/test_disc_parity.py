@@ -8,12 +8,12 @@ from __future__ import annotations
 import pytest
 import torch
 
+from glassplat.kernels.backend.devices import SIMULATED
 from glassplat.kernels.composite_discs import composite_discs
 from glassplat.kernels.composite_discs.reference import composite_discs as composite_twin
-from glassplat.kernels.devices import SIMULATED
 from glassplat.kernels.project_discs import project_discs
 from glassplat.kernels.project_discs.reference import project_discs as project_twin
-from glassplat.kernels.splats import CameraBatch
+from glassplat.kernels.records import CameraBatch
 from tests.kernels.cuda.agreement import DTYPES, check_gradients, close, many, on_a_device_or_skipped, on_device
 from tests.kernels.gaussians_and_cameras import random_cameras
 from tests.kernels.test_composite_discs import NEAR, Case, cameras_of, case_of, scattered, with_gradients

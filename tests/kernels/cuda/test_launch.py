@@ -17,10 +17,9 @@ pytest.importorskip("numba_cuda", reason="numba-cuda is not installed; `make set
 from cuda.bindings.driver import CUresult
 from numba import types
 
-from glassplat.kernels.cuda.cache import ImageCache
-from glassplat.kernels.cuda.launch import Expected, blocks_for, kernel
-from glassplat.kernels.cuda.machine_code import MachineCode
-from glassplat.kernels.devices import SIMULATED
+from glassplat.kernels.backend.cuda import Expected, blocks_for, kernel
+from glassplat.kernels.backend.cuda_code import ImageCache, MachineCode
+from glassplat.kernels.backend.devices import SIMULATED
 
 if SIMULATED:
     pytest.skip("the simulator launches nothing", allow_module_level=True)
@@ -28,8 +27,8 @@ if SIMULATED:
 from numba.cuda.args import ArgHint
 from numba.cuda.dispatcher import _Kernel
 
-from glassplat.kernels.cuda import driver, launch
-from glassplat.kernels.cuda.driver import SLOT
+from glassplat.kernels.backend import cuda as launch
+from glassplat.kernels.backend.cuda import SLOT
 
 
 class OnDevice(ArgHint):
@@ -125,10 +124,9 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> Driver:
     """A GPU that is not there, and takes every launch."""
     found = Driver()
     library = SimpleNamespace(get_kernel=lambda entry: SimpleNamespace(handle=77))
-    monkeypatch.setattr(driver, "driver", found)
-    monkeypatch.setattr(driver, "ObjectCode", SimpleNamespace(from_cubin=lambda cubin, name: library))
-    for module in (driver, launch):
-        monkeypatch.setattr(module, "current_gpu", lambda index: nullcontext())
+    monkeypatch.setattr(launch, "driver", found)
+    monkeypatch.setattr(launch, "ObjectCode", SimpleNamespace(from_cubin=lambda cubin, name: library))
+    monkeypatch.setattr(launch, "current_gpu", lambda index: nullcontext())
     monkeypatch.setattr(torch.Tensor, "get_device", lambda tensor: 0)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda index: SimpleNamespace(cuda_stream=STREAM))
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: (9, 0))

@@ -8,11 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.bin_tiles import bin_tiles
+from glassplat.kernels.backend.devices import SIMULATED, cuda_problem
 from glassplat.kernels.composite import composite
-from glassplat.kernels.devices import SIMULATED, cuda_problem
 from glassplat.kernels.project import project
-from glassplat.kernels.splats import CameraBatch, Deviation, RawGaussians, Splats, TileBins
+from glassplat.kernels.records import CameraBatch, Deviation, RawGaussians, Splats, TileBins
+from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.traced import traced_surroundings
 from glassplat.scene.gaussians import Gaussians
 from tests.kernels.gaussians_and_cameras import draw

@@ -15,29 +15,22 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels import adam as adam_operation
-from glassplat.kernels import bin_tiles as bin_operation
-from glassplat.kernels import blend_panes as blend_operation
 from glassplat.kernels import composite as composite_operation
-from glassplat.kernels import cube_lookup as lookup_operation
-from glassplat.kernels import pane_hits as hits_operation
+from glassplat.kernels import environment as environment_operation
+from glassplat.kernels import panes as panes_operation
 from glassplat.kernels import photometric as photometric_operation
 from glassplat.kernels import project as project_operation
-from glassplat.kernels import shade_environment as shade_operation
-from glassplat.kernels import surface_channels as surface_operation
+from glassplat.kernels import tiles as tiles_operation
 from glassplat.kernels.adam import reference as adam_twin
-from glassplat.kernels.bin_tiles import reference as bin_twin
-from glassplat.kernels.blend_panes import reference as blend_twin
+from glassplat.kernels.backend.devices import SIMULATED, kernels_for
 from glassplat.kernels.composite import reference as composite_twin
-from glassplat.kernels.cube_lookup import reference as lookup_twin
-from glassplat.kernels.devices import SIMULATED, kernels_for
+from glassplat.kernels.environment import reference as environment_twin
 from glassplat.kernels.fresnel import Fresnel
-from glassplat.kernels.pane_hits import reference as hits_twin
-from glassplat.kernels.panes import Panes
+from glassplat.kernels.panes import reference as panes_twin
 from glassplat.kernels.photometric import reference as photometric_twin
 from glassplat.kernels.project import reference as project_twin
-from glassplat.kernels.shade_environment import reference as shade_twin
-from glassplat.kernels.splats import CameraBatch, Deviation, RawGaussians, Splats
-from glassplat.kernels.surface_channels import reference as surface_twin
+from glassplat.kernels.records import CameraBatch, Deviation, Panes, RawGaussians, Splats
+from glassplat.kernels.tiles import reference as tiles_twin
 from tests.kernels.cuda.agreement import (
     DEVICE,
     DTYPES,
@@ -103,11 +96,11 @@ def test_bin_tiles(random_splats: SplatMaker, masked: bool, dtype: torch.dtype) 
     splats = random_splats((2, many(12, 500)), (WIDTH, HEIGHT), dtype=dtype)
     splats.depths[:, 3] = splats.depths[:, 5]
     splats.radii[0, 1] = 0
-    rows, columns = bin_operation.tile_grid(WIDTH, HEIGHT)
+    rows, columns = tiles_operation.tile_grid(WIDTH, HEIGHT)
     mask = draw(2, rows, columns, seed=4) > 0 if masked else None
     own_mask = None if mask is None else mask.to(DEVICE)
-    found = bin_operation.bin_tiles(on_device(splats), WIDTH, HEIGHT, own_mask)
-    expected = bin_twin.bin_tiles(splats, WIDTH, HEIGHT, mask)
+    found = tiles_operation.bin_tiles(on_device(splats), WIDTH, HEIGHT, own_mask)
+    expected = tiles_twin.bin_tiles(splats, WIDTH, HEIGHT, mask)
     assert listed(expected) <= listed(found)
     assert len(listed(found) - listed(expected)) <= 0.02 * len(listed(expected)) + 1
     assert found.active.tolist() == expected.active.tolist()
@@ -123,8 +116,8 @@ def test_bin_tiles(random_splats: SplatMaker, masked: bool, dtype: torch.dtype) 
 @pytest.mark.parametrize("count", [0, 1])
 def test_bin_tiles_of_hardly_any_splats(random_splats: SplatMaker, count: int) -> None:
     splats = random_splats((1, count), (WIDTH, HEIGHT))
-    found = bin_operation.bin_tiles(on_device(splats), WIDTH, HEIGHT)
-    assert listed(bin_twin.bin_tiles(splats, WIDTH, HEIGHT)) <= listed(found)
+    found = tiles_operation.bin_tiles(on_device(splats), WIDTH, HEIGHT)
+    assert listed(tiles_twin.bin_tiles(splats, WIDTH, HEIGHT)) <= listed(found)
     assert found.splat_offsets.shape == (count + 1,)
 
 
@@ -133,7 +126,7 @@ def test_splats_of_very_different_sizes_are_listed_in_their_tiles(random_splats:
     splats = random_splats((2, many(9, 900)), size, sigmas=(0.3, 9.0))
     splats.conics[1, 4] = torch.tensor([1e-6, 0.0, 1e-6])
     splats.radii[1, 4] = 1000
-    found, expected = bin_operation.bin_tiles(on_device(splats), *size), bin_twin.bin_tiles(splats, *size)
+    found, expected = tiles_operation.bin_tiles(on_device(splats), *size), tiles_twin.bin_tiles(splats, *size)
     assert found.splat_offsets.diff()[splats.depths.shape[1] + 4] == 20
     assert listed(expected) <= listed(found)
     assert len(listed(found) - listed(expected)) <= 0.02 * len(listed(expected)) + 1
@@ -143,8 +136,8 @@ def test_pairs_that_were_counted_but_not_found_end_behind_the_last_tile(
     random_splats: SplatMaker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     splats = on_device(random_splats((1, 6), (WIDTH, HEIGHT)))
-    expected = bin_operation.bin_tiles(splats, WIDTH, HEIGHT)
-    module = kernels_for("bin_tiles", DEVICE)
+    expected = tiles_operation.bin_tiles(splats, WIDTH, HEIGHT)
+    module = kernels_for("tiles", DEVICE)
     count = module.count_tiles(np.float64)
 
     def one_more(*arguments: Any) -> None:
@@ -152,7 +145,7 @@ def test_pairs_that_were_counted_but_not_found_end_behind_the_last_tile(
         arguments[-1].add_(1)
 
     monkeypatch.setattr(module, "count_tiles", lambda real: one_more)
-    found = bin_operation.bin_tiles(splats, WIDTH, HEIGHT)
+    found = tiles_operation.bin_tiles(splats, WIDTH, HEIGHT)
     assert torch.equal(found.tile_offsets, expected.tile_offsets)
     assert torch.equal(found.pair_splats[: len(expected.pair_splats)], expected.pair_splats)
     assert found.pair_splats[len(expected.pair_splats) :].sort().values.tolist() == list(range(6))
@@ -166,9 +159,9 @@ def blended(
     splats: Splats, channels: Tensor, marks: Tensor, probe: Tensor, deviation: Deviation | None, own: bool, size: Size
 ) -> list[Tensor]:
     """Image, alpha, mask and deviation of all cameras with glass; the last camera's first tile is left out."""
-    binning, blending = (bin_operation, composite_operation) if own else (bin_twin, composite_twin)
+    binning, blending = (tiles_operation, composite_operation) if own else (tiles_twin, composite_twin)
     primary = splats.depths.shape[1] - marks.shape[1]
-    mask = torch.ones(splats.depths.shape[0], *bin_operation.tile_grid(*size), dtype=torch.bool)
+    mask = torch.ones(splats.depths.shape[0], *tiles_operation.tile_grid(*size), dtype=torch.bool)
     mask[-1, 0, 0] = False
     bins = binning.bin_tiles(splats, *size, mask.to(channels.device))
     options = {"marks": marks, "num_primary": primary, "deviation": deviation, "probe": probe}
@@ -187,7 +180,7 @@ def check_composite(splats: Splats, glass: int, mean: bool | None, size: Size) -
     request = None if mean is None else Deviation(3, where, mean)
     own_request = None if mean is None else Deviation(3, where.to(DEVICE), mean)
     found = blended(
-        own_splats, own_channels, own_marks, own_probe, own_request, (bin_operation, composite_operation), size
+        own_splats, own_channels, own_marks, own_probe, own_request, (tiles_operation, composite_operation), size
     )
     expected = blended(splats, channels, marks, probe, request, False, size)
     for value, want in zip(found, expected, strict=True):
@@ -218,7 +211,7 @@ def test_composite(random_splats: SplatMaker, mean: bool | None, dtype: torch.dt
 def test_composite_of_many_splats_of_one_tile(random_splats: SplatMaker, dtype: torch.dtype) -> None:
     size, shape = (7, 3), (2, many(100, 1000))
     splats = random_splats(shape, size, dtype=dtype, opacities=(0.01, many(40, 10) / 100), sigmas=(2.0, 9.0))
-    assert bin_twin.bin_tiles(splats, *size).tile_offsets[1] > 64
+    assert tiles_twin.bin_tiles(splats, *size).tile_offsets[1] > 64
     check_composite(splats, many(25, 200), True, size)
 
 
@@ -229,8 +222,8 @@ def test_composite_without_glass(random_splats: SplatMaker, count: int, channels
     splats = Splats(*(tensor.requires_grad_(i < 3) for i, tensor in enumerate(splats)))
     values = draw(1, count, channels, seed=3).requires_grad_()
     own, own_values = on_device(splats), on_device(values)
-    found = composite_operation.composite(own, own_values, bin_operation.bin_tiles(own, *size))
-    expected = composite_twin.composite(splats, values, bin_twin.bin_tiles(splats, *size))
+    found = composite_operation.composite(own, own_values, tiles_operation.bin_tiles(own, *size))
+    expected = composite_twin.composite(splats, values, tiles_twin.bin_tiles(splats, *size))
     close(found.image, expected.image)
     close(found.alpha, expected.alpha)
     if count:
@@ -257,13 +250,13 @@ def test_pane_hits(masked: bool, dtype: torch.dtype) -> None:
     panes, intrinsics = two_panes(dtype)
     mask = draw(HEIGHT, WIDTH, seed=5).to(dtype).clamp(min=0) if masked else None
     own_mask = None if mask is None else mask.to(DEVICE)
-    found = hits_operation.pane_hits(on_device(panes), intrinsics.to(DEVICE), WIDTH, HEIGHT, own_mask)
-    expected = hits_twin.pane_hits(panes, intrinsics, WIDTH, HEIGHT, mask)
+    found = panes_operation.pane_hits(on_device(panes), intrinsics.to(DEVICE), WIDTH, HEIGHT, own_mask)
+    expected = panes_twin.pane_hits(panes, intrinsics, WIDTH, HEIGHT, mask)
     assert set(expected.pane.flatten().tolist()) == {-1, 0, 1}
     for value, want in zip(found, expected, strict=True):
         close(value, want)
-    further = hits_operation.pane_hits(on_device(panes), intrinsics.to(DEVICE), WIDTH, HEIGHT, own_mask, beyond=found)
-    expected = hits_twin.pane_hits(panes, intrinsics, WIDTH, HEIGHT, mask, beyond=expected)
+    further = panes_operation.pane_hits(on_device(panes), intrinsics.to(DEVICE), WIDTH, HEIGHT, own_mask, beyond=found)
+    expected = panes_twin.pane_hits(panes, intrinsics, WIDTH, HEIGHT, mask, beyond=expected)
     assert bool((expected.pane >= 0).any())
     for value, want in zip(further, expected, strict=True):
         close(value, want)
@@ -272,7 +265,7 @@ def test_pane_hits(masked: bool, dtype: torch.dtype) -> None:
 def test_no_pane_is_hit_where_there_is_none() -> None:
     panes, intrinsics = two_panes(torch.float64)
     none = Panes(*(tensor[:0].to(DEVICE) for tensor in panes))
-    found = hits_operation.pane_hits(none, intrinsics.to(DEVICE), WIDTH, HEIGHT)
+    found = panes_operation.pane_hits(none, intrinsics.to(DEVICE), WIDTH, HEIGHT)
     assert (found.pane == -1).all()
     assert found.windows.shape == (0, 4)
 
@@ -283,14 +276,14 @@ def test_no_pane_is_hit_where_there_is_none() -> None:
 )
 def test_blend_panes(switches: tuple[Fresnel, bool, bool], dtype: torch.dtype) -> None:
     panes, intrinsics = two_panes(dtype)
-    pane = hits_twin.pane_hits(panes, intrinsics, WIDTH, HEIGHT).pane
+    pane = panes_twin.pane_hits(panes, intrinsics, WIDTH, HEIGHT).pane
     mask = draw(HEIGHT, WIDTH, seed=1).to(dtype).clamp(min=0, max=1)
     images = (torch.rand(HEIGHT, WIDTH, 3, dtype=dtype), mask, torch.rand(2, HEIGHT, WIDTH, 4, dtype=dtype))
     leaves = [t.requires_grad_() for t in (*images, panes.normals, torch.tensor([0.04, 0.5], dtype=dtype))]
     own = [on_device(leaf) for leaf in leaves]
     names = dict(zip(("fresnel", "intensity", "linear"), switches, strict=True))
-    found = blend_operation.blend_panes(*own[:3], pane.to(DEVICE), *own[3:], intrinsics.to(DEVICE), **names)
-    expected = blend_twin.blend_panes(*leaves[:3], pane, *leaves[3:], intrinsics, **names)
+    found = panes_operation.blend_panes(*own[:3], pane.to(DEVICE), *own[3:], intrinsics.to(DEVICE), **names)
+    expected = panes_twin.blend_panes(*leaves[:3], pane, *leaves[3:], intrinsics, **names)
     for value, want in zip(found, expected, strict=True):
         close(value, want, 5)
     check_gradients(found, expected, own, leaves)
@@ -324,7 +317,7 @@ def test_cube_lookup(size: int, depth: int, count: int, dtype: torch.dtype) -> N
     texels = draw(6, size, size, depth, seed=5).to(dtype).requires_grad_()
     directions = directions_of(count).to(dtype).requires_grad_()
     leaves, own = [texels, directions], [on_device(texels), on_device(directions)]
-    found, expected = lookup_operation.cube_lookup(*own), lookup_twin.cube_lookup(*leaves)
+    found, expected = environment_operation.cube_lookup(*own), environment_twin.cube_lookup(*leaves)
     close(found, expected)
     check_gradients([found], [expected], own, leaves)
 
@@ -335,7 +328,7 @@ def test_cube_lookup_of_many_directions_of_one_texel_and_of_none() -> None:
         texels = draw(6, size, size, 1, seed=5).requires_grad_()
         leaves = [texels, directions.detach().requires_grad_()]
         own = [on_device(leaf) for leaf in leaves]
-        found, expected = lookup_operation.cube_lookup(*own), lookup_twin.cube_lookup(*leaves)
+        found, expected = environment_operation.cube_lookup(*own), environment_twin.cube_lookup(*leaves)
         close(found, expected)
         check_gradients([found], [expected], own, leaves)
 
@@ -353,8 +346,8 @@ def test_shade_environment(dtype: torch.dtype) -> None:
     leaves = [tensor.to(dtype).detach().requires_grad_() for tensor in (blended, alpha, texels, rotation)]
     own = [on_device(leaf) for leaf in leaves]
     options = {"background": (0.5, 1.0, 0.25), "least_strength": 0.2}
-    found = shade_operation.shade_environment(*own[:3], intrinsics.to(DEVICE), own[3], **options)
-    expected = shade_twin.shade_environment(*leaves[:3], intrinsics, leaves[3], **options)
+    found = environment_operation.shade_environment(*own[:3], intrinsics.to(DEVICE), own[3], **options)
+    expected = environment_twin.shade_environment(*leaves[:3], intrinsics, leaves[3], **options)
     for value, want in zip(found, expected, strict=True):
         close(value, want)
     check_gradients(found, expected, own, leaves)
@@ -371,8 +364,8 @@ def test_surface_channels(count: int, dtype: torch.dtype) -> None:
     leaves = [tensor.requires_grad_() for tensor in (colors, quats, strengths, extra)]
     own = [on_device(leaf) for leaf in leaves]
     fixed = [tensor.to(DEVICE) for tensor in (radii, log_scales, means, eye)]
-    found = surface_operation.surface_channels(own[0], fixed[0], own[1], *fixed[1:3], own[2], fixed[3], own[3])
-    expected = surface_twin.surface_channels(colors, radii, quats, log_scales, means, strengths, eye, extra)
+    found = environment_operation.surface_channels(own[0], fixed[0], own[1], *fixed[1:3], own[2], fixed[3], own[3])
+    expected = environment_twin.surface_channels(colors, radii, quats, log_scales, means, strengths, eye, extra)
     close(found, expected)
     check_gradients([found], [expected], own, leaves)
 
@@ -398,7 +391,7 @@ def test_the_result_has_the_same_bits_every_time(random_splats: SplatMaker) -> N
     channels = draw(1, splats.depths.shape[1], 4, seed=2).float().to(DEVICE)
     results = []
     for _ in range(2):
-        image = composite_operation.composite(splats, channels, bin_operation.bin_tiles(splats, *size)).image
+        image = composite_operation.composite(splats, channels, tiles_operation.bin_tiles(splats, *size)).image
         results.append((image, *torch.autograd.grad(image.square().sum(), splats[:3])))
     for first, second in zip(*results, strict=True):
         assert torch.equal(first, second)
@@ -416,7 +409,7 @@ def test_what_gradients_need_is_stored_only_for_them_and_freed_with_the_image(
 ) -> None:
     splats = on_device(random_splats((1, 3), (4, 2)))
     colors = draw(1, 3, 3, seed=1).to(DEVICE)
-    bins = bin_operation.bin_tiles(splats, 4, 2)
+    bins = tiles_operation.bin_tiles(splats, 4, 2)
     module = kernels_for("composite", DEVICE)
     composite, stored = module.composite, []
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from glassplat.kernels.devices import SIMULATED
+from glassplat.kernels.backend.devices import SIMULATED
 
 pytest.importorskip("numba_cuda", reason="numba-cuda is not installed; `make setup` installs it")
 

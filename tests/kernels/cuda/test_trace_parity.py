@@ -11,13 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.build_bvh import build_bvh
-from glassplat.kernels.build_bvh import cpu as build_cpu
-from glassplat.kernels.devices import SIMULATED
-from glassplat.kernels.splats import RawGaussians
-from glassplat.kernels.trace import Rays, trace
+from glassplat.kernels.backend.devices import SIMULATED
+from glassplat.kernels.records import RawGaussians, Rays
+from glassplat.kernels.trace import build_bvh, shapes_of, trace
+from glassplat.kernels.trace import cpu as build_cpu
 from glassplat.kernels.trace.reference import trace as twin
-from glassplat.kernels.trace.shapes import shapes_of
 from tests.kernels.cuda.agreement import DEVICE, DTYPES, close, many, on_a_device_or_skipped, on_device
 from tests.kernels.test_trace import DISCS, ELLIPSOIDS, bvh_of, cloud, one_disc, ray, rays_around, with_gradients
 

@@ -14,7 +14,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from glassplat.densify import default as densify
-from glassplat.kernels import devices
+from glassplat.kernels.backend import devices
 from glassplat.kernels.color_and_depth import reference as color_twin
 from glassplat.kernels.gradient_conflict import reference as conflict_twin
 from glassplat.kernels.harmonic_energy import reference as energy_twin
@@ -34,7 +34,7 @@ FROM_HERE = {ATEN.lift_fresh.default}
 INDEXED = {ATEN.index.Tensor, ATEN.index_put_.default, ATEN.index_put.default, ATEN._index_put_impl_.default}
 READ = {torch.Tensor.tolist, torch.Tensor.numpy, torch.Tensor.cpu}
 KERNEL_WAITS = {"bin_tiles": 1, "trace": 1}
-"""How often the CUDA kernels of an operation wait; the others never do (`test_waiting.py` looks)."""
+"""How often these functions of CUDA kernels wait; the others never do (`test_waiting.py` looks)."""
 
 
 class Waits(TorchDispatchMode):
@@ -109,7 +109,7 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch, waits: Waits) -> None:
 
         def run(name: str) -> Callable[..., Any]:
             def call(*args: Any, **kwargs: Any) -> Any:
-                waits.places += [f"kernel {operation}"] * KERNEL_WAITS.get(operation, 0)
+                waits.places += [f"kernel {name}"] * KERNEL_WAITS.get(name, 0)
                 with waits.paused():
                     return getattr(module, name)(*args, **kwargs)
 

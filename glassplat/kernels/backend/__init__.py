@@ -1,0 +1,1 @@
+"""How kernels are compiled, kept and launched, on which threads and on which device."""

@@ -1,0 +1,192 @@
+"""How CPU kernels are compiled and run: the compiler's flags, the threads, the memory between steps.
+
+Threads are OpenMP's where there are some, else those of Numba's own work queue. Left alone, Numba takes TBB wherever it
+finds one. TBB's waiting threads take the cores from PyTorch's pool, which makes training about twice as long, and when
+the process ends they may wait for each other forever. So TBB comes last, behind the work queue that is always there.
+Set NUMBA_THREADING_LAYER or NUMBA_THREADING_LAYER_PRIORITY to choose.
+
+What is freed stays at hand, up to a bound, where the C library can be told so. Images, packed splats and gradient rows
+are made anew in every step. glibc gives what is freed back to the system as soon as it is more than twice the largest
+of them, and the next step fetches it again page by page, 4 KiB at a time. Set MALLOC_TRIM_THRESHOLD_,
+MALLOC_MMAP_THRESHOLD_ or GLIBC_TUNABLES to choose.
+
+A `prange` gives each thread one contiguous run of tasks. Neighbouring Gaussians and tiles are alike (behind the camera,
+empty, crowded), so one thread would get most of the work. Taken with a stride that visits every task once
+(`even_stride`), any run of tasks is a sample of all of them. Which thread does a task never shows in the result.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import threading
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from numba import types
+from numba.extending import intrinsic, register_jitable
+from numba.np.arrayobj import populate_array
+
+from glassplat.kernels.backend.cpu_cache import KernelCache
+
+CHOSEN_BY_USER = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES")
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
+"""Numbers of the two parameters of glibc's `mallopt`."""
+KEPT = 128 << 20
+"""Bytes of freed memory that a process keeps at the most."""
+LARGEST_RECYCLED = 32 << 20
+"""Bytes of the largest arrays that are taken from it, the most that glibc allows; larger ones go back when freed."""
+
+
+def keep_freed_memory() -> bool:
+    """Lets this process keep freed memory; False where the user decides, or the C library has no such choice."""
+    if any(name in os.environ for name in CHOSEN_BY_USER):
+        return False
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError, TypeError):  # Not glibc, or not a system with one C library for all.
+        return False
+    return bool(mallopt(TRIM_THRESHOLD, KEPT)) and bool(mallopt(MMAP_THRESHOLD, LARGEST_RECYCLED))
+
+
+log = logging.getLogger("glassplat.kernels")
+
+PRIORITY = ["omp", "workqueue", "tbb"]
+NAMES = {"omp": "OpenMP", "workqueue": "Numba's work queue", "tbb": "TBB"}
+
+_alone = threading.Lock()
+
+
+def prefer_openmp() -> None:
+    """Puts TBB last, unless the user has said what comes first; before Numba starts its threads."""
+    if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
+        numba.config.THREADING_LAYER_PRIORITY = PRIORITY
+
+
+@cache
+def threading_layer() -> str:
+    """Numba's threading layer, `omp`, `workqueue` or `tbb`; starts its threads, and says which, at the first call."""
+    prefer_openmp()  # Again: Numba reads its variables anew when the environment has changed.
+    threads = numba.get_num_threads()
+    layer = str(numba.threading_layer())
+    log.info("kernels run on %d threads of %s", threads, NAMES.get(layer, layer))
+    return layer
+
+
+def entrance(compiled: Callable[..., Any]) -> Callable[..., Any]:
+    """A parallel kernel as any thread may call it: the work queue ends the process when two threads are in it."""
+    if threading_layer() != "workqueue":
+        return compiled
+
+    def enter(*arguments: Any) -> Any:
+        with _alone:
+            return compiled(*arguments)
+
+    return enter
+
+
+# Before anything else in the process can start Numba's threads.
+prefer_openmp()
+keep_freed_memory()
+
+HOW = "".join(Path(__file__).with_name(name).read_text() for name in ("cpu.py", "cpu_vector.py"))
+"""This file and what operators on vectors mean, which no kernel names: with its own code, they decide whether the cache
+still holds."""
+
+# `nnan` and `ninf` stay out: with them a comparison with NaN is undefined, and culling bad Gaussians relies on it.
+FAST_MATH = frozenset({"contract", "reassoc", "nsz", "arcp", "afn"})
+
+# Forced, because the compiler balks at functions of many arrays, where a call costs more than the body. Without
+# reference counting too: one atomic increment per array and call, of counters that all threads share.
+inlined = register_jitable(forceinline=True, _nrt=False, fastmath=set(FAST_MATH), error_model="numpy")
+"""Marks a scalar function that kernels call; it must not create arrays. Compiles for the CPU and for CUDA."""
+
+
+class Kernel:
+    """A compiled kernel and its name."""
+
+    def __init__(self, dispatcher: Any, name: str, *, parallel: bool) -> None:
+        self.dispatcher = dispatcher
+        self.name = name
+        self._run: Callable[..., Any] = self._first_run if parallel else dispatcher
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Runs the kernel, compiled at the first call unless the disk has it."""
+        return self._run(*arguments)
+
+    def _first_run(self, *arguments: Any) -> Any:
+        """Starts the threads: only then it is known which they are, and how a parallel kernel may be entered."""
+        self._run = entrance(self.dispatcher)
+        return self._run(*arguments)
+
+    @property
+    def compilations(self) -> int:
+        """How often this process had to compile it, once for each combination of argument types."""
+        return int(self.dispatcher._cache.compilations)
+
+
+def kernel(name: str, real: type, *, parallel: bool = True) -> Callable[[Callable[..., Any]], Kernel]:
+    """Compiles a kernel function made by a factory for one floating-point type.
+
+    The function may use functions marked `inlined` and typed constants, but no other compiled kernel.
+
+    Args:
+        name: the operation and direction, such as `composite_forward`.
+        real: `np.float32` or `np.float64`, part of the cached file's name.
+        parallel: whether the function holds a `prange`.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Kernel:
+        full_name = f"{name}_{np.dtype(real).name}"
+        function.__name__ = full_name
+        function.__qualname__ = full_name
+        compiled = numba.njit(parallel=parallel, fastmath=set(FAST_MATH), error_model="numpy")
+        dispatcher = compiled(function)
+        dispatcher._cache = KernelCache(function, compiled, flags=f"parallel={parallel} {HOW}")
+        return Kernel(dispatcher, full_name, parallel=parallel)
+
+    return decorate
+
+
+GOLDEN = 0.6180339887498949
+
+
+@inlined
+def even_stride(count):
+    """A stride near the golden section of `count` and coprime to it: task `t` does piece `t * stride % count`."""
+    stride = max(1, int(count * GOLDEN))
+    while True:
+        a, b = count, stride
+        while b != 0:
+            a, b = b, a % b
+        if a <= 1:
+            return stride
+        stride += 1
+
+
+def array_at(real: type) -> Callable[..., Any]:
+    """The function that makes an array of type `real` of the `count` elements from `first` on behind an address.
+
+    Nothing keeps what lies there: the caller holds the tensors until the kernel has returned.
+    """
+    kind = types.Array(types.float64 if real is np.float64 else types.float32, 1, "C")
+
+    @intrinsic
+    def at(typing, address, first, count):
+        def generate(context, builder, sig, arguments):
+            array = context.make_array(kind)(context, builder)
+            size = context.get_constant(types.intp, kind.dtype.bitwidth // 8)
+            begin = builder.inttoptr(arguments[0], context.get_data_type(kind.dtype).as_pointer())
+            data = builder.gep(begin, [arguments[1]])
+            populate_array(array, data=data, shape=[arguments[2]], strides=[size], itemsize=size, meminfo=None)
+            return array._getvalue()
+
+        if all(isinstance(argument, types.Integer) for argument in (address, first, count)):
+            return kind(types.int64, types.intp, types.intp), generate
+
+    return at

@@ -1,0 +1,298 @@
+"""The on-disk cache of compiled kernels: what makes a kernel the same as in an earlier process, and where it lies.
+
+Kernels are kept in the first of four folders that can be written: NUMBA_CACHE_DIR where it is set, `__pycache__` beside
+the kernel's source, the user's cache folder, and one in the folder for temporary files. What lies ready in one of them
+is used also where nothing can be written, as in a container whose kernels were compiled when it was built.
+"""
+
+from __future__ import annotations
+
+import dis
+import hashlib
+import logging
+import os
+import pickle
+import stat
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
+from typing import Any
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba.core import types
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    InTreeCacheLocator,
+    UserProvidedCacheLocator,
+    UserWideCacheLocator,
+)
+from numba.core.cpu import CPUContext
+from numba.core.registry import cpu_target
+from numba.extending import intrinsic
+
+log = logging.getLogger("glassplat.kernels")
+
+REMEDY = "set NUMBA_CACHE_DIR to a folder that can be written and lasts"
+
+
+class UserFolder(UserWideCacheLocator):
+    """The user's cache folder, if there is one."""
+
+    @classmethod
+    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> Any:
+        """The folder for a kernel; None where it cannot be written, or where a user without a home has none."""
+        # Without a home, `~` stays as it is, and a folder of that name would appear wherever the command runs.
+        return (
+            super().from_function(py_func, py_file) if os.path.isabs(cls(py_func, py_file).get_cache_path()) else None
+        )
+
+
+class TemporaryFolder(InTreeCacheLocator):
+    """A folder among the temporary files that nobody else can write to, since what is in it will be executed."""
+
+    def get_cache_path(self) -> str:
+        """The folder for the kernel's module."""
+        return os.path.join(_temporary_root(), self.get_suitable_cache_subpath(self._py_file))
+
+    def ensure_cache_path(self) -> None:
+        """Makes the folder.
+
+        Raises:
+            OSError: it cannot be written, or belongs to somebody else.
+        """
+        root = Path(_temporary_root())
+        root.mkdir(mode=0o700, exist_ok=True)
+        found = root.lstat()
+        if not stat.S_ISDIR(found.st_mode) or _user() not in (None, found.st_uid) or found.st_mode & 0o022:
+            raise PermissionError(f"{root} can be written by others")
+        super().ensure_cache_path()
+
+
+class Nowhere(InTreeCacheLocator):
+    """The folder beside the source when none can be written: kernels are read from it, and saving fails."""
+
+    def ensure_cache_path(self) -> None:
+        """Leaves everything as it is; whether something can be saved shows when it is."""
+
+
+class KernelFiles(CompileResultCacheImpl):
+    """How compiled kernels become files, and where: in the first folder that can be written."""
+
+    _locator_classes = (UserProvidedCacheLocator, InTreeCacheLocator, UserFolder, TemporaryFolder, Nowhere)
+
+    def files(self, function: Callable[..., Any]) -> list[IndexDataCacheFile]:
+        """The kernel's file in every folder, first the one that is written to."""
+        folders = [self.locator.get_cache_path()]
+        if not numba.config.CACHE_LOCATOR_CLASSES:  # Numba's own way to ask for one folder and no other.
+            kinds = [InTreeCacheLocator, UserFolder]
+            if numba.config.CACHE_DIR:
+                kinds.insert(0, UserProvidedCacheLocator)
+            folders += [kind(function, self.locator._py_file).get_cache_path() for kind in kinds]
+        stamp = self.locator.get_source_stamp()
+        return [IndexDataCacheFile(folder, self.filename_base, stamp) for folder in dict.fromkeys(folders)]
+
+    def remark(self) -> None:
+        """Says, once, when kernels are not kept where the user may expect them."""
+        folder = os.path.dirname(self.locator.get_cache_path())
+        if isinstance(self.locator, TemporaryFolder):
+            _warn_once(
+                "compiled kernels are kept in %s, which may not last: neither the package nor the user's cache "
+                "folder can be written; %s",
+                folder,
+                REMEDY,
+            )
+        elif numba.config.CACHE_DIR and not isinstance(self.locator, UserProvidedCacheLocator):
+            _warn_once(
+                "NUMBA_CACHE_DIR is %s, which cannot be written; compiled kernels are kept in %s",
+                numba.config.CACHE_DIR,
+                self.locator.get_cache_path(),
+            )
+
+    def not_kept(self, reason: Exception) -> None:
+        """Says, once, that kernels will be compiled again in the next process."""
+        _warn_once("cannot keep compiled kernels for the next time: %s; %s", str(reason), REMEDY)
+
+
+@cache
+def _warn_once(text: str, *values: str) -> None:
+    log.warning(text, *values)
+
+
+def _temporary_root() -> str:
+    return os.path.join(tempfile.gettempdir(), f"glassplat-kernels-{_user()}")
+
+
+def _user() -> int | None:
+    """The user's number; None where users have none."""
+    return os.getuid() if hasattr(os, "getuid") else None
+
+
+log = logging.getLogger("glassplat.kernels")
+
+PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
+NAMED = (ModuleType, type, BuiltinFunctionType, np.ufunc)
+SPELLED = (types.Type, ir.Type)
+"""Types whose text says all about them."""
+LIBRARIES = ("numba", "numpy", "llvmlite")
+INTRINSIC = type(intrinsic(lambda typing: None))
+DAMAGE = (EOFError, pickle.UnpicklingError, AttributeError, ImportError, LookupError, TypeError, ValueError)
+"""What reading a file ends with that was cut short, or is another program's."""
+
+
+def fingerprint(function: Callable[..., Any], flags: str) -> str:
+    """Digest of everything a compiled function is made from.
+
+    That is its bytecode and constants, what it closes over, the globals that it reads, and the same of every function
+    among those. Equal sources give equal digests in every process.
+
+    Args:
+        function: a Python function, before compilation.
+        flags: the compiler options, written out.
+
+    Raises:
+        TypeError: the function uses a value that has no stable description.
+    """
+    digest = hashlib.sha256(flags.encode())
+    for part in _described(function, set()):
+        digest.update(part.encode() + b"\0")
+    return digest.hexdigest()
+
+
+def _described(value: Any, seen: set[int]) -> Iterator[str]:
+    """The value as text, part by part; functions are entered once."""
+    if isinstance(value, PLAIN):
+        yield f"{type(value).__name__} {value!r}"
+    elif isinstance(value, tuple | frozenset):
+        parts = [" ".join(_described(item, seen)) for item in value]
+        yield f"{type(value).__name__} of {len(parts)}"
+        yield from sorted(parts) if isinstance(value, frozenset) else parts
+    elif isinstance(value, CodeType):
+        yield value.co_code.hex()
+        yield " ".join(value.co_names)
+        yield from _described(value.co_consts, seen)
+    elif isinstance(value, NAMED) or (isinstance(value, FunctionType) and value.__module__.startswith(LIBRARIES)):
+        yield f"{getattr(value, '__module__', '')} {value.__name__}"
+    elif isinstance(value, SPELLED):
+        yield f"{type(value).__name__} {value}"
+    elif isinstance(value, INTRINSIC):
+        yield "intrinsic"
+        yield from _described(value.__wrapped__, seen)
+    elif isinstance(value, FunctionType):
+        if id(value) not in seen:
+            seen.add(id(value))
+            yield from _described_function(value, seen)
+    elif type(value).__name__ == "_Intrinsic":
+        # What a kernel says to the compiler in its own words, in a function that Numba wraps.
+        yield from _described(value._defn, seen)
+    else:
+        raise TypeError(
+            f"a kernel uses {value!r}, a {type(value).__name__}, whose changes the cache would not notice; expected "
+            "numbers, strings, tuples, types, modules and functions that are plain or marked `inlined`"
+        )
+
+
+def _described_function(function: FunctionType, seen: set[int]) -> Iterator[str]:
+    """Bytecode, defaults, closure and globals of a function."""
+    yield from _described(function.__code__, seen)
+    yield from _described(function.__defaults__, seen)
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        yield f"closes over {name}"
+        yield from _described(cell.cell_contents, seen)
+    for name in sorted(_globals_read(function.__code__) & function.__globals__.keys()):
+        yield f"reads {name}"
+        yield from _described(function.__globals__[name], seen)
+
+
+def _globals_read(code: CodeType) -> set[str]:
+    """Names of the globals that a code object and those nested in it read."""
+    read = {step.argval for step in dis.get_instructions(code) if step.opname == "LOAD_GLOBAL"}
+    nested = (constant for constant in code.co_consts if isinstance(constant, CodeType))
+    return read.union(*map(_globals_read, nested))
+
+
+@cache
+def loading_context() -> CPUContext:
+    """Where kernels are loaded that this process has compiled itself: apart from what the compiler left."""
+    return CPUContext(cpu_target.typing_context, "cpu")
+
+
+class KernelCache(FunctionCache):
+    """Numba's on-disk cache, under keys that hold across processes, with an announcement of each compilation, and with
+    the same kernel in the process that compiles it as in all others.
+
+    Numba's own key pickles what a function closes over. Those bytes depend on which strings happen to be one object
+    in memory, so that another program that imports in another order compiles everything again.
+
+    The compiler optimises the body of a `prange` twice: by itself, and again as a part of the kernel. The process that
+    compiles would run the first result, those that load the kernel the second, and the two may round differently. So
+    what has been compiled is loaded from the disk like everything else.
+    """
+
+    _impl_class = KernelFiles
+
+    def __init__(self, function: Callable[..., Any], compiled: Callable[..., Any], flags: str) -> None:
+        super().__init__(function)
+        self._function, self._compiled = function, compiled
+        self._name_shown = function.__name__
+        self._files = self._impl.files(function)
+        self._fingerprint = fingerprint(function, flags)
+        self.compilations = 0
+
+    def _load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The kernel for a signature from the first folder that has it; a damaged file counts as none."""
+        key = self._index_key(sig, target_context.codegen())
+        for file in self._files:
+            try:
+                data = file.load(key)
+            except OSError:
+                continue  # A folder that is none, or that this user may not look into.
+            except DAMAGE as error:
+                log.warning("%s cannot be read (%s); compiling again", file._index_path, error)
+                continue
+            if data is not None:
+                return self._impl.rebuild(target_context, data)
+        return None
+
+    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, Any, str]:
+        return sig, codegen.magic_tuple(), self._fingerprint
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The kernel for a signature; where the disk does not have it, the compiler runs first, which is announced."""
+        found = super().load_overload(sig, target_context)
+        if found is None:
+            made = self._compile(sig)
+            # Without a place on the disk, what the compiler left has to do, but for its notes on time taken.
+            found = super().load_overload(sig, loading_context()) or made._replace(metadata=None)
+        return found
+
+    def _compile(self, sig: Any) -> Any:
+        """Compiles the kernel and keeps it; goes on without when the disk refuses."""
+        log.info("compiling %s for this machine (first use only, then cached on disk) ...", self._name_shown)
+        started = time.perf_counter()
+        dispatcher = self._compiled(self._function)
+        dispatcher.compile(sig)
+        (made,) = dispatcher.overloads.values()
+        self.compilations += 1
+        log.info("compiled %s in %.1f s", self._name_shown, time.perf_counter() - started)
+        self._keep(sig, made)
+        return made
+
+    def _keep(self, sig: Any, made: Any) -> None:
+        """Writes a compiled kernel to the disk; a damaged index, which cannot be added to, is begun anew."""
+        try:
+            try:
+                self.save_overload(sig, made)
+            except DAMAGE:
+                self.flush()
+                self.save_overload(sig, made)
+        except OSError as error:
+            self._impl.not_kept(error)
+        else:
+            self._impl.remark()

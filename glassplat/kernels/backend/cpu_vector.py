@@ -1,0 +1,538 @@
+"""Vectors in CPU kernels: several numbers that one instruction computes with.
+
+A kernel that uses them says itself what lies in one vector, where a loop leaves that to the compiler, and keeps sums in
+registers from one loop to the next. Vectors have one element type and a number of lanes, a power of two; LLVM splits
+what is wider than the machine's registers, so that a kernel means the same everywhere.
+
+    full, load = vector_kind(np.float32, 8)
+
+    @kernel("scale", np.float32)
+    def scale(values, factor):
+        for at in range(0, values.size, 8):
+            store(values, at, load(values, at) * factor)
+
+Vectors take `+ - * /`, comparisons, which give masks, and unary minus; masks take `&` and `|`. The other operand of
+arithmetic may be a scalar of the same element type and of no other: a bare literal, which would be float64, does not
+compile. Sums and products may be fused, as everywhere in kernels. A comparison with NaN is false.
+
+A row of four pixels with four channels is a vector of 16 lanes; with three channels it is 12 numbers, in vectors of 8
+and 4 lanes. What belongs to one thing lies beside each other in memory, the three coordinates of a place or its many
+coefficients; a vector holds one of these of several things.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, register_model
+
+from glassplat.kernels.backend.cpu import FAST_MATH
+
+FLAGS = tuple(sorted(FAST_MATH))
+MASK_BITS = 64
+"""Lanes of the widest mask."""
+
+Intrinsic = Callable[..., Any]
+
+
+class VectorType(types.Type):
+    """Type of vectors of `lanes` numbers of the type `element`."""
+
+    def __init__(self, element: types.Float, lanes: int) -> None:
+        self.element, self.lanes = element, lanes
+        super().__init__(name=f"vector({element} x {lanes})")
+
+
+class MaskType(types.Type):
+    """Type of vectors of truth values."""
+
+    def __init__(self, lanes: int) -> None:
+        self.lanes = lanes
+        super().__init__(name=f"mask({lanes})")
+
+
+def llvm_type(kind: VectorType) -> ir.VectorType:
+    """What such vectors are to LLVM."""
+    return ir.VectorType(ir.DoubleType() if kind.element == types.float64 else ir.FloatType(), kind.lanes)
+
+
+@register_model(VectorType)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: VectorType) -> None:
+        super().__init__(manager, kind, llvm_type(kind))
+
+
+@register_model(MaskType)
+class _MaskModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: MaskType) -> None:
+        super().__init__(manager, kind, ir.VectorType(ir.IntType(1), kind.lanes))
+
+
+class VectorKind(NamedTuple):
+    """What makes vectors of one element type and number of lanes.
+
+    Attributes:
+        full: a scalar in every lane.
+        load: consecutive elements of a contiguous one-dimensional array, from an index on.
+    """
+
+    full: Intrinsic
+    load: Intrinsic
+
+
+def vector_kind(real: type, lanes: int) -> VectorKind:
+    """The functions for vectors of `lanes` numbers of type `real`, np.float32 or np.float64."""
+    kind = VectorType(types.float64 if real is np.float64 else types.float32, lanes)
+
+    @intrinsic
+    def full(typing, value):
+        if value == kind.element:
+            return plain(kind, (value,), lambda builder, x: _spread(builder, x, kind))
+
+    @intrinsic
+    def load(typing, array, at):
+        def generate(context, builder, sig, arguments):
+            value = builder.load(_pointer(context, builder, sig, arguments, kind))
+            value.align = kind.element.bitwidth // 8
+            return value
+
+        if _holds(array, kind):
+            return kind(array, types.intp), generate
+
+    return VectorKind(full, load)
+
+
+def constant(real: type, values: tuple[float, ...]) -> Intrinsic:
+    """The function without arguments that gives a vector of these values."""
+    kind = VectorType(types.float64 if real is np.float64 else types.float32, len(values))
+
+    @intrinsic
+    def fixed(typing):
+        return plain(kind, (), lambda builder: ir.Constant(llvm_type(kind), [float(real(v)) for v in values]))
+
+    return fixed
+
+
+@intrinsic
+def item(typing, array, at):
+    """One element of a contiguous one-dimensional array, at an index that the caller knows not to be negative.
+
+    Between vectors, the arithmetic with which an ordinary index minds its sign is a good part of a loop.
+    """
+
+    def generate(context, builder, sig, arguments):
+        data = context.make_array(sig.args[0])(context, builder, arguments[0]).data
+        return builder.load(builder.gep(data, [arguments[1]]))
+
+    if isinstance(array, types.Array) and array.ndim == 1 and array.layout == "C":
+        return array.dtype(array, types.intp), generate
+
+
+@intrinsic
+def store(typing, array, at, value):
+    """Puts a vector into consecutive elements of a contiguous one-dimensional array, from index `at` on."""
+
+    def generate(context, builder, sig, arguments):
+        done = builder.store(arguments[2], _pointer(context, builder, sig, arguments, value))
+        done.align = value.element.bitwidth // 8
+        return context.get_dummy_value()
+
+    if isinstance(value, VectorType) and _holds(array, value):
+        return types.void(array, types.intp, value), generate
+
+
+@intrinsic
+def select(typing, mask, chosen, other):
+    """`chosen` where the mask holds, `other` elsewhere."""
+    if isinstance(mask, MaskType) and isinstance(chosen, VectorType) and chosen == other:
+        return plain(chosen, (mask, chosen, other), lambda builder, *arguments: builder.select(*arguments))
+
+
+def _extreme(order: str) -> Intrinsic:
+    @intrinsic
+    def extreme(typing, a, b):
+        if isinstance(a, VectorType) and a == b:
+            return plain(a, (a, b), lambda builder, x, y: builder.select(builder.fcmp_ordered(order, x, y), x, y))
+
+    return extreme
+
+
+minimum = _extreme("<")
+"""The smaller of two vectors, lane by lane; the second where either is NaN."""
+maximum = _extreme(">")
+"""The larger of two vectors, lane by lane; the second where either is NaN."""
+
+
+def _called(name: str) -> Intrinsic:
+    @intrinsic
+    def called(typing, value):
+        if isinstance(value, VectorType):
+            return plain(value, (value,), lambda builder, x: _call(builder, name, value, x))
+
+    return called
+
+
+absolute = _called("fabs")
+square_root = _called("sqrt")
+exp = _called("exp")
+"""e^x; a call for each lane, exact and slow."""
+
+
+@intrinsic
+def fraction(typing, value):
+    """What is left of numbers when they are cut towards 0; undefined from 2^31 on."""
+
+    def build(builder, x):
+        whole = builder.fptosi(x, ir.VectorType(ir.IntType(32), value.lanes))
+        return builder.fsub(x, builder.sitofp(whole, x.type), flags=FLAGS)
+
+    if isinstance(value, VectorType):
+        return plain(value, (value,), build)
+
+
+@intrinsic
+def times_power_of_2(typing, value, exponent):
+    """`value` times 2^n, where n is the exponent cut towards 0; undefined where the result is not a normal number."""
+    if isinstance(value, VectorType) and value == exponent:
+        return plain(value, (value, exponent), lambda builder, x, y: _times_power_of_2(builder, x, y, value))
+
+
+@intrinsic
+def bits_of(typing, mask):
+    """A mask as an integer; the first lane is its lowest bit."""
+
+    def build(builder, lanes):
+        bits = builder.bitcast(lanes, ir.IntType(mask.lanes))
+        return bits if mask.lanes == MASK_BITS else builder.zext(bits, ir.IntType(MASK_BITS))
+
+    if isinstance(mask, MaskType):
+        return plain(types.int64, (mask,), build)
+
+
+@intrinsic
+def lowest_bit(typing, bits):
+    """Which is the lowest bit that is set in an int64; undefined for 0."""
+    if bits == types.int64:
+        return plain(types.intp, (bits,), lambda builder, x: builder.cttz(x, ir.Constant(ir.IntType(1), 1)))
+
+
+@intrinsic
+def sums_of(typing, vectors):
+    """The vector of the sums over the lanes of as many vectors as it has lanes, in an order of adding that is fixed."""
+
+    def build(builder, packed):
+        parts = [builder.extract_value(packed, i) for i in range(vectors.count)]
+        groups = 1
+        while len(parts) > 1:
+            parts = [_halved(builder, *pair, groups) for pair in zip(parts[::2], parts[1::2], strict=True)]
+            groups *= 2
+        return parts[0]
+
+    if isinstance(vectors, types.UniTuple) and vectors.count == getattr(vectors.dtype, "lanes", 0):
+        return plain(vectors.dtype, (vectors,), build)
+
+
+def shuffled(builder: Any, a: Any, b: Any, order: Any) -> Any:
+    """Lanes of two vectors in a row, in some order, as one vector."""
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(order)), list(order)))
+
+
+def _halved(builder: Any, a: Any, b: Any, groups: int) -> Any:
+    """Halves the lanes that hold each of the sums begun in two vectors, `groups` sums in either."""
+    lanes = a.type.count
+    width = lanes // groups
+    near = [g * width + i for g in range(2 * groups) for i in range(width // 2)]
+    far = [i + width // 2 for i in near]
+    return builder.fadd(shuffled(builder, a, b, near), shuffled(builder, a, b, far), flags=FLAGS)
+
+
+def _times_power_of_2(builder: Any, x: Any, exponent: Any, kind: VectorType) -> Any:
+    mantissa, width = (52, 64) if kind.element == types.float64 else (23, 32)
+    narrow, bits = (ir.VectorType(ir.IntType(w), kind.lanes) for w in (32, width))
+    whole = builder.fptosi(exponent, narrow)
+    whole = builder.sext(whole, bits) if width > 32 else whole
+    raised = builder.shl(whole, ir.Constant(bits, [mantissa] * kind.lanes))
+    return builder.bitcast(builder.add(builder.bitcast(x, bits), raised), x.type)
+
+
+def plain(result: Any, arguments: tuple[Any, ...], build: Callable[..., Any]) -> tuple[Any, Callable[..., Any]]:
+    """What an intrinsic returns that needs nothing but the values of its arguments."""
+    return result(*arguments), lambda context, builder, sig, values: build(builder, *values)
+
+
+def _holds(array: Any, kind: VectorType) -> bool:
+    return isinstance(array, types.Array) and array.ndim == 1 and array.layout == "C" and array.dtype == kind.element
+
+
+def _pointer(context: Any, builder: Any, sig: Any, arguments: Any, kind: VectorType) -> Any:
+    data = context.make_array(sig.args[0])(context, builder, arguments[0]).data
+    return builder.bitcast(builder.gep(data, [arguments[1]]), llvm_type(kind).as_pointer())
+
+
+def _spread(builder: Any, x: Any, kind: VectorType) -> Any:
+    index = ir.IntType(32)
+    undefined = ir.Constant(llvm_type(kind), ir.Undefined)
+    first = builder.insert_element(undefined, x, ir.Constant(index, 0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(index, kind.lanes), [0] * kind.lanes))
+
+
+def _call(builder: Any, name: str, kind: VectorType, *values: Any) -> Any:
+    vector = llvm_type(kind)
+    full_name = f"llvm.{name}.v{kind.lanes}f{kind.element.bitwidth}"
+    signature = ir.FunctionType(vector, [vector] * len(values))
+    return builder.call(cgutils.get_or_insert_function(builder.module, signature, full_name), values, fastmath=FLAGS)
+
+
+def _arithmetic(symbol: Callable[..., Any], build: Callable[..., Any]) -> None:
+    """Registers an operator on two vectors, or on a vector and a scalar."""
+
+    @infer_global(symbol)
+    class _Template(AbstractTemplate):
+        def generic(self, arguments: Any, keywords: Any) -> Any:
+            kinds = [kind for kind in arguments if isinstance(kind, VectorType)]
+            if len(arguments) == 2 and kinds and all(kind in (kinds[0], kinds[0].element) for kind in arguments):
+                return signature(kinds[0], *arguments)
+            return None
+
+    def lower(context: Any, builder: Any, sig: Any, values: Any) -> Any:
+        kind = sig.return_type
+        return build(
+            builder, *(v if t == kind else _spread(builder, v, kind) for v, t in zip(values, sig.args, strict=True))
+        )
+
+    for arguments in ((VectorType, VectorType), (VectorType, types.Float), (types.Float, VectorType)):
+        lower_builtin(symbol, *arguments)(lower)
+
+
+def _comparison(symbol: Callable[..., Any], name: str) -> None:
+    @infer_global(symbol)
+    class _Template(AbstractTemplate):
+        def generic(self, arguments: Any, keywords: Any) -> Any:
+            if isinstance(arguments[0], VectorType) and arguments[1] in (arguments[0], arguments[0].element):
+                return signature(MaskType(arguments[0].lanes), *arguments)
+            return None
+
+    def lower(context: Any, builder: Any, sig: Any, values: Any) -> Any:
+        kind = sig.args[0]
+        other = values[1] if sig.args[1] == kind else _spread(builder, values[1], kind)
+        return builder.fcmp_ordered(name, values[0], other)
+
+    for second in (VectorType, types.Float):
+        lower_builtin(symbol, VectorType, second)(lower)
+
+
+def _unary_and_masks() -> None:
+    @infer_global(operator.neg)
+    class _Negative(AbstractTemplate):
+        def generic(self, arguments: Any, keywords: Any) -> Any:
+            return signature(arguments[0], arguments[0]) if isinstance(arguments[0], VectorType) else None
+
+    lower_builtin(operator.neg, VectorType)(lambda context, builder, sig, values: builder.fneg(values[0]))
+    for symbol, name in ((operator.and_, "and_"), (operator.or_, "or_")):
+        _logic(symbol, name)
+
+
+def _logic(symbol: Callable[..., Any], name: str) -> None:
+    @infer_global(symbol)
+    class _Template(AbstractTemplate):
+        def generic(self, arguments: Any, keywords: Any) -> Any:
+            if isinstance(arguments[0], MaskType) and arguments[0] == arguments[1]:
+                return signature(arguments[0], *arguments)
+            return None
+
+    lower_builtin(symbol, MaskType, MaskType)(lambda context, builder, sig, values: getattr(builder, name)(*values))
+
+
+_arithmetic(operator.add, lambda builder, a, b: builder.fadd(a, b, flags=FLAGS))
+_arithmetic(operator.sub, lambda builder, a, b: builder.fsub(a, b, flags=FLAGS))
+_arithmetic(operator.mul, lambda builder, a, b: builder.fmul(a, b, flags=FLAGS))
+_arithmetic(operator.truediv, lambda builder, a, b: builder.fdiv(a, b, flags=FLAGS))
+_comparison(operator.lt, "<")
+_comparison(operator.le, "<=")
+_comparison(operator.gt, ">")
+_comparison(operator.ge, ">=")
+_unary_and_masks()
+
+
+ROW = 16
+"""Lanes of a row of four pixels with four channels."""
+
+
+@intrinsic
+def interleaved(typing, vectors):
+    """Four vectors taken apart lane by lane: the first lanes of all four, then their second lanes, and so on.
+
+    The result is four vectors again; `sorted_apart` undoes it.
+    """
+
+    def build(builder, packed):
+        a, b, c, d = (builder.extract_value(packed, i) for i in range(4))
+        pairs = [zipped(builder, *pair) for pair in ((a, c), (b, d))]
+        rows = [row for even, odd in zip(*pairs, strict=True) for row in zipped(builder, even, odd)]
+        return cgutils.pack_array(builder, rows, a.type)
+
+    if isinstance(vectors, types.UniTuple) and vectors.count == 4 and isinstance(vectors.dtype, VectorType):
+        return plain(vectors, (vectors,), build)
+
+
+@intrinsic
+def sorted_apart(typing, vectors):
+    """Four vectors of which every fourth lane belongs together; undoes `interleaved`."""
+
+    def build(builder, packed):
+        rows = [builder.extract_value(packed, i) for i in range(4)]
+        halves = [_unzipped(builder, *pair) for pair in zip(rows[::2], rows[1::2], strict=True)]
+        evens, odds = (_unzipped(builder, *pair) for pair in zip(*halves, strict=True))
+        return cgutils.pack_array(builder, [evens[0], odds[0], evens[1], odds[1]], rows[0].type)
+
+    if isinstance(vectors, types.UniTuple) and vectors.count == 4 and isinstance(vectors.dtype, VectorType):
+        return plain(vectors, (vectors,), build)
+
+
+def zipped(builder: Any, a: Any, b: Any) -> tuple[Any, Any]:
+    """a0 b0 a1 b1 ..., in two vectors."""
+    lanes = a.type.count
+    order = [i // 2 + i % 2 * lanes for i in range(2 * lanes)]
+    return shuffled(builder, a, b, order[:lanes]), shuffled(builder, a, b, order[lanes:])
+
+
+def _unzipped(builder: Any, a: Any, b: Any) -> tuple[Any, Any]:
+    """The even lanes of two vectors in a row, and the odd ones."""
+    lanes = a.type.count
+    return shuffled(builder, a, b, range(0, 2 * lanes, 2)), shuffled(builder, a, b, range(1, 2 * lanes, 2))
+
+
+@intrinsic
+def without_fourths(typing, row):
+    """The first three channels of a row of four pixels: 12 numbers, in vectors of 8 and 4 lanes."""
+
+    def build(builder, x):
+        kept = [lane for lane in range(ROW) if lane % 4 < 3]
+        return cgutils.pack_struct(builder, [shuffled(builder, x, x, kept[:8]), shuffled(builder, x, x, kept[8:])])
+
+    if isinstance(row, VectorType) and row.lanes == ROW:
+        return plain(types.Tuple((VectorType(row.element, 8), VectorType(row.element, 4))), (row,), build)
+
+
+@intrinsic
+def with_fourths(typing, eight, four):
+    """A row of four pixels of which three channels are given, as `without_fourths` gives them; the fourth is zero."""
+
+    def build(builder, x, y):
+        padded = shuffled(builder, y, y, [*range(4), *range(4)])
+        twelve = shuffled(builder, x, padded, range(ROW))
+        zeros = ir.Constant(twelve.type, [0.0] * ROW)
+        order = [ROW if lane % 4 == 3 else lane // 4 * 3 + lane % 4 for lane in range(ROW)]
+        return shuffled(builder, twelve, zeros, order)
+
+    if isinstance(eight, VectorType) and (eight.lanes, four) == (8, VectorType(eight.element, 4)):
+        return plain(VectorType(eight.element, ROW), (eight, four), build)
+
+
+@intrinsic
+def thirds(typing, first, second, third):
+    """Three vectors in a row that hold triples: their first numbers, their second and their third ones."""
+
+    def build(builder, a, b, c):
+        lanes = a.type.count
+        columns = []
+        for k in range(3):
+            places = [3 * i + k for i in range(lanes)]
+            # From the first two vectors, 0 for what is in the third; then that from there.
+            early = shuffled(builder, a, b, [place if place < 2 * lanes else 0 for place in places])
+            late = [i if place < 2 * lanes else place - lanes for i, place in enumerate(places)]
+            columns.append(shuffled(builder, early, c, late))
+        return cgutils.pack_array(builder, columns, a.type)
+
+    if isinstance(first, VectorType) and first == second == third:
+        return plain(types.UniTuple(first, 3), (first, second, third), build)
+
+
+@intrinsic
+def triples(typing, first, second, third):
+    """Three vectors in a row that hold the triples of whose numbers these are the first, the second and the third ones.
+
+    Undoes `thirds`.
+    """
+
+    def build(builder, a, b, c):
+        lanes, rows = a.type.count, []
+        for k in range(3):
+            places = [divmod(k * lanes + i, 3) for i in range(lanes)]
+            early = shuffled(builder, a, b, [n + lanes * which if which < 2 else 0 for n, which in places])
+            late = [i if which < 2 else lanes + n for i, (n, which) in enumerate(places)]
+            rows.append(shuffled(builder, early, c, late))
+        return cgutils.pack_array(builder, rows, a.type)
+
+    if isinstance(first, VectorType) and first == second == third:
+        return plain(types.UniTuple(first, 3), (first, second, third), build)
+
+
+@intrinsic
+def transposed(typing, rows):
+    """As many vectors as each has lanes, lane i of vector k being lane k of vector i."""
+
+    def build(builder, packed):
+        parts = [builder.extract_value(packed, i) for i in range(rows.count)]
+        half = rows.count // 2
+        for _ in range(half.bit_length()):
+            pairs = zip(parts[:half], parts[half:], strict=True)
+            parts = [part for a, b in pairs for part in zipped(builder, a, b)]
+        return cgutils.pack_array(builder, parts, parts[0].type)
+
+    if isinstance(rows, types.UniTuple) and rows.count == getattr(rows.dtype, "lanes", 0):
+        return plain(rows, (rows,), build)
+
+
+def row_loader(real: type, lanes: int) -> Callable[..., Any]:
+    """The function that loads `lanes` vectors of an array, which begin `at` elements after as many positions in it."""
+    kind = VectorType(types.float64 if real is np.float64 else types.float32, lanes)
+    index = ir.IntType(64)
+
+    @intrinsic
+    def load_rows(typing, array, positions, at):
+        def generate(context, builder, sig, arguments):
+            data, firsts = (context.make_array(sig.args[i])(context, builder, arguments[i]).data for i in range(2))
+            rows = []
+            for i in range(lanes):
+                first = builder.load(builder.gep(firsts, [ir.Constant(index, i)]))
+                place = builder.gep(data, [builder.add(first, arguments[2])])
+                row = builder.load(builder.bitcast(place, llvm_type(kind).as_pointer()))
+                row.align = kind.element.bitwidth // 8
+                rows.append(row)
+            return cgutils.pack_array(builder, rows, llvm_type(kind))
+
+        fits = _is_flat(array, kind.element) and _is_flat(positions, types.int64)
+        return (types.UniTuple(kind, lanes)(array, positions, types.intp), generate) if fits else None
+
+    return load_rows
+
+
+@intrinsic
+def store_all(typing, array, at, vectors):
+    """Puts vectors one after the other into a contiguous one-dimensional array, from index `at` on."""
+
+    def generate(context, builder, sig, arguments):
+        data = context.make_array(sig.args[0])(context, builder, arguments[0]).data
+        kind = vectors.dtype
+        for i in range(vectors.count):
+            place = builder.gep(data, [builder.add(arguments[1], ir.Constant(arguments[1].type, i * kind.lanes))])
+            value = builder.extract_value(arguments[2], i)
+            done = builder.store(value, builder.bitcast(place, llvm_type(kind).as_pointer()))
+            done.align = kind.element.bitwidth // 8
+        return context.get_dummy_value()
+
+    kind = getattr(vectors, "dtype", None)
+    if isinstance(vectors, types.UniTuple) and isinstance(kind, VectorType) and _is_flat(array, kind.element):
+        return types.void(array, types.intp, vectors), generate
+
+
+def _is_flat(array: Any, element: types.Type) -> bool:
+    return isinstance(array, types.Array) and array.ndim == 1 and array.layout == "C" and array.dtype == element

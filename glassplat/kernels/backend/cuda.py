@@ -1,0 +1,266 @@
+"""How CUDA kernels are declared, compiled and launched: one place for the flags and for what torch and Numba share.
+
+Memory, sorting and scans belong to torch; a kernel gets views of its tensors and runs on its current stream. Numba's
+own launch looks at each array for microseconds; here the arguments are written out as its calling convention wants.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import re
+import struct
+import threading
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from cuda.bindings import driver
+from cuda.core import ObjectCode
+from numba import config, cuda, types
+from torch import Tensor
+
+from glassplat.kernels.backend.cuda_code import ImageCache, MachineCode
+from glassplat.kernels.backend.devices import SIMULATED
+
+SLOT = 8
+"""Bytes that each argument has to itself."""
+
+
+class LoadedKernel:
+    """A kernel in the memory of one GPU.
+
+    Attributes:
+        name: of the kernel.
+    """
+
+    def __init__(self, code: MachineCode, name: str, index: int, layout: struct.Struct) -> None:
+        """Loads machine code.
+
+        Args:
+            code: for the GPU.
+            name: of the kernel.
+            index: of the GPU, as torch counts.
+            layout: how the arguments lie in memory, each at the beginning of a slot.
+        """
+        self.name = name
+        with current_gpu(index):
+            self._context = driver.CUcontext(int(checked("cuCtxGetCurrent", driver.cuCtxGetCurrent())))
+            self._library = ObjectCode.from_cubin(code.cubin, name=name)
+            self._function = driver.CUfunction(int(self._library.get_kernel(code.entry).handle))
+        self._layout, self._memory = layout, ctypes.create_string_buffer(layout.size)
+        first = ctypes.addressof(self._memory)
+        self._slots = (ctypes.c_void_p * (layout.size // SLOT))(*range(first, first + layout.size, SLOT))
+        self._address = ctypes.addressof(self._slots)
+        # The threads of a backward pass launch too, and the driver reads the arguments while others may run.
+        self._lock = threading.Lock()
+
+    def launch(self, blocks: int, threads: int, stream: int, values: list[Any]) -> None:
+        """Queues the kernel.
+
+        Args:
+            blocks: how many of them.
+            threads: in each block.
+            stream: the address of a stream of the GPU's primary context.
+            values: what the slots hold.
+        """
+        with self._lock:
+            self._layout.pack_into(self._memory, 0, *values)
+            # A thread that has not used the GPU yet has no context, and one may be busy with another GPU.
+            current = checked("cuCtxGetCurrent", driver.cuCtxGetCurrent())
+            elsewhere = int(current) != int(self._context)
+            if elsewhere:
+                checked("cuCtxPushCurrent", driver.cuCtxPushCurrent(self._context))
+            try:
+                done = driver.cuLaunchKernel(
+                    self._function, blocks, 1, 1, threads, 1, 1, 0, stream, self._address, 0
+                )  # fmt: skip
+            finally:
+                if elsewhere:
+                    checked("cuCtxPopCurrent", driver.cuCtxPopCurrent())
+            checked(self.name, done)
+
+
+def current_gpu(index: int) -> Any:
+    """A block in which a GPU's primary context, the one that torch uses too, is the current one."""
+    return cuda.gpus[index]
+
+
+def checked(what: str, answer: tuple[Any, ...]) -> Any:
+    """What the driver answered.
+
+    Raises:
+        RuntimeError: the driver refused; the message names the call and the driver's error.
+    """
+    if answer[0] != 0:
+        raise RuntimeError(f"{what} failed on the GPU: {answer[0].name}")
+    return answer[1] if len(answer) > 1 else None
+
+
+if not SIMULATED:
+    # The simulator has no driver.
+    from glassplat.kernels.backend.cuda import LoadedKernel, current_gpu
+
+# Small launches are part of every frame (few cameras, few panes), and Numba warns of each of them.
+config.CUDA_LOW_OCCUPANCY_WARNINGS = 0
+
+SCALARS = {
+    "bool": types.boolean,
+    "byte": types.uint8,
+    "short": types.int16,
+    "int": types.int32,
+    "long": types.int64,
+    "float": types.float32,
+    "double": types.float64,
+}
+FORMATS = {"bool": "?", "uint8": "B", "int16": "h", "int32": "i", "int64": "q", "float32": "f", "float64": "d"}
+"""How numbers are written to memory."""
+TOKEN = re.compile(r"([a-z]+)([1-4]?)")
+
+
+class Kernel:
+    """A CUDA kernel, read from the disk or compiled at its first launch on each GPU.
+
+    Attributes:
+        name: the operation and direction, such as `composite_forward_float32`.
+        function: the kernel before compilation.
+        signature: the Numba types of its arguments.
+        bounds: threads of a block, and how many blocks a multiprocessor should hold at once; caps the registers.
+    """
+
+    def __init__(
+        self, function: Callable[..., None], name: str, signature: tuple[Any, ...], bounds: tuple[int, int] | None
+    ) -> None:
+        self.name = name
+        self.function = function
+        self.signature = signature
+        self.bounds = bounds
+        self._expected = [Expected(type_) for type_ in signature]
+        self._loaded: dict[int, LoadedKernel] = {}
+        self._layout = struct.Struct("<" + "".join(expected.layout for expected in self._expected))
+        self._images = ImageCache(function, name, signature, bounds)
+        self._simulated = cuda.jit(function) if SIMULATED else None
+
+    def __call__(self, blocks: int, threads: int, *arguments: Any) -> None:
+        """Launches on torch's current stream of the device of the first tensor; does nothing for no blocks.
+
+        Args:
+            blocks: how many of them.
+            threads: in each block.
+            arguments: contiguous tensors of one device, and numbers, in the order of the signature. None stands for
+                an array without elements.
+        """
+        if blocks == 0:
+            return
+        if len(arguments) != len(self.signature):
+            raise TypeError(f"{self.name} takes {len(self.signature)} arguments, got {len(arguments)}")
+        if self._simulated is not None:
+            values_of = (e.simulated(argument) for e, argument in zip(self._expected, arguments, strict=True))
+            self._simulated[blocks, threads](*values_of)
+            return
+        index = next(argument.get_device() for argument in arguments if isinstance(argument, Tensor))
+        values: list[Any] = []
+        for argument, expected in zip(arguments, self._expected, strict=True):
+            expected.append(values, argument)
+        loaded = self._loaded.get(index) or self._on_device(index)
+        loaded.launch(blocks, threads, torch.cuda.current_stream(index).cuda_stream, values)
+
+    def _on_device(self, index: int) -> LoadedKernel:
+        """The kernel on a GPU, loaded at first use."""
+        if index not in self._loaded:
+            # Numba asks the current GPU about itself while it compiles, and torch's threads may have none.
+            with current_gpu(index):
+                code = self._images.machine_code(torch.cuda.get_device_capability(index))
+                self._loaded[index] = LoadedKernel(code, self.name, index, self._layout)
+        return self._loaded[index]
+
+
+@lru_cache(maxsize=4096)
+def _array_layout(shape: tuple[int, ...], size: int) -> tuple[int, tuple[int, ...]]:
+    """The number of an array's elements, each of so many bytes, and what stands after its address: shape, strides."""
+    strides = tuple(math.prod(shape[axis + 1 :]) * size for axis in range(len(shape)))
+    return math.prod(shape), (*shape, *strides)
+
+
+class Expected:
+    """What a kernel takes in one place, and how it is handed over.
+
+    Attributes:
+        type: the Numba type.
+        layout: how what stands for an argument lies in memory, eight bytes for each value.
+    """
+
+    def __init__(self, type_: Any) -> None:
+        self.type = type_
+        self._is_array = isinstance(type_, types.Array)
+        self._ndim = type_.ndim if self._is_array else 0
+        element = str(type_.dtype if self._is_array else type_)
+        self._dtype = torch.bool if element == "bool" else getattr(torch, element)
+        self._is_bool = element == "bool"
+        self._size = self._dtype.itemsize
+        self._nothing = (0, 0, 0, self._size, 0, *(0,) * (2 * self._ndim))
+        self.layout = f"{5 + 2 * self._ndim}q" if self._is_array else f"{FORMATS[element]}{8 - self._size}x"
+
+    def append(self, values: list[Any], argument: Any) -> None:
+        """Adds what stands for an argument in Numba's calling convention to the values of a launch."""
+        if not self._is_array:
+            values.append(argument)
+            return
+        if argument is None:
+            values += self._nothing
+            return
+        shape = argument.shape
+        if argument.dtype != self._dtype or len(shape) != self._ndim or not argument.is_contiguous():
+            raise TypeError(f"got {argument.dtype} of shape {tuple(shape)}, expected contiguous {self.type}")
+        count, after = _array_layout(shape, self._size)
+        # Two pointers that only host memory uses come first.
+        values += (0, 0, count, self._size, argument.data_ptr(), *after)
+
+    def simulated(self, argument: Any) -> Any:
+        """What stands for an argument in the simulator."""
+        if not self._is_array:
+            return bool(argument) if self._is_bool else np.dtype(str(self.type)).type(argument)
+        if argument is None:
+            return np.empty((0,) * self.type.ndim, np.dtype(str(self.type.dtype)))
+        array = argument.detach().numpy()
+        if argument.dtype != self._dtype or array.ndim != self.type.ndim or not array.flags.c_contiguous:
+            raise TypeError(f"got {array.dtype} of shape {array.shape}, expected contiguous {self.type}")
+        return array
+
+
+def kernel(
+    name: str, real: type, arguments: str, *, bounds: tuple[int, int] | None = None
+) -> Callable[[Callable[..., None]], Kernel]:
+    """Declares a kernel function made by a factory for one floating-point type.
+
+    Args:
+        name: the operation and direction, such as `composite_forward`.
+        real: `np.float32` or `np.float64`.
+        arguments: the type of each argument: `bool`, `byte`, `short`, `int`, `long`, `float`, `double` or `real`, with
+            a digit for a C-contiguous array of so many dimensions: `"real2 int1 real"`.
+        bounds: threads of a block, and how many blocks a multiprocessor should hold at once.
+    """
+    full_name = f"{name}_{np.dtype(real).name}"
+
+    def decorate(function: Callable[..., None]) -> Kernel:
+        function.__name__ = full_name
+        function.__qualname__ = full_name
+        return Kernel(function, full_name, tuple(_numba_type(token, real) for token in arguments.split()), bounds)
+
+    return decorate
+
+
+def blocks_for(items: int, threads: int) -> int:
+    """Blocks of so many threads that have a thread for each item."""
+    return -(-items // threads)
+
+
+def _numba_type(token: str, real: type) -> Any:
+    match = TOKEN.fullmatch(token)
+    if match is None:
+        raise ValueError(f"{token!r} is no argument type; expected something like real, int1 or bool3")
+    scalar = types.float32 if real is np.float32 else types.float64
+    element = scalar if match[1] == "real" else SCALARS[match[1]]
+    return types.Array(element, int(match[2]), "C") if match[2] else element

@@ -1,1 +1,0 @@
-"""Numba kernels for the CPU. A kernel's file has the name of its operation."""

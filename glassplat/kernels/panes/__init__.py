@@ -1,0 +1,147 @@
+"""Flat panes: where the camera sees them, and how they blend what is behind them with what they reflect."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from glassplat.kernels.backend.devices import kernels_for
+from glassplat.kernels.fresnel import Fresnel
+from glassplat.kernels.maths.pane import LAWS
+from glassplat.kernels.records import BlendedPanes, PaneHits, Panes, check_device, check_tensors
+
+
+@torch.no_grad()
+def pane_hits(
+    panes: Panes,
+    intrinsics: Tensor,
+    width: int,
+    height: int,
+    mask: Tensor | None = None,
+    *,
+    beyond: PaneHits | None = None,
+) -> PaneHits:
+    """Finds the nearest pane along the ray of every pixel centre (H_k of TR-Gaussians, Section III-A2).
+
+    Not differentiable: piecewise constant in everything.
+
+    Args:
+        panes: rectangles in the camera frame, seen from either side.
+        intrinsics: [4] fx, fy, cx, cy in pixels.
+        width: of the image, pixels.
+        height: of the image, pixels.
+        mask: [H, W] visibility of the panes; where it is 0, `tiles` and `windows` leave the pixel out.
+        beyond: hits with the same panes and camera; the nearest pane after them is sought, and none where they have
+            none. Called with its own results, this finds all panes along a ray, one after another.
+
+    Raises:
+        ValueError: shapes disagree.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
+    """
+    count = panes.centers.shape[0]
+    expected = {
+        "centers": (panes.centers, (count, 3)),
+        "normals": (panes.normals, (count, 3)),
+        "axes": (panes.axes, (count, 2, 3)),
+        "half_sizes": (panes.half_sizes, (count, 2)),
+        "intrinsics": (intrinsics, (4,)),
+    }
+    if mask is not None:
+        expected["mask"] = (mask, (height, width))
+    if beyond is not None:
+        expected["beyond.depth"] = (beyond.depth, (height, width))
+    check_tensors(expected)
+    inputs = [tensor.detach().contiguous() for tensor in (*panes, intrinsics)]
+    visible = None if mask is None else mask.detach().contiguous()
+    hits: PaneHits = kernels_for("panes", intrinsics.device).pane_hits(inputs, width, height, visible, beyond)
+    return hits
+
+
+def blend_panes(
+    transmission: Tensor, mask: Tensor, reflections: Tensor, pane: Tensor,
+    normals: Tensor, base_reflectances: Tensor, intrinsics: Tensor,
+    *, fresnel: Fresnel = "pane", intensity: bool = True, linear: bool = True,
+) -> BlendedPanes:  # fmt: skip
+    """Blends transmission and reflection by the strength of each pixel's pane (TR-Gaussians, Section III-A).
+
+        R_k = f(R0, c), c = |n . d|                  (in place of Eq. 6), d the unit ray of the pixel
+        R = M R_k                                    (Eqs. 5, 19)
+        C_r = C_raw A                                (Eq. 13)
+        C = (1 - R) C_t + R C_r                      (Eq. 1)
+
+    f is what a real pane reflects of unpolarised light (`fresnel="pane"`): with r0 = R0 / (2 - R0) for one of its
+    surfaces and the index n = (1 + sqrt r0) / (1 - sqrt r0), Snell's and Fresnel's laws at one surface are
+
+        c_t = sqrt(1 - (1 - c^2) / n^2)
+        r_s = ((c - n c_t) / (c + n c_t))^2,  r_p = ((n c - c_t) / (n c + c_t))^2
+
+    and two surfaces, with all the light that goes to and fro between them, reflect
+
+        f = r_s / (1 + r_s) + r_p / (1 + r_p),       which is R0 at c = 1.
+
+    A mirror is a pane whose R0 is near 1.
+
+    Where no pane is shown or the mask is 0, the image is the transmission, bit for bit, and strength and reflection
+    are 0; also the image where the strength is 0.
+
+    Differentiable in `transmission`, `mask`, `reflections`, `normals` and `base_reflectances`.
+
+    Args:
+        transmission: [H, W, 3] C_t, sRGB.
+        mask: [H, W] M, visibility of the panes.
+        reflections: [K, H, W, 4] what each pane mirrors, C_raw in sRGB and A - 1, by how much the intensity departs
+            from 1: 0 where nothing was blended.
+        pane: [H, W] int32 position of each pixel's pane, -1 for none, as `pane_hits` gives it.
+        normals: [K, 3] unit normals in the camera frame; the sign does not matter.
+        base_reflectances: [K] R0 in [0, 1].
+        intrinsics: [4] fx, fy, cx, cy in pixels; no gradient.
+        fresnel: "pane" is the f above; "schlick" the paper's, f = R0 + (1 - R0) (1 - c)^5 (Eq. 6), which is one
+            surface's; "none" is f = R0 for every angle.
+        intensity: multiply by A; False sets C_r = C_raw.
+        linear: blend and multiply linear radiance; False does so with sRGB values, as the paper does.
+
+    Raises:
+        ValueError: shapes disagree, or there is no such `fresnel`.
+        TypeError: tensors of different or unsupported floating-point types, a pane that is not int32, or on
+            different devices.
+    """
+    height, width, count = *mask.shape, normals.shape[0]
+    check_tensors(
+        {
+            "transmission": (transmission, (height, width, 3)),
+            "mask": (mask, (height, width)),
+            "reflections": (reflections, (count, height, width, 4)),
+            "normals": (normals, (count, 3)),
+            "base_reflectances": (base_reflectances, (count,)),
+            "intrinsics": (intrinsics, (4,)),
+        }
+    )
+    if pane.dtype != torch.int32 or tuple(pane.shape) != (height, width):
+        raise TypeError(f"pane is {pane.dtype} of shape {tuple(pane.shape)}; expected int32 of {(height, width)}")
+    check_device("pane", pane, "mask", mask)
+    if fresnel not in LAWS:
+        raise ValueError(f"fresnel is {fresnel!r}; expected one of {', '.join(map(repr, LAWS))}")
+    switches = (LAWS.index(fresnel), intensity, linear)
+    outputs = _BlendPanes.apply(transmission, mask, reflections, normals, base_reflectances, pane, intrinsics, switches)
+    return BlendedPanes(*outputs)
+
+
+class _BlendPanes(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        *tensors, switches = arguments
+        tensors = [tensor.detach().contiguous() for tensor in tensors]
+        outputs: tuple[Tensor, ...] = kernels_for("panes", tensors[0].device).blend_panes(tensors, switches)
+        ctx.save_for_backward(*tensors)
+        ctx.switches = switches
+        return outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        inputs, cotangents = ctx.saved_tensors, [gradient.contiguous() for gradient in gradients]
+        kernels = kernels_for("panes", cotangents[0].device)
+        return (*kernels.blend_panes_gradients(inputs, ctx.switches, cotangents), None, None, None)

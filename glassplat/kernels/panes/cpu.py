@@ -1,0 +1,455 @@
+"""Panes on the CPU: which one each pixel shows, and their blending.
+
+Rays meet rectangles row by row: everything but one division is affine along a row. Blending takes runs of pixels of one
+row and one pane. A run is first copied into *planes* of one flat buffer, one plane per quantity, at offsets known to
+the compiler; that is what lets it turn the curves of the colour space into vector instructions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+from numba import prange
+from numpy.typing import NDArray
+from torch import Tensor
+
+from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
+from glassplat.kernels.backend.cpu_vector import (
+    bits_of,
+    interleaved,
+    sorted_apart,
+    store,
+    store_all,
+    thirds,
+    triples,
+    vector_kind,
+)
+from glassplat.kernels.composite.cpu_tile import TILE
+from glassplat.kernels.maths.blending import Scalar
+from glassplat.kernels.maths.color import color_space_maths
+from glassplat.kernels.maths.pane import pane_maths
+from glassplat.kernels.records import REAL_OF, PaneHits
+
+
+def pane_hits(
+    inputs: Sequence[Tensor], width: int, height: int, mask: Tensor | None, beyond: PaneHits | None
+) -> PaneHits:
+    """Nearest panes, from the fields of `Panes` and the intrinsics."""
+    centers = inputs[0]
+    count, real = centers.shape[0], REAL_OF[centers.dtype]
+    index = torch.empty(height, width, dtype=torch.int32)
+    depth = centers.new_empty(height, width)
+    tiles = torch.zeros(count, -(-height // TILE), -(-width // TILE), dtype=torch.bool)
+    windows = centers.new_zeros(count, 4)
+    visible = centers.new_empty(0, 0) if mask is None else mask
+    before = (index.new_empty(0, 0), centers.new_empty(0, 0)) if beyond is None else (beyond.pane, beyond.depth)
+    tensors = (*inputs, visible, *before, index, depth, tiles, windows)
+    pane_hits_forward(real)(*(tensor.numpy() for tensor in tensors))
+    return PaneHits(index, depth, tiles, windows)
+
+
+@cache
+def pane_hits_forward(real: type) -> Kernel:
+    """Fills the index, the depth, the tiles and the windows of the panes."""
+    half, one, zero, far = real(0.5), real(1.0), real(0.0), real(np.inf)
+
+    @kernel("pane_hits", real)
+    def forward(
+        centers, normals, axes, half_sizes, intrinsics, mask, before, depth_before, index, depth_of, tiles, windows
+    ):  # fmt: skip
+        height, width = index.shape
+        count = centers.shape[0]
+        spans: NDArray[Any] = np.empty((height, count, 2), np.int32)
+        for tile_row in prange((height + TILE - 1) // TILE):
+            least: NDArray[Any] = np.zeros(width, real)
+            own: NDArray[Any] = np.full(width, -1, np.int32)
+            for row in range(tile_row * TILE, min(height, tile_row * TILE + TILE)):
+                y = (real(np.int32(row)) + half - intrinsics[3]) / intrinsics[1]
+                nearest = depth_of[row]
+                nearest[:] = far
+                index[row, :] = -1
+                if before.size:
+                    least[:], own[:] = depth_before[row], before[row]
+                for k in range(count):
+                    n, u, v, c = normals[k], axes[k, 0], axes[k, 1], centers[k]
+                    distance = c[0] * n[0] + c[1] * n[1] + c[2] * n[2]
+                    along_u, along_v = c[0] * u[0] + c[1] * u[1] + c[2] * u[2], c[0] * v[0] + c[1] * v[1] + c[2] * v[2]
+                    n_x, n_row = n[0], n[1] * y + n[2]
+                    u_x, u_row = u[0], u[1] * y + u[2]
+                    v_x, v_row = v[0], v[1] * y + v[2]
+                    most_u, most_v = half_sizes[k, 0], half_sizes[k, 1]
+                    inverse_f, c_x = one / intrinsics[0], intrinsics[2]
+                    for column in range(width):
+                        x = (real(np.int32(column)) + half - c_x) * inverse_f
+                        depth = distance / (n_x * x + n_row)
+                        inside = (depth > least[column]) & (depth < nearest[column]) & (own[column] != k)
+                        inside &= abs(depth * (u_x * x + u_row) - along_u) <= most_u
+                        inside &= abs(depth * (v_x * x + v_row) - along_v) <= most_v
+                        nearest[column] = depth if inside else nearest[column]
+                        index[row, column] = np.int32(k) if inside else index[row, column]
+                spans[row, :, 0], spans[row, :, 1] = width, -1
+                for column in range(width):
+                    k = index[row, column]
+                    if k >= 0 and (mask.size == 0 or mask[row, column] > zero):
+                        tiles[k, tile_row, column // TILE] = True
+                        spans[row, k, 0] = min(spans[row, k, 0], column)
+                        spans[row, k, 1] = column
+        for k in range(count):
+            left, top, right, bottom = width, height, 0, 0
+            for row in range(height):
+                if spans[row, k, 1] >= 0:
+                    left, right = min(left, spans[row, k, 0]), max(right, spans[row, k, 1] + 1)
+                    top, bottom = min(top, row), row + 1
+            if right > 0:
+                windows[k, 0], windows[k, 1], windows[k, 2], windows[k, 3] = left, top, right, bottom
+
+    return forward
+
+
+LANES = 16
+RUN = 32
+"""Pixels of a run, whole vectors."""
+
+ALL = (1 << LANES) - 1
+"""Bits of a whole vector."""
+
+# Planes of a run. MASK is 0 where the run's pane is not shown; GAIN is the intensity.
+MASK, GAIN, RAW, SHARE, ALONG, LENGTH = (plane * RUN for plane in range(6))
+BEHIND, MIRRORED, RGB, BRIGHT = (plane * RUN for plane in (6, 9, 12, 15))
+FORWARD_PLANES = 18
+V_RGB, V_BRIGHT, V_SHARE, V_GAIN = (plane * RUN for plane in (18, 21, 24, 25))
+BACKWARD_PLANES = 26
+
+
+def blend_panes(inputs: Sequence[Tensor], switches: tuple[int, bool, bool]) -> tuple[Tensor, ...]:
+    """The fields of `BlendedPanes`; inputs in the order of the kernel, switches (law, intensity, linear)."""
+    transmission, mask = inputs[:2]
+    outputs = tuple(torch.empty_like(like) for like in (transmission, transmission, mask))
+    blend_panes_forward(REAL_OF[mask.dtype])(*_arrays(inputs), *switches, *_arrays(outputs))
+    return outputs
+
+
+def blend_panes_gradients(
+    inputs: Sequence[Tensor], switches: tuple[int, bool, bool], cotangents: Sequence[Tensor]
+) -> tuple[Tensor, ...]:
+    """Gradients of the first five inputs."""
+    found = tuple(torch.zeros_like(tensor) for tensor in inputs[:5])
+    blend_panes_backward(REAL_OF[found[0].dtype])(*_arrays(inputs), *switches, *_arrays(cotangents), *_arrays(found))
+    return found
+
+
+def _arrays(tensors: Sequence[Tensor]) -> list[Any]:
+    return [tensor.numpy() for tensor in tensors]
+
+
+@inlined
+def _span(pane, row, k):
+    """First and one-past-last column of a row that shows pane k."""
+    first, last = pane.shape[1], 0
+    for column in range(pane.shape[1]):
+        if pane[row, column] == k:
+            first = min(first, column)
+            last = column + 1
+    return first, last
+
+
+def _load(real: type) -> Scalar:
+    load_lanes, zero, one = vector_kind(real, LANES).load, real(0.0), real(1.0)
+    load_triples = _copies(real)[0]
+
+    @inlined
+    def load(run, transmission, mask, reflections, pane, intensity, row, k, first, count):
+        """Copies the pixels of a run; what lies beyond its end is not shown. Images of colours are flat."""
+        height, width = mask.shape
+        pixel = row * width + first
+        mirrored = k * height * width + pixel
+        if count == RUN:
+            for i in range(RUN):
+                run[MASK + i] = mask[row, first + i] if pane[row, first + i] == k else zero
+            for i in range(0, RUN, LANES):
+                load_triples(run, BEHIND + i, transmission, pixel + i)
+                at = 4 * (mirrored + i)
+                four = (
+                    load_lanes(reflections, at), load_lanes(reflections, at + LANES),
+                    load_lanes(reflections, at + 2 * LANES), load_lanes(reflections, at + 3 * LANES),
+                )  # fmt: skip
+                red, green, blue, gain = sorted_apart(four)
+                store(run, MIRRORED + i, red)
+                store(run, MIRRORED + RUN + i, green)
+                store(run, MIRRORED + 2 * RUN + i, blue)
+                store(run, GAIN + i, gain + one)
+        else:
+            for i in range(RUN):
+                x = min(i, count - 1)
+                shown = (pane[row, first + x] == k) & (i < count)
+                run[MASK + i] = mask[row, first + x] if shown else zero
+                run[GAIN + i] = one + reflections[4 * (mirrored + x) + 3]
+                for d in range(3):
+                    run[BEHIND + d * RUN + i] = transmission[3 * (pixel + x) + d]
+                    run[MIRRORED + d * RUN + i] = reflections[4 * (mirrored + x) + d]
+        if not intensity:
+            for i in range(RUN):
+                run[GAIN + i] = one
+
+    return load
+
+
+def _copies(real: type) -> tuple[Scalar, Scalar]:
+    """Between colours of `LANES` pixels, which lie in a row in a flat image, and three planes of a run."""
+    load_lanes = vector_kind(real, LANES).load
+
+    @inlined
+    def load_triples(run, at, image, pixel):
+        rows = (
+            load_lanes(image, 3 * pixel), load_lanes(image, 3 * pixel + LANES),
+            load_lanes(image, 3 * pixel + 2 * LANES),
+        )  # fmt: skip
+        red, green, blue = thirds(rows[0], rows[1], rows[2])
+        store(run, at, red)
+        store(run, at + RUN, green)
+        store(run, at + 2 * RUN, blue)
+
+    @inlined
+    def store_triples(run, at, image, pixel):
+        rows = triples(load_lanes(run, at), load_lanes(run, at + RUN), load_lanes(run, at + 2 * RUN))
+        store_all(image, 3 * pixel, rows)
+
+    return load_triples, store_triples
+
+
+def _shine(real: type) -> Scalar:
+    strength, _, ray_length = pane_maths(real)
+    zero, one, half = real(0.0), real(1.0), real(0.5)
+
+    @inlined
+    def shine(run, normals, bases, k, row, first, intrinsics, law):
+        """Strength of every pixel of a run, before the mask in RAW and after it in SHARE; returns the rays' y."""
+        inverse_f, c_x = one / intrinsics[0], intrinsics[2]
+        y = (real(np.int32(row)) + half - intrinsics[3]) / intrinsics[1]
+        n_x, n_row, base = normals[k, 0], normals[k, 1] * y + normals[k, 2], bases[k]
+        start = real(np.int32(first)) + half - c_x
+        for i in range(RUN):
+            x = (start + real(np.int32(i))) * inverse_f
+            along, length = n_x * x + n_row, ray_length(x, y)
+            raw = strength(law, base, abs(along) / length)
+            marked = run[MASK + i]
+            run[ALONG + i], run[LENGTH + i], run[RAW + i] = along, length, raw
+            run[SHARE + i] = raw * marked if marked > zero else zero
+        return y
+
+    return shine
+
+
+def _mix(real: type) -> Scalar:
+    linear_of, _, encoded, _ = color_space_maths(real)
+
+    @inlined
+    def mix(run, d, linear):
+        """Blends channel d of a run into RGB and BRIGHT."""
+        at = d * RUN
+        for i in range(RUN):
+            behind, mirrored = run[BEHIND + at + i], run[MIRRORED + at + i]
+            gain, share = run[GAIN + i], run[SHARE + i]
+            if linear:
+                lit = linear_of(behind)
+                bright = linear_of(mirrored) * gain
+                run[RGB + at + i] = encoded(lit + share * (bright - lit))
+                run[BRIGHT + at + i] = encoded(bright)
+            else:
+                bright = mirrored * gain
+                run[RGB + at + i] = behind + share * (bright - behind)
+                run[BRIGHT + at + i] = bright
+
+    return mix
+
+
+@cache
+def blend_panes_forward(real: type) -> Kernel:
+    """Fills rgb, reflection and strength."""
+    load, shine, mix, store_triples = _load(real), _shine(real), _mix(real), _copies(real)[1]
+    load_lanes, zero = vector_kind(real, LANES).load, real(0.0)
+
+    @kernel("blend_panes_forward", real)
+    def forward(
+        transmission, mask, reflections, normals, bases, pane, intrinsics, law, intensity, linear,
+        rgb, reflection, strength,
+    ):  # fmt: skip
+        height, width = mask.shape
+        behind, mirrored = transmission.reshape(transmission.size), reflections.reshape(reflections.size)
+        mixed, bright, shares = rgb.reshape(rgb.size), reflection.reshape(reflection.size), strength.reshape(mask.size)
+        stride = even_stride(height)
+        for task in prange(height):
+            row = task * stride % height
+            run: NDArray[Any] = np.empty(FORWARD_PLANES * RUN, real)
+            rgb[row], reflection[row], strength[row] = transmission[row], zero, zero
+            for k in range(normals.shape[0]):
+                begin, end = _span(pane, row, k)
+                for first in range(begin, end, RUN):
+                    count = min(RUN, end - first)
+                    load(run, behind, mask, mirrored, pane, intensity, row, k, first, count)
+                    shine(run, normals, bases, k, row, first, intrinsics, law)
+                    for d in range(3):
+                        mix(run, d, linear)
+                    for start in range(0, count, LANES):
+                        share = load_lanes(run, SHARE + start)
+                        if bits_of(share > zero) == ALL:
+                            pixel = row * width + first + start
+                            store_triples(run, RGB + start, mixed, pixel)
+                            store_triples(run, BRIGHT + start, bright, pixel)
+                            store(shares, pixel, share)
+                            continue
+                        for i in range(start, min(count, start + LANES)):
+                            column = first + i
+                            if run[MASK + i] > zero:
+                                strength[row, column] = run[SHARE + i]
+                                for d in range(3):
+                                    reflection[row, column, d] = run[BRIGHT + d * RUN + i]
+                            if run[SHARE + i] > zero:
+                                for d in range(3):
+                                    rgb[row, column, d] = run[RGB + d * RUN + i]
+
+    return forward
+
+
+def _unmix(real: type) -> Scalar:
+    linear_of, linear_slope, encoded, encoded_slope = color_space_maths(real)
+    zero, one = real(0.0), real(1.0)
+
+    @inlined
+    def unmix(run, d, linear):
+        """Gradients of channel d; those of BEHIND and MIRRORED replace V_RGB and V_BRIGHT, the others add up."""
+        at = d * RUN
+        for i in range(RUN):
+            behind, mirrored = run[BEHIND + at + i], run[MIRRORED + at + i]
+            gain, share = run[GAIN + i], run[SHARE + i]
+            v_mixed = run[V_RGB + at + i] if share > zero else zero
+            v_bright = run[V_BRIGHT + at + i]
+            if linear:
+                lit, shone = linear_of(behind), linear_of(mirrored)
+                bright = shone * gain
+                mixed = lit + share * (bright - lit)
+                v_mixed *= encoded_slope(mixed, encoded(mixed))
+                v_bright = v_mixed * share + v_bright * encoded_slope(bright, encoded(bright))
+                run[V_SHARE + i] += v_mixed * (bright - lit)
+                run[V_GAIN + i] += v_bright * shone
+                run[V_RGB + at + i] = v_mixed * (one - share) * linear_slope(behind, lit)
+                run[V_BRIGHT + at + i] = v_bright * gain * linear_slope(mirrored, shone)
+            else:
+                v_bright += v_mixed * share
+                run[V_SHARE + i] += v_mixed * (mirrored * gain - behind)
+                run[V_GAIN + i] += v_bright * mirrored
+                run[V_RGB + at + i] = v_mixed * (one - share)
+                run[V_BRIGHT + at + i] = v_bright * gain
+
+    return unmix
+
+
+def _dim(real: type) -> Scalar:
+    strength_slopes = pane_maths(real).strength_slopes
+    zero, one, half = real(0.0), real(1.0), real(0.5)
+
+    @inlined
+    def dim(run, base, first, intrinsics, law):
+        """From the gradient of SHARE to sums over the run for the normal (x, 1) and the base reflectance."""
+        inverse_f = one / intrinsics[0]
+        start = real(np.int32(first)) + half - intrinsics[2]
+        sum_x, sum_1, sum_base = zero, zero, zero
+        for i in range(RUN):
+            marked, along, length = run[MASK + i], run[ALONG + i], run[LENGTH + i]
+            v_raw = run[V_SHARE + i] * marked if marked > zero else zero
+            by_base, by_cosine = strength_slopes(law, base, abs(along) / length)
+            slope = v_raw * by_cosine / length
+            slope = slope if along > zero else -slope
+            sum_x += slope * (start + real(np.int32(i))) * inverse_f
+            sum_1 += slope
+            sum_base += v_raw * by_base
+        return sum_x, sum_1, sum_base
+
+    return dim
+
+
+@cache
+def blend_panes_backward(real: type) -> Kernel:
+    """Fills the gradients of transmission, mask, reflections, normals and base reflectances; all start at zero."""
+    load, shine, unmix, dim = _load(real), _shine(real), _unmix(real), _dim(real)
+    load_lanes, (load_triples, store_triples) = vector_kind(real, LANES).load, _copies(real)
+    zero = real(0.0)
+
+    @kernel("blend_panes_backward", real)
+    def backward(
+        transmission, mask, reflections, normals, bases, pane, intrinsics, law, intensity, linear,
+        v_rgb, v_reflection, v_strength, v_transmission, v_mask, v_reflections, v_normals, v_bases,
+    ):  # fmt: skip
+        (height, width), panes = mask.shape, normals.shape[0]
+        behind, mirrored = transmission.reshape(transmission.size), reflections.reshape(reflections.size)
+        v_mixed, v_bright = v_rgb.reshape(v_rgb.size), v_reflection.reshape(v_reflection.size)
+        v_behind, v_mirrored = v_transmission.reshape(v_rgb.size), v_reflections.reshape(v_reflections.size)
+        v_marked = v_mask.reshape(mask.size)
+        sums: NDArray[Any] = np.zeros((height, panes, 4), real)
+        stride = even_stride(height)
+        for task in prange(height):
+            row = task * stride % height
+            run: NDArray[Any] = np.empty(BACKWARD_PLANES * RUN, real)
+            v_transmission[row] = v_rgb[row]
+            for k in range(panes):
+                begin, end = _span(pane, row, k)
+                for first in range(begin, end, RUN):
+                    count = min(RUN, end - first)
+                    load(run, behind, mask, mirrored, pane, intensity, row, k, first, count)
+                    y = shine(run, normals, bases, k, row, first, intrinsics, law)
+                    for i in range(RUN):
+                        run[V_SHARE + i], run[V_GAIN + i] = v_strength[row, first + min(i, count - 1)], zero
+                    for start in range(0, count, LANES):
+                        if start + LANES <= count:
+                            load_triples(run, V_RGB + start, v_mixed, row * width + first + start)
+                            load_triples(run, V_BRIGHT + start, v_bright, row * width + first + start)
+                            continue
+                        for i in range(start, RUN):
+                            column = first + min(i, count - 1)
+                            for d in range(3):
+                                run[V_RGB + d * RUN + i] = v_rgb[row, column, d]
+                                run[V_BRIGHT + d * RUN + i] = v_reflection[row, column, d]
+                    for d in range(3):
+                        unmix(run, d, linear)
+                    sum_x, sum_1, sum_base = dim(run, bases[k], first, intrinsics, law)
+                    sums[row, k, 0] += sum_x
+                    sums[row, k, 1] += sum_1 * y
+                    sums[row, k, 2] += sum_1
+                    sums[row, k, 3] += sum_base
+                    if not intensity:
+                        for i in range(RUN):
+                            run[V_GAIN + i] = zero
+                    for start in range(0, count, LANES):
+                        if bits_of(load_lanes(run, SHARE + start) > zero) == ALL:
+                            pixel = row * width + first + start
+                            store(v_marked, pixel, load_lanes(run, V_SHARE + start) * load_lanes(run, RAW + start))
+                            store_triples(run, V_RGB + start, v_behind, pixel)
+                            at = 4 * (k * height * width + pixel)
+                            v = V_BRIGHT + start
+                            four = (
+                                load_lanes(run, v), load_lanes(run, v + RUN), load_lanes(run, v + 2 * RUN),
+                                load_lanes(run, V_GAIN + start),
+                            )  # fmt: skip
+                            store_all(v_mirrored, at, interleaved(four))
+                            continue
+                        for i in range(start, min(count, start + LANES)):
+                            column = first + i
+                            if not run[MASK + i] > zero:
+                                continue
+                            v_mask[row, column] = run[V_SHARE + i] * run[RAW + i]
+                            v_reflections[k, row, column, 3] = run[V_GAIN + i]
+                            for d in range(3):
+                                v_reflections[k, row, column, d] = run[V_BRIGHT + d * RUN + i]
+                                if run[SHARE + i] > zero:
+                                    v_transmission[row, column, d] = run[V_RGB + d * RUN + i]
+        for k in range(panes):
+            for row in range(height):
+                for axis in range(3):
+                    v_normals[k, axis] += sums[row, k, axis]
+                v_bases[k] += sums[row, k, 3]
+
+    return backward

@@ -1,0 +1,104 @@
+"""The definition of the operations on panes, in PyTorch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from glassplat.kernels.composite.cpu_tile import TILE
+from glassplat.kernels.fresnel import Fresnel
+from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
+from glassplat.kernels.records import BlendedPanes, PaneHits, Panes
+
+
+def pane_hits(
+    panes: Panes,
+    intrinsics: Tensor,
+    width: int,
+    height: int,
+    mask: Tensor | None = None,
+    *,
+    beyond: PaneHits | None = None,
+) -> PaneHits:
+    """See `glassplat.kernels.panes.pane_hits`."""
+    rays = ray_grid(intrinsics, width, height)
+    count = panes.centers.shape[0]
+    distance = (panes.centers * panes.normals).sum(-1)
+    depth = distance[:, None, None] / torch.einsum("hwi,ki->khw", rays, panes.normals)
+    inside = depth > 0
+    for axis in range(2):
+        along = torch.einsum("hwi,ki->khw", rays, panes.axes[:, axis]) * depth
+        offset = along - (panes.centers * panes.axes[:, axis]).sum(-1)[:, None, None]
+        inside &= offset.abs() <= panes.half_sizes[:, axis, None, None]
+    if beyond is not None:
+        # A pane is not behind itself, however its depth is rounded.
+        own = beyond.pane == torch.arange(count, device=beyond.pane.device)[:, None, None]
+        inside &= (depth > beyond.depth) & ~own
+    far = torch.full((1, height, width), torch.inf, dtype=rays.dtype)
+    nearest, index = torch.cat([far, torch.where(inside, depth, torch.inf)]).min(dim=0)
+    index = torch.where(nearest < torch.inf, index, 0) - 1
+    shown = torch.stack([index == k for k in range(count)]) if count else torch.zeros(0, height, width).bool()
+    if mask is not None:
+        shown &= mask > 0
+    tiles = torch.nn.functional.max_pool2d(shown.float()[:, None], TILE, ceil_mode=True)[:, 0] > 0
+    windows = torch.zeros(count, 4, dtype=rays.dtype)
+    for k in range(count):
+        rows, columns = shown[k].nonzero().unbind(-1)
+        if len(rows):
+            windows[k] = torch.stack([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1])
+    return PaneHits(index.to(torch.int32), nearest, tiles, windows)
+
+
+def ray_grid(intrinsics: Tensor, width: int, height: int) -> Tensor:
+    """Rays [H, W, 3] through the pixel centres, (x, y, 1) in the camera frame."""
+    fx, fy, cx, cy = intrinsics
+    x = (torch.arange(width, dtype=intrinsics.dtype, device=intrinsics.device) + 0.5 - cx) / fx
+    y = (torch.arange(height, dtype=intrinsics.dtype, device=intrinsics.device) + 0.5 - cy) / fy
+    plane = x.expand(height, width)
+    return torch.stack([plane, y[:, None].expand(height, width), torch.ones_like(plane)], dim=-1)
+
+
+def two_surfaces(base: Tensor, cosine: Tensor) -> Tensor:
+    """Snell's and Fresnel's laws at a surface, for both polarisations, and light going to and fro between two."""
+    one_surface = torch.sqrt(base / (2 - base))
+    inverse_index = (1 - one_surface) / (1 + one_surface)
+    inside = torch.sqrt(1 - inverse_index**2 * (1 - cosine**2))
+    across = ((inverse_index * cosine - inside) / (inverse_index * cosine + inside)) ** 2
+    along = ((cosine - inverse_index * inside) / (cosine + inverse_index * inside)) ** 2
+    return across / (1 + across) + along / (1 + along)
+
+
+REFLECTANCE: dict[Fresnel, Callable[[Tensor, Tensor], Tensor]] = {
+    "pane": two_surfaces,
+    "schlick": lambda base, cosine: base + (1 - base) * (1 - cosine) ** 5,
+    "none": lambda base, cosine: base,
+}
+
+
+def blend_panes(
+    transmission: Tensor, mask: Tensor, reflections: Tensor, pane: Tensor,
+    normals: Tensor, base_reflectances: Tensor, intrinsics: Tensor,
+    *, fresnel: Fresnel = "pane", intensity: bool = True, linear: bool = True,
+) -> BlendedPanes:  # fmt: skip
+    """See `glassplat.kernels.panes.blend_panes`."""
+    height, width = mask.shape
+    rays = torch.nn.functional.normalize(ray_grid(intrinsics, width, height), dim=-1)
+    strength, reflection = torch.zeros_like(mask), torch.zeros_like(transmission)
+    for k in range(len(normals)):
+        shown = (pane == k) & (mask > 0)
+        cosine = (rays @ normals[k]).abs().clamp(max=1)
+        base = base_reflectances[k]
+        strength = torch.where(shown, REFLECTANCE[fresnel](base, cosine) * mask, strength)
+        gain = 1 + reflections[k, ..., 3:] if intensity else torch.ones_like(mask)[..., None]
+        color = reflections[k, ..., :3]
+        bright = srgb_from_linear(linear_from_srgb(color) * gain) if linear else color * gain
+        reflection = torch.where(shown[..., None], bright, reflection)
+    share = strength[..., None]
+    if linear:
+        behind, mirrored = linear_from_srgb(transmission), linear_from_srgb(reflection)
+        mixed = srgb_from_linear(behind + share * (mirrored - behind))
+    else:
+        mixed = transmission + share * (reflection - transmission)
+    return BlendedPanes(torch.where(share > 0, mixed, transmission), reflection, strength)

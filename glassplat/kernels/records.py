@@ -1,0 +1,285 @@
+"""Records that the kernel operations hand to each other, and what every operation asks of its tensors.
+
+`C` cameras, `N` Gaussians, `G >= N` splats per camera. Dense layout: what a camera does not see has `radii == 0`, a
+disc `opacities == 0` too.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+REAL_OF = {torch.float32: np.float32, torch.float64: np.float64}
+"""Floating-point types that kernels are built for."""
+DEVICES = ("cpu", "cuda")
+
+
+def check_tensors(expected: dict[str, tuple[Tensor, tuple[int, ...]]]) -> None:
+    """Raises unless all tensors have their expected shapes, one floating-point type and one device with kernels."""
+    first_name, (first, _) = next(iter(expected.items()))
+    dtype, device = first.dtype, first.device
+    for name, (tensor, shape) in expected.items():
+        if tensor.shape != shape:
+            raise ValueError(f"{name} has shape {tuple(tensor.shape)}; expected {shape}")
+        if tensor.dtype != dtype or dtype not in REAL_OF:
+            raise TypeError(
+                f"{name} is {tensor.dtype} and {first_name} is {dtype}; expected float32 or float64 throughout"
+            )
+        if tensor.device != device or device.type not in DEVICES:
+            check_device(name, tensor, first_name, first)
+
+
+def check_device(name: str, tensor: Tensor, other_name: str, other: Tensor) -> None:
+    """Raises unless a tensor is where another one is, on a device that has kernels."""
+    if tensor.device.type not in DEVICES:
+        raise TypeError(
+            f"{name} is on {tensor.device}, but only the CPU and NVIDIA GPUs have kernels; move it there with .cpu()"
+        )
+    if tensor.device != other.device:
+        raise TypeError(f"{name} is on {tensor.device} and {other_name} on {other.device}; expected one device for all")
+
+
+class RawGaussians(NamedTuple):
+    """Unactivated Gaussians: means [N, 3], quats [N, 4], log_scales [N, 3], logit_opacities [N], sh [N, K, 3]."""
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    logit_opacities: Tensor
+    sh: Tensor
+
+
+class CameraBatch(NamedTuple):
+    """Cameras of one image size: cam_from_world [C, 4, 4], intrinsics [C, 4] as (fx, fy, cx, cy), pixels.
+
+    `clip_planes` [C, 4] are world planes (n, d): a Gaussian is kept where n . mean + d > 0.
+    `windows` [C, 4] are left, top, right and bottom edge, in pixels, of the part of each image that is wanted.
+    """
+
+    cam_from_world: Tensor
+    intrinsics: Tensor
+    width: int
+    height: int
+    clip_planes: Tensor | None = None
+    windows: Tensor | None = None
+
+
+class Projected(NamedTuple):
+    """Gaussians on screen.
+
+    means2d [C, N, 2] pixels; conics [C, N, 3] inverse covariance (xx, xy, yy) in 1/px^2; depths [C, N] camera z;
+    opacities [C, N] in (0, 1); colors [C, N, 3]; radii [C, N, 2] half extents in pixels of the region where
+    alpha >= 1/255, 0 where culled.
+    """
+
+    means2d: Tensor
+    conics: Tensor
+    depths: Tensor
+    opacities: Tensor
+    colors: Tensor
+    radii: Tensor
+
+
+class Splats(NamedTuple):
+    """What rasterisation needs of each splat; fields as in `Projected`, [C, G, ...]."""
+
+    means2d: Tensor
+    conics: Tensor
+    opacities: Tensor
+    depths: Tensor
+    radii: Tensor
+
+
+MOST_CHANNELS = 32
+"""Channels of a splat that can be blended at once."""
+
+TILE = 16
+"""Edge of a tile in pixels."""
+
+MOST_PAIRS = 2**31 - 1
+"""(tile, splat) pairs that their index type can count."""
+
+LEAST_ALPHA = 1e-6
+"""Coverage up to which a pixel holds nothing, and the mean of its channels is taken for 0."""
+
+
+class Deviation(NamedTuple):
+    """A request for the spread of one channel along each pixel's ray.
+
+    channel: which one. where [C, H, W]: factor on the result; tiles in which it is 0 throughout cost nothing.
+    through_mean: let the gradient pass through the mean too.
+    """
+
+    channel: int
+    where: Tensor
+    through_mean: bool = False
+
+
+class TileBins(NamedTuple):
+    """Splats per 16 x 16 tile, front to back.
+
+    pair_splats [P] int32: splat of each (tile, splat) pair, an index into the flattened [C * G].
+    tile_offsets [C * T + 1] int64: where each tile's pairs begin.
+    pair_slots [P] int32, splat_offsets [C * G + 1] int64: `pair_slots[splat_offsets[s] : splat_offsets[s + 1]]`
+    are the positions of splat s in `pair_splats`.
+    active [A] int32: tiles (camera * T + tile) to traverse.
+    """
+
+    pair_splats: Tensor
+    tile_offsets: Tensor
+    pair_slots: Tensor
+    splat_offsets: Tensor
+    active: Tensor
+    width: int
+    height: int
+    num_cameras: int
+
+
+def check_pair_count(count: int) -> None:
+    """Raises ValueError where there are more (tile, splat) pairs than can be indexed."""
+    if count > MOST_PAIRS:
+        raise ValueError(
+            f"{count} (tile, splat) pairs are more than the {MOST_PAIRS} that can be indexed; render fewer cameras at "
+            "once or a smaller image"
+        )
+
+
+FLAT, SOLID = 2, 3
+"""Scales of a disc and of an ellipsoid."""
+
+
+class ProjectedDiscs(NamedTuple):
+    """Discs on screen.
+
+    means2d [C, N, 2] pixels. maps [C, N, 6]: where a pixel's ray meets the disc (`maths/disc.py`). depths [C, N] of the
+    centres, camera z; opacities [C, N] in (0, 1); colors [C, N, 3]; normals [C, N, 3] unit, world axes, towards the
+    camera. outline_centers [C, N, 2], outline_conics [C, N, 3]: an ellipse around what a disc covers with at least
+    1/255, for `bin_tiles`; conics of zeros for one that crosses the near plane. radii [C, N, 2] half extents of that
+    ellipse in pixels, 0 where culled.
+    """
+
+    means2d: Tensor
+    maps: Tensor
+    depths: Tensor
+    opacities: Tensor
+    colors: Tensor
+    normals: Tensor
+    outline_centers: Tensor
+    outline_conics: Tensor
+    radii: Tensor
+
+    @property
+    def outlines(self) -> Splats:
+        """What `bin_tiles` takes for these discs."""
+        return Splats(self.outline_centers, self.outline_conics, self.opacities, self.depths, self.radii)
+
+
+class Discs(NamedTuple):
+    """What blending needs of each disc; fields as in `ProjectedDiscs`, [C, N, ...]."""
+
+    means2d: Tensor
+    maps: Tensor
+    opacities: Tensor
+    depths: Tensor
+    outlines: Splats
+
+
+class Panes(NamedTuple):
+    """K rectangles in the camera frame.
+
+    centers [K, 3]; normals [K, 3] and in-plane axes [K, 2, 3], all of unit length; half_sizes [K, 2] along the axes.
+    """
+
+    centers: Tensor
+    normals: Tensor
+    axes: Tensor
+    half_sizes: Tensor
+
+
+class PaneHits(NamedTuple):
+    """Which pane each pixel shows.
+
+    pane [H, W] int32: the nearest pane that the pixel's ray meets, -1 where there is none.
+    depth [H, W]: where it does, infinite where there is none.
+    tiles [K, rows, columns] bool: tiles in which a pixel shows the pane.
+    windows [K, 4]: left, top, right and bottom edge, in pixels, of the pixels that show it; all 0 where none does.
+    """
+
+    pane: Tensor
+    depth: Tensor
+    tiles: Tensor
+    windows: Tensor
+
+
+class BlendedPanes(NamedTuple):
+    """An image with its panes: rgb and reflection [H, W, 3] sRGB, strength [H, W]."""
+
+    rgb: Tensor
+    reflection: Tensor
+    strength: Tensor
+
+
+NORMAL_MIN = 1e-6
+"""A blended normal that is shorter has no direction."""
+
+
+NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS = 3, 6, 7
+"""Channels of blended surfaces: colour before the normal, then strength; others may follow."""
+
+
+class Shaded(NamedTuple):
+    """An image, what it shows without reflection, and what it mirrors: rgb, base and reflection [H, W, 3] sRGB."""
+
+    rgb: Tensor
+    base: Tensor
+    reflection: Tensor
+
+
+class Rays(NamedTuple):
+    """Origins [R, 3] and directions [R, 3], world units; a direction may have any length but zero."""
+
+    origins: Tensor
+    directions: Tensor
+
+
+class Shapes(NamedTuple):
+    """Activated Gaussians as rays meet them: means [N, 3], frames [N, 3, 3] (rows, see `maths/ray_hit.py`),
+    opacities [N], sh [N, K, 3].
+    """
+
+    means: Tensor
+    frames: Tensor
+    opacities: Tensor
+    sh: Tensor
+
+
+class Bvh(NamedTuple):
+    """A bounding volume hierarchy of eight children a node, over Gaussians in an order of their own.
+
+    order [N] int32: Gaussian at each place; a node of the lowest level holds eight places in a row, one of the next
+    level eight such nodes in a row, and so on.
+    boxes [nodes, 6, 8]: lowest x, y, z and highest x, y, z of each node's children, the lowest level first.
+    level_offsets [levels + 1] int64: where each level's nodes begin.
+    """
+
+    order: Tensor
+    boxes: Tensor
+    level_offsets: Tensor
+
+
+class Traced(NamedTuple):
+    """What rays meet.
+
+    colors [R, 3]: blended front to back (EnvGS, Eq. 2), over black.
+    alphas [R]: share of the light that Gaussians take.
+    depths [R]: distance from the origin to each hit, blended as colours are; divide by `alphas` for its mean.
+    hits [R] int32: how many Gaussians were blended.
+    """
+
+    colors: Tensor
+    alphas: Tensor
+    depths: Tensor
+    hits: Tensor

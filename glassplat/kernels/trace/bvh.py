@@ -1,0 +1,177 @@
+"""The order of Gaussians along a curve in space, and the boxes around them.
+
+On Hilbert's curve any run of points fills a compact part of space. Boxes around runs of eight are smaller than along a
+Morton curve, which leaps: rays enter two fifths fewer of them.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+from numba import prange
+from numpy.typing import NDArray
+from torch import Tensor
+
+from glassplat.kernels.backend.cpu import Kernel, inlined, kernel
+from glassplat.kernels.maths.blending import Scalar
+from glassplat.kernels.records import REAL_OF
+from glassplat.kernels.trace.steps import WIDTH
+
+
+def level_offsets(count: int) -> list[int]:
+    """Where the nodes of each level over `count` Gaussians begin, the lowest first, and where the last one ends."""
+    offsets = [0]
+    while count > 1 or (count == 1 and len(offsets) == 1):
+        count = -(-count // WIDTH)
+        offsets.append(offsets[-1] + count)
+    return offsets
+
+
+def half_widths_maths(real: type, flat: bool) -> Scalar:
+    """Builds (x, y, z): half the size of a Gaussian's box, from its frame and how many deviations it reaches."""
+    zero, one = real(0.0), real(1.0)
+
+    @inlined
+    def squares(frames, g, axis):  # type: ignore[no-untyped-def]
+        x, y, z = frames[g, axis, 0], frames[g, axis, 1], frames[g, axis, 2]
+        # A row is an axis divided by its deviation; divided by its squared length it is their product.
+        inverse = one / (x * x + y * y + z * z)
+        x, y, z = x * inverse, y * inverse, z * inverse
+        return x * x, y * y, z * z
+
+    @inlined
+    def half_widths(frames, g, extent):  # type: ignore[no-untyped-def]
+        u, v = squares(frames, g, 0), squares(frames, g, 1)
+        w = (zero, zero, zero) if flat else squares(frames, g, 2)
+        x, y, z = u[0] + v[0] + w[0], u[1] + v[1] + w[1], u[2] + v[2] + w[2]
+        return extent * real(math.sqrt(x)), extent * real(math.sqrt(y)), extent * real(math.sqrt(z))
+
+    return half_widths
+
+
+BITS = 20
+"""Bits for each axis."""
+CHUNK = 1024
+"""Points per task."""
+
+
+def hilbert_codes(points: Tensor) -> Tensor:
+    """[N] int64: place of each point [N, 3] along the curve through their bounding cube.
+
+    What is not finite comes last.
+    """
+    cells, finite = curve_cells(points)
+    places = torch.empty(len(points), dtype=torch.int64)
+    hilbert_places(REAL_OF[points.dtype])(cells.numpy(), places.numpy())
+    return torch.where(finite, places, torch.iinfo(torch.int64).max)
+
+
+def curve_cells(points: Tensor) -> tuple[Tensor, Tensor]:
+    """[N, 3] int64 cells of a grid over the finite points' bounding cube, and [N] which ones are finite.
+
+    On any device, and without asking it for a number.
+    """
+    finite = points.isfinite().all(dim=1)
+    if not len(points):
+        return points.long(), finite
+    lowest = torch.where(finite[:, None], points, torch.inf).amin(dim=0)
+    size = (torch.where(finite[:, None], points, -torch.inf).amax(dim=0) - lowest).amax().double()
+    scale = torch.where(size > 0, (2**BITS - 1) / size, 0.0)
+    cells = ((points - lowest).double() * scale).nan_to_num(0.0, 0.0, 0.0).long()
+    return cells, finite
+
+
+@inlined
+def unfolded(x, y, z):  # type: ignore[no-untyped-def]
+    """Coordinates turned, from the largest cube to the smallest, into the axes of the curve within it.
+
+    In each cube the curve enters and leaves at corners that lie along one edge; reflecting and exchanging axes brings
+    every cube into that position (Skilling 2004).
+    """
+    bit = np.int64(1 << (BITS - 1))
+    while bit > 1:
+        below = bit - 1
+        if x & bit:
+            x ^= below
+        if y & bit:
+            x ^= below
+        else:
+            differ = (x ^ y) & below
+            x, y = x ^ differ, y ^ differ
+        if z & bit:
+            x ^= below
+        else:
+            differ = (x ^ z) & below
+            x, z = x ^ differ, z ^ differ
+        bit >>= 1
+    y ^= x
+    z ^= y
+    turned, bit = np.int64(0), np.int64(1 << (BITS - 1))
+    while bit > 1:
+        if z & bit:
+            turned ^= bit - 1
+        bit >>= 1
+    return x ^ turned, y ^ turned, z ^ turned
+
+
+@inlined
+def curve_place(x, y, z):  # type: ignore[no-untyped-def]
+    """The place of a cell along the curve."""
+    x, y, z = unfolded(x, y, z)
+    place = np.int64(0)
+    for j in range(BITS):
+        shift = BITS - 1 - j
+        place = (place << 3) | ((x >> shift & 1) << 2) | ((y >> shift & 1) << 1) | (z >> shift & 1)
+    return place
+
+
+@cache
+def hilbert_places(real: type) -> Kernel:
+    """Fills the places of cells along the curve."""
+
+    @kernel("hilbert_places", real)
+    def fill(cells: NDArray[Any], places: NDArray[Any]) -> None:
+        count = places.size
+        for chunk in prange((count + CHUNK - 1) // CHUNK):
+            for i in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
+                places[i] = curve_place(cells[i, 0], cells[i, 1], cells[i, 2])
+
+    return fill
+
+
+MORTON_BITS = 21
+"""Bits for each axis: three times as many fit into an integer of 64 bits with a sign."""
+_SPREADS = (
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+
+
+@torch.no_grad()
+def morton_codes(means: Tensor) -> Tensor:
+    """[N] int64: place of each point [N, 3] along a Morton curve (Z-order) through their bounding cube.
+
+    What is not finite comes last.
+    """
+    finite = means.isfinite().all(dim=1)
+    if not bool(finite.any()):
+        return torch.zeros(means.shape[0], dtype=torch.int64, device=means.device)
+    lowest, highest = means[finite].amin(dim=0), means[finite].amax(dim=0)
+    size = (highest - lowest).amax().clamp(min=torch.finfo(means.dtype).tiny)
+    cells = (
+        ((means - lowest).double() / size.double() * (2**MORTON_BITS - 1))
+        .nan_to_num()
+        .long()
+        .clamp(0, 2**MORTON_BITS - 1)
+    )
+    for shift, mask in _SPREADS:
+        cells = (cells | (cells << shift)) & mask
+    codes = cells[:, 0] | (cells[:, 1] << 1) | (cells[:, 2] << 2)
+    return torch.where(finite, codes, torch.iinfo(torch.int64).max)
