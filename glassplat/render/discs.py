@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from glassplat.kernels.color_and_depth import mean_depth
-from glassplat.kernels.composite_discs import BlendedDiscs, composite_discs
-from glassplat.kernels.project_discs import project_discs
+from glassplat.kernels.composite import BlendedDiscs, composite_discs
+from glassplat.kernels.project import project_discs
 from glassplat.kernels.records import Discs, ProjectedDiscs
 from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.frame import ScreenPass

@@ -11,11 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.composite_discs import BlendedDiscs, composite_discs
-from glassplat.kernels.composite_discs.reference import composite_discs as twin
+from glassplat.kernels.composite import BlendedDiscs, composite_discs
+from glassplat.kernels.composite.reference import composite_discs as twin
 from glassplat.kernels.maths.disc import LOW_PASS
 from glassplat.kernels.panes.reference import ray_grid
-from glassplat.kernels.project_discs import project_discs
+from glassplat.kernels.project import project_discs
 from glassplat.kernels.records import CameraBatch, Discs, ProjectedDiscs, RawGaussians, Rays, TileBins
 from glassplat.kernels.tiles import bin_tiles
 from glassplat.kernels.trace import build_bvh, shapes_of, trace

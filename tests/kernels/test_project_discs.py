@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.project_discs import project_discs
-from glassplat.kernels.project_discs.reference import project_discs as twin
+from glassplat.kernels.project import project_discs
+from glassplat.kernels.project.reference import project_discs as twin
 from glassplat.kernels.records import CameraBatch, ProjectedDiscs, RawGaussians
 from tests.kernels.gaussians_and_cameras import HEIGHT, WIDTH, draw, random_cameras, random_gaussians
 

@@ -1,5 +1,259 @@
-"""Front-to-back blending of splats into images, with a second transmittance for the glass mask."""
+"""Front-to-back blending of splats into images: ellipsoids, with a second transmittance for the glass mask, and discs
+(2DGS).
+"""
 
-from glassplat.kernels.composite.operation import Composite, composite
+from __future__ import annotations
 
-__all__ = ["Composite", "composite"]
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from glassplat.kernels.backend.devices import kernels_for
+from glassplat.kernels.maths.disc import LOW_PASS, MAP
+from glassplat.kernels.records import MOST_CHANNELS, Deviation, Discs, Splats, TileBins, check_tensors
+
+
+def check_splats(splats: Splats, bins: TileBins) -> None:
+    """Raises where splats and bins do not belong together, or where no kernel exists for them.
+
+    Raises:
+        TypeError: the type is neither float32 nor float64, differs between tensors, or they are on different devices.
+        ValueError: shapes disagree.
+    """
+    cameras, count = splats.opacities.shape
+    trailing = {"means2d": (2,), "conics": (3,), "opacities": (), "depths": ()}
+    check_tensors({name: (getattr(splats, name), (cameras, count, *rest)) for name, rest in trailing.items()})
+    if bins.num_cameras != cameras or len(bins.splat_offsets) != cameras * count + 1:
+        raise ValueError(
+            f"the bins are for {bins.num_cameras} cameras and {len(bins.splat_offsets) - 1} splats, but there are "
+            f"{cameras} cameras with {count} splats each; bin these very splats with bin_tiles"
+        )
+
+
+def primary_count(num_primary: int | None, splats: Splats) -> int:
+    """The number of primary splats; all of them where none is given."""
+    count = splats.opacities.shape[1]
+    if num_primary is None:
+        return count
+    if not 0 <= num_primary <= count:
+        raise ValueError(f"num_primary is {num_primary}, expected between 0 and the {count} splats there are")
+    return num_primary
+
+
+PROBE = 7
+"""Which argument of the operation the probe is."""
+
+
+class Composite(NamedTuple):
+    """Blended images.
+
+    image [C, H, W, D]: sum of channels. alpha [C, H, W]: coverage by primary splats, 1 - T.
+    mask [C, H, W]: visible marks of glass splats. deviation [C, H, W]: empty unless asked for.
+    """
+
+    image: Tensor
+    alpha: Tensor
+    mask: Tensor
+    deviation: Tensor
+
+
+def composite(
+    splats: Splats, channels: Tensor, bins: TileBins,
+    *, marks: Tensor | None = None, num_primary: int | None = None, deviation: Deviation | None = None,
+    probe: Tensor | None = None,
+) -> Composite:  # fmt: skip
+    """Blends depth-sorted splats over each pixel (3DGS; TR-Gaussians, Eqs. 2, 4, 7 and 13).
+
+        alpha_i = min(0.99, opacity_i exp(-q_i / 2)), ignored below 1/255
+        image   = sum over primary i of channels_i alpha_i T_i
+        mask    = sum over glass j of marks_j alpha_j T_j T_glass_j
+        deviation = where sum over primary i of |z_i - mean z| alpha_i T_i,  mean z = image_z / alpha   (Eq. 14)
+
+    T_i is the product of (1 - alpha) over the primary splats in front, T_glass_j the same over the glass splats in
+    front; their product is the transmittance over both together. A pixel stops before the primary splat that would
+    take T below 1e-4; its mask also before the glass splat that would take T_glass there. Pixels of tiles that are
+    not active are zero everywhere. No background is added.
+
+    Differentiable in `means2d`, `conics`, `opacities`, `channels` and `marks`; the order of depths is constant.
+    A non-finite channel makes pixels non-finite only in the tiles that its splat reaches; a splat with non-finite
+    geometry is not drawn.
+
+    Args:
+        splats: [C, G] splats; those with index >= `num_primary` are glass, and appear in the mask only.
+        channels: [C, G, D] values to blend, 1 to 32 of them; those of glass splats are not used.
+        bins: the same splats sorted into tiles, from `bin_tiles`.
+        marks: [C, G - num_primary] what a glass splat adds to the mask, in [0, 1]; needed where there is glass.
+        num_primary: how many splats are primary; all of them by default.
+        deviation: the channel z whose deviation to compute, and where; the mean is a constant unless it says so.
+        probe: [C, G, 2], any values; they change nothing. Its gradient is how strongly single pixels pull at the
+            centres: |v_x| and |v_y|, summed over the pixels, of which the gradient of `means2d` is the sum
+            with signs (AbsGS, arXiv 2404.10484, Eq. 8). Pixels that pull against each other show here only.
+
+    Raises:
+        TypeError: tensors are not all float32 or all float64.
+        ValueError: shapes disagree, glass has no marks, or tensors are on different devices.
+    """
+    check_splats(splats, bins)
+    num_primary = primary_count(num_primary, splats)
+    cameras, count = splats.opacities.shape
+    if channels.ndim != 3 or not 1 <= channels.shape[2] <= MOST_CHANNELS:
+        raise ValueError(f"channels has shape {list(channels.shape)}, expected [C, G, D] with D in 1..{MOST_CHANNELS}")
+    if marks is None:
+        if num_primary < count:
+            raise ValueError(
+                f"{count - num_primary} splats are glass, but there are no marks; pass one per glass splat"
+            )
+        marks = channels.new_zeros(cameras, 0)
+    expected = {
+        "means2d": (splats.means2d, tuple(splats.means2d.shape)),
+        "channels": (channels, (cameras, count, channels.shape[2])),
+        "marks": (marks, (cameras, count - num_primary)),
+    }
+    if deviation is not None:
+        expected["deviation.where"] = (deviation.where, (cameras, bins.height, bins.width))
+        if not 0 <= deviation.channel < channels.shape[2]:
+            raise ValueError(f"deviation.channel is {deviation.channel}, but there are {channels.shape[2]} channels")
+    if probe is not None:
+        expected["probe"] = (probe, (cameras, count, 2))
+    check_tensors(expected)
+    needing = [tensor for tensor in (*splats[:3], channels, marks, probe) if tensor is not None]
+    needs_gradients = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in needing)
+    return Composite(*_Composite.apply(*splats, channels, marks, probe, bins, num_primary, deviation, needs_gradients))
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        *tensors, _, bins, num_primary, deviation, needs_gradients = arguments
+        *fields, channels, marks = (tensor.detach().contiguous() for tensor in tensors)
+        splats = Splats(*fields)
+        *outputs, saved = kernels_for("composite", channels.device).composite(
+            splats, channels, bins,
+            marks=marks, num_primary=num_primary, deviation=deviation, needs_gradients=needs_gradients,
+        )  # fmt: skip
+        ctx.save_for_backward(*splats, channels, marks)
+        ctx.bins, ctx.num_primary, ctx.deviation, ctx.saved = bins, num_primary, deviation, saved
+        return tuple(outputs)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *v_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        *fields, channels, marks = ctx.saved_tensors
+        kernels = kernels_for("composite", channels.device)
+        v_means, v_conics, v_opacities, v_channels, v_marks, v_probe = kernels.composite_gradients(
+            Splats(*fields), channels, ctx.bins, ctx.saved, v_outputs,
+            marks=marks, num_primary=ctx.num_primary, deviation=ctx.deviation, probed=ctx.needs_input_grad[PROBE],
+        )  # fmt: skip
+        return v_means, v_conics, v_opacities, None, None, v_channels, v_marks, v_probe, None, None, None, None
+
+
+class BlendedDiscs(NamedTuple):
+    """Blended images.
+
+    image [C, H, W, D]: sum of channels. alpha [C, H, W]: coverage, 1 - T. depth [C, H, W]: sum of the depths at which
+    the pixel's ray meets the discs; over alpha, the expected depth. median [C, H, W]: depth of the last disc before
+    which more than half of the light is left, 0 where nothing is. distortion [C, H, W]: how far apart along the ray
+    lies what the pixel shows.
+    """
+
+    image: Tensor
+    alpha: Tensor
+    depth: Tensor
+    median: Tensor
+    distortion: Tensor
+
+
+def composite_discs(
+    discs: Discs, channels: Tensor, bins: TileBins,
+    *, near: float, low_pass: float = LOW_PASS, probe: Tensor | None = None,
+) -> BlendedDiscs:  # fmt: skip
+    """Blends discs over each pixel, in the order of their centres' depths (2DGS, Eqs. 8 to 13).
+
+        alpha_i = min(0.99, opacity_i exp(-q_i / 2)),  q_i = min(u_i^2 + v_i^2, |d|^2 / low_pass^2)
+        image   = sum over i of channels_i alpha_i T_i,  depth = sum over i of z_i alpha_i T_i
+        distortion = sum over i < j of w_i w_j (1 / z_i - 1 / z_j)^2,  w_i = alpha_i T_i
+
+    (u, v) is where the pixel's ray meets the disc, in deviations, and z the depth there; d is the offset of the pixel
+    from the disc's centre. Where the falloff around the centre is the larger one, as of a disc far away or seen from
+    its edge, z is the depth of the centre. A disc ends where q reaches 9 or alpha 1/255, and where z is at most `near`.
+    A pixel stops before the disc that would take T below 1e-4. Depths in NDC, of which 2DGS takes the distortion, are
+    1 / z times a constant and plus one.
+
+    Pixels of tiles that are not active are zero everywhere. No background is added. Differentiable in `means2d`,
+    `maps`, `opacities`, `depths` and `channels`; the order of depths is constant. A non-finite channel makes pixels
+    non-finite only in the tiles that its disc reaches; a disc with non-finite geometry is not drawn.
+
+    Args:
+        discs: [C, G] discs, from `project_discs`.
+        channels: [C, G, D] values to blend, 1 to 32 of them.
+        bins: the outlines of the same discs sorted into tiles, from `bin_tiles`.
+        near: of `project_discs`.
+        low_pass: standard deviation in pixels of the falloff around the centre; 0 leaves it out.
+        probe: [C, G, 2], any values, as in `composite`; its gradient is that of `means2d` with the parts of single
+            pixels added up without their signs.
+
+    Raises:
+        TypeError: tensors are not all float32 or all float64.
+        ValueError: shapes disagree, a number is out of range, or tensors are on different devices.
+    """
+    _check(discs, channels, bins, probe)
+    if not near >= 0 or not low_pass >= 0:
+        raise ValueError(f"near is {near} and low_pass {low_pass}; expected numbers of at least 0")
+    return BlendedDiscs(*_CompositeDiscs.apply(*discs[:4], channels, probe, discs.outlines, bins, near, low_pass))
+
+
+def _check(discs: Discs, channels: Tensor, bins: TileBins, probe: Tensor | None) -> None:
+    cameras, count = discs.opacities.shape
+    if channels.ndim != 3 or not 1 <= channels.shape[2] <= MOST_CHANNELS:
+        raise ValueError(f"channels has shape {list(channels.shape)}, expected [C, G, D] with D in 1..{MOST_CHANNELS}")
+    expected = {
+        "means2d": (discs.means2d, (cameras, count, 2)),
+        "maps": (discs.maps, (cameras, count, MAP)),
+        "opacities": (discs.opacities, (cameras, count)),
+        "depths": (discs.depths, (cameras, count)),
+        "channels": (channels, (cameras, count, channels.shape[2])),
+        "outlines.means2d": (discs.outlines.means2d, (cameras, count, 2)),
+        "outlines.conics": (discs.outlines.conics, (cameras, count, 3)),
+    }
+    if probe is not None:
+        expected["probe"] = (probe, (cameras, count, 2))
+    check_tensors(expected)
+    if bins.num_cameras != cameras or len(bins.splat_offsets) != cameras * count + 1:
+        raise ValueError(
+            f"the bins are for {bins.num_cameras} cameras and {len(bins.splat_offsets) - 1} discs, but there are "
+            f"{cameras} cameras with {count} discs each; bin the outlines of these very discs with bin_tiles"
+        )
+
+
+def _discs(tensors: Sequence[Tensor], outlines: Splats) -> Discs:
+    means2d, maps, opacities, depths = tensors[:4]
+    return Discs(means2d, maps, opacities, depths, outlines)
+
+
+class _CompositeDiscs(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, means2d: Tensor, maps: Tensor, opacities: Tensor, depths: Tensor, channels: Tensor,
+        probe: Tensor | None, outlines: Splats, bins: TileBins, near: float, low_pass: float,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        tensors = tuple(tensor.detach().contiguous() for tensor in (means2d, maps, opacities, depths, channels))
+        plain = _discs(tensors, Splats(*(tensor.detach().contiguous() for tensor in outlines)))
+        kernels = kernels_for("composite", channels.device)
+        *outputs, saved = kernels.composite_discs(plain, tensors[4], bins, near=near, low_pass=low_pass)
+        ctx.save_for_backward(*tensors)
+        ctx.rest = (plain.outlines, bins, saved, near, low_pass)
+        return tuple(outputs)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *v_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        channels = ctx.saved_tensors[4]
+        outlines, bins, saved, near, low_pass = ctx.rest
+        found = kernels_for("composite", channels.device).composite_discs_gradients(
+            _discs(ctx.saved_tensors, outlines), channels, bins, saved, [v.contiguous() for v in v_outputs],
+            near=near, low_pass=low_pass, probed=ctx.needs_input_grad[5],
+        )  # fmt: skip
+        return (*found, None, None, None, None)

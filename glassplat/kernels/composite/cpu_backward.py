@@ -29,8 +29,7 @@ from glassplat.kernels.backend.cpu_vector import (
     with_fourths,
 )
 from glassplat.kernels.composite import cpu_tile as tile
-from glassplat.kernels.composite.cpu_pair_rows import PAIR_VALUES
-from glassplat.kernels.composite.cpu_tile import exponent, lane_of
+from glassplat.kernels.composite.cpu_tile import PAIR_VALUES, exponent, lane_of
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar
 from glassplat.kernels.records import LEAST_ALPHA
 

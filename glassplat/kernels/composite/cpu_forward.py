@@ -22,8 +22,7 @@ from glassplat.kernels.backend.cpu_vector import (
     without_fourths,
 )
 from glassplat.kernels.composite import cpu_tile as tile
-from glassplat.kernels.composite.cpu_pair_rows import CHUNK as SPLATS
-from glassplat.kernels.composite.cpu_tile import exponent, lane_of, list_block, list_plain_block
+from glassplat.kernels.composite.cpu_tile import SPLATS, exponent, lane_of, list_block, list_plain_block
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
 from glassplat.kernels.records import LEAST_ALPHA
 

@@ -16,8 +16,18 @@ from torch import Tensor
 
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.composite.cuda_backward import PULLS, THREADS, WARPS, composite_backward, composite_pulls
-from glassplat.kernels.composite.cuda_pair_rows import new_pair_rows, sum_pair_rows
-from glassplat.kernels.composite.cuda_tile import ALIGNMENT, BUCKET, COLUMNS, PIXELS, at, tile_steps
+from glassplat.kernels.composite.cuda_discs import composite_discs as composite_discs
+from glassplat.kernels.composite.cuda_discs import composite_discs_gradients as composite_discs_gradients
+from glassplat.kernels.composite.cuda_tile import (
+    ALIGNMENT,
+    BUCKET,
+    COLUMNS,
+    PIXELS,
+    at,
+    new_pair_rows,
+    sum_pair_rows,
+    tile_steps,
+)
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from glassplat.kernels.records import LEAST_ALPHA, REAL_OF, TILE, Deviation, Splats, TileBins
 

@@ -17,8 +17,7 @@ from numba import cuda
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, kernel
 from glassplat.kernels.backend.devices import SIMULATED
-from glassplat.kernels.composite.cuda_pair_rows import MOMENTS
-from glassplat.kernels.composite.cuda_tile import BUCKET, COLUMNS, MEAN_X, MEAN_Y, PIXELS, at, tile_steps
+from glassplat.kernels.composite.cuda_tile import BUCKET, COLUMNS, MEAN_X, MEAN_Y, MOMENTS, PIXELS, at, tile_steps
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar
 from glassplat.kernels.maths.fast_maths import reciprocal_maths
 from glassplat.kernels.records import TILE

@@ -1,17 +1,27 @@
-"""What the blending kernels share: a tile's pixels, its splats in shared memory, and how much they cover."""
+"""A tile's pixels on the GPU, its splats in shared memory, how much they cover, and the rows of their gradients.
+
+A row of a (tile, splat) pair holds sums over a tile's pixels: of g dx, g dy, g dx^2, g dx dy, g dy^2 and g, with g the
+gradient of the exponent of the splat's falloff and (dx, dy) the offset from its centre, then one value per channel, and
+the two of the probe if there is one. All of these add up over tiles; what they mean for mean, conic and opacity is
+worked out once per splat.
+"""
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
+from numba import cuda
+from torch import Tensor
 
 from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.backend.devices import SIMULATED
 from glassplat.kernels.composite.cpu_tile import tile_functions
 from glassplat.kernels.maths.blending import Scalar, blend_maths
 from glassplat.kernels.maths.fast_maths import exp2_maths, fused_maths
-from glassplat.kernels.records import TILE
+from glassplat.kernels.records import REAL_OF, TILE, Splats, TileBins
 
 PIXELS = TILE * TILE
 
@@ -85,3 +95,58 @@ def _coverage(real: type) -> Scalar:
         return geometry[i, OPACITY] * exp2(exponent)
 
     return coverage
+
+
+THREADS = 256
+MOMENTS = 6
+
+
+def new_pair_rows(bins: TileBins, channels: Tensor, probed: bool) -> Tensor:
+    """One gradient row per pair [P, 6 + D, + 2 if probed], all zero: a tile fills those of pairs that it blended."""
+    return channels.new_zeros(len(bins.pair_splats), MOMENTS + channels.shape[2] + (2 if probed else 0))
+
+
+def sum_pair_rows(
+    rows: Tensor, bins: TileBins, splats: Splats, num_values: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Gradients of means2d, conics, opacities, values [C, G, num_values] and probe [C, G, 2 or 0]: sums over tiles."""
+    shape, width = tuple(splats.opacities.shape), rows.shape[1]
+    count = shape[0] * shape[1]
+    found = [rows.new_empty(count, *rest) for rest in ((2,), (3,), (), (num_values,), (width - MOMENTS - num_values,))]
+    sum_rows(REAL_OF[rows.dtype])(
+        blocks_for(count * width, THREADS), THREADS, rows, bins.pair_slots, bins.splat_offsets,
+        splats.conics.view(-1, 3), splats.opacities.view(-1), *found,
+    )  # fmt: skip
+    v_means, v_conics, v_opacities, v_values, v_probe = (tensor.view(*shape, *tensor.shape[1:]) for tensor in found)
+    return v_means, v_conics, v_opacities, v_values, v_probe
+
+
+@cache
+def sum_rows(real: type) -> Kernel:
+    """One thread for each column of each splat: neighbouring threads read neighbouring numbers."""
+    zero, half = real(0.0), real(0.5)
+
+    @kernel("sum_pair_rows", real, "real2 int1 long1 real2 real1 real2 real2 real1 real2 real2")
+    def sum_up(rows, slots, offsets, conics, opacities, v_means, v_conics, v_opacities, v_values, v_probe):
+        i, width = cuda.grid(1), rows.shape[1]
+        s, column = i // width, i % width
+        if s >= opacities.size:
+            return
+        total, other = zero, zero
+        for k in range(offsets[s], offsets[s + 1]):
+            total += rows[slots[k], column]
+            if column < 2:
+                other += rows[slots[k], 1 - column]
+        if column < 2:
+            # q = xx dx^2 + 2 xy dx dy + yy dy^2, and the exponent is -q / 2.
+            v_means[s, column] = conics[s, 2 * column] * total + conics[s, 1] * other
+        elif column < 5:
+            v_conics[s, column - 2] = -total if column == 3 else -half * total
+        elif column == 5:
+            v_opacities[s] = total / opacities[s] if total != zero else zero
+        elif column < MOMENTS + v_values.shape[1]:
+            v_values[s, column - MOMENTS] = total
+        else:
+            v_probe[s, column - MOMENTS - v_values.shape[1]] = total
+
+    return sum_up

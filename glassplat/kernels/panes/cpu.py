@@ -28,11 +28,10 @@ from glassplat.kernels.backend.cpu_vector import (
     triples,
     vector_kind,
 )
-from glassplat.kernels.composite.cpu_tile import TILE
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.color import color_space_maths
 from glassplat.kernels.maths.pane import pane_maths
-from glassplat.kernels.records import REAL_OF, PaneHits
+from glassplat.kernels.records import REAL_OF, TILE, PaneHits
 
 
 def pane_hits(

@@ -7,10 +7,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from glassplat.kernels.composite.cpu_tile import TILE
 from glassplat.kernels.fresnel import Fresnel
 from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
-from glassplat.kernels.records import BlendedPanes, PaneHits, Panes
+from glassplat.kernels.records import TILE, BlendedPanes, PaneHits, Panes
 
 
 def pane_hits(

@@ -1,5 +1,249 @@
-"""Projects Gaussians onto the screens of a batch of cameras."""
+"""Projects Gaussians onto the screens of a batch of cameras: ellipsoids, and discs (2DGS)."""
 
-from glassplat.kernels.project.operation import GradientSum, project
+from __future__ import annotations
 
-__all__ = ["GradientSum", "project"]
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from glassplat.kernels.backend.devices import kernels_for
+from glassplat.kernels.maths.harmonics import check_sh_degree
+from glassplat.kernels.records import FLAT, SOLID, CameraBatch, Projected, ProjectedDiscs, RawGaussians, check_tensors
+
+
+def projection_inputs(
+    gaussians: RawGaussians, cameras: CameraBatch, *, scales: int, sh_degree: int, near: float
+) -> tuple[Tensor, ...]:
+    """The raw tensors, poses [C, 4, 4], intrinsics [C, 4], clip planes [C or 0, 4] and windows [C, 4].
+
+    Args:
+        gaussians: raw tensors, float32 or float64.
+        cameras: of the same floating-point type.
+        scales: how many a Gaussian has.
+        sh_degree: highest degree of the spherical harmonics to evaluate.
+        near: smallest depth.
+
+    Raises:
+        ValueError: a shape, the degree or `near` is out of range.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
+    """
+    _check(gaussians, cameras, scales)
+    check_sh_degree(sh_degree, gaussians.sh.shape[1])
+    if not near >= 0:
+        raise ValueError(f"near is {near}; expected a depth of at least 0")
+    clip_planes = cameras.clip_planes
+    if clip_planes is None:
+        clip_planes = gaussians.means.new_empty(0, 4)
+    windows = _whole_images(cameras) if cameras.windows is None else cameras.windows
+    return (*gaussians, cameras.cam_from_world, cameras.intrinsics, clip_planes, windows)
+
+
+def _whole_images(cameras: CameraBatch) -> Tensor:
+    """Windows of all pixels, filled in on the device: numbers that came from here would make it wait."""
+    windows = cameras.cam_from_world.new_zeros(cameras.cam_from_world.shape[0], 4)
+    windows[:, 2].fill_(cameras.width)
+    windows[:, 3].fill_(cameras.height)
+    return windows
+
+
+def _check(gaussians: RawGaussians, cameras: CameraBatch, scales: int) -> None:
+    count, num_cameras = gaussians.means.shape[0], cameras.cam_from_world.shape[0]
+    coefficients = gaussians.sh.shape[1] if gaussians.sh.dim() == 3 else 0
+    expected = {
+        "means": (gaussians.means, (count, 3)),
+        "quats": (gaussians.quats, (count, 4)),
+        "log_scales": (gaussians.log_scales, (count, scales)),
+        "logit_opacities": (gaussians.logit_opacities, (count,)),
+        "sh": (gaussians.sh, (count, coefficients, 3)),
+        "cam_from_world": (cameras.cam_from_world, (num_cameras, 4, 4)),
+        "intrinsics": (cameras.intrinsics, (num_cameras, 4)),
+    }
+    if cameras.clip_planes is not None:
+        expected["clip_planes"] = (cameras.clip_planes, (num_cameras, 4))
+    if cameras.windows is not None:
+        expected["windows"] = (cameras.windows, (num_cameras, 4))
+    check_tensors(expected)
+
+
+@dataclass
+class GradientSum:
+    """Where projections of the same Gaussians add up their gradients, instead of each filling tensors of its own.
+
+    Most of a gradient is zeros, of what a camera does not see; filling and adding them costs more than the rest. Each
+    projection hands the next one a token, so that autograd asks for their gradients from the last to the first, which
+    alone returns the sum.
+
+    Attributes:
+        token: of the projection before.
+        found: what the projections after it have found, where they have been asked; empty otherwise. Nodes of the graph
+            hold this list and not the record, whose token holds them.
+    """
+
+    token: Tensor | None = None
+    found: list[Tensor] = field(default_factory=list)
+
+
+def project(
+    gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, near: float, total: GradientSum | None = None
+) -> Projected:
+    """Projects Gaussians into cameras: activation, EWA splatting, bounds, culling and view-dependent colour.
+
+    A Gaussian is culled in a camera when its depth is at most `near`, its centre is not on the kept side of
+    the camera's clip plane, its coverage reaches 1/255 nowhere in the camera's window, or a parameter is not
+    finite. Then its radii and all its other values are zero and it gets no gradient from that camera.
+
+    A splat's covariance is J A Sigma A^T J^T plus 0.3 px^2 on the diagonal, A the upper 3x3 block of
+    `cam_from_world` and J the Jacobian of the projection; beyond 1.3 times the image, J stays that of the border.
+    Colours are seen along the direction from the camera centre, defined as -A^T t, to the mean, offset by 0.5 and
+    clamped at 0. A mirrored, left-handed A is as good as any.
+
+    Differentiable in all tensors of `gaussians` and in `cam_from_world`; `radii` carry no gradient.
+
+    Args:
+        gaussians: raw tensors, float32 or float64.
+        cameras: of the same floating-point type; intrinsics, clip planes and windows get no gradient.
+        sh_degree: highest degree of the spherical harmonics to evaluate; `gaussians.sh` may hold more, or
+            none at all, which makes all colours zero.
+        near: smallest depth (camera z, world units), at least 0.
+        total: the same for all projections of these very tensors whose gradients are to be added up.
+
+    Raises:
+        ValueError: a shape, the degree or `near` is out of range.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
+    """
+    inputs = projection_inputs(gaussians, cameras, scales=SOLID, sh_degree=sh_degree, near=near)
+    total = GradientSum() if total is None else total
+    *fields, total.token = _Project.apply(
+        *inputs, total.token, total.found, cameras.width, cameras.height, sh_degree, near
+    )  # fmt: skip
+    return Projected(*fields)
+
+
+class _Project(torch.autograd.Function):
+    """The kernels as one node of the autograd graph."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, quats: Tensor, log_scales: Tensor, logit_opacities: Tensor, sh: Tensor,
+        cam_from_world: Tensor, intrinsics: Tensor, clip_planes: Tensor, windows: Tensor,
+        token: Tensor | None, shared: list[Tensor], width: int, height: int, sh_degree: int, near: float,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        inputs = (means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, clip_planes, windows)
+        tensors = [tensor.detach().contiguous() for tensor in inputs]
+        degree = sh_degree if sh.shape[1] else -1
+        kernels = kernels_for("project", means.device)
+        outputs: tuple[Tensor, ...] = kernels.project(tensors, width, height, degree=degree, near=near)
+        conics, radii = outputs[1], outputs[5]
+        ctx.save_for_backward(*tensors[:7], radii, conics)
+        ctx.size_and_degree = (width, height, degree)
+        ctx.shared = shared
+        ctx.mark_non_differentiable(radii)
+        ctx.set_materialize_grads(False)
+        return *outputs, means.new_empty(0)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        *inputs, radii, conics = ctx.saved_tensors
+        seen = (radii, conics)
+        # Only a projection that was asked in this very pass has handed back its token.
+        known = None if gradients[6] is None else list(ctx.shared)
+        ctx.shared.clear()
+        found, cameras = kernels_for("project", radii.device).project_gradients(
+            inputs, *ctx.size_and_degree,
+            seen=seen, cotangents=_cotangents(gradients, seen), needs_camera=bool(ctx.needs_input_grad[5]), known=known,
+        )  # fmt: skip
+        pose_gradient, v_token = None, None
+        if ctx.needs_input_grad[5]:
+            pose_gradient = torch.zeros_like(inputs[5])
+            pose_gradient[:, :3] = cameras.reshape(-1, 3, 4)
+        if ctx.needs_input_grad[9]:
+            ctx.shared.extend(found)
+            found, v_token = [None] * 5, radii.new_empty(0)
+        return *found, pose_gradient, None, None, None, v_token, None, None, None, None, None
+
+
+def _cotangents(gradients: Sequence[Tensor | None], seen: tuple[Tensor, Tensor]) -> list[Tensor]:
+    """Gradients of means2d, conics, depths, opacities and colors; zeros for those that nothing comes from."""
+    radii, conics = seen
+    like = (radii, conics, radii[..., 0], radii[..., 0], conics)
+    return [
+        torch.zeros(fits.shape, dtype=fits.dtype, device=fits.device) if gradient is None else gradient.contiguous()
+        for gradient, fits in zip(gradients[:5], like, strict=True)
+    ]
+
+
+SMOOTH = 6
+"""Outputs with a gradient; they come first."""
+
+
+def project_discs(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, near: float) -> ProjectedDiscs:
+    """Projects discs into cameras: activation, the map from pixels to the disc, outlines, culling and colour.
+
+    A disc lies in the plane of the first two axes of its rotation and falls off with two deviations; the third axis is
+    its normal. It ends at three deviations, or before that where its coverage falls to 1/255.
+
+    A disc is culled in a camera when the depth of its centre is at most `near`, its centre is not on the kept side of
+    the camera's clip plane, it is seen from its edge (the cosine between its normal and the ray to its centre is at
+    most 1e-3), its outline lies beside the camera's window, its opacity is at most 1/255, it has no size (a log scale
+    beyond -40 or 40), or a parameter or its map is not finite. Then its radii and all its other values are zero and it
+    gets no gradient from that camera. A disc that reaches through the near plane is kept where what lies behind
+    that plane may be seen: then its outline is the whole image, and `composite_discs` leaves out what lies before it.
+
+    Colours are those of `project`: along the direction from the camera centre, -A^T t, to the mean. A mirrored,
+    left-handed A is as good as any.
+
+    Differentiable in all tensors of `gaussians` and in `cam_from_world`; outlines and radii carry no gradient.
+
+    Args:
+        gaussians: raw tensors with `log_scales` [N, 2], float32 or float64.
+        cameras: of the same floating-point type; intrinsics, clip planes and windows get no gradient.
+        sh_degree: highest degree of the spherical harmonics to evaluate; `gaussians.sh` may hold more, or none at all,
+            which makes all colours zero.
+        near: smallest depth (camera z, world units), at least 0.
+
+    Raises:
+        ValueError: a shape, the degree or `near` is out of range.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
+    """
+    inputs = projection_inputs(gaussians, cameras, scales=FLAT, sh_degree=sh_degree, near=near)
+    return ProjectedDiscs(*_ProjectDiscs.apply(*inputs, cameras.width, cameras.height, sh_degree, near))
+
+
+class _ProjectDiscs(torch.autograd.Function):
+    """The kernels as one node of the autograd graph."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, quats: Tensor, log_scales: Tensor, logit_opacities: Tensor, sh: Tensor,
+        cam_from_world: Tensor, intrinsics: Tensor, clip_planes: Tensor, windows: Tensor,
+        width: int, height: int, sh_degree: int, near: float,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        inputs = (means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, clip_planes, windows)
+        tensors = [tensor.detach().contiguous() for tensor in inputs]
+        degree = sh_degree if sh.shape[1] else -1
+        kernels = kernels_for("project", means.device)
+        outputs: tuple[Tensor, ...] = kernels.project_discs(tensors, width, height, degree=degree, near=near)
+        ctx.save_for_backward(*tensors[:7], outputs[-1], outputs[1])
+        ctx.size_and_degree = (width, height, degree)
+        ctx.mark_non_differentiable(*outputs[SMOOTH:])
+        return outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        *inputs, radii, maps = ctx.saved_tensors
+        cotangents = [gradient.contiguous() for gradient in gradients[:SMOOTH]]
+        cam_from_world, needs_camera = inputs[5], bool(ctx.needs_input_grad[5])
+        found, cameras = kernels_for("project", radii.device).project_discs_gradients(
+            inputs, *ctx.size_and_degree, seen=(radii, maps), cotangents=cotangents, needs_camera=needs_camera
+        )
+        pose_gradient = None
+        if needs_camera:
+            pose_gradient = torch.zeros_like(cam_from_world)
+            pose_gradient[:, :3] = cameras.reshape(-1, 3, 4)
+        return (*found, pose_gradient, None, None, None, None, None, None, None)

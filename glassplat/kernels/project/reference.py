@@ -1,4 +1,4 @@
-"""Projection in plain PyTorch: the definition of `glassplat.kernels.project.project`, same name and signature."""
+"""The definition of the projection of ellipsoids and discs, in PyTorch."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from glassplat.kernels.maths.disc import LOW_PASS as DISC_LOW_PASS
+from glassplat.kernels.maths.disc import SLACK
 from glassplat.kernels.maths.harmonics import SH_CONSTANTS
 from glassplat.kernels.maths.projection import ALPHA_MIN, LOW_PASS, TANGENT_MARGIN
-from glassplat.kernels.records import CameraBatch, Projected, RawGaussians
+from glassplat.kernels.maths.ray_hit import EDGE_ON, MOST_DEVIATIONS, MOST_LOG_SCALE
+from glassplat.kernels.records import CameraBatch, Projected, ProjectedDiscs, RawGaussians
 
 
 class _Ellipses(NamedTuple):
@@ -55,7 +58,7 @@ def _project_all(
         ellipse = _Ellipses(*(_where(visible, entry, torch.ones_like(entry)) for entry in ellipse))
     conics = torch.stack([ellipse.yy, -ellipse.xy, ellipse.xx], dim=-1) / ellipse.determinant[..., None]
     radii = _half_extents(ellipse, opacities).detach()
-    colors = _colors(gaussians, linear, offset, sh_degree)
+    colors = _colors(gaussians, _outwards(gaussians, linear, offset), sh_degree)
     projected = Projected(means2d, conics, depths, opacities, colors.clamp(min=0), radii)
     if visible is None:
         visible = _visible(projected, gaussians, cameras, near) & ellipse.determinant.isfinite()
@@ -101,12 +104,16 @@ def _half_extents(ellipse: _Ellipses, opacities: Tensor) -> Tensor:
     return torch.sqrt(reach[..., None] * torch.stack([ellipse.xx, ellipse.yy], dim=-1))
 
 
-def _colors(gaussians: RawGaussians, linear: Tensor, offset: Tensor, sh_degree: int) -> Tensor:
+def _outwards(gaussians: RawGaussians, linear: Tensor, offset: Tensor) -> Tensor:
+    """Vectors from the camera centres, -A^T t, to the means [C, N, 3]."""
+    centers = -(linear.mT @ offset[..., None])[..., 0]
+    return gaussians.means - centers[:, None]
+
+
+def _colors(gaussians: RawGaussians, outwards: Tensor, sh_degree: int) -> Tensor:
     """Colours [C, N, 3] before the clamp; zero where there are no coefficients."""
     if gaussians.sh.shape[1] == 0:
-        return torch.zeros_like(gaussians.means).expand(linear.shape[0], -1, -1)
-    centers = -(linear.mT @ offset[..., None])[..., 0]
-    outwards = gaussians.means - centers[:, None]
+        return torch.zeros_like(outwards)
     basis = sh_basis(outwards / outwards.square().sum(-1, keepdim=True).sqrt())
     count = (sh_degree + 1) ** 2
     return 0.5 + torch.einsum("cnk,nkd->cnd", basis[..., :count], gaussians.sh[:, :count])
@@ -141,3 +148,153 @@ def _visible(projected: Projected, gaussians: RawGaussians, cameras: CameraBatch
     first, last = windows[:, None, :2], windows[:, None, 2:]
     on_screen = (projected.means2d + projected.radii > first) & (projected.means2d - projected.radii < last)
     return visible & on_screen.all(dim=-1) & (projected.radii > 0).all(dim=-1)
+
+
+SMOOTH = ("means2d", "maps", "depths", "opacities", "colors", "normals")
+
+
+def project_discs(gaussians: RawGaussians, cameras: CameraBatch, *, sh_degree: int, near: float) -> ProjectedDiscs:
+    """Projects discs into cameras; see `glassplat.kernels.project.project_discs`."""
+    with torch.no_grad():
+        visible = _visible_discs(_project_all_discs(gaussians, cameras, sh_degree, near), gaussians, cameras, near)
+    # Where nothing is seen the arithmetic runs on harmless stand-ins: a NaN masked afterwards would still reach the
+    # gradients, as NaN times zero.
+    seen = visible.any(dim=0)
+    harmless = RawGaussians(*(_where(seen, tensor, torch.ones_like(tensor)) for tensor in gaussians))
+    projected = _project_all_discs(harmless, cameras, sh_degree, near, visible)
+    projected = projected._replace(colors=projected.colors.clamp(min=0))
+    return ProjectedDiscs(*(_where(visible, tensor, torch.zeros_like(tensor)) for tensor in projected))
+
+
+def _project_all_discs(
+    gaussians: RawGaussians, cameras: CameraBatch, sh_degree: int, near: float, visible: Tensor | None = None
+) -> ProjectedDiscs:
+    """Everything projected, culled or not."""
+    linear, offset = cameras.cam_from_world[:, :3, :3], cameras.cam_from_world[:, :3, 3]
+    focal, middle = cameras.intrinsics[:, None, :2], cameras.intrinsics[:, None, 2:]
+    centers = gaussians.means @ linear.mT + offset[:, None]
+    turned = rotations(gaussians.quats)
+    p, q = (torch.einsum("cij,nj->cni", linear, turned[..., i]) for i in range(2))
+    if visible is not None:
+        harmless = torch.eye(3, dtype=centers.dtype)
+        p, q, centers = (
+            _where(visible, value, harmless[i].expand_as(value)) for i, value in enumerate((p, q, centers))
+        )
+    inverse = torch.exp(-gaussians.log_scales)
+    n = torch.linalg.cross(p, q)
+    per_slope = (centers[..., 2] / (n * centers).sum(-1))[..., None] / focal
+    maps = torch.cat(
+        [
+            torch.linalg.cross(q, centers)[..., :2] * inverse[:, :1] * per_slope,
+            torch.linalg.cross(centers, p)[..., :2] * inverse[:, 1:] * per_slope,
+            n[..., :2] * per_slope,
+        ],
+        dim=-1,
+    )
+    depths = centers[..., 2]
+    opacities = torch.sigmoid(gaussians.logit_opacities).expand(depths.shape)
+    with torch.no_grad():
+        ahead = torch.stack([p[..., 2], q[..., 2]], dim=-1) * torch.exp(gaussians.log_scales)
+        nearest = depths - _squared_reach(opacities).sqrt() * ahead.norm(dim=-1)
+        outlines = _outlines(maps, opacities, nearest > near, cameras.width, cameras.height)
+    towards = -_outwards(gaussians, linear, offset)
+    side = torch.where((towards * turned[..., 2]).sum(-1, keepdim=True) < 0, -1.0, 1.0).to(depths.dtype)
+    means2d = centers[..., :2] / depths[..., None] * focal + middle
+    shift, conics, radii = (tensor.to(depths.dtype) for tensor in outlines)
+    return ProjectedDiscs(
+        means2d, maps, depths, opacities, _colors(gaussians, -towards, sh_degree), side * turned[..., 2],
+        means2d.detach() + shift, conics, radii,
+    )  # fmt: skip
+
+
+def _squared_reach(opacities: Tensor) -> Tensor:
+    """Squared deviations up to which discs are met; zero where nowhere."""
+    return (2 * torch.log(opacities / ALPHA_MIN)).clamp(min=0, max=MOST_DEVIATIONS**2)
+
+
+def _outlines(maps: Tensor, opacities: Tensor, whole: Tensor, width: int, height: int) -> tuple[Tensor, ...]:
+    """Shift of the centre [C, N, 2], conics [C, N, 3] and half extents [C, N, 2] of the ellipses, float64."""
+    maps, opacities = maps.double(), opacities.double()
+    squared = _squared_reach(opacities)
+    rows = maps.unflatten(-1, (3, 2))
+    u, v, w = (rows[..., i, :] for i in range(3))
+    outer = [x[..., :, None] * x[..., None, :] for x in (u, v, w)]
+    form = outer[0] + outer[1] - squared[..., None, None] * outer[2]
+    determinant = form[..., 0, 0] * form[..., 1, 1] - form[..., 0, 1] ** 2
+    whole = whole & (determinant > 0) & (form[..., 0, 0] > 0) & (squared > 0)
+    inverse = torch.linalg.inv(_where(whole, form, torch.eye(2, dtype=form.dtype)))
+    shift = squared[..., None] * (inverse @ w[..., None])[..., 0]
+    covariance = (squared * (1 + (w * shift).sum(-1)))[..., None, None] * inverse
+    least = DISC_LOW_PASS * squared.sqrt() + shift.norm(dim=-1)
+    values, axes = torch.linalg.eigh(torch.where(covariance.isfinite(), covariance, 0))
+    values = torch.maximum(values, least[..., None].square()) * SLACK**2
+    wide = axes @ torch.diag_embed(values) @ axes.mT
+    conic = torch.linalg.inv(_where(whole, wide, torch.eye(2, dtype=form.dtype)))
+    conic = conic * (2 * torch.log(opacities / ALPHA_MIN))[..., None, None]
+    entries = torch.stack([conic[..., 0, 0], conic[..., 0, 1], conic[..., 1, 1]], dim=-1)
+    radii = wide.diagonal(dim1=-2, dim2=-1).sqrt()
+    image = torch.tensor([width, height], dtype=radii.dtype).expand_as(radii)
+    nothing = torch.zeros_like(entries)
+    return _where(whole, shift, nothing[..., :2]), _where(whole, entries, nothing), _where(whole, radii, image)
+
+
+def _visible_discs(projected: ProjectedDiscs, gaussians: RawGaussians, cameras: CameraBatch, near: float) -> Tensor:
+    """What is in front of the near plane, not seen from its edge, on the kept side and in the window [C, N]."""
+    raw = torch.cat([*gaussians[:3], gaussians.logit_opacities[:, None]], dim=-1)
+    norm = gaussians.quats.square().sum(-1)
+    usable = raw.isfinite().all(dim=-1) & norm.isfinite() & (norm > 0)
+    usable &= (gaussians.log_scales.abs() <= MOST_LOG_SCALE).all(dim=-1)
+    visible = usable & (projected.depths > near)
+    visible = visible & projected.maps.isfinite().all(dim=-1) & projected.colors.isfinite().all(dim=-1)
+    visible = visible & projected.depths.isfinite() & _faces(gaussians, cameras)
+    visible = visible & (projected.opacities > ALPHA_MIN)
+    if cameras.clip_planes is not None:
+        visible &= cameras.clip_planes[:, :3] @ gaussians.means.T + cameras.clip_planes[:, 3:] > 0
+    windows = cameras.windows
+    if windows is None:
+        windows = torch.tensor([[0, 0, cameras.width, cameras.height]], dtype=projected.means2d.dtype)
+    first, last = windows[:, None, :2], windows[:, None, 2:]
+    low, high = projected.outline_centers - projected.radii, projected.outline_centers + projected.radii
+    crossing = (projected.outline_conics == 0).all(dim=-1, keepdim=True)
+    lowest, highest = _crossing_boxes(gaussians, cameras, projected.opacities, near)
+    low, high = torch.where(crossing, lowest, low), torch.where(crossing, highest, high)
+    return visible & ((high > first) & (low < last)).all(dim=-1)
+
+
+def _crossing_boxes(
+    gaussians: RawGaussians, cameras: CameraBatch, opacities: Tensor, near: float
+) -> tuple[Tensor, Tensor]:
+    """Lowest and highest pixel coordinates [C, N, 2] of what discs cover behind the near plane.
+
+    Those of a rectangle around each disc, with one side along the depth, cut off at the plane, and of the low-pass.
+    """
+    poses, lenses = cameras.cam_from_world.double(), cameras.intrinsics.double()
+    linear, offset = poses[:, :3, :3], poses[:, :3, 3]
+    focal, middle = lenses[:, None, :2], lenses[:, None, 2:]
+    centers = gaussians.means.double() @ linear.mT + offset[:, None]
+    axes = rotations(gaussians.quats.double())[..., :2] * torch.exp(gaussians.log_scales.double())[:, None]
+    sides = torch.einsum("cij,njk->cnki", linear, axes)
+    slopes, depths = sides[..., 2], centers[..., 2:]
+    steepness = slopes.norm(dim=-1, keepdim=True)
+    reach = _squared_reach(opacities.double()).sqrt()[..., None]
+    turn = slopes / steepness
+    along = (turn[..., None] * sides).sum(-2)
+    across = turn[..., :1] * sides[..., 1, :] - turn[..., 1:] * sides[..., 0, :]
+    nearest = torch.maximum(torch.tensor(near, dtype=torch.float64), 1e-6 * depths)
+    first = torch.maximum((nearest - depths) / steepness, -reach)
+    points = [centers + way * along + side * reach * across for way in (first, reach) for side in (-1, 1)]
+    corners = torch.stack([point[..., :2] / point[..., 2:] * focal for point in points])
+    spot, place = DISC_LOW_PASS * reach, centers[..., :2] / depths * focal
+    lowest = torch.minimum(corners.amin(0), place - spot) + middle
+    return lowest.to(opacities.dtype), (torch.maximum(corners.amax(0), place + spot) + middle).to(opacities.dtype)
+
+
+def _faces(gaussians: RawGaussians, cameras: CameraBatch) -> Tensor:
+    """Whether discs are seen from anywhere but their edge [C, N]."""
+    linear, offset = cameras.cam_from_world[:, :3, :3], cameras.cam_from_world[:, :3, 3]
+    centers = gaussians.means @ linear.mT + offset[:, None]
+    turned = rotations(gaussians.quats)
+    n = torch.linalg.cross(*(torch.einsum("cij,nj->cni", linear, turned[..., i]) for i in range(2)))
+    slope = (n * centers).sum(-1)
+    limit = EDGE_ON**2 * n.square().sum(-1) * centers.square().sum(-1)
+    return (slope.square() > limit) & slope.square().isfinite()

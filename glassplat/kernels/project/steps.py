@@ -1,21 +1,153 @@
-"""Steps of the forward projection that take one Gaussian: where a thread has one, and for discs."""
+"""How one camera sees one Gaussian, and the gradients of that: what the kernels of the projection share."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from glassplat.kernels.backend.cpu import inlined
-from glassplat.kernels.maths.projection import ALPHA_MIN, LOW_PASS, screen_maths, shape_maths, vector_maths
-from glassplat.kernels.project.cpu_view import view_steps
+from glassplat.kernels.maths.harmonics import color_maths
+from glassplat.kernels.maths.projection import ALPHA_MIN, screen_maths, shape_maths, vector_maths
+
+CHUNK = 512
+"""Gaussians per task; part of the result's rounding, so not to be tuned per machine."""
+LENS_VALUES = 9
+"""Tangent limits (4), camera centre (3), and how much longer than a sphere its footprint may get along x and y (2)."""
+
+
+class ViewSteps(NamedTuple):
+    """Parts of the kernels, which read the arrays that the scalar maths does not know.
+
+    Attributes:
+        vec3: row n of an array [N, 3] as a tuple.
+        pose: rows of the upper 3x3 block of a camera matrix, and its translation.
+        shape: (usable, opacity, unit quaternion, inverse norm, axes) of a Gaussian.
+        view: what a camera sees of a Gaussian before its colour.
+        fill_lenses: writes `LENS_VALUES` numbers per camera.
+        direction: unit vector from a camera's centre to a mean, and its inverse length.
+    """
+
+    vec3: Callable[..., Any]
+    pose: Callable[..., Any]
+    shape: Callable[..., Any]
+    view: Callable[..., Any]
+    fill_lenses: Callable[..., Any]
+    direction: Callable[..., Any]
+
+
+def view_steps(real: type) -> ViewSteps:
+    """Builds the parts for `real`, np.float32 or np.float64."""
+    vec3, pose = _loads()
+    return ViewSteps(vec3, pose, _shape(real), view_with(real, screen_maths(real).clamped), *_lenses(real))
+
+
+def _loads() -> tuple[Callable[..., Any], Callable[..., Any]]:
+    @inlined
+    def vec3(array, n):
+        return array[n, 0], array[n, 1], array[n, 2]
+
+    @inlined
+    def pose(cam_from_world, c):
+        row_x = cam_from_world[c, 0, 0], cam_from_world[c, 0, 1], cam_from_world[c, 0, 2]
+        row_y = cam_from_world[c, 1, 0], cam_from_world[c, 1, 1], cam_from_world[c, 1, 2]
+        row_z = cam_from_world[c, 2, 0], cam_from_world[c, 2, 1], cam_from_world[c, 2, 2]
+        return row_x, row_y, row_z, (cam_from_world[c, 0, 3], cam_from_world[c, 1, 3], cam_from_world[c, 2, 3])
+
+    return vec3, pose
+
+
+def _shape(real: type) -> Callable[..., Any]:
+    sigmoid, is_finite, unit_quat, rotation, _ = shape_maths(real)
+    zero = real(0.0)
+
+    @inlined
+    def shape(means, quats, log_scales, logit_opacities, n):
+        quat, inverse_norm = unit_quat(quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3])
+        column_x, column_y, column_z = rotation(quat)
+        s_x, s_y, s_z = math.exp(log_scales[n, 0]), math.exp(log_scales[n, 1]), math.exp(log_scales[n, 2])
+        axes = (
+            (s_x * column_x[0], s_x * column_x[1], s_x * column_x[2]),
+            (s_y * column_y[0], s_y * column_y[1], s_y * column_y[2]),
+            (s_z * column_z[0], s_z * column_z[1], s_z * column_z[2]),
+        )
+        raw = abs(means[n, 0]) + abs(means[n, 1]) + abs(means[n, 2]) + abs(logit_opacities[n])
+        raw += abs(log_scales[n, 0]) + abs(log_scales[n, 1]) + abs(log_scales[n, 2])
+        usable = is_finite(raw) and inverse_norm > zero and is_finite(inverse_norm)
+        return usable, sigmoid(logit_opacities[n]), quat, inverse_norm, axes
+
+    return shape
+
+
+def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    tangent_limits, *_ = screen_maths(real)
+    vectors = vector_maths()
+    dot, blend = vectors.dot, vectors.blend
+    _, pose = _loads()
+    one = real(1.0)
+
+    @inlined
+    def skewed(row, row_z, tangent):
+        """Length of a footprint in multiples of focal length over depth."""
+        w = blend(one, row, -tangent, row_z)
+        return math.sqrt(dot(w, w))
+
+    @inlined
+    def fill_lenses(lens, cam_from_world, intrinsics, width, height):
+        num_cameras = cam_from_world.shape[0]
+        for c in range(num_cameras):
+            limits = tangent_limits(
+                intrinsics[c, 0], intrinsics[c, 1], intrinsics[c, 2], intrinsics[c, 3], width, height
+            )
+            lens[c, 0], lens[c, 1], lens[c, 2], lens[c, 3] = limits
+            # A footprint's length is convex in the tangent, so it is greatest at one of the limits.
+            row_x, row_y, row_z, _ = pose(cam_from_world, c)
+            lens[c, 7] = max(skewed(row_x, row_z, limits[0]), skewed(row_x, row_z, limits[1]))
+            lens[c, 8] = max(skewed(row_y, row_z, limits[2]), skewed(row_y, row_z, limits[3]))
+            for j in range(3):
+                lens[c, 4 + j] = -(
+                    cam_from_world[c, 0, j] * cam_from_world[c, 0, 3]
+                    + cam_from_world[c, 1, j] * cam_from_world[c, 1, 3]
+                    + cam_from_world[c, 2, j] * cam_from_world[c, 2, 3]
+                )
+
+    @inlined
+    def direction(mean, lens, c):
+        x, y, z = mean[0] - lens[c, 4], mean[1] - lens[c, 5], mean[2] - lens[c, 6]
+        inverse_length = one / math.sqrt(x * x + y * y + z * z)
+        return (x * inverse_length, y * inverse_length, z * inverse_length), inverse_length
+
+    return fill_lenses, direction
+
+
+def view_with(real: type, clamped: Callable[..., Any]) -> Callable[..., Any]:
+    """What a camera sees, of numbers or of vectors, with the function that holds them between two limits."""
+    along = vector_maths().along
+    _, _, footprint, screen_covariance, *_ = screen_maths(real)
+    one = real(1.0)
+
+    @inlined
+    def view(rows, position, axes, intrinsics, lens, c):
+        """Tangents, their clamped values, the footprint, the axes on screen and the covariance there."""
+        inverse_depth = one / position[2]
+        tangent_x, tangent_y = position[0] * inverse_depth, position[1] * inverse_depth
+        held_x, held_y = clamped(tangent_x, lens[c, 0], lens[c, 1]), clamped(tangent_y, lens[c, 2], lens[c, 3])
+        scale_x, scale_y = intrinsics[c, 0] * inverse_depth, intrinsics[c, 1] * inverse_depth
+        w_x, w_y = footprint(rows[0], rows[1], rows[2], scale_x, scale_y, held_x, held_y)
+        v_x, v_y = along(w_x, axes[0], axes[1], axes[2]), along(w_y, axes[0], axes[1], axes[2])
+        return (tangent_x, tangent_y), (held_x, held_y), (w_x, w_y), (v_x, v_y), screen_covariance(v_x, v_y)
+
+    return view
+
 
 MOST_DEVIATIONS = 1.01 * 2.0 * math.log(1.0 / ALPHA_MIN)
 """Squared number of standard deviations within which any coverage sinks to `ALPHA_MIN`; a percent is slack."""
 
 
 def placing(real: type) -> Callable[..., Any]:
-    """One Gaussian in one camera: fills everything but the colour, where it is visible."""
+    """One ellipsoid in one camera: fills everything but the colour, where it is visible."""
     _, pose, _, view, *_ = view_steps(real)
     dot = vector_maths().dot
     half_extents = screen_maths(real).half_extents
@@ -23,10 +155,9 @@ def placing(real: type) -> Callable[..., Any]:
     zero, one = real(0.0), real(1.0)
 
     @inlined
-    def place(
-        n, c, mean, opacity, axes, cam_from_world, intrinsics, lens, windows,
-        means2d, conics, depths, opacities, radii,
-    ):  # fmt: skip
+    def place(c, n, mean, shaped, cam_from_world, intrinsics, lens, windows, size, near, outputs):
+        means2d, conics, depths, opacities, _, radii = outputs
+        _, opacity, _, _, axes = shaped
         row_x, row_y, row_z, offset = pose(cam_from_world, c)
         depth = dot(row_z, mean) + offset[2]
         position = dot(row_x, mean) + offset[0], dot(row_y, mean) + offset[1], depth
@@ -48,11 +179,9 @@ def placing(real: type) -> Callable[..., Any]:
     return place
 
 
-def culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
-    """Writing zeros for one Gaussian in one camera, whether it is on the kept sides, and whether it may show at all."""
-    vec3, pose, *_ = view_steps(real)
-    dot = vector_maths().dot
-    zero, one, low_pass, most_deviations = real(0.0), real(1.0), real(LOW_PASS), real(MOST_DEVIATIONS)
+def culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Writing zeros for one ellipsoid in one camera, and whether a Gaussian is on the kept sides."""
+    vec3, dot, zero = view_steps(real).vec3, vector_maths().dot, real(0.0)
 
     @inlined
     def cull(n, c, means2d, conics, depths, opacities, colors, radii):
@@ -68,21 +197,252 @@ def culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any], Callabl
             return False
         return not clips or dot(vec3(clip_planes, c), mean) + clip_planes[c, 3] > zero
 
-    @inlined
-    def may_show(n, c, mean, log_scales, cam_from_world, intrinsics, lens, near, clip_planes, clips, windows):
-        """Whether a Gaussian is on the kept sides, and a sphere around it comes near the window: cheap and safe."""
-        if not in_front(c, mean, cam_from_world, near, clip_planes, clips):
-            return False
-        row_x, row_y, row_z, offset = pose(cam_from_world, c)
-        depth = dot(row_z, mean) + offset[2]
-        inverse_depth = one / depth
-        u = intrinsics[c, 0] * (dot(row_x, mean) + offset[0]) * inverse_depth + intrinsics[c, 2]
-        v = intrinsics[c, 1] * (dot(row_y, mean) + offset[1]) * inverse_depth + intrinsics[c, 3]
-        past_x, past_y = max(windows[c, 0] - u, u - windows[c, 2]), max(windows[c, 1] - v, v - windows[c, 3])
-        size = math.exp(max(log_scales[n, 0], log_scales[n, 1], log_scales[n, 2])) * inverse_depth
-        wide, high = size * intrinsics[c, 0] * lens[c, 7], size * intrinsics[c, 1] * lens[c, 8]
-        # Written so that NaN leaves the decision to the exact test.
-        beside = past_x > zero and past_x * past_x > most_deviations * (wide * wide + low_pass)
-        return not (beside or (past_y > zero and past_y * past_y > most_deviations * (high * high + low_pass)))
+    return cull, in_front
 
-    return cull, in_front, may_show
+
+def place_gradients(real: type, free: Callable[..., Any] | None = None) -> Callable[..., Any]:
+    """One Gaussian in one camera, without its colour; or vectors of them.
+
+    Of vectors, `free(x, held, tangent)` is x where a tangent is not held at a limit, and 0 elsewhere.
+    """
+    dot, blend = vector_maths().dot, vector_maths().blend
+    covariance_gradient, footprint_gradient = (
+        screen_maths(real).covariance_gradient,
+        screen_maths(real).footprint_gradient,
+    )
+    zero, one = real(0.0), real(1.0)
+
+    @inlined
+    def free_number(x, held, tangent):
+        return x if held == tangent else zero
+
+    free = free_number if free is None else free
+
+    @inlined
+    def place_gradient(rows, position, seen, axes, intrinsics, c, g_mean2d, g_conic, g_depth, conic):
+        """Gradients of the camera-space position, of the three rows (through the footprint) and of the axes."""
+        tangent, held, (w_x, w_y), (v_x, v_y), _ = seen
+        fx, fy, inverse_depth = intrinsics[c, 0], intrinsics[c, 1], one / position[2]
+        scale_x, scale_y = fx * inverse_depth, fy * inverse_depth
+        g_xx, g_xy, g_yy = covariance_gradient(conic[0], conic[1], conic[2], g_conic[0], g_conic[1], g_conic[2])
+        gw_x, gw_y, g_axes = footprint_gradient(w_x, w_y, v_x, v_y, axes, g_xx, g_xy, g_yy)
+        # w_x = (fx / z) (row_x - held_x row_z); where the tangent is held at its limit it passes no gradient.
+        g_held_x = free(-scale_x * dot(gw_x, rows[2]), held[0], tangent[0])
+        g_held_y = free(-scale_y * dot(gw_y, rows[2]), held[1], tangent[1])
+        g_tangent_x, g_tangent_y = fx * g_mean2d[0] + g_held_x, fy * g_mean2d[1] + g_held_y
+        g_log_depth = dot(gw_x, w_x) + dot(gw_y, w_y) + g_tangent_x * tangent[0] + g_tangent_y * tangent[1]
+        g_position = inverse_depth * g_tangent_x, inverse_depth * g_tangent_y, g_depth - inverse_depth * g_log_depth
+        g_row_x, g_row_y = blend(scale_x, gw_x, zero, gw_x), blend(scale_y, gw_y, zero, gw_y)
+        g_row_z = blend(-scale_x * held[0], gw_x, -scale_y * held[1], gw_y)
+        return g_position, (g_row_x, g_row_y, g_row_z), g_axes
+
+    return place_gradient
+
+
+def camera_sums(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Adding to a camera's gradient [12], rows of (3x3 block, translation), in double precision."""
+    dot, blend = vector_maths().dot, vector_maths().blend
+    one = real(1.0)
+
+    @inlined
+    def add_place(total, g_rows, g_position, mean):
+        for i in range(3):
+            g_row = g_rows[0] if i == 0 else (g_rows[1] if i == 1 else g_rows[2])
+            g_i = g_position[0] if i == 0 else (g_position[1] if i == 1 else g_position[2])
+            from_row = blend(one, g_row, g_i, mean)
+            total[4 * i + 0] += np.float64(from_row[0])
+            total[4 * i + 1] += np.float64(from_row[1])
+            total[4 * i + 2] += np.float64(from_row[2])
+            total[4 * i + 3] += np.float64(g_i)
+
+    @inlined
+    def add_view(total, cam_from_world, c, g_view):
+        # The centre is -A^T t: with mean - centre = mean + A^T t, row i gets t_i g_view and t_i gets row_i . g_view.
+        for i in range(3):
+            row = cam_from_world[c, i, 0], cam_from_world[c, i, 1], cam_from_world[c, i, 2]
+            translation = cam_from_world[c, i, 3]
+            total[4 * i + 0] += np.float64(translation * g_view[0])
+            total[4 * i + 1] += np.float64(translation * g_view[1])
+            total[4 * i + 2] += np.float64(translation * g_view[2])
+            total[4 * i + 3] += np.float64(dot(row, g_view))
+
+    return add_place, add_view
+
+
+def view_gradients(real: type) -> Callable[..., Any]:
+    """The colour of one Gaussian in one camera."""
+    direction, tangential = view_steps(real).direction, vector_maths().tangential
+    color, color_gradient = color_maths(real)
+    zero, half = real(0.0), real(0.5)
+
+    @inlined
+    def view_gradient(sh, n, degree, mean, lens, c, g_color, g_sh):
+        """Adds to g_sh[n]; returns the gradient of the vector from the camera centre to the mean."""
+        (x, y, z), inverse_length = direction(mean, lens, c)
+        red, green, blue = color(sh, n, degree, x, y, z)
+        passed = (
+            g_color[0] if red + half > zero else zero,
+            g_color[1] if green + half > zero else zero,
+            g_color[2] if blue + half > zero else zero,
+        )
+        return tangential(inverse_length, color_gradient(sh, n, degree, x, y, z, passed, g_sh), (x, y, z))
+
+    return view_gradient
+
+
+class Footprint(NamedTuple):
+    """What a Gaussian is on a screen, an ellipsoid or a disc: the parts in which their projections differ.
+
+    Inputs are raw Gaussians, poses, intrinsics, clip planes and windows. Of outputs and cotangents the first five are
+    centres, conics or maps, depths, opacities and colours; the last output are the radii.
+
+    Attributes:
+        shape: (usable, opacity, unit quaternion, inverse norm, axes, ...) of a Gaussian.
+        cull: writes zeros for one Gaussian in one camera.
+        place: fills everything but the colour, where the Gaussian is visible; its radii say whether it is.
+        place_gradient: gradients of (the centre in camera space, the rows of the pose without the centre's part, the
+            three axes, two log scales besides).
+        finish: writes the gradients of a Gaussian but that of its coefficients, from (the mean's, the opacity's, the
+            axes', the two log scales').
+    """
+
+    shape: Callable[..., Any]
+    cull: Callable[..., Any]
+    place: Callable[..., Any]
+    place_gradient: Callable[..., Any]
+    finish: Callable[..., Any]
+
+
+def ellipsoids(real: type) -> Footprint:
+    """The footprint of ellipsoids, one at a time."""
+    culled = culling(real)[0]
+
+    @inlined
+    def cull(c, n, outputs):
+        means2d, conics, depths, opacities, colors, radii = outputs
+        culled(n, c, means2d, conics, depths, opacities, colors, radii)
+
+    return Footprint(view_steps(real).shape, cull, placing(real), _ellipsoid_gradient(real), _finish_ellipsoid(real))
+
+
+def _ellipsoid_gradient(real: type) -> Callable[..., Any]:
+    pose, view = view_steps(real).pose, view_steps(real).view
+    dot, placed, zero = vector_maths().dot, place_gradients(real), real(0.0)
+
+    @inlined
+    def place_gradient(c, n, mean, shaped, cam_from_world, intrinsics, lens, conics, cotangents):
+        g_means2d, g_conics, g_depths, _, _ = cotangents
+        axes = shaped[4]
+        row_x, row_y, row_z, offset = pose(cam_from_world, c)
+        rows = row_x, row_y, row_z
+        position = dot(row_x, mean) + offset[0], dot(row_y, mean) + offset[1], dot(row_z, mean) + offset[2]
+        g_position, g_rows, g_axes = placed(
+            rows, position, view(rows, position, axes, intrinsics, lens, c), axes, intrinsics, c,
+            (g_means2d[c, n, 0], g_means2d[c, n, 1]), (g_conics[c, n, 0], g_conics[c, n, 1], g_conics[c, n, 2]),
+            g_depths[c, n], (conics[c, n, 0], conics[c, n, 1], conics[c, n, 2]),
+        )  # fmt: skip
+        return g_position, g_rows, g_axes, (zero, zero)
+
+    return place_gradient
+
+
+def _finish_ellipsoid(real: type) -> Callable[..., Any]:
+    dot, blend = vector_maths().dot, vector_maths().blend
+    maths = shape_maths(real)
+    rotation, unit_quat_gradient = maths.rotation, maths.unit_quat_gradient
+    zero, one = real(0.0), real(1.0)
+
+    @inlined
+    def finish(n, shaped, sums, g_means, g_quats, g_log_scales, g_logit_opacities):
+        """Adds, because projections of the same Gaussians may share their gradients."""
+        _, opacity, quat, inverse_norm, axes = shaped
+        g_mean, g_opacity, g_axes, _ = sums
+        x, y, z = rotation(quat)
+        g_means[n, 0] += g_mean[0]
+        g_means[n, 1] += g_mean[1]
+        g_means[n, 2] += g_mean[2]
+        g_logit_opacities[n] += g_opacity * opacity * (one - opacity)
+        g_log_scales[n, 0] += dot(axes[0], g_axes[0])
+        g_log_scales[n, 1] += dot(axes[1], g_axes[1])
+        g_log_scales[n, 2] += dot(axes[2], g_axes[2])
+        g_x, g_y, g_z = (
+            blend(dot(axes[0], x), g_axes[0], zero, x),
+            blend(dot(axes[1], y), g_axes[1], zero, y),
+            blend(dot(axes[2], z), g_axes[2], zero, z),
+        )
+        g_w, g_i, g_j, g_k = unit_quat_gradient(quat, inverse_norm, g_x, g_y, g_z)
+        g_quats[n, 0] += g_w
+        g_quats[n, 1] += g_i
+        g_quats[n, 2] += g_j
+        g_quats[n, 3] += g_k
+
+    return finish
+
+
+def projecting(real: type, footprint: Footprint) -> Callable[..., Any]:
+    """One Gaussian in all cameras: fills its outputs, zeros where it is culled."""
+    vec3, direction, in_front = view_steps(real).vec3, view_steps(real).direction, culling(real)[1]
+    shape, cull, place, *_ = footprint
+    is_finite, color = shape_maths(real).is_finite, color_maths(real).color
+    zero, half = real(0.0), real(0.5)
+
+    @inlined
+    def project(n, inputs, lens, size, degree, near, outputs):
+        means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, clip_planes, windows = inputs
+        colors, radii = outputs[4], outputs[-1]
+        clips, mean, wanted = clip_planes.shape[0] > 0, vec3(means, n), False
+        for c in range(cam_from_world.shape[0]):
+            cull(c, n, outputs)
+            wanted |= in_front(c, mean, cam_from_world, near, clip_planes, clips)
+        if not wanted:
+            return
+        shaped = shape(means, quats, log_scales, logit_opacities, n)
+        for c in range(cam_from_world.shape[0]):
+            if not (shaped[0] and in_front(c, mean, cam_from_world, near, clip_planes, clips)):
+                continue
+            place(c, n, mean, shaped, cam_from_world, intrinsics, lens, windows, size, near, outputs)
+            if degree < 0 or not radii[c, n, 0] > zero:
+                continue
+            (x, y, z), _ = direction(mean, lens, c)
+            red, green, blue = color(sh, n, degree, x, y, z)
+            if is_finite(abs(red) + abs(green) + abs(blue)):
+                colors[c, n, 0] = max(red + half, zero)
+                colors[c, n, 1] = max(green + half, zero)
+                colors[c, n, 2] = max(blue + half, zero)
+            else:
+                cull(c, n, outputs)
+
+    return project
+
+
+def projecting_back(real: type, footprint: Footprint) -> Callable[..., Any]:
+    """One Gaussian in one camera that sees it: adds to the sums that `finish` takes, and to the camera's gradient."""
+    pose, place_gradient = view_steps(real).pose, footprint.place_gradient
+    view_gradient, (add_place, add_view) = view_gradients(real), camera_sums(real)
+    blend, scaled_sum, zero, one = vector_maths().blend, vector_maths().scaled_sum, real(0.0), real(1.0)
+
+    @inlined
+    def project_back(c, n, mean, shaped, inputs, lens, degree, found, cotangents, needs_camera, total, sums, g_sh):
+        """`inputs` are coefficients, poses and intrinsics, `found` the conics or maps of the forward pass."""
+        sh, cam_from_world, intrinsics = inputs
+        g_opacities, g_colors = cotangents[3], cotangents[4]
+        g_mean, g_opacity, (ga_x, ga_y, ga_z), (g_u, g_v) = sums
+        g_center, g_rows, g_axes, g_scales = place_gradient(
+            c, n, mean, shaped, cam_from_world, intrinsics, lens, found, cotangents
+        )
+        row_x, row_y, row_z, _ = pose(cam_from_world, c)
+        g_mean = blend(one, g_mean, one, scaled_sum(g_center, row_x, row_y, row_z))
+        ga_x, ga_y = blend(one, ga_x, one, g_axes[0]), blend(one, ga_y, one, g_axes[1])
+        ga_z = blend(one, ga_z, one, g_axes[2])
+        g_u, g_v, g_opacity = g_u + g_scales[0], g_v + g_scales[1], g_opacity + g_opacities[c, n]
+        if needs_camera:
+            add_place(total, g_rows, g_center, mean)
+        g_color = g_colors[c, n, 0], g_colors[c, n, 1], g_colors[c, n, 2]
+        if degree >= 0 and (g_color[0] != zero or g_color[1] != zero or g_color[2] != zero):
+            g_view = view_gradient(sh, n, degree, mean, lens, c, g_color, g_sh)
+            g_mean = blend(one, g_mean, one, g_view)
+            if needs_camera:
+                add_view(total, cam_from_world, c, g_view)
+        return g_mean, g_opacity, (ga_x, ga_y, ga_z), (g_u, g_v)
+
+    return project_back

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from glassplat.kernels.backend.devices import SIMULATED
-from glassplat.kernels.composite_discs import composite_discs
-from glassplat.kernels.composite_discs.reference import composite_discs as composite_twin
-from glassplat.kernels.project_discs import project_discs
-from glassplat.kernels.project_discs.reference import project_discs as project_twin
+from glassplat.kernels.composite import composite_discs
+from glassplat.kernels.composite.reference import composite_discs as composite_twin
+from glassplat.kernels.project import project_discs
+from glassplat.kernels.project.reference import project_discs as project_twin
 from glassplat.kernels.records import CameraBatch
 from tests.kernels.cuda.agreement import DTYPES, check_gradients, close, many, on_a_device_or_skipped, on_device
 from tests.kernels.gaussians_and_cameras import random_cameras

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,29 +11,12 @@ from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
 from glassplat.kernels.maths.disc import MAP, disc_maths, outline_maths
 from glassplat.kernels.maths.projection import shape_maths, vector_maths
 from glassplat.kernels.maths.ray_hit import MOST_LOG_SCALE
-from glassplat.kernels.project.cpu_view import view_steps
+from glassplat.kernels.project.steps import Footprint, view_steps
 
 
-class DiscSteps(NamedTuple):
-    """Parts of the kernels, which read and write the arrays that the scalar maths does not know.
-
-    Attributes:
-        shape: (usable, opacity, unit quaternion, inverse norm, axes, deviations) of a disc.
-        cull: writes zeros for one disc in one camera.
-        place: fills everything but the colour, where the disc is visible; `radii` says whether it is.
-        place_gradient: gradients of (the centre in camera space, the three rows of the pose without the centre's part,
-            the three axes, both log scales).
-    """
-
-    shape: Scalar
-    cull: Scalar
-    place: Scalar
-    place_gradient: Scalar
-
-
-def disc_steps(real: type) -> DiscSteps:
-    """Builds the parts for `real`, np.float32 or np.float64."""
-    return DiscSteps(_shape(real), _cull(real), _place(real), _place_gradient(real))
+def discs(real: type) -> Footprint:
+    """The footprint of discs, whose shape ends with two deviations, on the CPU and on a GPU."""
+    return Footprint(_shape(real), _cull(real), _place(real), _place_gradient(real), _finish(real))
 
 
 def _shape(real: type) -> Scalar:
@@ -105,7 +87,8 @@ def _place(real: type) -> Scalar:
     one, alpha_min = real(1.0), real(ALPHA_MIN)
 
     @inlined
-    def place(c, n, mean, opacity, axes, deviations, cam_from_world, intrinsics, lens, windows, size, near, outputs):  # type: ignore[no-untyped-def]
+    def place(c, n, mean, shaped, cam_from_world, intrinsics, lens, windows, size, near, outputs):  # type: ignore[no-untyped-def]
+        _, opacity, _, _, axes, deviations = shaped
         means2d, maps, depths, opacities, _, normals, centers, conics, radii = outputs
         row_x, row_y, row_z, offset = pose(cam_from_world, c)
         p, q, m = tangents((row_x, row_y, row_z), offset, mean, axes)
@@ -156,8 +139,10 @@ def _place_gradient(real: type) -> Scalar:
 
     @inlined
     def place_gradient(  # type: ignore[no-untyped-def]
-        c, n, mean, axes, deviations, cam_from_world, intrinsics, lens, maps, g_means2d, g_maps, g_depths, g_normals
+        c, n, mean, shaped, cam_from_world, intrinsics, lens, maps, cotangents
     ):  # fmt: skip
+        g_means2d, g_maps, g_depths, _, _, g_normals = cotangents
+        axes, deviations = shaped[4], shaped[5]
         row_x, row_y, row_z, offset = pose(cam_from_world, c)
         rows = row_x, row_y, row_z
         p, q, m = tangents(rows, offset, mean, axes)
@@ -183,3 +168,20 @@ def _place_gradient(real: type) -> Scalar:
         return g_center, g_rows, g_axes, (g_u, g_v)
 
     return place_gradient
+
+
+def _finish(real: type) -> Scalar:
+    unit_quat_gradient, one = shape_maths(real).unit_quat_gradient, real(1.0)
+
+    @inlined
+    def finish(n, shaped, sums, g_means, g_quats, g_log_scales, g_logit_opacities):  # type: ignore[no-untyped-def]
+        _, opacity, quat, inverse_norm, _, _ = shaped
+        g_mean, g_opacity, (ga_x, ga_y, ga_z), g_scales = sums
+        g_means[n, 0], g_means[n, 1], g_means[n, 2] = g_mean
+        g_logit_opacities[n] = g_opacity * opacity * (one - opacity)
+        g_log_scales[n, 0], g_log_scales[n, 1] = g_scales
+        g_quats[n, 0], g_quats[n, 1], g_quats[n, 2], g_quats[n, 3] = unit_quat_gradient(
+            quat, inverse_norm, ga_x, ga_y, ga_z
+        )
+
+    return finish

@@ -1,0 +1,660 @@
+"""Blending of sorted discs on the CPU, tile by tile and block by block: forwards, and the gradients.
+
+Tiles, blocks and outlines are those of `cpu_tile`: which blocks a disc may reach is decided by its outline, and what it
+covers by its map. Forwards, discs are blended front to back. Backwards, a disc is taken off the blocks that it reached,
+one row of sums is written per (tile, disc) pair, and the rows of each disc are summed afterwards in a fixed order. Of
+the distortion a disc needs to know only the sums over all discs of a pixel, and none over those in front of it.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numba import prange
+from numpy.typing import NDArray
+from torch import Tensor
+
+from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
+from glassplat.kernels.backend.cpu_vector import (
+    absolute,
+    bits_of,
+    item,
+    lowest_bit,
+    minimum,
+    select,
+    store,
+    sums_of,
+    vector_kind,
+)
+from glassplat.kernels.composite import cpu_tile as tile
+from glassplat.kernels.composite.cpu_tile import lane_of, list_block
+from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
+from glassplat.kernels.maths.disc import MAP, meet_maths
+from glassplat.kernels.maths.ray_hit import MOST_DEVIATIONS
+from glassplat.kernels.records import REAL_OF, Discs, TileBins
+
+# Columns of a packed disc: first its outline as a packed splat, of which ORDER is reused once blocks are known.
+CENTER_X, CENTER_Y, U_X, U_Y, V_X, V_Y, W_X, W_Y, BITS, Z, INVERSE_Z, VALUES = range(tile.VALUES, tile.VALUES + 12)
+ORDER = tile.ORDER
+
+# Planes of a tile's state, which the backward pass starts from: transmittance, position in the tile's list of the last
+# disc that a pixel blended and of the one whose depth is the median, and of the inverse depths the one that others are
+# measured from, the weighted sum and the weighted sum of squares. T is negative where a pixel has stopped.
+T, LAST, MEDIAN, FIRST, TOTAL, SQUARES = (plane * tile.PIXELS for plane in range(6))
+STATE = 6 * tile.PIXELS
+
+
+class DiscFunctions(NamedTuple):
+    """Compiled steps that every kernel takes.
+
+    Attributes:
+        pack: copies one disc's geometry into its packed row; returns whether it may be drawn.
+        fetch: copies the packed discs of consecutive pairs next to each other, their centres relative to the tile.
+        cover: of a fetched disc and a block: the offset (dx, dy) of the pixels, (u, v, 1 / e) and e where their rays
+            meet the disc, (0, 0, 1) and 1 where the falloff around its centre is the larger one; the coverage before it
+            is clamped, 0 where it is not drawn; and which pixels show the disc and not that falloff.
+    """
+
+    pack: Scalar
+    fetch: Scalar
+    cover: Scalar
+
+
+def disc_functions(real: type) -> DiscFunctions:
+    """Builds the functions for `real`, np.float32 or np.float64."""
+    return DiscFunctions(_pack(real), _fetch(real), _cover(real))
+
+
+def packed_width(num_values: int) -> int:
+    """Columns of a packed disc that carries `num_values` channels in whole groups: whole vectors."""
+    return tile.LANES * ((VALUES + tile.GROUP * tile.groups_of(num_values) + tile.LANES - 1) // tile.LANES)
+
+
+def _pack(real: type) -> Scalar:
+    pack_outline = tile.tile_functions(real).pack
+    zero, one, nothing, endless = real(0.0), real(1.0), real(-np.inf), real(np.inf)
+    alpha_min, bits = real(ALPHA_MIN), 1.0 / math.log(2.0)
+
+    @inlined
+    def pack(packed, at, center, map_of, opacity, depth, outline_center, conic):
+        pack_outline(packed, at, outline_center, conic, opacity)
+        if conic[0] == zero and conic[1] == zero and conic[2] == zero:
+            # It crosses the near plane and may reach any block.
+            for column in range(tile.FORM_XX, tile.VALUES):
+                packed[at + column] = zero
+        total = center[0] + center[1] + depth
+        for j in range(6):
+            packed[at + U_X + j] = map_of[j]
+            total += map_of[j]
+        drawn = abs(total) < endless and alpha_min <= opacity < endless and zero < depth
+        if not drawn:
+            packed[at + tile.BITS] = nothing
+        packed[at + CENTER_X], packed[at + CENTER_Y] = center[0], center[1]
+        packed[at + BITS] = real(bits * math.log(np.float64(opacity))) if drawn else nothing
+        packed[at + Z], packed[at + INVERSE_Z] = depth, one / depth
+
+    return pack
+
+
+def _fetch(real: type) -> Scalar:
+    fetch_splats = tile.tile_functions(real).fetch
+
+    @inlined
+    def fetch(batch, packed, pair_splats, first, last, width, x0, y0):
+        fetch_splats(batch, packed, pair_splats, first, last, width, x0, y0)
+        for k in range(last - first):
+            batch[k * width + CENTER_X] -= real(x0)
+            batch[k * width + CENTER_Y] -= real(y0)
+
+    return fetch
+
+
+def _cover(real: type) -> Scalar:
+    meet, exp2, full = meet_maths(real)[0], tile.tile_functions(real).exp2, vector_kind(real, tile.LANES).full
+    x_centers, y_centers = tile.pixel_centers(real)
+    zero, one, farthest = real(0.0), real(1.0), real(MOST_DEVIATIONS**2)
+    half_bits, least = real(0.5 / math.log(2.0)), real(math.log2(ALPHA_MIN))
+    far = real(4 * MOST_DEVIATIONS**2)
+
+    @inlined
+    def cover(batch, at, x, y, near, sharpness):
+        """`x` and `y` are the block's corner, `sharpness` is one over the variance of the low-pass."""
+        dx = x_centers() + (x - item(batch, at + CENTER_X))
+        dy = y_centers() + (y - item(batch, at + CENTER_Y))
+        found = (
+            item(batch, at + U_X), item(batch, at + U_Y), item(batch, at + V_X), item(batch, at + V_Y),
+            item(batch, at + W_X), item(batch, at + W_Y),
+        )  # fmt: skip
+        none, ones = full(zero), full(one)
+        up, vp, e = meet(found, dx, dy)
+        inverse = ones / e
+        u, v = up * inverse, vp * inverse
+        solid = u * u + v * v
+        around = (dx * dx + dy * dy) * sharpness
+        # Comparisons with NaN are false, and so no falloff that is NaN is chosen.
+        within = (e > zero) & (full(item(batch, at + Z)) > e * near) & (solid <= farthest)
+        solid = select(within, solid, full(far))
+        nearer = around < solid
+        q = select(nearer, around, solid)
+        bits = full(item(batch, at + BITS)) - q * half_bits
+        drawn = (q <= farthest) & (bits >= least)
+        coverage = select(drawn, exp2(bits), none)
+        on_disc = within & (solid <= select(nearer, around, full(far)))
+        met = select(on_disc, u, none), select(on_disc, v, none), select(on_disc, inverse, ones)
+        return (dx, dy), met, select(on_disc, e, ones), coverage, on_disc
+
+    return cover
+
+
+# Planes of a tile's results; SUMS has one per channel.
+DEPTH_SUM, MIDDLE, DISTORTION, SUMS = (plane * tile.PIXELS for plane in range(4))
+STOP_AFTER = 8
+"""Discs after which a block looks whether all of its pixels have stopped."""
+SPLATS = 512
+"""Discs per task that packs them."""
+
+
+def _blend_block(real: type) -> Scalar:
+    """Builds the loop over the discs of a block."""
+    full, load = vector_kind(real, tile.LANES)
+    cover = disc_functions(real).cover
+    zero, half, one, t_min, alpha_max = real(0.0), real(0.5), real(1.0), real(TRANSMITTANCE_MIN), real(ALPHA_MAX)
+
+    @inlined
+    def blend_block(state, at_state, planes, at, batch, width, entries, count, x, y, near, sharpness, weights):
+        """Fills the weights; returns how many discs it took, and whether any pixel still runs."""
+        none, most = full(zero), full(alpha_max)
+        t, last, middle_at = load(state, at_state + T), load(state, at_state + LAST), load(state, at_state + MEDIAN)
+        first, total = load(state, at_state + FIRST), load(state, at_state + TOTAL)
+        squares, distortion = load(state, at_state + SQUARES), load(planes, at + DISTORTION)
+        depth, middle = load(planes, at + DEPTH_SUM), load(planes, at + MIDDLE)
+        e = 0
+        while e < count:
+            splat = item(entries, e) * width
+            _, met, nearness, coverage, _ = cover(batch, splat, x, y, near, sharpness)
+            alpha = minimum(coverage, most)
+            weight = alpha * t
+            after = t - weight
+            alive = after >= t_min
+            weight = select(alive, weight, none)
+            z, position = met[2] * item(batch, splat + Z), full(item(batch, splat + ORDER))
+            inverse = nearness * item(batch, splat + INVERSE_Z)
+            # Measured from the first one that a pixel shows: squares of what is alike would cancel.
+            first = select(t >= one, inverse, first)
+            apart = inverse - first
+            part = (apart * apart) * (one - t) - (apart * total) * (one + one) + squares
+            distortion = distortion + weight * part
+            total, squares = total + weight * apart, squares + weight * (apart * apart)
+            depth = depth + weight * z
+            halfway = (t > half) & (weight > zero)
+            middle, middle_at = select(halfway, z, middle), select(halfway, position, middle_at)
+            last = select(weight > zero, position, last)
+            t = select(alive, after, -absolute(t))
+            store(weights, e * tile.LANES, weight)
+            e += 1
+            if e % STOP_AFTER == 0 and bits_of(t > zero) == 0:
+                break
+        store(state, at_state + T, t)
+        store(state, at_state + LAST, last)
+        store(state, at_state + MEDIAN, middle_at)
+        store(state, at_state + FIRST, first)
+        store(state, at_state + TOTAL, total)
+        store(state, at_state + SQUARES, squares)
+        store(planes, at + DISTORTION, distortion)
+        store(planes, at + DEPTH_SUM, depth)
+        store(planes, at + MIDDLE, middle)
+        return e, bits_of(t > zero) != 0
+
+    return blend_block
+
+
+def _blend_channels(real: type) -> Scalar:
+    load, zero = vector_kind(real, tile.LANES).load, real(0.0)
+    PIXELS, LANES = tile.PIXELS, tile.LANES
+
+    @inlined
+    def blend_channels(planes, at, batch, width, entries, count, column, weights):
+        """Adds four channels, the first of which is a disc's `column`."""
+        s0, s1 = load(planes, at), load(planes, at + PIXELS)
+        s2, s3 = load(planes, at + 2 * PIXELS), load(planes, at + 3 * PIXELS)
+        for e in range(count):
+            weight, value = load(weights, e * LANES), item(entries, e) * width + column
+            # What no pixel of the block shows may hold anything.
+            if bits_of(weight > zero) != 0:
+                s0 = s0 + weight * item(batch, value)
+                s1 = s1 + weight * item(batch, value + 1)
+                s2 = s2 + weight * item(batch, value + 2)
+                s3 = s3 + weight * item(batch, value + 3)
+        store(planes, at, s0)
+        store(planes, at + PIXELS, s1)
+        store(planes, at + 2 * PIXELS, s2)
+        store(planes, at + 3 * PIXELS, s3)
+
+    return blend_channels
+
+
+def _begin_state(real: type) -> Scalar:
+    zero, one, never = real(0.0), real(1.0), real(-1.0)
+    BLOCK, ACROSS, LANES, BLOCKS = tile.BLOCK, tile.ACROSS, tile.LANES, tile.BLOCKS
+
+    @inlined
+    def begin(state, at, columns, rows):
+        """A fresh state; pixels beyond the image's edge start as stopped. Returns bits of blocks that run."""
+        state[at + LAST : at + FIRST] = never
+        state[at + FIRST : at + STATE] = zero
+        running = np.int64(0)
+        for b in range(BLOCKS):
+            x, y = b % ACROSS * BLOCK, b // ACROSS * BLOCK
+            running |= np.int64(x < columns and y < rows) << b
+            for i in range(LANES):
+                inside = x + i % BLOCK < columns and y + i // BLOCK < rows
+                state[at + T + b * LANES + i] = one if inside else zero
+        return running
+
+    return begin
+
+
+def _write_tile(real: type) -> Scalar:
+    one, PIXELS = real(1.0), tile.PIXELS
+
+    @inlined
+    def write_tile(state, at, planes, images, first, width, columns, rows, channels):
+        """Puts a tile into the images, which are flat, and takes off the signs that tell which pixels have stopped."""
+        image, alpha, depth, median, distortion = images
+        for i in range(PIXELS):
+            state[at + T + i] = abs(state[at + T + i])
+        for y in range(rows):
+            for x in range(columns):
+                pixel, lane = first + y * width + x, lane_of(x, y)
+                alpha[pixel] = one - state[at + T + lane]
+                depth[pixel], median[pixel] = planes[DEPTH_SUM + lane], planes[MIDDLE + lane]
+                distortion[pixel] = planes[DISTORTION + lane]
+                for d in range(channels):
+                    image[pixel * channels + d] = planes[SUMS + d * PIXELS + lane]
+
+    return write_tile
+
+
+@functools.cache
+def composite_discs_forward(real: type) -> Kernel:
+    """Builds the kernel that blends all tiles."""
+    place, reached = tile.tile_functions(real).place, tile.tile_functions(real).reached
+    pack, fetch, _ = disc_functions(real)
+    blend_block, blend_channels, begin = _blend_block(real), _blend_channels(real), _begin_state(real)
+    write_tile, zero = _write_tile(real), real(0.0)
+    BLOCK, ACROSS, BLOCKS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.BLOCKS, tile.LANES, tile.PIXELS
+    CHUNK = tile.CHUNK
+
+    @kernel("composite_discs_forward", real)
+    def forward(
+        means, maps, opacities, depths, outline_centers, conics, channels, image_width, height, near, sharpness,
+        pair_splats, tile_offsets, splat_offsets, active, packed, pairs, state, images,
+    ):  # fmt: skip
+        num_discs, num_channels = channels.shape
+        width, groups = packed.size // max(1, num_discs), (num_channels + 3) // 4
+        num_chunks = (num_discs + SPLATS - 1) // SPLATS
+        pack_stride = even_stride(num_chunks)
+        for task in prange(num_chunks):
+            chunk = task * pack_stride % num_chunks
+            for s in range(chunk * SPLATS, min(num_discs, (chunk + 1) * SPLATS)):
+                if splat_offsets[s + 1] > splat_offsets[s]:
+                    pack(packed, s * width, means[s], maps[s], opacities[s], depths[s], outline_centers[s], conics[s])
+                    for d in range(width - VALUES):
+                        packed[s * width + VALUES + d] = channels[s, d] if d < num_channels else zero
+        stride = even_stride(active.size)
+        for task in prange(active.size):
+            n = task * stride % active.size
+            camera, x0, y0, columns, rows = place(active[n], image_width, height)
+            start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
+            at = n * STATE
+            running = begin(state, at, columns, rows)
+            if start == stop:
+                continue
+            planes = np.empty(SUMS + groups * 4 * PIXELS, real)
+            planes[:] = zero
+            batch, entries = np.empty(CHUNK * width, real), np.empty(CHUNK + 1, np.int32)
+            weights: Any = np.empty(CHUNK * LANES, real)
+            for first in range(start, stop, CHUNK):
+                last = min(first + CHUNK, stop)
+                fetch(batch, packed, pair_splats, first, last, width, x0, y0)
+                for p in range(first, last):
+                    pairs[p] = reached(batch, (p - first) * width) & running
+                    batch[(p - first) * width + ORDER] = real(np.int32(p - start))
+                for b in range(BLOCKS):
+                    count = list_block(entries, pairs, first, last, b)
+                    if count == 0:
+                        continue
+                    x, y = real(b % ACROSS * BLOCK), real(b // ACROSS * BLOCK)
+                    i = b * LANES
+                    taken, runs = blend_block(
+                        state, at + i, planes, i, batch, width, entries, count, x, y, near, sharpness, weights
+                    )
+                    for group in range(groups):
+                        blend_channels(
+                            planes, SUMS + 4 * group * PIXELS + i, batch, width, entries, taken, VALUES + 4 * group,
+                            weights,
+                        )  # fmt: skip
+                    if not runs:
+                        running &= ~(np.int64(1) << b)
+                        # What the block was not asked about any more does not reach it in the backward pass either.
+                        for e in range(taken, count):
+                            pairs[first + entries[e]] &= ~(np.int32(1) << b)
+                if running == 0:
+                    break
+            corner = (camera * height + y0) * image_width + x0
+            write_tile(state, at, planes, images, corner, image_width, columns, rows, num_channels)
+
+    return forward
+
+
+# Planes of the backward pass; V_IMAGE has one per channel. T_AT is the transmittance in front of the current disc,
+# BEHIND what lies behind it, weighted by the incoming gradients, COVERED the coverage in the end, WEIGHT how much of it
+# shows.
+T_AT, BEHIND, COVERED, WEIGHT, V_DEPTH, V_MEDIAN, V_DISTORTION, V_IMAGE = (plane * tile.PIXELS for plane in range(8))
+
+# Columns of a pair's row, sums over its pixels: gradients of both numerators and of e, times dx, times dy and alone;
+# those of the falloff around the centre, times dx and dy; of the logarithm of the coverage; of the centre's depth; the
+# probe's; and from PAIR_VALUES on those of the channels.
+UP, VP, E, AROUND, G, V_Z, PULL, PAIR_VALUES = 0, 3, 6, 9, 11, 12, 13, 16
+
+
+def _value_of(real: type) -> Scalar:
+    load = vector_kind(real, tile.LANES).load
+    PIXELS = tile.PIXELS
+
+    @inlined
+    def value_of(planes, i, batch, splat, groups):
+        """What a disc's channels are worth to a block."""
+        dot = load(planes, V_IMAGE + i) * item(batch, splat + VALUES)
+        for d in range(1, 4 * groups):
+            dot = dot + load(planes, V_IMAGE + d * PIXELS + i) * item(batch, splat + VALUES + d)
+        return dot
+
+    return value_of
+
+
+def _unblend(real: type) -> Scalar:
+    full, load = vector_kind(real, tile.LANES)
+    cover, value_of, slopes = disc_functions(real).cover, _value_of(real), meet_maths(real)[1]
+    zero, one, two, alpha_max, endless = real(0.0), real(1.0), real(2.0), real(ALPHA_MAX), real(np.inf)
+    BLOCK, ACROSS, LANES = tile.BLOCK, tile.ACROSS, tile.LANES
+
+    @inlined
+    def sharpness_of(sharpness):
+        """Endless where there is no low-pass: then no pixel has a gradient through it, and zero times it is none."""
+        return sharpness if sharpness < endless else zero
+
+    @inlined
+    def unblend(planes, state, at, batch, splat, blocks, groups, near, sharpness, row, row_at):
+        """Takes a disc off the pixels of its blocks and writes its sums but for those of the channels."""
+        none, most = full(zero), full(alpha_max)
+        found = (
+            item(batch, splat + U_X), item(batch, splat + U_Y), item(batch, splat + V_X),
+            item(batch, splat + V_Y), item(batch, splat + W_X), item(batch, splat + W_Y),
+        )  # fmt: skip
+        order, depth, inverse_depth = item(batch, splat + ORDER), item(batch, splat + Z), item(batch, splat + INVERSE_Z)
+        up_x, up_y, up_1, vp_x, vp_y, vp_1 = none, none, none, none, none, none
+        e_x, e_y, e_1, around_x, around_y = none, none, none, none, none
+        g, g_depth, pull_x, pull_y = none, none, none, none
+        while blocks != 0:
+            b = lowest_bit(blocks)
+            blocks &= blocks - 1
+            i = b * LANES
+            (dx, dy), (u, v, inverse), nearness, coverage, on_disc = cover(
+                batch, splat, real(b % ACROSS * BLOCK), real(b // ACROSS * BLOCK), near, sharpness
+            )
+            shown = load(state, at + LAST + i) >= order
+            alpha = select(shown, minimum(coverage, most), none)
+            rest = one / (one - alpha)
+            t = load(planes, T_AT + i) * rest
+            weight = alpha * t
+            store(planes, WEIGHT + i, weight)
+            z, apart = inverse * depth, nearness * inverse_depth - load(state, at + FIRST + i)
+            total, covered = load(state, at + TOTAL + i), load(planes, COVERED + i)
+            v_depth, v_distortion = load(planes, V_DEPTH + i), load(planes, V_DISTORTION + i)
+            spread = (apart * covered - total * two) * apart + load(state, at + SQUARES + i)
+            value = value_of(planes, i, batch, splat, groups) + v_depth * z + v_distortion * spread
+            behind = load(planes, BEHIND + i)
+            v_alpha = t * value - behind * rest
+            store(planes, BEHIND + i, behind + weight * value)
+            store(planes, T_AT + i, t)
+            middle = (load(state, at + MEDIAN + i) >= order) & (full(order) >= load(state, at + MEDIAN + i))
+            v_z = weight * v_depth + select(middle, load(planes, V_MEDIAN + i), none)
+            v_inverse = (weight * v_distortion) * ((apart * covered - total) * two)
+            gain = select(coverage < most, v_alpha * alpha, none)
+            v_up, v_vp = -(gain * u) * inverse, -(gain * v) * inverse
+            v_e = (gain * (u * u + v * v) - v_z * z) * inverse + v_inverse * inverse_depth
+            v_e = select(on_disc, v_e, none)
+            v_around = select(on_disc, none, gain * (-sharpness_of(sharpness)))
+            g, g_depth = g + gain, g_depth + (v_z * inverse - v_inverse * nearness * (inverse_depth * inverse_depth))
+            up_x, up_y, up_1 = up_x + v_up * dx, up_y + v_up * dy, up_1 + v_up
+            vp_x, vp_y, vp_1 = vp_x + v_vp * dx, vp_y + v_vp * dy, vp_1 + v_vp
+            e_x, e_y, e_1 = e_x + v_e * dx, e_y + v_e * dy, e_1 + v_e
+            around_x, around_y = around_x + v_around * dx, around_y + v_around * dy
+            slope_x, slope_y = slopes(found, v_up, v_vp, v_e)
+            pull_x = pull_x + absolute(slope_x + v_around * dx)
+            pull_y = pull_y + absolute(slope_y + v_around * dy)
+        sums = (
+            up_x, up_y, up_1, vp_x, vp_y, vp_1, e_x, e_y, e_1, around_x, around_y, g, g_depth, pull_x, pull_y, none
+        )  # fmt: skip
+        store(row, row_at, sums_of(sums))
+
+    return unblend
+
+
+def _sum_channels(real: type) -> Scalar:
+    full, load = vector_kind(real, tile.LANES)
+    zero, LANES, PIXELS = real(0.0), tile.LANES, tile.PIXELS
+
+    @inlined
+    def sum_channels(planes, blocks, groups, rows, row, sums):
+        """Adds to a row of sums the gradients of the channels, with the weights that are kept; `sums` is scratch."""
+        none = full(zero)
+        for d in range(0, groups * 4, 4):
+            s0, s1, s2, s3, left = none, none, none, none, blocks
+            while left != 0:
+                i = lowest_bit(left) * LANES
+                left &= left - 1
+                v, weight = V_IMAGE + d * PIXELS + i, load(planes, WEIGHT + i)
+                s0, s1 = s0 + weight * load(planes, v), s1 + weight * load(planes, v + PIXELS)
+                s2, s3 = s2 + weight * load(planes, v + 2 * PIXELS), s3 + weight * load(planes, v + 3 * PIXELS)
+            four = (s0, s1, s2, s3, none, none, none, none, none, none, none, none, none, none, none, none)
+            store(sums, 0, sums_of(four))
+            for i in range(4):
+                rows[row + PAIR_VALUES + d + i] = sums[i]
+
+    return sum_channels
+
+
+def _begin_gradients(real: type) -> Scalar:
+    zero, one, PIXELS = real(0.0), real(1.0), tile.PIXELS
+
+    @inlined
+    def begin(planes, state, at, v_images, first, width, columns, rows, channels):
+        """Loads a tile's gradients; returns how many pairs of it any pixel has blended."""
+        v_image, v_alpha, v_depth, v_median, v_distortion = v_images
+        planes[:] = zero
+        most = state[at + LAST]
+        for i in range(PIXELS):
+            planes[T_AT + i] = state[at + T + i]
+            planes[COVERED + i] = one - planes[T_AT + i]
+            most = max(most, state[at + LAST + i])
+        for y in range(rows):
+            for x in range(columns):
+                pixel, i = first + y * width + x, lane_of(x, y)
+                # alpha = 1 - T_AT: its gradient acts like something behind every disc.
+                planes[BEHIND + i] = -v_alpha[pixel] * planes[T_AT + i]
+                planes[V_DEPTH + i], planes[V_MEDIAN + i] = v_depth[pixel], v_median[pixel]
+                planes[V_DISTORTION + i] = v_distortion[pixel]
+                for d in range(channels):
+                    planes[V_IMAGE + d * PIXELS + i] = v_image[pixel * channels + d]
+        return int(most) + 1
+
+    return begin
+
+
+@functools.cache
+def composite_discs_backward(real: type) -> Kernel:
+    """Builds the kernel that fills one row of sums per pair, given the final state of each tile."""
+    place, fetch = tile.tile_functions(real).place, disc_functions(real).fetch
+    unblend, sum_channels, begin = _unblend(real), _sum_channels(real), _begin_gradients(real)
+    zero = real(0.0)
+    LANES, PIXELS, CHUNK = tile.LANES, tile.PIXELS, tile.CHUNK
+    REACHED = (1 << tile.BLOCKS) - 1
+
+    @kernel("composite_discs_backward", real)
+    def backward(
+        num_discs, num_channels, image_width, height, near, sharpness,
+        pair_splats, tile_offsets, active, packed, pairs, state, v_images, rows,
+    ):  # fmt: skip
+        groups, width = (num_channels + 3) // 4, packed.size // max(1, num_discs)
+        row_width = rows.size // max(1, pair_splats.size)
+        stride = even_stride(active.size)
+        for task in prange(active.size):
+            n = task * stride % active.size
+            start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
+            if start == stop:
+                continue
+            camera, x0, y0, columns, lines = place(active[n], image_width, height)
+            corner, at = (camera * height + y0) * image_width + x0, n * STATE
+            planes = np.empty(V_IMAGE + groups * 4 * PIXELS, real)
+            sums: Any = np.empty(LANES, real)
+            batch = np.empty(CHUNK * width, real)
+            looked_at = begin(planes, state, at, v_images, corner, image_width, columns, lines, num_channels)
+            rows[(start + looked_at) * row_width : stop * row_width] = zero
+            for behind in range(0, looked_at, CHUNK):
+                last = start + looked_at - behind
+                first = max(last - CHUNK, start)
+                fetch(batch, packed, pair_splats, first, last, width, x0, y0)
+                for k in range(last - first):
+                    p = last - 1 - k
+                    splat, row = (p - first) * width, p * row_width
+                    batch[splat + ORDER] = real(np.int32(p - start))
+                    blocks = np.int64(pairs[p]) & REACHED
+                    if blocks == 0:
+                        rows[row : row + row_width] = zero
+                        continue
+                    unblend(planes, state, at, batch, splat, blocks, groups, near, sharpness, rows, row)
+                    sum_channels(planes, blocks, groups, rows, row, sums)
+
+    return backward
+
+
+class Saved(NamedTuple):
+    """What the backward pass needs from the forward pass, flat: packed discs, the blocks that each pair reaches, and
+    each active tile's final state.
+    """
+
+    packed: NDArray[Any]
+    pairs: NDArray[np.int32]
+    state: NDArray[Any]
+
+
+def composite_discs(
+    discs: Discs, channels: Tensor, bins: TileBins, *, near: float, low_pass: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Saved]:
+    """The fields of `BlendedDiscs`, and what `composite_discs_gradients` starts from."""
+    cameras, count, num_channels = channels.shape
+    shape, real = (bins.num_cameras, bins.height, bins.width), REAL_OF[channels.dtype]
+    images = [channels.new_zeros(s) for s in ((*shape, num_channels), shape, shape, shape, shape)]
+    # Of PyTorch, because its arrays begin with a cache line, and a packed disc is whole ones.
+    sizes = cameras * count * packed_width(num_channels), len(bins.active) * STATE
+    packed, state = (torch.empty(size, dtype=channels.dtype).numpy() for size in sizes)
+    saved = Saved(packed, np.zeros(len(bins.pair_splats), np.int32), state)
+    composite_discs_forward(real)(
+        *_by_disc(discs), channels.numpy().reshape(-1, num_channels), bins.width, bins.height,
+        *_real_options(real, near, low_pass), bins.pair_splats.numpy(), bins.tile_offsets.numpy(),
+        bins.splat_offsets.numpy(), bins.active.numpy(), *saved, tuple(_flat(image) for image in images),
+    )  # fmt: skip
+    image, alpha, depth, median, distortion = images
+    return image, alpha, depth, median, distortion, saved
+
+
+def composite_discs_gradients(
+    discs: Discs, channels: Tensor, bins: TileBins, saved: Saved, v_outputs: Sequence[Tensor],
+    *, near: float, low_pass: float, probed: bool,
+) -> tuple[Tensor | None, ...]:  # fmt: skip
+    """Gradients of means2d, maps, opacities, depths, channels and probe; the last where `probed`."""
+    (cameras, count, num_channels), real = channels.shape, REAL_OF[channels.dtype]
+    # Of tiles that are not active nothing is written.
+    width = tile.LANES * ((PAIR_VALUES + 4 * tile.groups_of(num_channels) + tile.LANES - 1) // tile.LANES)
+    rows = torch.zeros(len(bins.pair_splats) * width, dtype=channels.dtype).numpy()
+    composite_discs_backward(real)(
+        cameras * count, num_channels, bins.width, bins.height, *_real_options(real, near, low_pass),
+        bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), *saved,
+        tuple(_flat(v) for v in v_outputs), rows,
+    )  # fmt: skip
+    widths = ((2,), (MAP,), (), (), (num_channels,), (2,))
+    found = [channels.new_zeros(cameras, count, *rest) for rest in widths]
+    sum_disc_rows(real)(
+        rows, bins.pair_slots.numpy(), bins.splat_offsets.numpy(), discs.maps.numpy().reshape(-1, MAP),
+        discs.opacities.numpy().reshape(-1),
+        *(tensor.numpy().reshape(cameras * count, *tensor.shape[2:]) for tensor in found),
+    )  # fmt: skip
+    return (*found[:5], found[5] if probed else None)
+
+
+def _real_options(real: type, near: float, low_pass: float) -> tuple[Any, Any]:
+    """The near plane, and one over the variance of the low-pass."""
+    return real(near), real(1 / low_pass**2) if low_pass else real(np.inf)
+
+
+def _flat(tensor: Tensor) -> NDArray[Any]:
+    array: NDArray[Any] = tensor.contiguous().numpy().reshape(-1)
+    return array
+
+
+def _by_disc(discs: Discs) -> tuple[NDArray[Any], ...]:
+    return (
+        discs.means2d.numpy().reshape(-1, 2),
+        discs.maps.numpy().reshape(-1, MAP),
+        discs.opacities.numpy().reshape(-1),
+        discs.depths.numpy().reshape(-1),
+        discs.outlines.means2d.numpy().reshape(-1, 2),
+        discs.outlines.conics.numpy().reshape(-1, 3),
+    )
+
+
+@functools.cache
+def sum_disc_rows(real: type) -> Kernel:
+    """Fills the gradients of each disc, which are zero, from the rows of its pairs, in a fixed order."""
+    full, load = vector_kind(real, tile.LANES)
+    zero, LANES = real(0.0), tile.LANES
+
+    @kernel("sum_disc_rows", real)
+    def sum_rows(rows, slots, offsets, maps, opacities, v_means, v_maps, v_opacities, v_depths, v_channels, v_probe):
+        count, width = offsets.size - 1, rows.size // max(1, slots.size)
+        num_chunks = (count + SPLATS - 1) // SPLATS
+        stride = even_stride(num_chunks)
+        for task in prange(num_chunks):
+            chunk = task * stride % num_chunks
+            total = np.empty(width, real)
+            for s in range(chunk * SPLATS, min(count, (chunk + 1) * SPLATS)):
+                if offsets[s] == offsets[s + 1]:
+                    continue
+                for column in range(0, width, LANES):
+                    part = full(zero)
+                    for k in range(offsets[s], offsets[s + 1]):
+                        part = part + load(rows, slots[k] * width + column)
+                    store(total, column, part)
+                for d in range(v_channels.shape[1]):
+                    v_channels[s, d] = total[PAIR_VALUES + d]
+                for j in range(2):
+                    v_maps[s, j], v_maps[s, 2 + j], v_maps[s, 4 + j] = total[UP + j], total[VP + j], total[E + j]
+                    # What no pixel shows stays zero, even where its geometry is not finite.
+                    if total[UP + 2] != zero or total[VP + 2] != zero or total[E + 2] != zero:
+                        v_means[s, j] -= total[UP + 2] * maps[s, j]
+                        v_means[s, j] -= total[VP + 2] * maps[s, 2 + j]
+                        v_means[s, j] -= total[E + 2] * maps[s, 4 + j]
+                    v_means[s, j] -= total[AROUND + j]
+                    v_probe[s, j] = total[PULL + j]
+                if total[G] != zero:
+                    v_opacities[s] = total[G] / opacities[s]
+                v_depths[s] = total[V_Z]
+
+    return sum_rows

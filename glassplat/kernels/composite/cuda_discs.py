@@ -1,0 +1,535 @@
+"""Blending of sorted discs on the GPU.
+
+Forwards there is one block for each active tile, one thread for each pixel. Backwards there is one thread for each
+(tile, disc) pair: a warp takes a bucket of 32 consecutive pairs of a tile, one for each lane, and the pixels of the
+tile pass through the lanes (`cuda_backward`). So every lane sums its own disc's gradient in registers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numba import cuda
+from torch import Tensor
+
+from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
+from glassplat.kernels.backend.devices import SIMULATED
+from glassplat.kernels.composite.cuda_tile import BUCKET, PIXELS, at, tile_steps
+from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar, blend_maths
+from glassplat.kernels.maths.disc import MAP, meet_maths
+from glassplat.kernels.maths.fast_maths import exp2_maths, fused_maths, reciprocal_maths
+from glassplat.kernels.maths.ray_hit import MOST_DEVIATIONS
+from glassplat.kernels.records import REAL_OF, TILE, Discs, TileBins
+
+CENTER_X, CENTER_Y, U_X, U_Y, V_X, V_Y, W_X, W_Y, OPACITY, Z, INVERSE_Z, COLUMNS = range(12)
+"""Columns of a disc's geometry; the centre is relative to that of the tile's first pixel."""
+
+# Planes of what a tile's pixels end with, and with `LAST` and `MEDIAN` of the pairs that decided it.
+T, FIRST, TOTAL, SQUARES, FINALS = range(5)
+LAST, MEDIAN, ORDERS = range(3)
+
+# Planes of what a pixel had gathered before a bucket, the channels after them.
+KEPT_T, KEPT_DEPTH, KEPT_TOTAL, KEPT_SQUARES, KEPT_VALUES = range(5)
+
+
+class DiscTileFunctions(NamedTuple):
+    """Compiled steps.
+
+    Attributes:
+        load: copies one disc's geometry into row `i` of an array, and returns the rows of pixels that its outline
+            reaches, a bit for each.
+        cover: ((dx, dy), (u, v, 1 / e), e, coverage, on the disc itself) of the disc in row `i` and the pixel in column
+            x and row y of the tile, as `cpu_tile.DiscFunctions.cover`.
+    """
+
+    load: Scalar
+    cover: Scalar
+
+
+def disc_tile_steps(real: type) -> DiscTileFunctions:
+    """Builds the functions for `real`, np.float32 or np.float64."""
+    return DiscTileFunctions(_load(real), _cover(real))
+
+
+def _load(real: type) -> Scalar:
+    maths = blend_maths(real)
+    vertical_reach, row_range = maths.vertical_reach, maths.row_range
+    zero, half, one, endless, alpha_min = real(0.0), real(0.5), real(1.0), real(np.inf), real(ALPHA_MIN)
+
+    @inlined
+    def load(geometry, i, s, means, maps, opacities, depths, centers, conics, x0, y0, num_rows):
+        opacity, depth, total = opacities[s], depths[s], means[s, 0] + means[s, 1] + depths[s]
+        geometry[i, CENTER_X], geometry[i, CENTER_Y] = means[s, 0] - real(x0) - half, means[s, 1] - real(y0) - half
+        for j in range(6):
+            geometry[i, U_X + j] = maps[s, j]
+            total += maps[s, j]
+        geometry[i, OPACITY], geometry[i, Z], geometry[i, INVERSE_Z] = opacity, depth, one / depth
+        # Written so that NaN anywhere ends in "reaches nothing".
+        if not (abs(total) < endless and alpha_min <= opacity < endless and zero < depth):
+            return np.int32(0)
+        if conics[s, 0] == zero and conics[s, 1] == zero and conics[s, 2] == zero:
+            # It crosses the near plane and may reach any row.
+            return np.int32((1 << num_rows) - 1)
+        reach = vertical_reach(conics[s, 0], conics[s, 1], conics[s, 2], opacity)
+        first, last = row_range(centers[s, 1] - real(y0), reach, num_rows)
+        return np.int32((1 << last) - (1 << first))
+
+    return load
+
+
+def _cover(real: type) -> Scalar:
+    exp2, fused, reciprocal = exp2_maths(real), fused_maths(), reciprocal_maths(real)
+    zero, one, farthest, far = real(0.0), real(1.0), real(MOST_DEVIATIONS**2), real(4 * MOST_DEVIATIONS**2)
+    half_bits, alpha_min = real(-0.5 / math.log(2.0)), real(ALPHA_MIN)
+
+    @inlined
+    def cover(geometry, i, x, y, near, sharpness):
+        dx, dy = x - geometry[i, CENTER_X], y - geometry[i, CENTER_Y]
+        # Written out, because the compiler would choose anew in every kernel which products and sums to fuse: a disc
+        # at exactly 1/255 could be in the image and not in its gradient.
+        e = fused(dx, geometry[i, W_X], fused(dy, geometry[i, W_Y], one))
+        inverse, solid = one, far
+        u, v = zero, zero
+        if e > zero and geometry[i, Z] > near * e:
+            inverse = reciprocal(e)
+            u = fused(dx, geometry[i, U_X], dy * geometry[i, U_Y]) * inverse
+            v = fused(dx, geometry[i, V_X], dy * geometry[i, V_Y]) * inverse
+            solid = fused(u, u, v * v)
+            solid = solid if solid <= farthest else far
+        around = fused(dx, dx, dy * dy) * sharpness
+        on_disc = solid <= farthest and not around < solid
+        q = solid if on_disc else around
+        covered = geometry[i, OPACITY] * exp2(q * half_bits) if q <= farthest else zero
+        covered = covered if covered >= alpha_min else zero
+        if not on_disc:
+            u, v, inverse, e = zero, zero, one, one
+        return (dx, dy), (u, v, inverse), e, covered, on_disc
+
+    return cover
+
+
+WARPS = 2
+"""Buckets of a block; they have nothing to do with each other."""
+THREADS, SLOTS = WARPS * BUCKET, WARPS * PIXELS
+
+BEHIND, BLENDED, MIDDLE, STATES = at(SLOTS), at(2 * SLOTS), at(3 * SLOTS), 4 * SLOTS
+"""Where what follows the transmittances begins in shared memory: what lies behind each pixel, the last lane whose disc
+it blended and the one whose depth is its median; and the end."""
+
+# Planes of a tile's pulls beyond those of its channels.
+V_DEPTH, V_MEDIAN, V_DISTORTION, GATHERED, PULL_FIRST, PULL_COVERED, PULL_TOTAL, PULL_SQUARES, PULLS = range(9)
+
+# Columns of a pair's row, as on the CPU; the channels' follow.
+UP, VP, E, AROUND, G, G_Z, PULL, MOMENTS = 0, 3, 6, 9, 11, 12, 13, 15
+
+
+@cache
+def composite_discs_pulls(real: type, num_channels: int = 6) -> Kernel:
+    """Gathers, tile by tile, what each pixel's gradients pull at [A, D + 8, 256]: one plane per channel, then those
+    that the constants name. What the pixel gathered in all holds each part times its gradient.
+    """
+    place = tile_steps(real).place
+    zero, one, two = real(0.0), real(1.0), real(2.0)
+
+    @kernel(
+        f"composite_discs_pulls_{num_channels}",
+        real,
+        "int1 real3 real4 real3 real4 real3 real3 real3 real3 real3",
+    )
+    def gather(active, finals, image, depth, v_image, v_alpha, v_depth, v_median, v_distortion, pulls):
+        n, pixel = cuda.blockIdx.x, cuda.threadIdx.x
+        camera, x0, y0, columns, rows = place(active[n], v_image.shape[2], v_image.shape[1])
+        column, row = pixel % TILE, pixel // TILE
+        if column >= columns or row >= rows:
+            return
+        y, x = y0 + row, x0 + column
+        t, total, squares = finals[n, 0, pixel], finals[n, 2, pixel], finals[n, 3, pixel]
+        covered, v_spread = one - t, v_distortion[camera, y, x]
+        # alpha = 1 - T: its gradient acts like something behind every disc.
+        gathered = v_depth[camera, y, x] * depth[camera, y, x] - v_alpha[camera, y, x] * t
+        if v_spread != zero:
+            gathered += v_spread * two * (covered * squares - total * total)
+        for d in range(num_channels):
+            v = v_image[camera, y, x, d]
+            gathered += v * image[camera, y, x, d]
+            pulls[n, d, pixel] = v
+        pulls[n, num_channels + V_DEPTH, pixel] = v_depth[camera, y, x]
+        pulls[n, num_channels + V_MEDIAN, pixel] = v_median[camera, y, x]
+        pulls[n, num_channels + V_DISTORTION, pixel], pulls[n, num_channels + GATHERED, pixel] = v_spread, gathered
+        pulls[n, num_channels + PULL_FIRST, pixel] = finals[n, 1, pixel]
+        pulls[n, num_channels + PULL_COVERED, pixel] = covered
+        pulls[n, num_channels + PULL_TOTAL, pixel], pulls[n, num_channels + PULL_SQUARES, pixel] = total, squares
+
+    return gather
+
+
+def _enter(real: type, num_channels: int) -> Scalar:
+    """Puts what a pixel is before a bucket's first pair into shared memory."""
+    one, two, behinds = real(1.0), real(2.0), BEHIND
+    of_depth, of_spread, gathered = (PIXELS * (num_channels + plane) for plane in (V_DEPTH, V_DISTORTION, GATHERED))
+    of_covered, of_total, of_squares = (
+        PIXELS * (num_channels + plane) for plane in (PULL_COVERED, PULL_TOTAL, PULL_SQUARES)
+    )
+
+    @inlined
+    def enter(mine, pulled, had, pulls, kept, state):
+        t = kept[at(had + KEPT_T * PIXELS)]
+        behind = pulls[at(pulled + gathered)]
+        behind -= pulls[at(pulled + of_depth)] * kept[at(had + KEPT_DEPTH * PIXELS)]
+        spread = pulls[at(pulled + of_covered)] * kept[at(had + KEPT_SQUARES * PIXELS)]
+        spread -= two * pulls[at(pulled + of_total)] * kept[at(had + KEPT_TOTAL * PIXELS)]
+        spread += pulls[at(pulled + of_squares)] * (one - t)
+        behind -= pulls[at(pulled + of_spread)] * spread
+        for d in range(num_channels):
+            behind -= pulls[at(pulled + d * PIXELS)] * kept[at(had + (KEPT_VALUES + d) * PIXELS)]
+        state[mine], state[mine + behinds] = t, behind
+
+    return enter
+
+
+@cache
+def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
+    """Fills one gradient row per pair that any pixel blended; all rows start at zero."""
+    place, (load, cover), slopes = tile_steps(real).place, disc_tile_steps(real), meet_maths(real)[1]
+    reciprocal, enter = reciprocal_maths(real), _enter(real, num_channels)
+    zero, one, two, alpha_max, endless = real(0.0), real(1.0), real(2.0), real(ALPHA_MAX), real(np.inf)
+    behinds, lasts, middles = BEHIND, BLENDED, MIDDLE
+    of_depth, of_median, of_spread, _, of_first, of_covered, of_total, of_squares = (
+        at(PIXELS * (num_channels + plane)) for plane in range(PULLS)
+    )
+
+    @kernel(
+        f"composite_discs_backward_{num_channels}",
+        real,
+        "real2 real2 real1 real1 real2 real2 real2 real real int int int1 long1 int1 int1 int1 int1 real1 real1 real2",
+    )
+    def backward(
+        means, maps, opacities, depths, centers, conics, channels, near, sharpness, width, height,
+        pair_splats, tile_offsets, active, orders, looked_at, bucket_tiles, kept, pulls, out,
+    ):  # fmt: skip
+        state = cuda.shared.array(STATES, real)
+        geometry = cuda.local.array((1, COLUMNS), real)
+        value = cuda.local.array(num_channels, real)
+        v_value = cuda.local.array(num_channels, real)
+        warp, lane = cuda.threadIdx.x // BUCKET, cuda.threadIdx.x % BUCKET
+        bucket = cuda.blockIdx.x * WARPS + warp
+        n = bucket_tiles[bucket] if bucket < bucket_tiles.size else -1
+        if n < 0:
+            return
+        start = tile_offsets[active[n]]
+        first = (bucket - n - start // BUCKET) * BUCKET
+        if first >= looked_at[n]:
+            return
+        _, x0, y0, _, rows = place(active[n], width, height)
+        entry, tile_pulls = bucket * (KEPT_VALUES + num_channels) * PIXELS, n * (num_channels + PULLS) * PIXELS
+        tile_orders = n * ORDERS * PIXELS
+        for pixel in range(lane, PIXELS, BUCKET):
+            mine = at(warp * PIXELS + pixel)
+            own_last = orders[at(tile_orders + LAST * PIXELS + pixel)] - first
+            state[mine + lasts] = real(own_last)
+            state[mine + middles] = real(orders[at(tile_orders + MEDIAN * PIXELS + pixel)] - first)
+            # A pixel that had stopped before stored nothing, and no lane will look at it.
+            if own_last >= 0:
+                enter(mine, tile_pulls + pixel, entry + pixel, pulls, kept, state)
+        order, tile, own = first + lane, np.uint32(n), real(np.int32(lane))
+        inside, reached = order < looked_at[n], np.int32(0)
+        for d in range(num_channels):
+            v_value[d] = value[d] = zero
+        if inside:
+            s = pair_splats[start + order]
+            reached = load(geometry, 0, s, means, maps, opacities, depths, centers, conics, x0, y0, rows)
+            for d in range(num_channels):
+                value[d] = channels[s, d]
+        found = (
+            geometry[0, U_X], geometry[0, U_X + 1], geometry[0, U_X + 2], geometry[0, U_X + 3], geometry[0, U_X + 4],
+            geometry[0, U_X + 5],
+        )  # fmt: skip
+        depth, inverse_depth, around = geometry[0, Z], geometry[0, INVERSE_Z], zero
+        if sharpness < endless:
+            around = -sharpness
+        up_x, up_y, up_1, vp_x, vp_y, vp_1, e_x, e_y, e_1 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+        around_x, around_y, g, g_depth, pull_x, pull_y = zero, zero, zero, zero, zero, zero
+        own_pulls, step = at(tile) * at((num_channels + PULLS) * PIXELS), np.int32(0)
+        while step < PIXELS + BUCKET - 1:
+            # The lanes of a warp wait for each other; the simulator knows no warps, but blocks.
+            if SIMULATED:
+                cuda.syncthreads()
+            else:
+                cuda.syncwarp()
+            p = np.int32(step - lane)
+            step = np.int32(step + 1)
+            # A disc that is not there reaches no row, and none was blended where the tile reaches beyond the image.
+            if 0 <= p < PIXELS and np.int32(reached & np.int32(1 << (p >> 4))) != 0:
+                x, y, mine = real(np.int32(p & (TILE - 1))), real(np.int32(p >> 4)), at(warp * PIXELS + p)
+                (dx, dy), (u, v, inverse), e, covered, on_disc = cover(geometry, 0, x, y, near, sharpness)
+                if covered > zero and own <= state[mine + lasts]:
+                    pulled, t, a = own_pulls + at(np.uint32(p)), state[mine], min(covered, alpha_max)
+                    weight, worth = a * t, zero
+                    for d in range(num_channels):
+                        pull = pulls[pulled + at(d * PIXELS)]
+                        worth += pull * value[d]
+                        v_value[d] += weight * pull
+                    z, apart = inverse * depth, e * inverse_depth - pulls[pulled + of_first]
+                    lean = apart * pulls[pulled + of_covered] - two * pulls[pulled + of_total]
+                    v_spread = pulls[pulled + of_spread]
+                    worth += pulls[pulled + of_depth] * z + v_spread * (lean * apart + pulls[pulled + of_squares])
+                    v_z = weight * pulls[pulled + of_depth]
+                    if own == state[mine + middles]:
+                        v_z += pulls[pulled + of_median]
+                    # The derivative of a square is twice as steep: `lean` holds the sum of distances but for half.
+                    v_inverse = weight * v_spread * two * (lean + pulls[pulled + of_total])
+                    behind = state[mine + behinds] - weight * worth
+                    gain = (t * worth - behind * reciprocal(one - a)) * a if covered < alpha_max else zero
+                    state[mine], state[mine + behinds] = t - weight, behind
+                    g += gain
+                    g_depth += v_z * inverse - v_inverse * e * inverse_depth * inverse_depth
+                    if on_disc:
+                        v_up, v_vp = -gain * u * inverse, -gain * v * inverse
+                        v_e = (gain * (u * u + v * v) - v_z * z) * inverse + v_inverse * inverse_depth
+                        up_x, up_y, up_1 = up_x + v_up * dx, up_y + v_up * dy, up_1 + v_up
+                        vp_x, vp_y, vp_1 = vp_x + v_vp * dx, vp_y + v_vp * dy, vp_1 + v_vp
+                        e_x, e_y, e_1 = e_x + v_e * dx, e_y + v_e * dy, e_1 + v_e
+                        slope_x, slope_y = slopes(found, v_up, v_vp, v_e)
+                        pull_x, pull_y = pull_x + abs(slope_x), pull_y + abs(slope_y)
+                    else:
+                        moved_x, moved_y = gain * around * dx, gain * around * dy
+                        around_x, around_y = around_x + moved_x, around_y + moved_y
+                        pull_x, pull_y = pull_x + abs(moved_x), pull_y + abs(moved_y)
+        if inside:
+            row = start + order
+            out[row, UP], out[row, UP + 1], out[row, UP + 2] = up_x, up_y, up_1
+            out[row, VP], out[row, VP + 1], out[row, VP + 2] = vp_x, vp_y, vp_1
+            out[row, E], out[row, E + 1], out[row, E + 2] = e_x, e_y, e_1
+            out[row, AROUND], out[row, AROUND + 1], out[row, G], out[row, G_Z] = around_x, around_y, g, g_depth
+            out[row, PULL], out[row, PULL + 1] = pull_x, pull_y
+            for d in range(num_channels):
+                out[row, MOMENTS + d] = v_value[d]
+
+    return backward
+
+
+SUM_THREADS = 256
+
+
+class Saved(NamedTuple):
+    """What the backward pass needs from the forward pass.
+
+    finals [A, 4, 256], orders [A, 2, 256] int32: of each pixel of the active tiles, the planes that `cuda_tile` names;
+    orders count from the tile's first pair, -1 for none. looked_at [A] int32: how many pairs of each tile any pixel
+    blended. bucket_tiles [B] int32: the active tile that each bucket belongs to, -1 for none. kept [B, D + 4, 256]:
+    what each pixel had gathered before a bucket. outputs: image and depth.
+    """
+
+    finals: Tensor
+    orders: Tensor
+    looked_at: Tensor
+    bucket_tiles: Tensor
+    kept: Tensor
+    outputs: tuple[Tensor, Tensor]
+
+
+def composite_discs(
+    discs: Discs, channels: Tensor, bins: TileBins, *, near: float, low_pass: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Saved]:
+    """As `glassplat.kernels.composite.cpu_discs.composite_discs`."""
+    num_channels, tiles, device = channels.shape[2], len(bins.active), channels.device
+    shape = (bins.num_cameras, bins.height, bins.width)
+    image, *flat = (channels.new_zeros(s) for s in ((*shape, num_channels), shape, shape, shape, shape))
+    buckets = len(bins.pair_splats) // BUCKET + tiles
+    alpha, depth, median, distortion = flat
+    saved = Saved(
+        channels.new_empty(tiles, FINALS, PIXELS),
+        torch.empty(tiles, ORDERS, PIXELS, dtype=torch.int32, device=device),
+        torch.empty(tiles, dtype=torch.int32, device=device),
+        torch.full((buckets,), -1, dtype=torch.int32, device=device),
+        channels.new_empty(buckets, KEPT_VALUES + num_channels, PIXELS),
+        # Without their history: it holds this record, and would keep itself alive.
+        (image.detach(), depth.detach()),
+    )
+    composite_discs_forward(REAL_OF[channels.dtype], num_channels)(
+        tiles, PIXELS, *_geometry(discs), channels.view(-1), near, _sharpness(low_pass),
+        bins.pair_splats, bins.tile_offsets, bins.active, *saved[:5], image, *flat,
+    )  # fmt: skip
+    return image, alpha, depth, median, distortion, saved
+
+
+def composite_discs_gradients(
+    discs: Discs, channels: Tensor, bins: TileBins, saved: Saved, v_outputs: Sequence[Tensor],
+    *, near: float, low_pass: float, probed: bool,
+) -> tuple[Tensor | None, ...]:  # fmt: skip
+    """As `glassplat.kernels.composite.cpu_discs.composite_discs_gradients`."""
+    real, (cameras, count, num_channels) = REAL_OF[channels.dtype], channels.shape
+    tiles, size = len(bins.active), cameras * count
+    pulls = channels.new_empty(tiles, num_channels + PULLS, PIXELS)
+    composite_discs_pulls(real, num_channels)(
+        tiles, PIXELS, bins.active, saved.finals, *saved.outputs, *v_outputs, pulls
+    )  # fmt: skip
+    rows = channels.new_zeros(len(bins.pair_splats), MOMENTS + num_channels)
+    composite_discs_backward(real, num_channels)(
+        blocks_for(len(saved.bucket_tiles), WARPS), THREADS, *_geometry(discs), channels.view(-1, num_channels),
+        near, _sharpness(low_pass), bins.width, bins.height, bins.pair_splats, bins.tile_offsets, bins.active,
+        saved.orders.view(-1), saved.looked_at, saved.bucket_tiles, saved.kept.view(-1), pulls.view(-1), rows,
+    )  # fmt: skip
+    sums = channels.new_empty(size, MOMENTS + num_channels)
+    sum_disc_rows(real)(
+        blocks_for(sums.numel(), SUM_THREADS), SUM_THREADS, rows, bins.pair_slots, bins.splat_offsets, sums
+    )  # fmt: skip
+    return _from_sums(sums, discs, num_channels, probed)
+
+
+def _from_sums(sums: Tensor, discs: Discs, num_channels: int, probed: bool) -> tuple[Tensor | None, ...]:
+    """Gradients of each disc from the sums over its pixels; what no pixel shows stays zero, finite or not."""
+    leading, size = discs.opacities.shape, sums.shape[0]
+    by_row = sums[:, :AROUND].unflatten(1, (3, 3))
+    v_maps, alone = by_row[:, :, :2], by_row[:, :, 2:]
+    through_map = torch.where(alone != 0, alone * discs.maps.view(-1, 3, 2), 0).sum(1)
+    v_means = -through_map - sums[:, AROUND:G]
+    gained, opacities = sums[:, G], discs.opacities.view(-1)
+    v_opacities = torch.where(gained != 0, gained / opacities, 0)
+    found = (v_means, v_maps.reshape(size, MAP), v_opacities, sums[:, G_Z], sums[:, MOMENTS:])
+    shaped = [tensor.reshape(*leading, *tensor.shape[1:]) for tensor in found]
+    return (*shaped, sums[:, PULL:MOMENTS].reshape(*leading, 2) if probed else None)
+
+
+def _sharpness(low_pass: float) -> float:
+    """One over the variance of the low-pass."""
+    return 1 / low_pass**2 if low_pass else float("inf")
+
+
+def _geometry(discs: Discs) -> tuple[Tensor, ...]:
+    """What stands for the discs of all cameras: centres, maps, opacities, depths, outlines' centres and conics."""
+    outlines = discs.outlines
+    return (
+        discs.means2d.view(-1, 2),
+        discs.maps.view(-1, MAP),
+        discs.opacities.view(-1),
+        discs.depths.view(-1),
+        outlines.means2d.view(-1, 2),
+        outlines.conics.view(-1, 3),
+    )
+
+
+@cache
+def composite_discs_forward(real: type, num_channels: int = 6) -> Kernel:
+    """Fills the images of the active tiles, and what the backward pass needs."""
+    place, (load, cover) = tile_steps(real).place, disc_tile_steps(real)
+    zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
+    t_min, alpha_max, stopped = real(TRANSMITTANCE_MIN), real(ALPHA_MAX), np.int32(PIXELS)
+
+    @kernel(
+        f"composite_discs_forward_{num_channels}",
+        real,
+        "real2 real2 real1 real1 real2 real2 real1 real real int1 long1 int1 "
+        "real3 int3 int1 int1 real3 real4 real3 real3 real3 real3",
+    )
+    def forward(
+        means, maps, opacities, depths, centers, conics, channels, near, sharpness, pair_splats, tile_offsets, active,
+        finals, orders, looked_at, bucket_tiles, kept, image, alpha, depth, median, distortion,
+    ):  # fmt: skip
+        geometry = cuda.shared.array((PIXELS, COLUMNS), real)
+        reached = cuda.shared.array(PIXELS, np.int32)
+        members = cuda.shared.array(PIXELS, np.int32)
+        most = cuda.shared.array(1, np.int32)
+        sums = cuda.local.array(num_channels, real)
+        n, pixel = cuda.blockIdx.x, cuda.threadIdx.x
+        camera, x0, y0, columns, num_rows = place(active[n], image.shape[2], image.shape[1])
+        column, row = pixel % TILE, pixel // TILE
+        x, y, bit = real(np.int32(column)), real(np.int32(row)), np.int32(1 << row)
+        inside = column < columns and row < num_rows
+        running, last_order, middle_order = np.int32(inside), np.int32(-1), np.int32(-1)
+        t, spread, far, middle, first_seen, total, squares = one, zero, zero, zero, zero, zero, zero
+        for d in range(num_channels):
+            sums[d] = zero
+        if pixel == 0:
+            most[0] = 0
+        start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
+        first_bucket = start // BUCKET + n
+        for first in range(0, stop - start, PIXELS):
+            if not cuda.syncthreads_or(running):
+                break
+            if start + first + pixel < stop:
+                if pixel % BUCKET == 0:
+                    bucket_tiles[first_bucket + (first + pixel) // BUCKET] = n
+                s = pair_splats[start + first + pixel]
+                reached[pixel] = load(
+                    geometry, pixel, s, means, maps, opacities, depths, centers, conics, x0, y0, num_rows
+                )
+                members[pixel] = s
+            cuda.syncthreads()
+            here, group = np.int32(min(PIXELS, stop - start - first)), np.int32(0)
+            while running != 0 and group < here:
+                bucket = first_bucket + (first + group) // BUCKET
+                kept[bucket, KEPT_T, pixel], kept[bucket, KEPT_DEPTH, pixel] = t, far
+                kept[bucket, KEPT_TOTAL, pixel], kept[bucket, KEPT_SQUARES, pixel] = total, squares
+                for d in range(num_channels):
+                    kept[bucket, KEPT_VALUES + d, pixel] = sums[d]
+                i = group
+                group = np.int32(min(group + BUCKET, here))
+                while i < group:
+                    k = np.uint32(i)
+                    if np.int32(reached[k] & bit) != 0:
+                        _, met, e, covered, _ = cover(geometry, k, x, y, near, sharpness)
+                        weight = min(covered, alpha_max) * t
+                        left = t - weight
+                        if covered > zero and left >= t_min:
+                            inverse = e * geometry[k, INVERSE_Z]
+                            if last_order < 0:
+                                first_seen = inverse
+                            apart = inverse - first_seen
+                            spread += weight * ((apart * (one - t) - two * total) * apart + squares)
+                            total += weight * apart
+                            squares += weight * apart * apart
+                            z = met[2] * geometry[k, Z]
+                            far += weight * z
+                            last_order = np.int32(first + i)
+                            if t > half:
+                                middle, middle_order = z, last_order
+                            t = left
+                            for d in range(num_channels):
+                                sums[d] += weight * channels[at(members[k] * num_channels + d)]
+                        elif covered > zero:
+                            i = stopped
+                    i = np.int32(i + 1)
+                if i > stopped:
+                    running = np.int32(0)
+        cuda.syncthreads()
+        cuda.atomic.max(most, 0, np.int32(last_order + 1))
+        cuda.syncthreads()
+        if pixel == 0:
+            looked_at[n] = most[0]
+        finals[n, 0, pixel], finals[n, 1, pixel] = t, first_seen
+        finals[n, 2, pixel], finals[n, 3, pixel] = total, squares
+        orders[n, LAST, pixel], orders[n, MEDIAN, pixel] = last_order, middle_order
+        if inside:
+            alpha[camera, y0 + row, x0 + column], depth[camera, y0 + row, x0 + column] = one - t, far
+            median[camera, y0 + row, x0 + column] = middle
+            distortion[camera, y0 + row, x0 + column] = spread
+            for d in range(num_channels):
+                image[camera, y0 + row, x0 + column, d] = sums[d]
+
+    return forward
+
+
+@cache
+def sum_disc_rows(real: type) -> Kernel:
+    """One thread for each column of each disc: sums its pairs' rows in a fixed order."""
+    zero = real(0.0)
+
+    @kernel("sum_disc_rows", real, "real2 int1 long1 real2")
+    def sum_up(rows, slots, offsets, sums):
+        i, width = cuda.grid(1), rows.shape[1]
+        s, column = i // width, i % width
+        if s >= sums.shape[0]:
+            return
+        total = zero
+        for k in range(offsets[s], offsets[s + 1]):
+            total += rows[slots[k], column]
+        sums[s, column] = total
+
+    return sum_up
