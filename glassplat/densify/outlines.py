@@ -15,8 +15,7 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, normalize
 
 from glassplat.data.view import View
-from glassplat.kernels.color_and_depth import mean_depth
-from glassplat.kernels.composite import composite
+from glassplat.kernels.composite import composite, mean_depth
 from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
 from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.frame import Renderer

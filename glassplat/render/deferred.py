@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from glassplat.kernels.color_and_depth import mean_depth
-from glassplat.kernels.composite import composite
+from glassplat.kernels.composite import composite, mean_depth
 from glassplat.kernels.environment import cube_lookup, shade_environment, surface_channels
 from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS, Projected
 from glassplat.kernels.tiles import bin_tiles

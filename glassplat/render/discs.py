@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from glassplat.kernels.color_and_depth import mean_depth
-from glassplat.kernels.composite import BlendedDiscs, composite_discs
+from glassplat.kernels.composite import BlendedDiscs, composite_discs, mean_depth
 from glassplat.kernels.project import project_discs
 from glassplat.kernels.records import Discs, ProjectedDiscs
 from glassplat.kernels.tiles import bin_tiles

@@ -9,12 +9,9 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from glassplat.kernels.color_and_depth import color_and_depth
-from glassplat.kernels.composite import composite
+from glassplat.kernels.composite import color_and_depth, composite, join_channels
 from glassplat.kernels.fresnel import Fresnel
-from glassplat.kernels.join_channels import join_channels
-from glassplat.kernels.layer_slopes import layer_slopes, slopes_at
-from glassplat.kernels.pane_layers import pane_layers
+from glassplat.kernels.panes import layer_slopes, pane_layers, slopes_at
 from glassplat.kernels.project import GradientSum
 from glassplat.kernels.records import SURFACE_CHANNELS, Deviation, PaneHits, Panes, Projected, Splats
 from glassplat.kernels.tiles import bin_tiles

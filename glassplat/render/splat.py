@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from glassplat.kernels.color_and_depth import mean_depth
-from glassplat.kernels.composite import composite
+from glassplat.kernels.composite import composite, mean_depth
 from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.discs import blended_discs, disc_layers, projected_discs
 from glassplat.render.frame import Frame

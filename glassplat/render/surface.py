@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from glassplat.kernels.color_and_depth import mean_depth
-from glassplat.kernels.composite import composite
+from glassplat.kernels.composite import composite, mean_depth
 from glassplat.kernels.environment import surface_channels
 from glassplat.kernels.panes.reference import ray_grid
 from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, STRENGTH_AT, SURFACE_CHANNELS, Projected

@@ -7,8 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.screen_statistics import Sums, Views, add_views
-from glassplat.kernels.screen_statistics.reference import add_views as reference_add_views
+from glassplat.kernels.screen_statistics import Sums, Views, add_views, add_views_in_torch
 
 
 def no_views(count: int, dtype: torch.dtype = torch.float32) -> Sums:
@@ -47,12 +46,12 @@ def test_agrees_with_its_twin(
 ) -> None:
     views = some_views(cameras, count, dtype, weighted=weighted, direct=direct)
     found, expected = added(views, dtype), no_views(count, dtype)
-    reference_add_views(expected, views)
+    add_views_in_torch(expected, views)
     for _ in range(2):
         for own, wanted in zip(found, expected, strict=True):
             torch.testing.assert_close(own, wanted, rtol=tolerance, atol=tolerance)
         add_views(found, views)
-        reference_add_views(expected, views)
+        add_views_in_torch(expected, views)
 
 
 def test_what_no_view_sees_adds_nothing_whatever_its_gradient() -> None:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from glassplat.data.view import View
-from glassplat.kernels.pane_layers import pane_layers
+from glassplat.kernels.panes import pane_layers
 from glassplat.losses.geometry import depth_deviation_loss
 from glassplat.losses.reflection import gradient_conflict, intensity_departure, mask_loss, tint_departure
 from glassplat.render.frame import Frame

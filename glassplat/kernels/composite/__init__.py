@@ -1,6 +1,4 @@
-"""Front-to-back blending of splats into images: ellipsoids, with a second transmittance for the glass mask, and discs
-(2DGS).
-"""
+"""Front-to-back blending of splats into images: ellipsoids, with a second transmittance for glass, and discs."""
 
 from __future__ import annotations
 
@@ -13,7 +11,15 @@ from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.backend.devices import kernels_for
 from glassplat.kernels.maths.disc import LOW_PASS, MAP
-from glassplat.kernels.records import MOST_CHANNELS, Deviation, Discs, Splats, TileBins, check_tensors
+from glassplat.kernels.records import (
+    LEAST_ALPHA,
+    MOST_CHANNELS,
+    Deviation,
+    Discs,
+    Splats,
+    TileBins,
+    check_tensors,
+)
 
 
 def check_splats(splats: Splats, bins: TileBins) -> None:
@@ -257,3 +263,59 @@ class _CompositeDiscs(torch.autograd.Function):
             near=near, low_pass=low_pass, probed=ctx.needs_input_grad[5],
         )  # fmt: skip
         return (*found, None, None, None, None)
+
+
+def color_and_depth(image: Tensor, alpha: Tensor, background: tuple[float, ...]) -> tuple[Tensor, Tensor]:
+    """Adds a constant background behind blended colours, and divides blended depths by their weight.
+
+        C = sum_i c_i w_i + (1 - alpha) C_b
+        D = (sum_i z_i w_i) / alpha                  (TR-Gaussians, Eq. 4)
+
+    D is 0 where alpha is 1e-6 or less. Differentiable in `image` and `alpha`.
+
+    Args:
+        image: [H, W, 4] blended colours and depths.
+        alpha: [H, W] their weight.
+        background: three numbers.
+
+    Returns:
+        The image [H, W, 3] and the depths [H, W].
+
+    Raises:
+        ValueError: shapes disagree.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
+    """
+    height, width = alpha.shape
+    check_tensors({"image": (image, (height, width, 4)), "alpha": (alpha, (height, width))})
+    colors, total = image[..., :3], image[..., 3]
+    if any(background):
+        # Filled in on the device: a tensor of numbers that came from here would make a GPU wait.
+        behind = torch.stack([torch.full_like(alpha, value) for value in background], dim=-1)
+        colors = colors + (1 - alpha)[..., None] * behind
+    return colors, mean_depth(total, alpha)
+
+
+def mean_depth(depth_sum: Tensor, alpha: Tensor) -> Tensor:
+    """Blended depth (TR-Gaussians, Eq. 4): weighted depth sum over total weight; 0 where nothing is."""
+    return torch.where(alpha > LEAST_ALPHA, depth_sum / alpha.clamp(min=LEAST_ALPHA), 0)
+
+
+def join_channels(colors: Tensor, values: Tensor, more: int = 0) -> Tensor:
+    """Colours and one value more of each splat, as `composite` reads them. Differentiable in both.
+
+    Args:
+        colors: [C, N, 3].
+        values: [C, N].
+        more: how many splats follow that carry zeros.
+
+    Returns:
+        [C, N + more, 4].
+
+    Raises:
+        ValueError: shapes disagree.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
+    """
+    leading = tuple(values.shape)
+    check_tensors({"colors": (colors, (*leading, 3)), "values": (values, leading)})
+    joined = torch.cat([colors, values[..., None]], dim=-1)
+    return torch.nn.functional.pad(joined, (0, 0, 0, more)) if more else joined

@@ -12,11 +12,12 @@ from torch import Tensor
 
 from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.composite.cpu_backward import composite_backward
-from glassplat.kernels.composite.cpu_discs import composite_discs as composite_discs
-from glassplat.kernels.composite.cpu_discs import composite_discs_gradients as composite_discs_gradients
+from glassplat.kernels.composite.cpu_discs import composite_discs, composite_discs_gradients
 from glassplat.kernels.composite.cpu_forward import composite_forward
 from glassplat.kernels.composite.cpu_tile import new_pair_rows, sum_pair_rows
 from glassplat.kernels.records import Deviation, Splats, TileBins
+
+__all__ = ["composite", "composite_discs", "composite_discs_gradients", "composite_gradients"]
 
 
 class Saved(NamedTuple):

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.composite.cuda_backward import PULLS, THREADS, WARPS, composite_backward, composite_pulls
-from glassplat.kernels.composite.cuda_discs import composite_discs as composite_discs
-from glassplat.kernels.composite.cuda_discs import composite_discs_gradients as composite_discs_gradients
+from glassplat.kernels.composite.cuda_discs import composite_discs, composite_discs_gradients
 from glassplat.kernels.composite.cuda_tile import (
     ALIGNMENT,
     BUCKET,
@@ -30,6 +29,8 @@ from glassplat.kernels.composite.cuda_tile import (
 )
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from glassplat.kernels.records import LEAST_ALPHA, REAL_OF, TILE, Deviation, Splats, TileBins
+
+__all__ = ["composite", "composite_discs", "composite_discs_gradients", "composite_gradients"]
 
 
 class Saved(NamedTuple):

@@ -1,4 +1,4 @@
-"""Flat panes: where the camera sees them, and how they blend what is behind them with what they reflect."""
+"""Flat panes: where the camera sees them, and how they blend what is behind with what they reflect."""
 
 from __future__ import annotations
 
@@ -145,3 +145,100 @@ class _BlendPanes(torch.autograd.Function):
         inputs, cotangents = ctx.saved_tensors, [gradient.contiguous() for gradient in gradients]
         kernels = kernels_for("panes", cotangents[0].device)
         return (*kernels.blend_panes_gradients(inputs, ctx.switches, cotangents), None, None, None)
+
+
+@torch.no_grad()
+def pane_layers(pane: Tensor, strength: Tensor) -> tuple[Tensor, Tensor]:
+    """Two images: 1 in the panes' rectangles, and 1 where a pixel and its eight neighbours show the same pane.
+
+    The second is 0 where nothing reflects: on the rim of a pane, and where it is hit and no glass is there. Pixels
+    beyond the border of the image count as those next to them. Not differentiable.
+
+    Args:
+        pane: [H, W] int32, which pane is nearest, -1 for none.
+        strength: [H, W] of the reflection.
+
+    Returns:
+        Both [H, W], of the type of the strength.
+
+    Raises:
+        ValueError: shapes disagree.
+        TypeError: a pane that is not int32, a strength of an unsupported type, or differing devices.
+    """
+    check_tensors({"strength": (strength, tuple(pane.shape))})
+    check_device("pane", pane, "strength", strength)
+    if pane.dtype != torch.int32:
+        raise TypeError(f"pane is {pane.dtype}; expected int32")
+    shown = torch.where(strength > 0, pane, -1)
+    above, along = shown[1:] == shown[:-1], shown[:, 1:] == shown[:, :-1]
+    # Three rows that are each the same throughout, and the same as their neighbours.
+    row = torch.nn.functional.pad(along, (0, 1), value=True) & torch.nn.functional.pad(along, (1, 0), value=True)
+    pair = row[1:] & row[:-1] & above
+    inner = torch.nn.functional.pad(pair, (0, 0, 0, 1), value=True) & torch.nn.functional.pad(
+        pair, (0, 0, 1, 0), value=True
+    )
+    return (pane >= 0).to(strength.dtype), (inner & row & (shown >= 0)).to(strength.dtype)
+
+
+@torch.no_grad()
+def layer_slopes(
+    strength: Tensor, transmission: Tensor, reflection: Tensor, where: Tensor, *, linear: bool
+) -> tuple[Tensor, Tensor]:
+    """The derivatives of Eq. 1 of TR-Gaussians by the transmission and by the reflection, of grey.
+
+    Grey is as bright as the mean of a layer's channels. In linear radiance the derivatives are not 1 - R and R: a weak
+    reflection stands out from a dark transmission, and takes contrast from it. Not differentiable.
+
+    Args:
+        strength: [H, W] R.
+        transmission: [H, W, 3] C_t, sRGB.
+        reflection: [H, W, 3] C_r, sRGB.
+        where: [H, W] bool; elsewhere the derivatives are 1 and 0.
+        linear: blend linear radiance; False blends sRGB values, as the paper does.
+
+    Returns:
+        Two images [H, W].
+
+    Raises:
+        ValueError: shapes disagree.
+        TypeError: tensors of different or unsupported floating-point types, `where` is not bool, or differing devices.
+    """
+    height, width = strength.shape
+    shape = (height, width, 3)
+    check_tensors(
+        {"strength": (strength, shape[:2]), "transmission": (transmission, shape), "reflection": (reflection, shape)}
+    )
+    check_device("where", where, "strength", strength)
+    if where.dtype != torch.bool or where.shape != strength.shape:
+        raise TypeError(f"where is {where.dtype} of shape {tuple(where.shape)}; expected bool of {(height, width)}")
+    kernels = kernels_for("panes", strength.device)
+    layers = (tensor.detach().contiguous() for tensor in (strength, transmission, reflection, where))
+    through, mirrored = kernels.layer_slopes(*layers, linear=linear)
+    return through, mirrored
+
+
+@torch.no_grad()
+def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
+    """What an image of slopes holds at the centres of splats, 1 where they lie before a surface. Not differentiable.
+
+    Args:
+        slopes: [H, W], by the transmission.
+        near: [H, W] depth of the surface, infinite where there is none.
+        means2d: [C, N, 2] centres in pixels; those beyond the image, and NaN, count as at its border.
+        depths: [C, N] of the centres.
+
+    Returns:
+        [C, N].
+
+    Raises:
+        ValueError: shapes disagree.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
+    """
+    size, leading = tuple(slopes.shape), tuple(depths.shape)
+    expected = {"slopes": (slopes, size), "near": (near, size), "means2d": (means2d, (*leading, 2))}
+    check_tensors({**expected, "depths": (depths, leading)})
+    height, width = slopes.shape
+    # Held within the image before the conversion, which infinities would leave to chance.
+    columns, rows = means2d.nan_to_num().unbind(-1)
+    pixels = rows.clamp(0, height - 1).long(), columns.clamp(0, width - 1).long()
+    return torch.where(depths > near[pixels], slopes[pixels], 1.0)

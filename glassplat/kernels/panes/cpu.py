@@ -1,12 +1,14 @@
-"""Panes on the CPU: which one each pixel shows, and their blending.
+"""Panes on the CPU: which one each pixel shows, their blending, and how much of each layer is left.
 
 Rays meet rectangles row by row: everything but one division is affine along a row. Blending takes runs of pixels of one
 row and one pane. A run is first copied into *planes* of one flat buffer, one plane per quantity, at offsets known to
-the compiler; that is what lets it turn the curves of the colour space into vector instructions.
+the compiler; that is what lets it turn the curves of the colour space into vector instructions. Of slopes, greys come
+first, for the same reason.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from functools import cache
 from typing import Any
@@ -452,3 +454,44 @@ def blend_panes_backward(real: type) -> Kernel:
                 v_bases[k] += sums[row, k, 3]
 
     return backward
+
+
+def layer_slopes(
+    strength: Tensor, transmission: Tensor, reflection: Tensor, where: Tensor, *, linear: bool
+) -> tuple[Tensor, Tensor]:
+    """The slopes by the transmission and by the reflection [H, W]; see `glassplat.kernels.panes.layer_slopes`."""
+    through, mirrored = torch.empty_like(strength), torch.empty_like(strength)
+    layers = (tensor.numpy() for tensor in (strength, transmission, reflection, where))
+    layer_slopes_kernel(REAL_OF[strength.dtype])(*layers, linear, through.numpy(), mirrored.numpy())
+    return through, mirrored
+
+
+@functools.cache
+def layer_slopes_kernel(real: type) -> Kernel:
+    """Fills both images [H, W]."""
+    linear_of, linear_slope, encoded, encoded_slope = color_space_maths(real)
+    zero, one, third = real(0.0), real(1.0), real(1.0 / 3.0)
+
+    @kernel("layer_slopes", real)
+    def slopes(strength, transmission, reflection, where, linear, through, mirrored):
+        height, width = strength.shape
+        for row in prange(height):
+            greys: NDArray[Any] = np.empty((2, width), real)
+            for x in range(width):
+                t, r = transmission[row, x], reflection[row, x]
+                greys[0, x] = (t[0] + t[1] + t[2]) * third
+                greys[1, x] = (r[0] + r[1] + r[2]) * third
+            behind, mirror_image, share = greys[0], greys[1], strength[row]
+            shown, out_through, out_mirrored = where[row], through[row], mirrored[row]
+            for x in range(width):
+                by_behind, by_mirror_image = one - share[x], share[x]
+                if linear:
+                    lit, bright = linear_of(behind[x]), linear_of(mirror_image[x])
+                    light = lit + share[x] * (bright - lit)
+                    slope = encoded_slope(light, encoded(light))
+                    by_behind *= slope * linear_slope(behind[x], lit)
+                    by_mirror_image *= slope * linear_slope(mirror_image[x], bright)
+                out_through[x] = by_behind if shown[x] else one
+                out_mirrored[x] = by_mirror_image if shown[x] else zero
+
+    return slopes

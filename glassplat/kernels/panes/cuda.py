@@ -15,7 +15,11 @@ from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.color import color_space_maths
 from glassplat.kernels.maths.pane import pane_maths
+from glassplat.kernels.panes.reference import layer_slopes
 from glassplat.kernels.records import REAL_OF, TILE, PaneHits
+
+# Of slopes, a few operations on an image, the definition is fast enough.
+__all__ = ["blend_panes", "blend_panes_gradients", "layer_slopes", "pane_hits"]
 
 PIXELS = TILE * TILE
 

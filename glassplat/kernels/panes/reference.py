@@ -101,3 +101,24 @@ def blend_panes(
     else:
         mixed = transmission + share * (reflection - transmission)
     return BlendedPanes(torch.where(share > 0, mixed, transmission), reflection, strength)
+
+
+GREY = 0.5
+"""Any strength and light at which the derivatives are finite, in place of what is left out."""
+
+
+def layer_slopes(
+    strength: Tensor, transmission: Tensor, reflection: Tensor, where: Tensor, *, linear: bool
+) -> tuple[Tensor, Tensor]:
+    """See `glassplat.kernels.panes.layer_slopes`; left-out pixels are computed too, as no GPU is asked which."""
+    layers = (strength, transmission.mean(dim=-1), reflection.mean(dim=-1))
+    share, *greys = (torch.where(where, layer.detach(), GREY) for layer in layers)
+    with torch.enable_grad():
+        behind, mirror_image = (grey.requires_grad_() for grey in greys)
+        if linear:
+            light = (1 - share) * linear_from_srgb(behind) + share * linear_from_srgb(mirror_image)
+            image = srgb_from_linear(light)
+        else:
+            image = (1 - share) * behind + share * mirror_image
+        through, mirrored = torch.autograd.grad(image.sum(), (behind, mirror_image))
+    return torch.where(where, through, 1), torch.where(where, mirrored, 0)

@@ -30,11 +30,12 @@ from glassplat.kernels.backend.cpu_vector import (
     vector_kind,
 )
 from glassplat.kernels.maths.projection import screen_maths
-from glassplat.kernels.project.cpu_discs import project_discs as project_discs
-from glassplat.kernels.project.cpu_discs import project_discs_gradients as project_discs_gradients
+from glassplat.kernels.project.cpu_discs import project_discs, project_discs_gradients
 from glassplat.kernels.project.cpu_lanes import COLUMNS, LANES, gather, gather_shapes, gradient_steps, lane_steps
 from glassplat.kernels.project.steps import CHUNK, LENS_VALUES, camera_sums, culling, view_steps
 from glassplat.kernels.records import REAL_OF
+
+__all__ = ["project", "project_discs", "project_discs_gradients", "project_gradients"]
 
 OWN, SHARED = 11, 12
 """Gradients of a Gaussian without its coefficients, and what it adds to those of a camera."""

@@ -15,13 +15,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from glassplat.densify import default as densify
 from glassplat.kernels.backend import devices
-from glassplat.kernels.color_and_depth import reference as color_twin
 from glassplat.kernels.gradient_conflict import reference as conflict_twin
-from glassplat.kernels.harmonic_energy import reference as energy_twin
-from glassplat.kernels.join_channels import reference as channels_twin
-from glassplat.kernels.layer_slopes import reference as slopes_twin
-from glassplat.kernels.pane_layers import reference as panes_twin
-from glassplat.kernels.screen_statistics import reference as statistics_twin
+from glassplat.kernels.harmonic_energy import _EnergyInTorch
+from glassplat.kernels.panes.reference import layer_slopes
+from glassplat.kernels.screen_statistics import add_views_in_torch
 from glassplat.losses import parsimony, reflection
 from glassplat.render import planar
 from glassplat.scene import transfer
@@ -120,11 +117,7 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch, waits: Waits) -> None:
     monkeypatch.setattr(devices, "_module", counted)
     # The operations that are PyTorch's own on a GPU.
     monkeypatch.setattr(reflection, "shared_edges", conflict_twin.gradient_conflict)
-    monkeypatch.setattr(parsimony, "harmonic_energy", energy_twin.harmonic_energy)
-    monkeypatch.setattr(planar, "layer_slopes", slopes_twin.layer_slopes)
-    monkeypatch.setattr(planar, "slopes_at", slopes_twin.slopes_at)
-    monkeypatch.setattr(planar, "color_and_depth", color_twin.color_and_depth)
-    monkeypatch.setattr(planar, "join_channels", channels_twin.join_channels)
-    monkeypatch.setattr(planar, "pane_layers", panes_twin.pane_layers)
-    monkeypatch.setattr(densify, "add_views", statistics_twin.add_views)
+    monkeypatch.setattr(parsimony, "harmonic_energy", _EnergyInTorch.apply)
+    monkeypatch.setattr(planar, "layer_slopes", layer_slopes)
+    monkeypatch.setattr(densify, "add_views", add_views_in_torch)
     monkeypatch.setattr(transfer, "waits", lambda device: True)

@@ -1,0 +1,127 @@
+"""What the views of a step saw of each Gaussian, added up for densification."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numba import prange
+from torch import Tensor
+
+from glassplat.kernels.backend.cpu import Kernel, kernel
+from glassplat.kernels.records import REAL_OF, check_tensors
+
+CHUNK = 1024
+"""Gaussians per task."""
+
+
+class Sums(NamedTuple):
+    """What is added up for each of N Gaussians, in two rows: over all views, and over those that see it directly.
+
+    gradient_sum [2, N]: norms of the gradient of the centre; pull_sum [2, N]: of the probe's; view_count [2, N]: how
+    many views; max_radius [N]: largest radius, as a share of the longer image side.
+    """
+
+    gradient_sum: Tensor
+    pull_sum: Tensor
+    view_count: Tensor
+    max_radius: Tensor
+
+
+class Views(NamedTuple):
+    """Views of one image size, and the gradients of a loss in them.
+
+    v_means2d, v_probe, radii [C, N, 2]: gradients of centres and probe, and half extents, in pixels, 0 where a view
+    does not see the Gaussian. weight: what a view counts, a number or a scalar for all or [C, N] for each Gaussian.
+    direct: whether the views see the Gaussians themselves, and not their mirror images.
+    """
+
+    v_means2d: Tensor
+    v_probe: Tensor
+    radii: Tensor
+    width: int
+    height: int
+    weight: float | Tensor = 1.0
+    direct: bool = True
+
+
+@torch.no_grad()
+def add_views(sums: Sums, views: Views) -> None:
+    """Adds the views of one step to the sums, in place.
+
+    Gradients are taken to normalised device coordinates, in which the image spans [-1, 1] both ways: a shift by one
+    pixel is 2 / width there, so gradients per pixel are multiplied by width / 2 and height / 2.
+
+    Args:
+        sums: the record so far; contiguous float32 or float64.
+        views: of the same floating-point type.
+
+    Raises:
+        ValueError: shapes disagree.
+        TypeError: tensors of different or unsupported floating-point types, or on different devices.
+    """
+    cameras, count, _ = views.radii.shape
+    expected: dict[str, tuple[Tensor, tuple[int, ...]]] = {"max_radius": (sums.max_radius, (count,))}
+    expected |= {name: (getattr(sums, name), (2, count)) for name in ("gradient_sum", "pull_sum", "view_count")}
+    expected |= {name: (getattr(views, name), (cameras, count, 2)) for name in ("v_means2d", "v_probe", "radii")}
+    if isinstance(views.weight, Tensor):
+        expected["weight"] = (views.weight, (cameras, count) if views.weight.dim() else ())
+    check_tensors(expected)
+    if sums.max_radius.device.type != "cpu":
+        # On a GPU these few sums over Gaussians are no bottleneck, so that there they stay PyTorch's.
+        add_views_in_torch(sums, views)
+        return
+    real = REAL_OF[sums.max_radius.dtype]
+    weight = np.ascontiguousarray(np.atleast_2d(views.weight), real)
+    gradients = (tensor.detach().contiguous().numpy() for tensor in views[:3])
+    add_views_kernel(real)(
+        *(tensor.numpy() for tensor in sums), *gradients, weight,
+        views.width, views.height, 1 + views.direct,
+    )  # fmt: skip
+
+
+@torch.no_grad()
+def add_views_in_torch(sums: Sums, views: Views) -> None:
+    """The definition of `add_views`, for tensors that are checked."""
+    visible = (views.radii > 0).all(dim=-1)
+    rows = slice(None) if views.direct else slice(0, 1)
+    for total, gradient in ((sums.gradient_sum, views.v_means2d), (sums.pull_sum, views.v_probe)):
+        across, down = gradient[..., 0] * (views.width / 2), gradient[..., 1] * (views.height / 2)
+        total[rows] += torch.where(visible, torch.hypot(across, down), 0).sum(dim=0)
+    sums.view_count[rows] += (views.weight * visible.to(views.radii.dtype)).sum(dim=0)
+    shares = torch.where(visible, views.radii.amax(dim=-1) / max(views.width, views.height), 0)
+    torch.maximum(sums.max_radius, shares.amax(dim=0).to(sums.max_radius.dtype), out=sums.max_radius)
+
+
+@functools.cache
+def add_views_kernel(real: type) -> Kernel:
+    """Adds to the first `rows` rows of the sums; `weight` is [C, N], or [1, 1] where it is the same for all."""
+    half, zero = real(0.5), real(0.0)
+
+    @kernel("screen_statistics", real)
+    def add(  # type: ignore[no-untyped-def]
+        gradient_sum, pull_sum, view_count, max_radius, v_means2d, v_probe, radii, weight, width, height, rows
+    ):  # fmt: skip
+        cameras, count = radii.shape[0], radii.shape[1]
+        right, down, longer = half * real(width), half * real(height), real(max(width, height))
+        for chunk in prange((count + CHUNK - 1) // CHUNK):
+            for n in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
+                gradient = pull = views = radius = zero
+                for c in range(cameras):
+                    if radii[c, n, 0] > zero and radii[c, n, 1] > zero:
+                        x, y = right * v_means2d[c, n, 0], down * v_means2d[c, n, 1]
+                        gradient += math.sqrt(x * x + y * y)
+                        x, y = right * v_probe[c, n, 0], down * v_probe[c, n, 1]
+                        pull += math.sqrt(x * x + y * y)
+                        views += weight[c, n] if weight.size > 1 else weight[0, 0]
+                        radius = max(radius, radii[c, n, 0], radii[c, n, 1])
+                for row in range(rows):
+                    gradient_sum[row, n] += gradient
+                    pull_sum[row, n] += pull
+                    view_count[row, n] += views
+                max_radius[n] = max(max_radius[n], radius / longer)
+
+    return add
