@@ -25,7 +25,5 @@ def renderer_with(renderer: Renderer, layers: Sequence[str]) -> Renderer:
     if isinstance(renderer, Traced):
         surroundings = renderer.surroundings or "surroundings" in layers
         return replace(renderer, surroundings=surroundings, tint="tint" in layers)
-    if isinstance(renderer, Planar) and renderer.curved is not None and "surroundings" in layers:
-        renderer = replace(renderer, curved=replace(renderer.curved, surroundings=True))
     renderer = with_photographer(renderer, "beside") if PHOTOGRAPHED in layers else renderer
     return WithNormals(renderer) if "normal" in layers and isinstance(renderer, Planar | Splat) else renderer

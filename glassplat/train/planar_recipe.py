@@ -21,9 +21,6 @@ from glassplat.densify.options import DefaultDensify, McmcDensify
 from glassplat.init.plane_options import PlaneFit
 from glassplat.kernels.fresnel import Fresnel
 from glassplat.render.choices import Blend
-from glassplat.train.mirror_options import (
-    CurvedMirrors,
-)
 from glassplat.train.photograph_options import PhotoExposure, Photographer, PoseRefinement
 from glassplat.train.rates import PUBLISHED_ITERATIONS, GaussianRates, PlaneRates
 from glassplat.train.rhythm import Rhythm, Strategy
@@ -132,7 +129,6 @@ class PlanarRecipe:
         exposure: whether the exposure of each photograph is learned.
         poses: whether the camera of each photograph is corrected.
         photographer: whether panes show who took the photographs.
-        curved: whether things that are not flat mirror as well.
     """
 
     method: ClassVar[str] = "planar"
@@ -170,7 +166,6 @@ class PlanarRecipe:
     exposure: PhotoExposure = field(default_factory=PhotoExposure)
     poses: PoseRefinement = field(default_factory=PoseRefinement)
     photographer: Photographer = field(default_factory=Photographer)
-    curved: CurvedMirrors = field(default_factory=CurvedMirrors)
 
     @classmethod
     def paper(cls) -> PlanarRecipe:
@@ -194,10 +189,6 @@ class PlanarRecipe:
             densify=DefaultDensify.published(),
             mcmc=McmcDensify.published(),
         )
-
-    def contradiction(self) -> str | None:
-        """What is wrong with the options together, if anything."""
-        return self.curved.contradiction()
 
     def initialise(self, dataset: Dataset) -> Scene:
         """The first scene: one Gaussian per point, no planes yet.

@@ -20,7 +20,6 @@ from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, GrowSh, PerturbOpacity, ResetOpacity
-from glassplat.train.curved_mirrors import curved_mirrors_learnt, with_curved_mirrors
 from glassplat.train.photo_exposure import exposures_begun, exposures_learnt
 from glassplat.train.photographer_entry import photographer_learnt
 from glassplat.train.planar_recipe import PlanarRecipe, ReflectionWeights
@@ -58,11 +57,6 @@ def _lack_of_masks(dataset: Dataset) -> str:
 
 def finished_renderer(recipe: PlanarRecipe) -> Planar:
     """The renderer of the finished scene, with all its layers."""
-    return with_curved_mirrors(recipe.curved, _of_panes(recipe))
-
-
-def _of_panes(recipe: PlanarRecipe) -> Planar:
-    """The renderer of panes, without curved mirrors."""
     return Planar(
         recipe.background or BLACK,
         fresnel=recipe.fresnel,
@@ -101,7 +95,6 @@ def stages_of(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERA
     else:
         stages = (initialisation, _adjustment(recipe, second, entry), _joint(recipe, third))
     stages = photographer_learnt(recipe.photographer, stages, recipe.densify, seed)
-    stages = curved_mirrors_learnt(recipe.curved, stages, recipe.rhythm.sh)
     return poses_learnt(recipe.poses, exposures_learnt(recipe.exposure, stages))
 
 
@@ -198,7 +191,7 @@ def _joint_start(recipe: PlanarRecipe) -> float:
 
 def _training_renderer(recipe: PlanarRecipe, gradient: str) -> Planar:
     return replace(
-        _of_panes(recipe),
+        finished_renderer(recipe),
         reflection_gradient="all" if gradient == "all" else "planes",
         deviation=recipe.weights.depth != 0,
         deviation_depth_gradient=recipe.moving_mean,
