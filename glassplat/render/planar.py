@@ -41,7 +41,6 @@ from glassplat.render.seen_panes import (
     panes_in_camera,
     seen_panes,
 )
-from glassplat.render.uneven_glass import in_uneven_glass
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
@@ -212,7 +211,6 @@ class Planar:
         if self.reflection_gradient == "planes":
             primary, total = detached(scene.primary), GradientSum()
         projected = project_mirrored(primary, camera, seen, near=NEAR_PER_EXTENT * scene.extent, total=total)
-        projected = in_uneven_glass(projected, seen, camera)
         # By how much it departs from 1: what is behind all Gaussians has 0 then, and needs no blending.
         gain = torch.expm1(primary.channels["log_intensity"])[None].expand(len(seen.planes), -1)
         channels = join_channels(projected.colors, gain)
@@ -220,7 +218,6 @@ class Planar:
         screen: tuple[ScreenPass, ...] = (screen_pass("primary", projected, direct=False),) if probed else ()
         if self.photographer == "present" and len(scene.photographer):
             body = project_photographer(scene, camera, seen, near=NEAR_PER_EXTENT * scene.extent)
-            body = in_uneven_glass(body, seen, camera)
             # A body is as bright as it is: an intensity of its own would be a second factor on its colours.
             plain = torch.nn.functional.pad(body.colors, (0, channels.shape[-1] - 3))
             channels = torch.cat([channels, plain], dim=1)

@@ -45,7 +45,6 @@ Switch = Literal[
     "culling",
     "hurry-found",
     "tint",
-    "waves",
 ]
 Ablated = Literal["planar", "deferred", "traced"]
 
@@ -81,10 +80,6 @@ def _without_averaging(recipe: PlanarRecipe) -> PlanarRecipe:
 
 def _with_published_rates(recipe: PlanarRecipe) -> PlanarRecipe:
     return replace(recipe, rates=replace(recipe.rates, short_run_power=0.0))
-
-
-def _with_waves(recipe: PlanarRecipe) -> PlanarRecipe:
-    return replace(recipe, waves=replace(recipe.waves, learn=True))
 
 
 Reflective = TypeVar("Reflective", DeferredRecipe, TracedRecipe)
@@ -128,7 +123,6 @@ PLANAR: dict[Switch, Ablation] = {
     "calm-colors": Ablation("harmonics left free (the paper's)", lambda r: replace(r, view_dependence_weight=0.0)),
     "averaging": Ablation("last step, not the mean of a pass", _without_averaging),
     "tint": Ablation("with a transmittance of each pane for red, green and blue", lambda r: replace(r, tint=True)),
-    "waves": Ablation("with heights of uneven glass", _with_waves),
     "short-run-rates": Ablation("learning rates as published, however short the run", _with_published_rates),
 }
 """The first seven are the rows of TR-Gaussians' Table IV, the others are parts that the paper does not ablate."""

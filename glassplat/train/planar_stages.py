@@ -13,7 +13,6 @@ from glassplat.losses.reflection import (
     intensity_departure,
     mask_loss,
     tint_departure,
-    unevenness,
 )
 from glassplat.losses.term import LossTerm, weighted
 from glassplat.render.planar import Planar
@@ -78,7 +77,6 @@ def stages_of(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERA
         fixed_mirrors=recipe.fixed_mirrors,
         seed_reflections=recipe.seed_reflections,
         tint=recipe.tint,
-        heights=recipe.waves.heights if recipe.waves.learn else 0,
     )
     initialisation = Stage(
         name="1 initialisation",
@@ -132,8 +130,7 @@ def _joint(recipe: PlanarRecipe, share: float) -> Stage:
         rates=recipe.rates.of("primary")
         | recipe.rates.of("glass")
         | recipe.plane_rates.of(recipe.plane_rates.joint_factor)
-        | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {})
-        | ({"planes.heights": Rate(recipe.waves.rate, per_extent=True)} if recipe.waves.learn else {}),
+        | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {}),
         actions=(
             *population.edits,
             GrowSh(Every(recipe.rhythm.sh)),
@@ -154,10 +151,7 @@ def _glass_motions(recipe: PlanarRecipe) -> tuple[Motion, ...]:
 
 def _joint_terms(recipe: PlanarRecipe, population: Population) -> tuple[LossTerm, ...]:
     image = image_terms(recipe.ssim_weight, recipe.view_dependence_weight)
-    glass = weighted(
-        LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, tint_departure),
-        LossTerm("waves", recipe.waves.weight if recipe.waves.learn else 0.0, unevenness),
-    )
+    glass = weighted(LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, tint_departure))
     return (*image, *reflection_terms(recipe.weights), *glass, *population.terms)
 
 
