@@ -13,7 +13,6 @@ Layer = Literal[
     "without_panes",
     "reflection",
     "strength",
-    "tint",
     "mask",
     "depth",
     "alpha",
@@ -28,8 +27,8 @@ Layer = Literal[
 LAYERS: dict[str, tuple[Layer, ...]] = {
     "splat": ("rgb", "normal", "depth", "alpha"),
     "planar": ("rgb", "transmission", "without_panes", "reflection", "strength", "mask", "normal", "depth", "alpha"),
-    "deferred": ("rgb", "base", "reflection", "strength", "tint", "normal", "environment", "depth", "alpha"),
-    "traced": ("rgb", "base", "reflection", "strength", "tint", "normal", "surroundings", "depth", "alpha"),
+    "deferred": ("rgb", "base", "reflection", "strength", "normal", "environment", "depth", "alpha"),
+    "traced": ("rgb", "base", "reflection", "strength", "normal", "surroundings", "depth", "alpha"),
 }
 """What each method renders that is worth looking at; its frames hold more for the losses."""
 

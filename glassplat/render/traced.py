@@ -21,7 +21,6 @@ from glassplat.render.rasterize import (
     over_background,
 )
 from glassplat.render.surface import Surface, reflected_rays, seen_surface, view_directions
-from glassplat.render.tint import tint_layer
 from glassplat.scene.activations import SH_ZERO
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
@@ -43,13 +42,11 @@ class Traced:
     The scene's Gaussians are discs, as in the paper, or ellipsoids, whose n_i is the shortest axis, turned to the
     camera. c_ref is what the ray from x along d_ref meets of the scene's `surroundings`, a set of Gaussians of their
     own, and behind these the `environment` where the scene has one (not in the paper), else the background. Without
-    surroundings it is the environment alone. Colours are sRGB, as in the paper. Where the Gaussians have a tint
-    (`scene/tint.py`, not in the paper), red, green and blue have a strength each in place of beta.
+    surroundings it is the environment alone. Colours are sRGB, as in the paper.
 
     Layers: `base`, `reflection` [H, W, 3]; `normal` [H, W, 3] in world axes, blended and not normalised; `strength`,
     `depth`, `alpha` [H, W], of discs also `median_depth` and `distortion`; `surroundings` [H, W, 3], with the
-    environment those behind each pixel, if asked for; `tint` [H, W, 3], the strengths of red, green and blue as
-    multiples of beta, if there are such or if asked for.
+    environment those behind each pixel, if asked for.
 
     Attributes:
         background: colour behind everything, also behind surroundings without an environment, sRGB.
@@ -59,7 +56,6 @@ class Traced:
             reflect.
         joint: False keeps the reflection's gradient from the surfaces (Table 4, ablation).
         surroundings: also render the layer `surroundings`.
-        tint: also render the layer `tint` of reflections without colour, which are white.
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -67,7 +63,6 @@ class Traced:
     faintest: float = INVISIBLE
     joint: bool = True
     surroundings: bool = False
-    tint: bool = False
 
     def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are.
@@ -80,8 +75,6 @@ class Traced:
         surface = seen_surface(scene, camera, background=self.background, probed=probed)
         rgb, reflection, places = self._shaded(scene, camera, surface)
         layers = surface.layers() | {"reflection": reflection}
-        if self.tint:
-            layers.setdefault("tint", tint_layer(surface.strength, None))
         if self.surroundings:
             layers["surroundings"] = self.behind(scene, camera)
         return Frame(
@@ -106,7 +99,7 @@ class Traced:
         reflection, mirrors = self._elsewhere(scene, camera, surface, chosen)
         reflection = reflection.index_put(torch.where(chosen), colors)
         strength = surface.strength[..., None]
-        share = torch.where(mirrors[..., None], strength if surface.excess is None else strength + surface.excess, 0)
+        share = torch.where(mirrors[..., None], strength, 0)
         return (1 - share) * surface.base + share * reflection, reflection, places
 
     def _mirrors_near(self, scene: Scene, surface: Surface) -> Tensor:

@@ -133,7 +133,6 @@ DEFERRED: dict[Switch, Ablation] = {
     "deferred-shading": Ablation("forward shading", lambda r: replace(r, shading="forward"), -6.02),
     "monocular-normals": Ablation("w/o estimated normals", _without_estimated_normals),
     "coarse-to-fine": Ablation("w/o coarse-to-fine environment", lambda r: replace(r, first_texels=r.texels)),
-    "tint": Ablation("with a strength for each of red, green and blue", lambda r: replace(r, tint=True)),
     "strength-price": Ablation("strength without a price (the paper's)", lambda r: replace(r, strength_weight=0.0)),
 }
 """The rows of 3DGS-DR's Table 5 and its forward variant (Table 1, `ball`), and what the paper does not have."""
@@ -148,7 +147,6 @@ TRACED: dict[Switch, Ablation] = {
     "copied-surroundings": Ablation("surroundings spread over the box (the paper's)", _spread_over_the_box),
     "found-mirrors": Ablation("strengths that grow from nothing (the paper's)", _without_search),
     "normal-consistency": Ablation("w/o normal consistency", lambda r: replace(r, consistency_weight=0.0)),
-    "tint": Ablation("with a strength for each of red, green and blue", lambda r: replace(r, tint=True)),
     "hurry-found": Ablation("published rates after propagation", lambda r: replace(r, hurry_found=False)),
     "culling": Ablation("rays wherever anything reflects", lambda r: replace(r, least_strength=0.0)),
 }
