@@ -1,4 +1,4 @@
-"""The command line: `glassplat prepare | annotate | train | eval | render | dereflect | export | info | demo | bench`.
+"""The command line: `glassplat prepare | annotate | train | eval | render | dereflect | export | info | demo`.
 
 A command's module is imported when the command is chosen, and nothing before that which takes long: the list of
 commands appears at once, and Ctrl-C works from the beginning. What does a command's work, and PyTorch with it, is
@@ -73,11 +73,6 @@ COMMANDS = {
         "measuring.demo",
         "Demo",
         "Train planar and splat on the bundled showcase and compare them; goes on where it was interrupted.",
-    ),
-    "bench": Listed(
-        "measuring.bench",
-        "Bench",
-        "Compare methods over scenes or in a given time, or the parts of a method with each other.",
     ),
 }
 

@@ -19,7 +19,6 @@ PARTS = {
     "transmission": "behind the glass",
     "base": "its own colour",
     "reflection": "what it reflects",
-    "curved_reflection": "what curved things mirror",
     "normal": "normals",
 }
 

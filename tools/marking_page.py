@@ -28,7 +28,6 @@ from PIL import Image
 
 from glassplat.annotate.server import AnnotationServer
 from glassplat.annotate.session import opened_session
-from glassplat.suggest.suggestion import Suggestion
 from tools.browser import Browser
 
 Places = Sequence[Any] | np.ndarray
@@ -115,11 +114,9 @@ class MarkingPage:
 
 
 @contextmanager
-def marking_page(
-    capture: Path, *, width: int = 1400, height: int = 900, suggestions: Sequence[Suggestion] = ()
-) -> Iterator[MarkingPage]:
-    """The page of a capture, open in a browser, with panes that it proposes."""
-    with AnnotationServer(opened_session(capture, lambda _: suggestions), 0) as server:
+def marking_page(capture: Path, *, width: int = 1400, height: int = 900) -> Iterator[MarkingPage]:
+    """The page of a capture, open in a browser."""
+    with AnnotationServer(opened_session(capture), 0) as server:
         thread = Thread(target=server.serve_forever, args=(0.02,))
         thread.start()
         try:

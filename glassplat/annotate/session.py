@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
@@ -18,7 +17,6 @@ from glassplat.annotate.document import PLACE, MarkedPane, parsed_document, read
 from glassplat.annotate.grab import grabbed
 from glassplat.annotate.outline import seen_outline
 from glassplat.annotate.pane_fit import Marks, PaneFit, TooFewMarksError, fitted_pane
-from glassplat.annotate.proposals import proposals
 from glassplat.annotate.results import earlier_masks, write_results
 from glassplat.annotate.view_advice import first_view, second_views, settling_views
 from glassplat.data.dataset import Dataset, load_dataset
@@ -27,7 +25,6 @@ from glassplat.data.view import View
 from glassplat.files.fields import Field, Items, Whole, checked
 from glassplat.files.folders import check_folder
 from glassplat.scene.eye import Eye
-from glassplat.suggest.suggestion import Suggestion
 
 Array = NDArray[np.float64]
 
@@ -61,12 +58,10 @@ class Session:
         root: the capture's folder.
         views: all views, by name.
         eyes: their cameras.
-        suggestions: panes that the page proposes.
     """
 
-    def __init__(self, dataset: Dataset, suggestions: Sequence[Suggestion] = ()) -> None:
+    def __init__(self, dataset: Dataset) -> None:
         self.root = dataset.root
-        self.suggestions = suggestions
         self.views: tuple[View, ...] = tuple(sorted((*dataset.train, *dataset.test), key=lambda view: view.name))
         self.eyes = [Eye.of(view.camera) for view in self.views]
         points = dataset.points.positions.double().numpy() if dataset.measured_points else np.zeros((0, 3))
@@ -91,13 +86,7 @@ class Session:
             ],
             "first": first_view(self.eyes, self._points),
             "document": self._document,
-            "suggestions": self._proposals(),
         }
-
-    def _proposals(self) -> list[dict[str, Any]]:
-        """The suggestions that were not taken yet, for the page."""
-        known = [self.solve(pane).fit for pane in parsed_document(self._document, "the document")]
-        return proposals(self.suggestions, [fit.shape for fit in known if fit is not None], self.views, self.eyes)
 
     def picture(self, number: int, longest: int) -> bytes:
         """A photograph as JPEG, without distortion, reduced to `longest` pixels.
@@ -257,12 +246,11 @@ def _places(eye: Eye, corners: Array) -> list[list[float] | None]:
     return [place if depth > 0 else None for place, depth in zip(places, eye.in_camera(corners)[:, 2], strict=True)]
 
 
-def opened_session(root: Path, suggest: Callable[[Dataset], Sequence[Suggestion]] = lambda _: ()) -> Session:
+def opened_session(root: Path) -> Session:
     """The session of a capture.
 
     Args:
         root: folder of the capture.
-        suggest: looks for panes to propose.
 
     Raises:
         InputError: it cannot be read, or nothing may be written in it.
@@ -270,4 +258,4 @@ def opened_session(root: Path, suggest: Callable[[Dataset], Sequence[Suggestion]
     dataset = load_dataset(root)
     check_folder(root)
     earlier_masks(root)
-    return Session(dataset, suggest(dataset))
+    return Session(dataset)

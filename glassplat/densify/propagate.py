@@ -15,44 +15,33 @@ from glassplat.scene.gaussians import Gaussians
 
 @torch.no_grad()
 def normals_propagated(
-    options: NormalPropagation, gaussians: Gaussians, moments: Moments, where: Tensor | None = None
+    options: NormalPropagation, gaussians: Gaussians, moments: Moments
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
-    """Raised opacities and strengths, and reflective Gaussians grown; what changed forgets its moments.
-
-    `where` [N] bool leaves the others as they are; None leaves none.
-    """
+    """Raised opacities and strengths, and reflective Gaussians grown; what changed forgets its moments."""
     if not options.propagates:
         return gaussians, dict(moments)
-    where = torch.ones_like(gaussians.logit_opacities, dtype=torch.bool) if where is None else where
     opacities = gaussians.logit_opacities.clamp(min=logit(options.least_opacity))
     strengths = gaussians.channels["logit_strength"].clamp(min=logit(options.least_strength))
-    grows = where & (strengths >= logit(options.reflective))
+    grows = strengths >= logit(options.reflective)
     log_scales = gaussians.log_scales + math.log(options.growth) * (grows[:, None] & _within_surface(gaussians))
     changed = {
-        "logit_opacities": torch.where(where, opacities, gaussians.logit_opacities),
-        "logit_strength": torch.where(where, strengths, gaussians.channels["logit_strength"]),
+        "logit_opacities": opacities,
+        "logit_strength": strengths,
         "log_scales": log_scales,
     }
-    return gaussians.with_tensors(changed), forget(moments, [f"primary.{name}" for name in changed], where)
+    everything = torch.ones_like(grows)
+    return gaussians.with_tensors(changed), forget(moments, [f"primary.{name}" for name in changed], everything)
 
 
 @torch.no_grad()
 def colors_disturbed(
-    options: NormalPropagation,
-    gaussians: Gaussians,
-    moments: Moments,
-    generator: torch.Generator,
-    where: Tensor | None = None,
+    options: NormalPropagation, gaussians: Gaussians, moments: Moments, generator: torch.Generator
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
-    """Noise on the constant colour of what does not reflect yet, which hinders it from explaining reflections.
-
-    `where` [N] bool leaves the others as they are; None leaves none.
-    """
+    """Noise on the constant colour of what does not reflect yet, which hinders it from explaining reflections."""
     if options.sabotage == 0:
         return gaussians, dict(moments)
     unit = torch.rand(gaussians.sh[:, 0].shape, generator=generator, device=gaussians.sh.device)
     dull = gaussians.channels["logit_strength"] <= logit(options.sabotaged)
-    dull = dull if where is None else dull & where
     sh = gaussians.sh.clone()
     sh[:, 0] += torch.where(dull[:, None], options.sabotage * (2 * unit - 1) / SH_ZERO, 0)
     return gaussians.with_tensors({"sh": sh}), forget(moments, ["primary.sh"], dull)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from glassplat.data.view import View
-from glassplat.render.contribution import contributions, gathered
+from glassplat.render.contribution import contributions
 from glassplat.render.frame import Frame, Renderer
 from glassplat.scene.activations import SH_ZERO, logit
 from glassplat.scene.scene import Scene
@@ -91,16 +91,8 @@ def residual_spreads(scene: Scene, views: Sequence[View], renderer: Renderer) ->
 
 
 def shown_and_residual(scene: Scene, view: View, renderer: Renderer) -> tuple[Tensor, Tensor]:
-    """[N] what a view shows of each primary Gaussian, in pixels, and [N, 3] photograph minus render over these.
-
-    What is seen through a pane counts by what the pane lets through; mirror images do not count.
-    """
-    if not len(scene.planes):
-        return contributions(scene, view.camera), residual_sums(scene, view, renderer)
-    frame = renderer(scene, view.camera)
-    direct = 1 - frame.layers["share"][..., None]
-    sums = gathered(scene, view.camera, torch.cat([direct, direct * residual(frame, view, scene)], dim=-1))
-    return sums[:, 0], sums[:, 1:]
+    """[N] what a view shows of each primary Gaussian, in pixels, and [N, 3] photograph minus render over these."""
+    return contributions(scene, view.camera), residual_sums(scene, view, renderer)
 
 
 def residual_sums(scene: Scene, view: View, renderer: Renderer) -> Tensor:

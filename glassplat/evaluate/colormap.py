@@ -80,11 +80,6 @@ def normal_colors(normals: Tensor) -> Tensor:
     return (0.5 * normals.nan_to_num(0.0) + 0.5).clamp(0, 1)
 
 
-def tint_colors(tint: Tensor) -> Tensor:
-    """Colours [..., 3] in [0, 1] of tints [..., 3], of which the largest channel becomes 1 where it is larger."""
-    return (tint / tint.amax(dim=-1, keepdim=True).clamp(min=1)).clamp(0, 1)
-
-
 def label_colors(labels: Tensor) -> Tensor:
     """Colours [H, W, 3] in [0, 1] of pane labels [H, W]; 0 is black."""
     palette = torch.tensor(LABEL_COLORS, dtype=torch.float32, device=labels.device) / 255

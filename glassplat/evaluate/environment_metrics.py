@@ -16,7 +16,7 @@ from torch import Tensor
 from glassplat.data.errors import input_checked
 from glassplat.evaluate.lpips import Lpips
 from glassplat.evaluate.metrics import quantized
-from glassplat.evaluate.outcome import NO_WEIGHTS, Outcome
+from glassplat.evaluate.outcome import NO_LPIPS, Outcome
 from glassplat.files.environment_image import read_equirect
 from glassplat.render.environment import equirect_from_environment
 from glassplat.scene.scene import Scene
@@ -96,7 +96,7 @@ def environment_lpips(learned: Tensor, truth: Tensor, lpips: Lpips | str) -> Out
         lpips: the distance, or why there is none.
     """
     if isinstance(lpips, str):
-        return NO_WEIGHTS
+        return NO_LPIPS
     image, target, _ = _equalised(learned, truth)
     return lpips(quantized(image), quantized(target))
 

@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -19,7 +18,7 @@ from glassplat.data.ignored import with_ignored_right
 from glassplat.evaluate.environment_metrics import environment_metrics, learned_environment, true_environment
 from glassplat.evaluate.lpips import Lpips, load_lpips
 from glassplat.evaluate.metrics import color_corrected, psnr, quantized, reflection_gain, ssim
-from glassplat.evaluate.outcome import NO_WEIGHTS, SMALLEST_REGION, Outcome, plain
+from glassplat.evaluate.outcome import NO_LPIPS, SMALLEST_REGION, Outcome, plain
 from glassplat.evaluate.pane_regions import (
     NO_TRUTH,
     NO_VIEW_TRUTH,
@@ -97,7 +96,6 @@ def evaluate(
     renderer: Renderer,
     dataset: Dataset,
     *,
-    lpips_weights: Path | None = None,
     regions: PaneRegions | None = None,
     listen: ViewListener = _nobody,
 ) -> Evaluation:
@@ -123,7 +121,6 @@ def evaluate(
         scene: what to render.
         renderer: how; called under `no_grad`. The median of its times is `seconds_per_frame`.
         dataset: the test views; ground truth is read where it has some.
-        lpips_weights: folder with LPIPS weights; None looks in the usual places.
         regions: which pixels show a pane; those of the ground truth if None, or else of the rendered mask.
         listen: called once per view with its frame, which is not kept afterwards; draws pictures of it.
 
@@ -133,7 +130,7 @@ def evaluate(
     if not dataset.test:
         raise InputError(f"{dataset.root} has no test views; expected at least one image to compare with")
     truth = load_truth(dataset.truth)
-    lpips = _available_lpips(lpips_weights)
+    lpips = load_lpips()
     regions = regions or (RenderedRegions() if truth is None else TrueRegions())
     # The first frame may wait for the compiler; it must not count.
     timed_render(renderer, scene, dataset.test[0])
@@ -191,13 +188,6 @@ def peak_memory_mib() -> Outcome:
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
 
 
-def _available_lpips(folder: Path | None) -> Lpips | str:
-    try:
-        return load_lpips(folder)
-    except FileNotFoundError as error:
-        return str(error)
-
-
 def _measure(
     frame: Frame,
     seconds: float,
@@ -218,7 +208,7 @@ def _measure(
         "corrected_psnr": _counted_psnr(color_corrected(image, photo, region=counted), photo, counted),
         "right_half_psnr": _right_half_psnr(image, photo, counted),
         "ssim": ssim(image, photo),
-        "lpips": NO_WEIGHTS if isinstance(lpips, str) else lpips(quantized(image), quantized(photo)),
+        "lpips": NO_LPIPS if isinstance(lpips, str) else lpips(quantized(image), quantized(photo)),
         "pane_psnr": pane if isinstance(pane, str) else _region_psnr(image, photo, pane, TOO_FEW),
         "transmission_psnr": _transmission_psnr(frame, *truth),
         **surface_metrics(frame, photo, surface),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from glassplat.evaluate.colormap import depth_colors, normal_colors, tint_colors
+from glassplat.evaluate.colormap import depth_colors, normal_colors
 from glassplat.render.frame import Frame
 
 
@@ -18,6 +18,4 @@ def layer_image(frame: Frame, layer: str) -> Tensor:
         return normal_colors(image)
     if layer in ("depth", "median_depth"):
         return depth_colors(image, frame.layers["alpha"])
-    if layer == "tint":
-        return tint_colors(image)
     return image.clamp(0, 1)

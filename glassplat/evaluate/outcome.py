@@ -11,7 +11,7 @@ Outcome = float | str
 
 SMALLEST_REGION = 100
 """Pixels that a view's region needs to count; a sliver of a pane says nothing."""
-NO_WEIGHTS = "no LPIPS weights"
+NO_LPIPS = "no LPIPS"
 
 
 def plain(outcomes: Mapping[str, Outcome]) -> dict[str, Any]:

@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from glassplat.evaluate.truth import GroundTruth, TruePlane
 from glassplat.scene.plane import Planes
-from glassplat.scene.uneven import mean_square_slopes
 
 ERRORS = ("normal_error_deg", "offset_error", "base_reflectance_error")
 
@@ -23,8 +21,7 @@ def plane_table(
     `normal_error_deg` is the angle between the normals, whose sign does not matter; `offset_error` the
     distance of the true centre from the fitted plane over `extent`; `base_reflectance_error` an absolute
     difference. Without a true pane of that label they are None, with a reason beside each.
-    Glass that may be tinted has its `transmittance` of red, green and blue, glass that may be uneven `waves_deg`,
-    root of the mean square of the angle by which its normals are turned.
+    Glass that may be tinted has its `transmittance` of red, green and blue.
     `normal_drift_deg` and `offset_drift` compare in the same way with the plane that the masks led to, where known.
 
     Args:
@@ -35,7 +32,8 @@ def plane_table(
     """
     true_planes = {} if truth is None else {plane.label: plane for plane in truth.planes}
     missing = "the data set has no ground truth" if truth is None else "the ground truth has no pane of this label"
-    glass, table = _glass(planes), []
+    glass = {} if planes.transmittances is None else {"transmittance": planes.transmittances}
+    table = []
     for index, label in enumerate(planes.labels):
         entry: dict[str, Any] = {
             "label": label,
@@ -51,16 +49,6 @@ def plane_table(
             entry |= _drift(entry, marked, marked.labels.index(label), extent)
         table.append(entry)
     return table
-
-
-def _glass(planes: Planes) -> dict[str, Tensor]:
-    """What is known of the panes' glass beside its reflectance, a row for each pane."""
-    glass = {}
-    if planes.transmittances is not None:
-        glass["transmittance"] = planes.transmittances
-    if planes.level_heights is not None:
-        glass["waves_deg"] = mean_square_slopes(planes.level_heights, planes.half_sizes).sqrt().rad2deg()
-    return glass
 
 
 def missing_panes(planes: Planes, truth: GroundTruth | None) -> list[int]:

@@ -16,7 +16,6 @@ from glassplat.evaluate.colormap import (
     error_colors,
     label_colors,
     normal_colors,
-    tint_colors,
 )
 from glassplat.evaluate.metrics import quantized
 from glassplat.evaluate.surface_truth import NOTHING_KNOWN, TrueSurface
@@ -29,8 +28,8 @@ CAPTION_HEIGHT, TITLE_HEIGHT = 24, 34
 CAPTION_SIZE, TITLE_SIZE = 15, 19
 BACKGROUND, TEXT, QUIET_TEXT = (22, 24, 28), (236, 236, 236), (160, 166, 174)
 SMALLEST_STRENGTH_SCALE = 0.05
-COLORED = ("transmission", "base", "reflection", "curved_reflection", "environment")
-COLUMNS = (*COLORED, "strength", "curved_strength", "tint", "normal", "mask")
+COLORED = ("transmission", "base", "reflection", "environment")
+COLUMNS = (*COLORED, "strength", "normal", "mask")
 """Layers in the order in which they are shown."""
 
 
@@ -123,10 +122,6 @@ def _rendered_panels(frame: Frame, scale: float) -> dict[str, Panel]:
     panels = {name: Panel(name.replace("_", " "), layers[name]) for name in COLORED if name in layers}
     if "strength" in layers:
         panels["strength"] = _strength_panel("strength", layers["strength"], scale)
-    if "curved_strength" in layers:
-        panels["curved_strength"] = Panel("curved strength", _grey(layers["curved_strength"]))
-    if "tint" in layers:
-        panels["tint"] = Panel("tint", tint_colors(layers["tint"]))
     if "normal" in layers:
         panels["normal"] = Panel("normals", normal_colors(layers["normal"]))
     if "mask" in layers:
@@ -144,8 +139,6 @@ def _true_panels(truth: TrueView | None, surface: TrueSurface, scale: float) -> 
     if truth is not None:
         panels["transmission"] = Panel("true transmission", truth.transmission)
         panels["reflection"] = Panel("true reflection", truth.reflection)
-        if surface.strength is not None:
-            panels["curved_strength"] = Panel("true curved strength", _grey(surface.strength))
         panels["strength"] = _strength_panel("true strength", truth.strength, scale)
         panels["mask"] = Panel("true panes", label_colors(truth.labels))
     return panels

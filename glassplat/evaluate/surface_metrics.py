@@ -67,8 +67,7 @@ def _strength_errors(frame: Frame, truth: TrueSurface) -> Tensor | str:
     if truth.strength is None:
         return NO_TRUE_STRENGTH
     # Where there are panes, `strength` is theirs.
-    strength = frame.layers.get("curved_strength" if "mask" in frame.layers else "strength")
-    return NO_STRENGTH if strength is None else (strength - truth.strength).abs()
+    return NO_STRENGTH if "mask" in frame.layers else (frame.layers["strength"] - truth.strength).abs()
 
 
 def _reflective(truth: TrueSurface) -> Tensor | str:

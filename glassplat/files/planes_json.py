@@ -27,7 +27,6 @@ from glassplat.files.fields import (
 )
 from glassplat.files.json_text import read_json
 from glassplat.scene.plane import Planes
-from glassplat.scene.uneven import LEAST_HEIGHTS
 
 EDIT_TOLERANCE = 1e-5
 """Above this difference the readable value has been edited by hand, and wins over the raw one."""
@@ -54,7 +53,6 @@ PLANE: dict[str, Field] = {
     "logit_reflectance": Optional(LOGIT),
     "transmittance": Optional(Items(Number(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE), 3)),
     "log_transmittance": Optional(Items(LOGIT, 3)),
-    "heights": Optional(Items(Items(COORDINATE))),
 }
 
 
@@ -64,7 +62,7 @@ def write_planes(path: Path | str, planes: Planes) -> None:
     Each entry has label, mirror, center, normal (unit), tangent, half_sizes and base_reflectance for people
     and other programs (world units, the capture's frame), and the raw values raw_normal and
     logit_reflectance that training continues from; where glass may be tinted also transmittance, of red, green and
-    blue, and its raw log_transmittance, and where it may be uneven its heights (see `Planes`).
+    blue, and its raw log_transmittance (see `Planes`).
 
     Raises:
         ValueError: a plane holds a value that is not finite.
@@ -106,7 +104,6 @@ def read_planes(path: Path | str) -> Planes:
         labels=labels,
         mirrors=tuple(entry["label"] for entry in entries if entry["mirror"]),
         log_transmittances=_log_transmittances(entries),
-        heights=_heights(entries, path),
     )
 
 
@@ -126,13 +123,11 @@ def _entry(planes: Planes, index: int) -> dict[str, Any]:
 
 
 def _glass(planes: Planes) -> dict[str, Tensor]:
-    """What panes have if their glass may be tinted or uneven, a row for each."""
+    """What panes have if their glass may be tinted, a row for each."""
     glass = {}
     if planes.transmittances is not None and planes.log_transmittances is not None:
         glass["transmittance"] = planes.transmittances.clamp(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE)
         glass["log_transmittance"] = planes.log_transmittances
-    if planes.heights is not None:
-        glass["heights"] = planes.heights
     return glass
 
 
@@ -198,18 +193,3 @@ def _log_transmittance(entry: Mapping[str, Any]) -> Tensor:
         if (raw.exp() - readable).abs().max() <= EDIT_TOLERANCE:
             return raw
     return readable.log()
-
-
-def _heights(entries: list[dict[str, Any]], path: Path) -> Tensor | None:
-    """[K, R, C], zeros for panes that say nothing of them; None if none does."""
-    given = {tuple(map(len, entry["heights"])) for entry in entries if entry["heights"] is not None}
-    if not given:
-        return None
-    rows = max(given)
-    if len(given) > 1 or len(set(rows)) > 1 or min(len(rows), *rows) < LEAST_HEIGHTS:
-        raise ValueError(
-            f"{path} has heights of {sorted(map(list, given))} values in their rows; expected as many in each row, "
-            f"{LEAST_HEIGHTS} rows of {LEAST_HEIGHTS} at least, and the same of every pane"
-        )
-    even = [[0.0] * rows[0]] * len(rows)
-    return torch.tensor([entry["heights"] or even for entry in entries], dtype=torch.float32)

@@ -13,7 +13,6 @@ Layer = Literal[
     "without_panes",
     "reflection",
     "strength",
-    "tint",
     "mask",
     "depth",
     "alpha",
@@ -23,20 +22,15 @@ Layer = Literal[
     "surroundings",
     "median_depth",
     "photographed",
-    "curved_reflection",
-    "curved_strength",
 ]
 
 LAYERS: dict[str, tuple[Layer, ...]] = {
     "splat": ("rgb", "normal", "depth", "alpha"),
     "planar": ("rgb", "transmission", "without_panes", "reflection", "strength", "mask", "normal", "depth", "alpha"),
-    "deferred": ("rgb", "base", "reflection", "strength", "tint", "normal", "environment", "depth", "alpha"),
-    "traced": ("rgb", "base", "reflection", "strength", "tint", "normal", "surroundings", "depth", "alpha"),
+    "deferred": ("rgb", "base", "reflection", "strength", "normal", "environment", "depth", "alpha"),
+    "traced": ("rgb", "base", "reflection", "strength", "normal", "surroundings", "depth", "alpha"),
 }
 """What each method renders that is worth looking at; its frames hold more for the losses."""
-
-CURVED_LAYERS: tuple[Layer, ...] = ("base", "curved_reflection", "curved_strength", "surroundings")
-"""What `planar` renders beside its own layers with `--curved.learn`."""
 
 DISC_LAYERS: tuple[Layer, ...] = ("median_depth",)
 """What any method renders of discs beside its own layers."""
@@ -44,9 +38,8 @@ DISC_LAYERS: tuple[Layer, ...] = ("median_depth",)
 
 def layers_of(recipe: Any) -> tuple[Layer, ...]:
     """What a run of a recipe renders that is worth looking at."""
-    curved = CURVED_LAYERS if recipe.method == "planar" and recipe.curved.learn else ()
     discs = DISC_LAYERS if getattr(recipe, "primitive", None) == "disc" else ()
-    return (*LAYERS[recipe.method], *curved, *discs)
+    return (*LAYERS[recipe.method], *discs)
 
 
 def check_layers(layers: Sequence[str], recipe: Any) -> None:

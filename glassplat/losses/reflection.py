@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from torch import Tensor
 
 from glassplat.data.dataset import View
@@ -11,7 +9,6 @@ from glassplat.kernels.gradient_conflict import gradient_conflict as shared_edge
 from glassplat.render.frame import Frame
 from glassplat.scene.scene import Scene
 from glassplat.scene.transfer import moved
-from glassplat.scene.uneven import mean_square_slopes
 
 PAPER_PIXELS = 960 * 720
 """Size of the photographs for which the paper's weight of L_c was chosen."""
@@ -62,14 +59,3 @@ def tint_departure(frame: Frame, view: View, scene: Scene) -> Tensor | None:
     """
     logarithms = scene.planes.log_transmittances
     return None if logarithms is None or not len(logarithms) else logarithms.square().mean()
-
-
-def unevenness(frame: Frame, view: View, scene: Scene) -> Tensor | None:
-    """Mean over the panes of the square of the angle by which uneven glass turns its normals, degrees.
-
-    Where nothing is mirrored that has edges, glass may as well be even.
-    """
-    heights, half_sizes = scene.planes.level_heights, scene.planes.half_sizes
-    if heights is None or not len(heights):
-        return None
-    return mean_square_slopes(heights, half_sizes).mean() * math.degrees(1) ** 2

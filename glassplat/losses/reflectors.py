@@ -8,7 +8,6 @@ from torch import Tensor
 from glassplat.data.dataset import View
 from glassplat.render.frame import Frame
 from glassplat.scene.scene import Scene
-from glassplat.scene.tint import has_tint, logit_tints
 
 
 def strength_outside(frame: Frame, view: View, scene: Scene) -> Tensor | None:
@@ -28,11 +27,3 @@ def strength_outside(frame: Frame, view: View, scene: Scene) -> Tensor | None:
 def mean_strength(frame: Frame, view: View, scene: Scene) -> Tensor:
     """Mean reflection strength of all Gaussians: a price, so that what a colour explains as well does not reflect."""
     return torch.sigmoid(scene.primary.channels["logit_strength"]).mean()
-
-
-def mean_tint(frame: Frame, view: View, scene: Scene) -> Tensor | None:
-    """Mean square of what makes reflections coloured: a price, so that only what no white reflection explains is.
-
-    None before anything reflects in colours.
-    """
-    return logit_tints(scene.primary).square().sum(dim=1).mean() if has_tint(scene.primary) else None

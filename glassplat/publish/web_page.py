@@ -106,7 +106,7 @@ def page_text(scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Cam
 
 def can_show(renderer: Renderer) -> TypeGuard[Planar | Splat]:
     """Whether a page can draw what a renderer draws."""
-    return isinstance(renderer, Splat) or (isinstance(renderer, Planar) and renderer.curved is None)
+    return isinstance(renderer, Splat | Planar)
 
 
 def asset(name: str) -> str:

@@ -25,11 +25,9 @@ from glassplat.render.rasterize import (
     shown,
 )
 from glassplat.render.surface import view_directions
-from glassplat.render.tint import further_channels, tint_layer, tinted
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
-from glassplat.scene.tint import has_tint
 
 INVISIBLE = 1 / 512
 """A pixel that reflects less changes by at most half a step of eight bits, from black to white."""
@@ -43,12 +41,10 @@ class Deferred:
         C' = (1 - R) C + R E(2 (v . n) n - v),  n = N / |N|           (Eq. 3)
 
     n_i is the shortest axis of a Gaussian, turned to the camera, v the direction to the camera, E the environment.
-    Colours are sRGB, as in the paper. Where the Gaussians have a tint (`scene/tint.py`, not in the paper), red, green
-    and blue have a strength each in place of R.
+    Colours are sRGB, as in the paper.
 
     Layers: `base` C, `reflection` E, `normal` N in world axes, blended and not normalised [H, W, 3]; `strength` R,
-    `alpha`, `depth` [H, W]; `environment` [H, W, 3], what surrounds the scene behind each pixel, if asked for; `tint`
-    [H, W, 3], the strengths of red, green and blue as multiples of R, if there are such or if asked for.
+    `alpha`, `depth` [H, W]; `environment` [H, W, 3], what surrounds the scene behind each pixel, if asked for.
 
     Attributes:
         background: colour behind everything, sRGB.
@@ -56,7 +52,6 @@ class Deferred:
             is the blended light that the Gaussians reflect, divided by R.
         depth: also render the depth layer.
         environment: also render the layer `environment`.
-        tint: also render the layer `tint` of reflections without colour, which are white.
         least_strength: pixels that reflect less are not shaded, and their `reflection` is 0. Not for training, where a
             strength learns from what it would reflect.
     """
@@ -65,7 +60,6 @@ class Deferred:
     shading: Shading = "deferred"
     depth: bool = True
     environment: bool = False
-    tint: bool = False
     least_strength: float = 0.0
 
     def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
@@ -81,8 +75,6 @@ class Deferred:
         channels = self._channels_of(scene.primary, camera, projected)
         screen = (screen_pass("primary", projected),) if probed else ()
         rgb, layers = shade(scene, camera, projected, channels, joined_probe(screen))
-        if self.tint:
-            layers.setdefault("tint", tint_layer(layers["strength"], None))
         if self.environment:
             layers["environment"] = torch.sigmoid(cube_lookup(scene.environment.raw, view_directions(camera)))
         return Frame(rgb, layers, direct=shown(projected), screen=screen)
@@ -103,7 +95,7 @@ class Deferred:
             gaussians.means,
             gaussians.channels["logit_strength"],
             camera.center,
-            further_channels(gaussians, projected.depths[0, :, None] if self.depth else None),
+            projected.depths[0, :, None] if self.depth else None,
         )
 
     def _shade_pixels(
@@ -119,12 +111,7 @@ class Deferred:
             background=self.background,
             least_strength=self.least_strength,
         )
-        layers |= {"base": shaded.base, "reflection": shaded.reflection}
-        excess = self._excess(scene.primary, image)
-        if excess is None:
-            return shaded.rgb, layers
-        layers["tint"] = tint_layer(layers["strength"], excess)
-        return tinted(shaded.rgb, shaded.base, shaded.reflection, excess), layers
+        return shaded.rgb, layers | {"base": shaded.base, "reflection": shaded.reflection}
 
     def _shade_gaussians(
         self, scene: Scene, camera: Camera, projected: Projected, channels: Tensor, probe: Tensor | None
@@ -133,18 +120,11 @@ class Deferred:
         to_eye = torch.nn.functional.normalize(camera.center - scene.primary.means, dim=1)
         cosines = (normals * to_eye).sum(-1, keepdim=True)
         mirrored = torch.sigmoid(cube_lookup(scene.environment.raw, 2 * cosines * normals - to_eye))
-        excess = self._excess(scene.primary, channels)
-        if excess is not None:
-            strengths = strengths + excess
         channels = torch.cat([channels, strengths * colors, strengths * mirrored], dim=1)
         image, layers = self._blend(camera, projected, channels, probe)
         base = over_background(image[..., :NORMAL_AT], layers["alpha"], self.background)
         lost, gained = image[..., -6:-3], image[..., -3:]
-        strength, excess = layers["strength"][..., None], self._excess(scene.primary, image)
-        if excess is not None:
-            strength = strength + excess
-            layers["tint"] = tint_layer(layers["strength"], excess)
-        reflection = gained / strength.clamp(min=1e-6)
+        reflection = gained / layers["strength"][..., None].clamp(min=1e-6)
         return base - lost + gained, layers | {"base": base, "reflection": reflection}
 
     def _blend(
@@ -158,13 +138,6 @@ class Deferred:
         if self.depth:
             layers["depth"] = mean_depth(image[..., SURFACE_CHANNELS], alpha)
         return image, layers
-
-    def _excess(self, gaussians: Gaussians, values: Tensor) -> Tensor | None:
-        """Of channels or of what they blend to [..., D] the excess of strengths [..., 3], where there is any."""
-        if not has_tint(gaussians):
-            return None
-        start = SURFACE_CHANNELS + self.depth
-        return values[..., start : start + 3]
 
 
 def check_reflective(scene: Scene) -> None:

@@ -20,12 +20,8 @@ PHOTOGRAPHED: Final = "photographed"
 def renderer_with(renderer: Renderer, layers: Sequence[str]) -> Renderer:
     """The renderer, also of those of the layers that it renders only when asked."""
     if isinstance(renderer, Deferred):
-        environment = renderer.environment or "environment" in layers
-        return replace(renderer, environment=environment, tint="tint" in layers)
+        return replace(renderer, environment=renderer.environment or "environment" in layers)
     if isinstance(renderer, Traced):
-        surroundings = renderer.surroundings or "surroundings" in layers
-        return replace(renderer, surroundings=surroundings, tint="tint" in layers)
-    if isinstance(renderer, Planar) and renderer.curved is not None and "surroundings" in layers:
-        renderer = replace(renderer, curved=replace(renderer.curved, surroundings=True))
+        return replace(renderer, surroundings=renderer.surroundings or "surroundings" in layers)
     renderer = with_photographer(renderer, "beside") if PHOTOGRAPHED in layers else renderer
     return WithNormals(renderer) if "normal" in layers and isinstance(renderer, Planar | Splat) else renderer

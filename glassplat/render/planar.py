@@ -13,19 +13,10 @@ from glassplat.kernels.composite import color_and_depth, composite, join_channel
 from glassplat.kernels.fresnel import Fresnel
 from glassplat.kernels.panes import layer_slopes, pane_layers, slopes_at
 from glassplat.kernels.project import GradientSum
-from glassplat.kernels.records import SURFACE_CHANNELS, Deviation, PaneHits, Panes, Projected, Splats
+from glassplat.kernels.records import Deviation, PaneHits, Panes, Splats
 from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.choices import Blend
-from glassplat.render.curved import (
-    Shades,
-    curved_layers,
-    mirrored_cameras,
-    mirrors_anything,
-    shades_of,
-    with_matte_layers,
-    within_panes,
-)
-from glassplat.render.frame import Frame, Renderer, ScreenPass, SpacePass
+from glassplat.render.frame import Frame, Renderer, ScreenPass
 from glassplat.render.glazing import Glazed, glazed, own_masks, visibilities
 from glassplat.render.mirror_images import project_mirrored, project_photographer
 from glassplat.render.rasterize import (
@@ -46,13 +37,12 @@ from glassplat.render.seen_panes import (
     panes_in_camera,
     seen_panes,
 )
-from glassplat.render.surface import blended_surface, ellipsoid_channels
-from glassplat.render.traced import Traced, space_pass
-from glassplat.render.uneven_glass import in_uneven_glass
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
+DEPTH_CHANNEL = 3
+"""Of the first pass, after the colours."""
 Shown = Literal["absent", "present", "beside"]
 """Whether panes show who took a photograph."""
 
@@ -69,7 +59,6 @@ class FirstPass(NamedTuple):
     marks: Tensor
     direct: Tensor
     screen: tuple[ScreenPass, ...]
-    curved: Shades | None
     total: GradientSum
 
 
@@ -79,7 +68,6 @@ class SecondPass(NamedTuple):
     reflections: Tensor
     mirrored: Tensor
     screen: tuple[ScreenPass, ...]
-    curved: Shades | None
 
 
 @dataclass(frozen=True)
@@ -102,12 +90,7 @@ class Planar:
     Layers: `transmission`, `reflection` [H, W, 3]; `strength`, `mask`, `depth`, `alpha` [H, W]; `hit` [H, W], 1 in
     the panes' rectangles, and `inner` [H, W], without the rim of what reflects; `without_panes` [H, W, 3], the image
     were there no panes, and `share` [H, W], how much of what is seen the panes add, all of them together;
-    `deviation` [H, W] (Eq. 14) if asked for. With `curved` those of `traced`, of what is seen straight through the
-    panes: `base`, `curved_reflection`, `normal` [H, W, 3], `curved_strength` [H, W], and `surroundings` if asked for.
-
-    Curved things may mirror, too: with `curved`, pixels of both passes that show such things are shaded as `traced`
-    does, by rays from the place of each that meet the scene's surroundings. So a pane shows what a curved thing
-    mirrors; light meets one of each at most.
+    `deviation` [H, W] (Eq. 14) if asked for.
 
     A photograph also shows who took it, in the panes: `Scene.photographer`, Gaussians in a frame that goes along with
     the camera. They are drawn among those that a pane mirrors, through the camera mirrored about it, and nowhere else.
@@ -115,7 +98,7 @@ class Planar:
     Attributes:
         background: colour behind everything, sRGB.
         fresnel: how R_k rises from R0 at normal incidence: as that of a pane with its two surfaces, by Schlick's curve
-            of one surface (Eq. 6), or not at all; see `glassplat.kernels.panes`.
+            of one surface (Eq. 6), or not at all; see `glassplat.kernels.panes.blend_panes`.
         intensity: use the learned intensity a(u); False sets C_r = C_raw.
         reflection_gradient: what the reflection image's gradient reaches: everything, or the planes alone.
         deviation: also compute the depth deviation where a pane is hit (Eq. 14), for training.
@@ -127,8 +110,6 @@ class Planar:
             the image without.
         tells_mirrored: whether the records of a probed frame tell mirror images from what is seen directly, and how
             much is left of either; if not, all of them count alike.
-        curved: how things that are not flat mirror; its background has to be the same. None if nothing does, as in a
-            scene in which no such thing has been looked for yet.
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -141,18 +122,13 @@ class Planar:
     nearest_only: bool = False
     photographer: Shown = "absent"
     tells_mirrored: bool = True
-    curved: Traced | None = None
 
     def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are."""
-        if self.curved is not None and not mirrors_anything(scene):
-            return with_matte_layers(replace(self, curved=None)(scene, camera, probed=probed))
         camera = camera.to(scene.primary.means.device)
         rectangles = panes_in_camera(scene.planes, camera)
         first = self._first_pass(scene, camera, rectangles, probed)
         layers = {"without_panes": first.image, "depth": first.depth, "alpha": first.alpha, "mask": first.mask}
-        if first.curved is not None:
-            layers |= curved_layers(first.curved) | self._behind(scene, camera)
         hits = nearest_hits(rectangles, camera, first.mask)
         if first.deviation is not None:
             layers["deviation"] = first.deviation
@@ -162,7 +138,7 @@ class Planar:
             layers["hit"] = (hits.pane >= 0).to(nothing.dtype)
             layers |= {"transmission": first.image, "reflection": torch.zeros_like(first.image)}
             layers |= {"strength": nothing, "share": nothing, "inner": nothing}
-            return Frame(first.image, layers, first.direct, None, first.screen, self._space(scene, probed, first))
+            return Frame(first.image, layers, first.direct, None, first.screen)
         second = self._second_pass(scene, camera, seen, probed, first.total)
         masks = self._visibilities(scene, camera, seen, first)
         result = self._glazed(first, seen, masks, second, camera)
@@ -172,8 +148,7 @@ class Planar:
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
         layers["hit"], layers["inner"] = pane_layers(hits.pane, result.strength)
         screen = self._screen(first, second, hits, result) if probed else ()
-        space = self._space(scene, probed, first, second)
-        return Frame(result.rgb, layers, first.direct, second.mirrored, screen, space)
+        return Frame(result.rgb, layers, first.direct, second.mirrored, screen)
 
     def check(self, scene: Scene) -> None:
         """Raises ValueError where a scene lacks colours, or its panes what they need; there may be no panes."""
@@ -193,12 +168,12 @@ class Planar:
         glass = project_gaussians(scene.glass, camera, near=near)
         splats = joined_splats(primary, glass)
         bins = bin_tiles(splats, camera.width, camera.height)
-        channels = self._channels(scene, primary, camera)
+        channels = join_channels(primary.colors, primary.depths, more=len(scene.glass))
         marks = torch.sigmoid(scene.glass.channels["logit_mark"])[None]
         deviation = None
         if self.deviation:
             hit = nearest_hits(rectangles, camera).pane >= 0
-            deviation = Deviation(self._depth_at, hit.to(channels.dtype)[None], self.deviation_depth_gradient)
+            deviation = Deviation(DEPTH_CHANNEL, hit.to(channels.dtype)[None], self.deviation_depth_gradient)
         screen = (screen_pass("primary", primary), screen_pass("glass", glass)) if probed else ()
         result = composite(
             splats,
@@ -211,13 +186,7 @@ class Planar:
         )
         alpha = result.alpha.squeeze(0)
         # Squeezed, because the gradient of an indexed image is a whole one of zeros first.
-        blended, shades = result.image.squeeze(0), None
-        if self.curved is None:
-            image, depth = color_and_depth(blended, alpha, self.background)
-        else:
-            surface = blended_surface(blended, alpha, shown(primary), self.background)
-            shades = shades_of(self.curved, scene, [camera], [surface])
-            image, depth = shades.images[0], surface.depth
+        image, depth = color_and_depth(result.image.squeeze(0), alpha, self.background)
         return FirstPass(
             image=image,
             alpha=alpha,
@@ -228,27 +197,8 @@ class Planar:
             marks=marks,
             direct=shown(primary),
             screen=screen,
-            curved=shades,
             total=total,
         )
-
-    def _behind(self, scene: Scene, camera: Camera) -> dict[str, Tensor]:
-        """The layer of what curved things mirror, if asked for."""
-        if self.curved is None or not self.curved.surroundings:
-            return {}
-        return {"surroundings": self.curved.behind(scene, camera)}
-
-    @property
-    def _depth_at(self) -> int:
-        """Which channel of the first pass is the depth."""
-        return 3 if self.curved is None else SURFACE_CHANNELS
-
-    def _channels(self, scene: Scene, projected: Projected, camera: Camera) -> Tensor:
-        """[1, G, D] channels of the first pass, of glass too: colours first, and the depth at `_depth_at`."""
-        if self.curved is None:
-            return join_channels(projected.colors, projected.depths, more=len(scene.glass))
-        looks = ellipsoid_channels(scene.primary, projected, camera.center[None])
-        return torch.nn.functional.pad(looks, (0, 0, 0, len(scene.glass)))
 
     def _second_pass(
         self, scene: Scene, camera: Camera, seen: SeenPanes, probed: bool, total: GradientSum
@@ -257,21 +207,14 @@ class Planar:
         if self.reflection_gradient == "planes":
             primary, total = detached(scene.primary), GradientSum()
         projected = project_mirrored(primary, camera, seen, near=NEAR_PER_EXTENT * scene.extent, total=total)
-        projected = in_uneven_glass(projected, seen, camera)
         # By how much it departs from 1: what is behind all Gaussians has 0 then, and needs no blending.
         gain = torch.expm1(primary.channels["log_intensity"])[None].expand(len(seen.planes), -1)
-        cameras = [] if self.curved is None else mirrored_cameras(camera, seen.planes)
-        if self.curved is None:
-            channels = join_channels(projected.colors, gain)
-        else:
-            looks = ellipsoid_channels(primary, projected, torch.stack([each.center for each in cameras]))
-            channels = torch.cat([looks, gain[..., None]], dim=-1)
+        channels = join_channels(projected.colors, gain)
         mirrored = [projected]
         screen: tuple[ScreenPass, ...] = (screen_pass("primary", projected, direct=False),) if probed else ()
         if self.photographer == "present" and len(scene.photographer):
             body = project_photographer(scene, camera, seen, near=NEAR_PER_EXTENT * scene.extent)
-            body = in_uneven_glass(body, seen, camera)
-            # A body is as bright as it is, and matte: an intensity of its own would be a second factor on its colours.
+            # A body is as bright as it is: an intensity of its own would be a second factor on its colours.
             plain = torch.nn.functional.pad(body.colors, (0, channels.shape[-1] - 3))
             channels = torch.cat([channels, plain], dim=1)
             mirrored.append(body)
@@ -280,23 +223,8 @@ class Planar:
         splats = joined_splats(*mirrored)
         bins = bin_tiles(splats, camera.width, camera.height, seen.tiles)
         result = composite(splats, channels, bins, probe=joined_probe(screen))
-        if self.curved is None:
-            reflections, shades = over_background(result.image, result.alpha, (*self.background, 0.0)), None
-        else:
-            surfaces = [
-                blended_surface(image[..., :-1], alpha, shown(projected), self.background)
-                for image, alpha in zip(result.image, result.alpha, strict=True)
-            ]
-            shades = shades_of(self.curved, scene, cameras, within_panes(surfaces, seen))
-            reflections = torch.cat([torch.stack(shades.images), result.image[..., -1:]], dim=-1)
-        return SecondPass(reflections, shown(projected), screen, shades)
-
-    def _space(self, scene: Scene, probed: bool, *passes: FirstPass | SecondPass) -> tuple[SpacePass, ...]:
-        """What densification reads of the surroundings that curved things mirror."""
-        shades = [each.curved for each in passes if each.curved is not None]
-        if not probed or not shades or not len(scene.surroundings):
-            return ()
-        return (space_pass(scene, torch.cat([each.places for each in shades])),)
+        reflections = over_background(result.image, result.alpha, (*self.background, 0.0))
+        return SecondPass(reflections, shown(projected), screen)
 
     def _glazed(
         self, first: FirstPass, seen: SeenPanes, masks: Sequence[Tensor], second: SecondPass, camera: Camera

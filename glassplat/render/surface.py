@@ -24,7 +24,6 @@ from glassplat.render.rasterize import (
     screen_pass,
     shown,
 )
-from glassplat.render.tint import further_channels, tint_layer
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
@@ -41,7 +40,6 @@ class Surface:
         depth: [H, W] mean camera z, 0 where nothing is.
         alpha: [H, W] coverage.
         direct: [N] bool, which Gaussians reach a pixel.
-        excess: [H, W, 3] by how much red, green and blue reflect more strongly; None where reflections are white.
         screen: the record of the pass, if it was probed.
         extra: further layers, of discs those that say how thin the surface is.
     """
@@ -52,16 +50,13 @@ class Surface:
     depth: Tensor
     alpha: Tensor
     direct: Tensor
-    excess: Tensor | None = None
     screen: tuple[ScreenPass, ...] = ()
     extra: Mapping[str, Tensor] = field(default_factory=dict)
 
     def layers(self) -> dict[str, Tensor]:
         """The layers of a frame."""
-        tint = {} if self.excess is None else {"tint": tint_layer(self.strength, self.excess)}
         return {
             **self.extra,
-            **tint,
             "base": self.base,
             "normal": self.normal,
             "strength": self.strength,
@@ -85,63 +80,33 @@ def _seen_ellipsoids(
     """Depths are those of the centres."""
     projected = project_gaussians(scene.primary, camera, near=near)
     screen = (screen_pass("primary", projected),) if probed else ()
-    channels = ellipsoid_channels(scene.primary, projected, camera.center[None])
+    channels = _ellipsoid_channels(scene.primary, projected, camera.center)
     splats = joined_splats(projected)
     bins = bin_tiles(splats, camera.width, camera.height)
-    result = composite(splats, channels, bins, probe=joined_probe(screen))
-    return blended_surface(result.image[0], result.alpha[0], shown(projected), background, screen)
-
-
-def ellipsoid_channels(gaussians: Gaussians, projected: Projected, eyes: Tensor) -> Tensor:
-    """[C, N, D] what each ellipsoid adds to the images that `blended_surface` reads.
-
-    Args:
-        gaussians: with a `logit_strength`.
-        projected: the same, into C cameras.
-        eyes: [C, 3] the cameras' centres, to which normals are turned.
-    """
-    return torch.stack(
-        [
-            surface_channels(
-                projected.colors[view],
-                projected.radii[view],
-                gaussians.quats,
-                gaussians.log_scales,
-                gaussians.means,
-                gaussians.channels["logit_strength"],
-                eye,
-                further_channels(gaussians, projected.depths[view, :, None]),
-            )
-            for view, eye in enumerate(eyes)
-        ]
-    )
-
-
-def blended_surface(
-    image: Tensor,
-    alpha: Tensor,
-    direct: Tensor,
-    background: tuple[float, float, float],
-    screen: tuple[ScreenPass, ...] = (),
-) -> Surface:
-    """The surface of one view from the blended `ellipsoid_channels`.
-
-    Args:
-        image: [H, W, D] of these channels.
-        alpha: [H, W] coverage.
-        direct: [N] bool, which Gaussians reach a pixel.
-        background: colour behind everything, sRGB.
-        screen: the record of the pass, if it was probed.
-    """
+    result = composite(splats, channels[None], bins, probe=joined_probe(screen))
+    image, alpha = result.image[0], result.alpha[0]
     return Surface(
         base=over_background(image[..., :NORMAL_AT], alpha, background),
         normal=image[..., NORMAL_AT:STRENGTH_AT],
         strength=image[..., STRENGTH_AT],
         depth=mean_depth(image[..., SURFACE_CHANNELS], alpha),
         alpha=alpha,
-        direct=direct,
-        excess=_excess(image, SURFACE_CHANNELS + 1),
+        direct=shown(projected),
         screen=screen,
+    )
+
+
+def _ellipsoid_channels(gaussians: Gaussians, projected: Projected, eye: Tensor) -> Tensor:
+    """[N, 8] colour, normal, strength and depth of each ellipsoid; normals are turned to `eye` [3]."""
+    return surface_channels(
+        projected.colors[0],
+        projected.radii[0],
+        gaussians.quats,
+        gaussians.log_scales,
+        gaussians.means,
+        gaussians.channels["logit_strength"],
+        eye,
+        projected.depths[0, :, None],
     )
 
 
@@ -152,9 +117,7 @@ def _seen_discs(
     projected = projected_discs(scene.primary, camera, near=near)
     screen = (screen_pass("primary", projected),) if probed else ()
     strengths = torch.sigmoid(scene.primary.channels["logit_strength"])[None, :, None]
-    further = further_channels(scene.primary, None)
-    parts = [projected.colors, projected.normals, strengths, *([] if further is None else [further[None]])]
-    channels = torch.cat(parts, dim=-1)
+    channels = torch.cat([projected.colors, projected.normals, strengths], dim=-1)
     blended = blended_discs(projected, channels, camera, near=near, screen=screen)
     image, extra = blended.image[0], disc_layers(blended, scene.extent)
     alpha, depth = extra.pop("alpha"), extra.pop("depth")
@@ -165,15 +128,9 @@ def _seen_discs(
         depth=depth,
         alpha=alpha,
         direct=shown(projected),
-        excess=_excess(image, SURFACE_CHANNELS),
         screen=screen,
         extra=extra,
     )
-
-
-def _excess(image: Tensor, start: int) -> Tensor | None:
-    """What was blended [H, W, D] from a channel on, where there is any."""
-    return image[..., start:] if image.shape[-1] > start else None
 
 
 def reflected_rays(surface: Surface, camera: Camera, chosen: Tensor) -> tuple[Tensor, Tensor]:

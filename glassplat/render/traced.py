@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -20,7 +19,6 @@ from glassplat.render.rasterize import (
     over_background,
 )
 from glassplat.render.surface import Surface, reflected_rays, seen_surface, view_directions
-from glassplat.render.tint import tint_layer
 from glassplat.scene.activations import SH_ZERO
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
@@ -42,13 +40,11 @@ class Traced:
     The scene's Gaussians are discs, as in the paper, or ellipsoids, whose n_i is the shortest axis, turned to the
     camera. c_ref is what the ray from x along d_ref meets of the scene's `surroundings`, a set of Gaussians of their
     own, and behind these the `environment` where the scene has one (not in the paper), else the background. Without
-    surroundings it is the environment alone. Colours are sRGB, as in the paper. Where the Gaussians have a tint
-    (`scene/tint.py`, not in the paper), red, green and blue have a strength each in place of beta.
+    surroundings it is the environment alone. Colours are sRGB, as in the paper.
 
     Layers: `base`, `reflection` [H, W, 3]; `normal` [H, W, 3] in world axes, blended and not normalised; `strength`,
     `depth`, `alpha` [H, W], of discs also `median_depth` and `distortion`; `surroundings` [H, W, 3], with the
-    environment those behind each pixel, if asked for; `tint` [H, W, 3], the strengths of red, green and blue as
-    multiples of beta, if there are such or if asked for.
+    environment those behind each pixel, if asked for.
 
     Attributes:
         background: colour behind everything, also behind surroundings without an environment, sRGB.
@@ -58,7 +54,6 @@ class Traced:
             reflect.
         joint: False keeps the reflection's gradient from the surfaces (Table 4, ablation).
         surroundings: also render the layer `surroundings`.
-        tint: also render the layer `tint` of reflections without colour, which are white.
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -66,7 +61,6 @@ class Traced:
     faintest: float = INVISIBLE
     joint: bool = True
     surroundings: bool = False
-    tint: bool = False
 
     def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are.
@@ -77,10 +71,8 @@ class Traced:
         check_mirrored(scene)
         camera = camera.to(scene.primary.means.device)
         surface = seen_surface(scene, camera, background=self.background, probed=probed)
-        ((rgb, reflection),), places = self.shaded(scene, [camera], [surface])
+        rgb, reflection, places = self._shaded(scene, camera, surface)
         layers = surface.layers() | {"reflection": reflection}
-        if self.tint:
-            layers.setdefault("tint", tint_layer(surface.strength, None))
         if self.surroundings:
             layers["surroundings"] = self.behind(scene, camera)
         return Frame(
@@ -91,21 +83,10 @@ class Traced:
             space=(space_pass(scene, places),) if probed and len(scene.surroundings) else (),
         )
 
-    def shaded(
-        self, scene: Scene, cameras: Sequence[Camera], surfaces: Sequence[Surface]
-    ) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
-        """Of each camera the image and what it mirrors, [H, W, 3] each; and the places [R, 3] that mirror things near.
-
-        The rays of all cameras are traced together.
-
-        Args:
-            scene: what is mirrored.
-            cameras: mirror images of cameras may be among them.
-            surfaces: what each camera sees.
-        """
-        chosen = [self._mirrors_near(scene, surface) for surface in surfaces]
-        rays = [reflected_rays(*view) for view in zip(surfaces, cameras, chosen, strict=True)]
-        places, directions = (torch.cat(parts) for parts in zip(*rays, strict=True))
+    def _shaded(self, scene: Scene, camera: Camera, surface: Surface) -> tuple[Tensor, Tensor, Tensor]:
+        """The image and what it mirrors, [H, W, 3] each, and the places [R, 3] that mirror things near (Eq. 5)."""
+        chosen = self._mirrors_near(scene, surface)
+        places, directions = reflected_rays(surface, camera, chosen)
         if not self.joint:
             places, directions = places.detach(), directions.detach()
         if len(scene.surroundings):
@@ -113,24 +94,16 @@ class Traced:
             colors = traced_colors(scene, places, directions, near, self.background)
         else:
             colors = places
-        counts = [len(origins) for origins, _ in rays]
-        views = zip(cameras, surfaces, chosen, colors.split(counts), strict=True)
-        return [self._blended(scene, *view) for view in views], places
+        reflection, mirrors = self._elsewhere(scene, camera, surface, chosen)
+        reflection = reflection.index_put(torch.where(chosen), colors)
+        strength = surface.strength[..., None]
+        share = torch.where(mirrors[..., None], strength, 0)
+        return (1 - share) * surface.base + share * reflection, reflection, places
 
     def _mirrors_near(self, scene: Scene, surface: Surface) -> Tensor:
         """[H, W] bool: where rays are traced."""
         chosen = (surface.strength > self.least_strength) & (surface.depth > 0)
         return chosen if len(scene.surroundings) else torch.zeros_like(chosen)
-
-    def _blended(
-        self, scene: Scene, camera: Camera, surface: Surface, chosen: Tensor, colors: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Eq. 5 of one view, of whose chosen pixels the rays have met these colours [R, 3]; and the mirrored image."""
-        reflection, mirrors = self._elsewhere(scene, camera, surface, chosen)
-        reflection = reflection.index_put(torch.where(chosen), colors)
-        strength = surface.strength[..., None]
-        share = torch.where(mirrors[..., None], strength if surface.excess is None else strength + surface.excess, 0)
-        return (1 - share) * surface.base + share * reflection, reflection
 
     def check(self, scene: Scene) -> None:
         """Raises ValueError where a scene lacks colours, or what reflection needs."""
@@ -192,15 +165,9 @@ def mirrored_contributions(scene: Scene, camera: Camera) -> Tensor:
     camera = camera.to(scene.primary.means.device)
     with torch.no_grad():
         surface = seen_surface(scene, camera, background=(0.0, 0.0, 0.0))
-    return surface_contributions(scene, camera, surface)
-
-
-def surface_contributions(scene: Scene, camera: Camera, surface: Surface) -> Tensor:
-    """[N] the same by a surface that the camera sees, which may be a camera's mirror image."""
-    part = scene.surroundings
-    with torch.no_grad():
         chosen = (surface.strength > INVISIBLE) & (surface.depth > 0)
         places, directions = reflected_rays(surface, camera, chosen)
+    part = scene.surroundings
     with torch.enable_grad():
         # The blending weight is what a constant colour has for a gradient; that of this one is 1.
         ones = torch.full_like(part.sh[:, :1], 0.5 / SH_ZERO).requires_grad_()

@@ -9,11 +9,10 @@ import torch
 from torch import Tensor
 
 from glassplat.scene.transfer import constant
-from glassplat.scene.uneven import without_tilt
 
 LEAST_SINE = 1e-6
 """Of the angle between a pane's normal and its tangent."""
-TRAINABLE = ("centers", "raw_normals", "logit_reflectances", "log_transmittances", "heights")
+TRAINABLE = ("centers", "raw_normals", "logit_reflectances", "log_transmittances")
 
 
 @dataclass(frozen=True)
@@ -34,8 +33,6 @@ class Planes:
         mirrors: labels of the planes that transmit nothing; their base reflectance gets no gradient.
         log_transmittances: [K, 3] logarithm of the share of red, green and blue light that gets through, of what does
             not come back. None where all panes are clear.
-        heights: [K, R, C] of uneven glass above the plane, control values of a spline over the rectangle;
-            world units. None where all panes are even.
     """
 
     centers: Tensor
@@ -46,7 +43,6 @@ class Planes:
     labels: tuple[int, ...]
     mirrors: tuple[int, ...] = ()
     log_transmittances: Tensor | None = None
-    heights: Tensor | None = None
 
     def __post_init__(self) -> None:
         for name, tensor in self.tensors().items():
@@ -87,16 +83,6 @@ class Planes:
         clear = self.centers.new_zeros(len(self), 3)
         return self if self.log_transmittances is not None else replace(self, log_transmittances=clear)
 
-    @property
-    def level_heights(self) -> Tensor | None:
-        """[K, R, C] control values of the heights, of panes that are not turned by them; None where all are even."""
-        return None if self.heights is None else without_tilt(self.heights)
-
-    def that_may_wave(self, count: int) -> Planes:
-        """The same planes, still even where they were, with `count` heights along each side that can be learnt."""
-        even = self.centers.new_zeros(len(self), count, count)
-        return self if self.heights is not None else replace(self, heights=even)
-
     def axes(self) -> tuple[Tensor, Tensor]:
         """Unit in-plane axes (tangent, bitangent), each [K, 3]; right-handed with the normal."""
         normals = self.normals
@@ -127,10 +113,6 @@ class Planes:
         """These planes and others, in the order of their labels."""
         if (self.log_transmittances is None) != (other.log_transmittances is None):
             return self.that_may_tint().joined(other.that_may_tint())
-        if self.heights is None and other.heights is not None:
-            return other.joined(self)
-        if self.heights is not None and other.heights is None:
-            other = replace(other, heights=self.heights.new_zeros(len(other), *self.heights.shape[1:]))
         mine, theirs = self.tensors(), other.tensors()
         together = Planes(
             **{name: torch.cat([mine[name], theirs[name]]) for name in mine},

@@ -55,8 +55,8 @@ PLANE_SHAPES: dict[str, tuple[int, ...] | None] = {
     "tangents": (3,),
     "half_sizes": (2,),
 }
-FURTHER_PLANE_SHAPES: dict[str, tuple[int, ...] | None] = {"log_transmittances": (3,), "heights": None}
-"""Of panes that are tinted or uneven."""
+FURTHER_PLANE_SHAPES: dict[str, tuple[int, ...] | None] = {"log_transmittances": (3,)}
+"""Of panes that are tinted."""
 SCALE_SHAPES = [(DISC_SCALES,), (DISC_SCALES + 1,)]
 SH_SHAPES = [(count, 3) for count in (0, 1, 4, 9, 16)]
 

@@ -65,8 +65,6 @@ class DeferredRecipe:
         outside_weight: weight of the mean strength outside of the region in the objective.
         strength_weight: of the mean strength of all Gaussians in the objective, which the paper does not have: a matte
             thing would learn to reflect a little.
-        tint: reflections may have a colour, as those of gold and copper do, which the paper does not have.
-        tint_weight: of the mean square of what gives them one in the objective.
         consistency_weight: weight of the difference between normals and the slope of the depths, while normals spread.
         monocular_weight: of the difference between normals and those that lie in `normals/` beside the photographs;
             nothing where there are none (not in the paper).
@@ -107,8 +105,6 @@ class DeferredRecipe:
     find_region: bool = True
     outside_weight: NotNegative = 0.4
     strength_weight: NotNegative = 0.005
-    tint: Annotated[bool, ESSENTIAL] = False
-    tint_weight: NotNegative = 2e-4
     consistency_weight: NotNegative = 0.3
     monocular_weight: NotNegative = 0.5
     propagation: NormalPropagation = field(default_factory=NormalPropagation)

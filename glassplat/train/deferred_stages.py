@@ -11,7 +11,7 @@ from glassplat.data.backgrounds import BLACK
 from glassplat.data.dataset import Dataset
 from glassplat.losses.geometry import normal_consistency
 from glassplat.losses.monocular import MonocularNormals
-from glassplat.losses.reflectors import mean_strength, mean_tint, strength_outside
+from glassplat.losses.reflectors import mean_strength, strength_outside
 from glassplat.losses.term import LossTerm, weighted
 from glassplat.render.deferred import INVISIBLE, Deferred
 from glassplat.render.splat import Splat
@@ -78,7 +78,6 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
     guidance = weighted(
         LossTerm("outside", recipe.outside_weight, strength_outside),
         LossTerm("strength", recipe.strength_weight, mean_strength),
-        LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, mean_tint),
         LossTerm("consistency", recipe.consistency_weight, normal_consistency),
         LossTerm("monocular normals", recipe.monocular_weight, MonocularNormals()),
     )
@@ -145,7 +144,7 @@ def _regular(recipe: DeferredRecipe, population: Population) -> tuple[Action, ..
 def first_reflections(recipe: DeferredRecipe) -> BeginReflections:
     """How things begin to reflect."""
     seen_by = Splat(recipe.background or BLACK, depth=False)
-    return BeginReflections(_environment(recipe), None, recipe.search, seen_by, recipe.tint, harmonics_wait=True)
+    return BeginReflections(_environment(recipe), None, recipe.search, seen_by, harmonics_wait=True)
 
 
 def _environment(recipe: DeferredRecipe) -> AddEnvironment:

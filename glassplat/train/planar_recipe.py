@@ -10,7 +10,6 @@ from glassplat.data.ranges import (
     Ascending,
     Color,
     InnerShare,
-    LearningRate,
     NotNegative,
     Positive,
     Range,
@@ -21,9 +20,6 @@ from glassplat.densify.options import DefaultDensify, McmcDensify
 from glassplat.init.plane_options import PlaneFit
 from glassplat.kernels.fresnel import Fresnel
 from glassplat.render.choices import Blend
-from glassplat.train.mirror_options import (
-    CurvedMirrors,
-)
 from glassplat.train.photograph_options import PhotoExposure, Photographer, PoseRefinement
 from glassplat.train.rates import PUBLISHED_ITERATIONS, GaussianRates, PlaneRates
 from glassplat.train.rhythm import Rhythm, Strategy
@@ -71,23 +67,6 @@ class Perturbation:
 
 
 @dataclass(frozen=True)
-class UnevenGlass:
-    """Whether panes are wavy and hung unevenly, which bends what they mirror (not in the paper).
-
-    Attributes:
-        learn: find out.
-        heights: control values along each side of a pane; three for each wave.
-        weight: of the mean square of the angles in degrees by which normals are turned, in the objective.
-        rate: learning rate of the heights in stage 3, per scene extent.
-    """
-
-    learn: bool = False
-    heights: Annotated[int, Range(4, 256)] = 16
-    weight: NotNegative = 0.01
-    rate: LearningRate = 5e-6
-
-
-@dataclass(frozen=True)
 class PlanarRecipe:
     """TR-Gaussians: transmission, reflection and planes, trained in three stages.
 
@@ -110,7 +89,6 @@ class PlanarRecipe:
         seed_reflections: start what no photograph shows directly from the virtual points behind the panes.
         tint: panes may be tinted: each learns what share of red, green and blue light gets through (not in the paper).
         tint_weight: of the mean square of the logarithm of that share in the objective.
-        waves: whether panes are uneven.
         glass_count: glass Gaussians placed on each pane.
         weights: of the loss terms; zero switches a term off (ablation).
         perturbation: of opacities; amplitude zero switches it off (ablation).
@@ -132,7 +110,6 @@ class PlanarRecipe:
         exposure: whether the exposure of each photograph is learned.
         poses: whether the camera of each photograph is corrected.
         photographer: whether panes show who took the photographs.
-        curved: whether things that are not flat mirror as well.
     """
 
     method: ClassVar[str] = "planar"
@@ -152,7 +129,6 @@ class PlanarRecipe:
     seed_reflections: bool = True
     tint: bool = False
     tint_weight: NotNegative = 0.01
-    waves: UnevenGlass = field(default_factory=UnevenGlass)
     glass_count: Annotated[int, Range(1, 1_000_000)] = 1000
     weights: ReflectionWeights = field(default_factory=ReflectionWeights)
     moving_mean: bool = False
@@ -170,7 +146,6 @@ class PlanarRecipe:
     exposure: PhotoExposure = field(default_factory=PhotoExposure)
     poses: PoseRefinement = field(default_factory=PoseRefinement)
     photographer: Photographer = field(default_factory=Photographer)
-    curved: CurvedMirrors = field(default_factory=CurvedMirrors)
 
     @classmethod
     def paper(cls) -> PlanarRecipe:
@@ -194,10 +169,6 @@ class PlanarRecipe:
             densify=DefaultDensify.published(),
             mcmc=McmcDensify.published(),
         )
-
-    def contradiction(self) -> str | None:
-        """What is wrong with the options together, if anything."""
-        return self.curved.contradiction()
 
     def initialise(self, dataset: Dataset) -> Scene:
         """The first scene: one Gaussian per point, no planes yet.

@@ -13,14 +13,12 @@ from glassplat.losses.reflection import (
     intensity_departure,
     mask_loss,
     tint_departure,
-    unevenness,
 )
 from glassplat.losses.term import LossTerm, weighted
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, GrowSh, PerturbOpacity, ResetOpacity
-from glassplat.train.curved_mirrors import curved_mirrors_learnt, with_curved_mirrors
 from glassplat.train.photo_exposure import exposures_begun, exposures_learnt
 from glassplat.train.photographer_entry import photographer_learnt
 from glassplat.train.planar_recipe import PlanarRecipe, ReflectionWeights
@@ -58,11 +56,6 @@ def _lack_of_masks(dataset: Dataset) -> str:
 
 def finished_renderer(recipe: PlanarRecipe) -> Planar:
     """The renderer of the finished scene, with all its layers."""
-    return with_curved_mirrors(recipe.curved, _of_panes(recipe))
-
-
-def _of_panes(recipe: PlanarRecipe) -> Planar:
-    """The renderer of panes, without curved mirrors."""
     return Planar(
         recipe.background or BLACK,
         fresnel=recipe.fresnel,
@@ -84,7 +77,6 @@ def stages_of(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERA
         fixed_mirrors=recipe.fixed_mirrors,
         seed_reflections=recipe.seed_reflections,
         tint=recipe.tint,
-        heights=recipe.waves.heights if recipe.waves.learn else 0,
     )
     initialisation = Stage(
         name="1 initialisation",
@@ -101,7 +93,6 @@ def stages_of(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERA
     else:
         stages = (initialisation, _adjustment(recipe, second, entry), _joint(recipe, third))
     stages = photographer_learnt(recipe.photographer, stages, recipe.densify, seed)
-    stages = curved_mirrors_learnt(recipe.curved, stages, recipe.rhythm.sh)
     return poses_learnt(recipe.poses, exposures_learnt(recipe.exposure, stages))
 
 
@@ -139,8 +130,7 @@ def _joint(recipe: PlanarRecipe, share: float) -> Stage:
         rates=recipe.rates.of("primary")
         | recipe.rates.of("glass")
         | recipe.plane_rates.of(recipe.plane_rates.joint_factor)
-        | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {})
-        | ({"planes.heights": Rate(recipe.waves.rate, per_extent=True)} if recipe.waves.learn else {}),
+        | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {}),
         actions=(
             *population.edits,
             GrowSh(Every(recipe.rhythm.sh)),
@@ -161,10 +151,7 @@ def _glass_motions(recipe: PlanarRecipe) -> tuple[Motion, ...]:
 
 def _joint_terms(recipe: PlanarRecipe, population: Population) -> tuple[LossTerm, ...]:
     image = image_terms(recipe.ssim_weight, recipe.view_dependence_weight)
-    glass = weighted(
-        LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, tint_departure),
-        LossTerm("waves", recipe.waves.weight if recipe.waves.learn else 0.0, unevenness),
-    )
+    glass = weighted(LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, tint_departure))
     return (*image, *reflection_terms(recipe.weights), *glass, *population.terms)
 
 
@@ -198,7 +185,7 @@ def _joint_start(recipe: PlanarRecipe) -> float:
 
 def _training_renderer(recipe: PlanarRecipe, gradient: str) -> Planar:
     return replace(
-        _of_panes(recipe),
+        finished_renderer(recipe),
         reflection_gradient="all" if gradient == "all" else "planes",
         deviation=recipe.weights.depth != 0,
         deviation_depth_gradient=recipe.moving_mean,

@@ -44,7 +44,6 @@ class PlaneEntry:
             start at that reflectance.
         seed_reflections: start what no photograph shows directly from the virtual points behind the panes.
         tint: whether panes may be tinted.
-        heights: control values along each side of uneven panes; 0 takes all glass for even.
     """
 
     fit: PlaneFit
@@ -54,7 +53,6 @@ class PlaneEntry:
     fixed_mirrors: bool = True
     seed_reflections: bool = True
     tint: bool = False
-    heights: int = 0
 
     def __call__(self, state: TrainState, dataset: Dataset) -> Work:
         """Edits `state`, and tells how far it is."""
@@ -66,7 +64,7 @@ class PlaneEntry:
             planes = yield from self._with_mirrors_found(scene, dataset)
         if not self.fixed_mirrors:
             planes = replace(planes, mirrors=())
-        state.scene = replace(scene, planes=self._glass(planes))
+        state.scene = replace(scene, planes=planes.that_may_tint() if self.tint else planes)
         state.statistics.clear()
         for mirrors in surfaces(planes, mirrors=True):
             yield Working(f"moving what was built behind {named(mirrors, 'mirror')}", 0, 1)
@@ -74,12 +72,6 @@ class PlaneEntry:
         for panes in surfaces(planes, mirrors=False) if self.seed_reflections else ():
             yield from seed_reflection(state, dataset, panes)
         return True
-
-    def _glass(self, planes: Planes) -> Planes:
-        """The planes, with what of them may be learnt."""
-        if self.tint:
-            planes = planes.that_may_tint()
-        return planes.that_may_wave(self.heights) if self.heights else planes
 
     def _with_mirrors_found(self, scene: Scene, dataset: Dataset) -> Generator[Working, None, Planes]:
         """The scene's planes, with those as mirrors that look like it; of given ones the capture says what they are."""

@@ -127,16 +127,11 @@ class ReflectionRates:
     Attributes:
         strength: logit of the reflection strength.
         environment: raw texels of the environment.
-        tint: logits of what red, green and blue reflect more or less strongly.
     """
 
     strength: LearningRate = 2e-2
     environment: LearningRate = 5e-2
-    tint: LearningRate = 2e-2
 
     def of(self) -> dict[str, Rate]:
         """The rates by dotted parameter name."""
-        from glassplat.scene.tint import TINT
-
-        tints = {f"primary.{name}": Rate(self.tint) for name in TINT}
-        return {"primary.logit_strength": Rate(self.strength), "environment.raw": Rate(self.environment), **tints}
+        return {"primary.logit_strength": Rate(self.strength), "environment.raw": Rate(self.environment)}

@@ -10,7 +10,6 @@ from glassplat.densify.edit import forget
 from glassplat.densify.mirrors import made_mirrors, mirror_lookalikes
 from glassplat.densify.options import MirrorSearch
 from glassplat.render.frame import Renderer
-from glassplat.scene.tint import with_tint
 from glassplat.train.environment_entry import AddEnvironment
 from glassplat.train.messages import Working
 from glassplat.train.state import TrainState
@@ -26,7 +25,6 @@ class BeginReflections:
         surroundings: adds what is near; None where only the environment is mirrored.
         mirrors: what looks like a mirror.
         renderer: that of the stage before.
-        tint: reflections may learn a colour; at first they are white.
         harmonics_wait: where mirrors were found, colours are again the same from all sides, until harmonics rise anew:
             what they had learnt by then is what those mirrors show.
     """
@@ -35,13 +33,10 @@ class BeginReflections:
     surroundings: AddSurroundings | None
     mirrors: MirrorSearch
     renderer: Renderer
-    tint: bool = False
     harmonics_wait: bool = False
 
     def __call__(self, state: TrainState, dataset: Dataset) -> Generator[Working, None, bool]:
         """Edits `state`."""
-        if self.tint:
-            state.scene = replace(state.scene, primary=with_tint(state.scene.primary))
         if self.environment is not None:
             self.environment(state, dataset)
         if self.surroundings is None and not self.mirrors.begin_found:

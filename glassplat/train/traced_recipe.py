@@ -73,8 +73,6 @@ class TracedRecipe:
             says otherwise, as in the paper.
         outside_weight: weight of the mean strength outside of the region in the objective.
         strength_weight: of the mean strength of all Gaussians in the objective, which the paper does not have.
-        tint: reflections may have a colour, as those of gold and copper do, which the paper does not have.
-        tint_weight: of the mean square of what gives them one in the objective.
         consistency_weight: weight of the difference between normals and the slope of the depths.
         consistency_to_end: keep that term after propagation (paper).
         monocular_weight: of the difference between normals and those that lie in `normals/` beside the photographs;
@@ -118,8 +116,6 @@ class TracedRecipe:
     find_region: bool = True
     outside_weight: NotNegative = 0.4
     strength_weight: NotNegative = 0.005
-    tint: Annotated[bool, ESSENTIAL] = False
-    tint_weight: NotNegative = 2e-4
     consistency_weight: NotNegative = 0.3
     consistency_to_end: bool = False
     monocular_weight: NotNegative = 0.5

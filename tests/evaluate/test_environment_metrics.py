@@ -88,7 +88,7 @@ def test_values_that_are_not_finite_are_refused() -> None:
 def test_lpips_sees_equalised_maps() -> None:
     assert environment_lpips(0.4 * TRUTH, TRUTH, MeanDifference()) == 0  # type: ignore[arg-type]
     assert environment_lpips(TRUTH.flip(0), TRUTH, MeanDifference()) > 1  # type: ignore[arg-type]
-    assert environment_lpips(TRUTH, TRUTH, "no LPIPS weights: put them somewhere") == "no LPIPS weights"
+    assert environment_lpips(TRUTH, TRUTH, "no LPIPS: install it") == "no LPIPS"
 
 
 def test_what_is_missing_is_the_reason() -> None:

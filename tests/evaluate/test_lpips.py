@@ -1,168 +1,64 @@
-"""LPIPS on narrow random networks that are stored in the published key layout."""
+"""LPIPS: what enters torchmetrics, and why there is no distance without it."""
 
-from itertools import pairwise
-from pathlib import Path
+from __future__ import annotations
+
+import sys
+from types import ModuleType
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from glassplat.data.errors import InputError
-from glassplat.evaluate.lpips import LAYERS, Backbone, Lpips, load_lpips
+from glassplat.evaluate.lpips import Lpips, load_lpips
 
-WIDTHS = {"alex": (4, 6, 5, 5, 3), "vgg": (3, 4, 5, 4, 6, 5, 4, 3, 4, 5, 3, 4, 5)}
-KERNELS = {"alex": (11, 5, 3, 3, 3), "vgg": (3,) * 13}
-FILES = {"alex": ("alexnet-owt-7be5be79.pth", "alex.pth"), "vgg": ("vgg16-397923af.pth", "vgg.pth")}
-SHIFT, SCALE = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+MODULE = "torchmetrics.image.lpip"
 
 
-@pytest.fixture(autouse=True)
-def _nothing_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The machine's own weights must not leak into the tests."""
-    monkeypatch.delenv("GLASSPLAT_LPIPS_WEIGHTS", raising=False)
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "empty_cache"))
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+def with_metric(monkeypatch: pytest.MonkeyPatch, metric: object) -> None:
+    """Stands for torchmetrics, whose network needs weights from elsewhere."""
+    for name in ("torchmetrics", "torchmetrics.image", MODULE):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    sys.modules[MODULE].LearnedPerceptualImagePatchSimilarity = metric  # type: ignore[attr-defined]
 
 
-def random_weights(backbone: Backbone) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """The two files' contents: features with a stray classifier weight, and the linear weights."""
-    generator = torch.Generator().manual_seed(7)
-    features, linear, inputs = {"classifier.1.weight": torch.zeros(2, 2)}, {}, 3
-    for layer, width, side in zip(LAYERS[backbone], WIDTHS[backbone], KERNELS[backbone], strict=True):
-        scale = (2 / (inputs * side * side)) ** 0.5
-        features[f"features.{layer.index}.weight"] = scale * torch.randn(width, inputs, side, side, generator=generator)
-        features[f"features.{layer.index}.bias"] = 0.1 * torch.randn(width, generator=generator)
-        if layer.tapped:
-            linear[f"lin{len(linear)}.model.1.weight"] = torch.rand(1, width, 1, 1, generator=generator)
-        inputs = width
-    return features, linear
+def mean_difference(image: Tensor, target: Tensor) -> Tensor:
+    assert image.shape == target.shape and image.shape[:2] == (1, 3)
+    assert float(image.min()) >= 0 and float(image.max()) <= 1
+    return (image - target).abs().mean()
 
 
-def write_weights(folder: Path, backbone: Backbone) -> Path:
-    folder.mkdir(exist_ok=True)
-    for name, weights in zip(FILES[backbone], random_weights(backbone), strict=True):
-        torch.save(weights, folder / name)
-    return folder
+def test_images_enter_as_batches_between_0_and_1(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, object] = {}
+    with_metric(monkeypatch, lambda **options: asked.update(options) or mean_difference)
+    lpips = load_lpips()
+    assert isinstance(lpips, Lpips) and lpips.backbone == "vgg"
+    assert asked == {"net_type": "vgg", "normalize": True}  # `normalize` says that images are in [0, 1].
+    white, grey = torch.full((32, 40, 3), 255, dtype=torch.uint8), torch.full((32, 40, 3), 51, dtype=torch.uint8)
+    assert lpips(white, grey) == pytest.approx(0.8)
+    assert lpips(white / 255, 1.5 * torch.ones(32, 40, 3)) == 0, "what is brighter than white is white"
 
 
-def torchvision_stack(backbone: Backbone, weights: dict[str, Tensor]) -> tuple[nn.Sequential, list[int]]:
-    """The features as torchvision lays them out, and the positions of the ReLUs that LPIPS taps."""
-    relu_taps = {"alex": [1, 4, 7, 9, 11], "vgg": [3, 8, 15, 22, 29]}[backbone]
-    w = WIDTHS[backbone]
-    if backbone == "alex":
-        modules = [nn.Conv2d(3, w[0], 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2), nn.Conv2d(w[0], w[1], 5, padding=2)]
-        modules += [nn.ReLU(), nn.MaxPool2d(3, 2)]
-        for inputs, outputs in pairwise(w[1:]):
-            modules += [nn.Conv2d(inputs, outputs, 3, padding=1), nn.ReLU()]
-    else:
-        modules, inputs, widths = [], 3, iter(w)
-        for block in (2, 2, 3, 3, 3):
-            for _ in range(block):
-                outputs = next(widths)
-                modules += [nn.Conv2d(inputs, outputs, 3, padding=1), nn.ReLU()]
-                inputs = outputs
-            modules += [nn.MaxPool2d(2, 2)]
-    stack = nn.Sequential(*modules)
-    names = {key.removeprefix("features."): value for key, value in weights.items() if key.startswith("features.")}
-    stack.load_state_dict(names)
-    return stack, relu_taps
+@pytest.mark.parametrize("size", [(31, 40), (40, 31)])
+def test_images_that_are_too_small_are_refused(size: tuple[int, int]) -> None:
+    image = torch.zeros(*size, 3)
+    with pytest.raises(ValueError, match="at least 32 pixels a side"):
+        Lpips(mean_difference)(image, image)
 
 
-def recomputed(backbone: Backbone, image: Tensor, target: Tensor) -> float:
-    """The distance written out over torch modules, as the paper defines it."""
-    features, linear = random_weights(backbone)
-    stack, taps = torchvision_stack(backbone, features)
-    total, pair = 0.0, [((2 * x - 1 - SHIFT) / SCALE).permute(2, 0, 1)[None] for x in (image, target)]
-    for index, module in enumerate(stack):
-        with torch.no_grad():
-            pair = [module(x) for x in pair]
-        if index in taps:
-            unit = [nn.functional.normalize(x, dim=1) for x in pair]
-            weight = linear[f"lin{taps.index(index)}.model.1.weight"]
-            total += float(((unit[0] - unit[1]) ** 2 * weight).sum(1).mean())
-    return total
-
-
-def random_images() -> tuple[Tensor, Tensor]:
-    generator = torch.Generator().manual_seed(1)
-    image = torch.rand(40, 52, 3, generator=generator)
-    return image, (image + 0.2 * torch.randn(40, 52, 3, generator=generator)).clamp(0, 1)
-
-
-@pytest.mark.parametrize("backbone", ["alex", "vgg"])
-def test_agrees_with_a_direct_computation(tmp_path: Path, backbone: Backbone) -> None:
-    lpips = load_lpips(write_weights(tmp_path / "weights", backbone))
-    image, target = random_images()
-    assert lpips.backbone == backbone
-    assert lpips(image, target) == pytest.approx(recomputed(backbone, image, target), rel=1e-4)
-    assert lpips(image, target) > 0
-
-
-@pytest.fixture
-def alex(tmp_path: Path) -> Lpips:
-    return load_lpips(write_weights(tmp_path / "weights", "alex"))
-
-
-def test_is_zero_for_equal_images_and_symmetric(alex: Lpips) -> None:
-    image, target = random_images()
-    assert alex(image, image.clone()) == 0.0
-    assert alex(image, target) == pytest.approx(alex(target, image), rel=1e-6)
-
-
-def test_bytes_and_floats_mean_the_same(alex: Lpips) -> None:
-    stored = [torch.round(image * 255) for image in random_images()]
-    assert alex(*(s.to(torch.uint8) for s in stored)) == pytest.approx(alex(*(s / 255 for s in stored)), rel=1e-6)
-
-
-def test_vgg_is_preferred_and_either_can_be_asked_for(tmp_path: Path) -> None:
-    folder = tmp_path / "weights"
-    write_weights(folder, "alex")
-    write_weights(folder, "vgg")
-    assert load_lpips(folder).backbone == "vgg"
-    assert load_lpips(folder, "alex").backbone == "alex"
-
-
-def test_the_environment_names_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("GLASSPLAT_LPIPS_WEIGHTS", str(write_weights(tmp_path / "weights", "alex")))
-    assert load_lpips().backbone == "alex"
-
-
-def test_features_from_the_hub_cache_go_with_linear_weights_from_the_folder(tmp_path: Path) -> None:
-    folder = write_weights(tmp_path / "weights", "alex")
-    cache = tmp_path / "empty_cache" / "hub" / "checkpoints"
-    cache.mkdir(parents=True)
-    (folder / FILES["alex"][0]).rename(cache / FILES["alex"][0])
-    assert load_lpips(folder).backbone == "alex"
-
-
-def test_absent_weights_say_what_to_do(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"vgg16-\*\.pth with vgg\.pth or alexnet.*GLASSPLAT_LPIPS_WEIGHTS"):
-        load_lpips()
-    with pytest.raises(FileNotFoundError, match="is not a folder"):
-        load_lpips(tmp_path / "nowhere")
-
-
-def test_a_damaged_file_is_named(tmp_path: Path) -> None:
-    folder = write_weights(tmp_path / "weights", "alex")
-    linear = folder / "alex.pth"
-    linear.write_bytes(linear.read_bytes()[:100])
-    with pytest.raises(InputError, match=r"cannot read the weights in .*alex\.pth"):
-        load_lpips(folder)
-
-
-def test_files_of_two_backbones_do_not_mix(tmp_path: Path) -> None:
-    folder = write_weights(tmp_path / "weights", "alex")
-    torch.save(random_weights("vgg")[1], folder / "alex.pth")
-    with pytest.raises(ValueError, match="channels differ"):
-        load_lpips(folder)
-    torch.save({}, folder / "alex.pth")
-    with pytest.raises(ValueError, match="no weights named 'lin0"):
-        load_lpips(folder)
-
-
-def test_bad_images_are_refused(alex: Lpips) -> None:
-    image, target = random_images()
+def test_images_of_different_sizes_are_refused() -> None:
     with pytest.raises(ValueError, match="of one size"):
-        alex(image, target[1:])
-    with pytest.raises(ValueError, match="at least 32 pixels"):
-        alex(image[:20], target[:20])
+        Lpips(mean_difference)(torch.zeros(32, 32, 3), torch.zeros(32, 33, 3))
+
+
+def test_without_torchmetrics_the_reason_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torchmetrics", None)
+    assert load_lpips() == "no LPIPS: torchmetrics or torchvision is not installed; install glassplat[lpips]"
+
+
+@pytest.mark.parametrize("error", [RuntimeError("operator torchvision::nms does not exist"), OSError("no network")])
+def test_what_keeps_torchmetrics_from_loading_is_the_reason(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(**options: object) -> None:
+        raise error
+
+    with_metric(monkeypatch, fail)
+    assert load_lpips() == f"no LPIPS: torchmetrics cannot load it: {error}"

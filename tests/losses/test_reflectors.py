@@ -8,11 +8,10 @@ from typing import Any
 import pytest
 import torch
 
-from glassplat.losses.reflectors import mean_strength, mean_tint, strength_outside
+from glassplat.losses.reflectors import mean_strength, strength_outside
 from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
-from glassplat.scene.tint import TINT, with_tint
 
 UNUSED: Any = None
 STRENGTHS = torch.tensor([0.1, 0.5, 0.9])
@@ -45,15 +44,3 @@ def test_outside_of_the_region_is_what_lies_beyond_its_radius(radius: float, exp
 
 def test_without_a_region_nothing_is_outside() -> None:
     assert strength_outside(UNUSED, UNUSED, scene_of(None)) is None
-
-
-def test_a_tint_costs_by_how_far_it_is_from_white() -> None:
-    scene = scene_of(None)
-    assert mean_tint(UNUSED, UNUSED, scene) is None
-    primary = with_tint(scene.primary)
-    assert mean_tint(UNUSED, UNUSED, replace(scene, primary=primary)).item() == 0  # type: ignore[union-attr]
-    # Red 3, and 1 of it is the mean: (2, -1, -1), on one Gaussian of three; the same for all of another costs nothing.
-    rows = torch.tensor([[3.0, 5.0, 0.0], [0.0, 5.0, 0.0], [0.0, 5.0, 0.0]])
-    tinted = primary.with_tensors(dict(zip(TINT, rows, strict=True)))
-    coloured = mean_tint(UNUSED, UNUSED, replace(scene, primary=tinted))
-    assert coloured is not None and coloured.item() == pytest.approx(2.0)

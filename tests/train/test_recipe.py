@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 from glassplat.commands.looking.render import Render
-from glassplat.commands.measuring.bench import BenchAblation, BenchScenes
 from glassplat.commands.measuring.demo import Demo
 from glassplat.commands.training.train import Train
 from glassplat.data.errors import InputError
@@ -22,7 +21,7 @@ from glassplat.train.recipe import RECIPES, recipe_from_json, recipe_of, recipe_
 from glassplat.train.run_directory import RunDirectory, RunSettings
 from glassplat.train.splat_recipe import SplatRecipe
 
-COMMANDS = [Train, Demo, BenchScenes, BenchAblation, Render, RunSettings]
+COMMANDS = [Train, Demo, Render, RunSettings]
 DECLARED = [(kind, name, hint) for kind in (*RECIPES.values(), *COMMANDS) for name, hint in number_fields(kind)]
 
 

@@ -13,7 +13,6 @@ from glassplat.densify.options import MirrorSearch
 from glassplat.render.splat import Splat
 from glassplat.scene.activations import logit
 from glassplat.scene.scene import Scene
-from glassplat.scene.tint import TINT
 from glassplat.train.actions import GrowSh, ResetOpacity
 from glassplat.train.deferred_recipe import DeferredRecipe
 from glassplat.train.environment_entry import AddEnvironment
@@ -47,7 +46,6 @@ def begun(
     search: MirrorSearch | None = None,
     *,
     near: bool = True,
-    tint: bool = False,
     harmonics_wait: bool = False,
 ) -> tuple[TrainState, list[str]]:
     """A state in which reflections have begun, and what was told on the way."""
@@ -56,7 +54,7 @@ def begun(
     ones = {name: torch.ones_like(tensor) for name, tensor in state.scene.primary.tensors().items()}
     state.optimizer.moments = {f"primary.{name}": (tensor, tensor.clone()) for name, tensor in ones.items()}
     around = AddSurroundings(SurroundingsStart("scene"), 1) if near else None
-    entry = BeginReflections(AddEnvironment(2), around, search or MirrorSearch(), Splat(), tint, harmonics_wait)
+    entry = BeginReflections(AddEnvironment(2), around, search or MirrorSearch(), Splat(), harmonics_wait)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("glassplat.train.reflection_entry.mirror_lookalikes", found)
         messages, _ = followed(entry(state, tiny_capture()))
@@ -121,25 +119,3 @@ def test_colors_wait_until_normals_have_spread(recipe: DeferredRecipe | TracedRe
     stage = recipe.stages(0, 7000)[1]
     assert isinstance(stage.entry, BeginReflections) and stage.entry.harmonics_wait
     assert any(isinstance(action, GrowShAfterPropagation) for action in stage.actions)
-
-
-def test_reflections_begin_white_and_may_learn_a_color_where_that_is_asked_for() -> None:
-    search = MirrorSearch(begin_found=False)
-    white, tinted = (begun(nothing, search, tint=tint)[0].scene for tint in (False, True))
-    assert not set(TINT) & set(white.primary.channels)
-    assert set(TINT) <= set(tinted.primary.channels)
-    assert not any(bool(tinted.primary.channels[name].any()) for name in TINT)
-    # What is mirrored is not copied with it.
-    assert not tinted.surroundings.channels
-
-
-@pytest.mark.parametrize(
-    "recipe", [DeferredRecipe(tint=True, least_iterations=1), TracedRecipe(tint=True, least_iterations=1)]
-)
-def test_a_tint_is_learned_at_a_price_from_when_things_reflect(recipe: DeferredRecipe | TracedRecipe) -> None:
-    bootstrap, *reflecting = recipe.stages(0, 7000)
-    names = {f"primary.{name}" for name in TINT}
-    assert not names & bootstrap.rates.keys()
-    for stage in reflecting:
-        assert names <= stage.rates.keys() and "tint" in {term.name for term in stage.losses}
-    assert "tint" not in {term.name for term in replace(recipe, tint=False).stages(0, 7000)[1].losses}

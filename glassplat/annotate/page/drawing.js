@@ -4,7 +4,6 @@ import { distance, fromSegment } from "/marking.js";
 
 export const COLORS = ["#53a6ff", "#ff8a5c", "#58d68d", "#d58cff", "#ffd84d", "#5ce1e6", "#ff6fa3", "#b5e853"];
 export const colorOf = (label) => COLORS[(label - 1) % COLORS.length];
-const SUGGESTED = "#fff27a";
 const ROOM = 0.25; // Beside the photograph, in its sizes: corners may lie there.
 
 export class Drawing {
@@ -46,7 +45,7 @@ export class Drawing {
 
   move(way) { this.shift = [this.shift[0] + way[0], this.shift[1] + way[1]]; }
 
-  draw(panes, answers, active, pending, suggestions = []) {
+  draw(panes, answers, active, pending) {
     const { canvas, context } = this;
     const box = canvas.getBoundingClientRect();
     const ratio = window.devicePixelRatio || 1;
@@ -57,19 +56,7 @@ export class Drawing {
     const [x, y] = this.shift;
     if (this.image) context.drawImage(this.image, x, y, this.view.width * this.scale, this.view.height * this.scale);
     for (const pane of panes) this.#pane(pane, answers[pane.label], pane.label === active);
-    for (const one of suggestions) if (one.outlines[this.view.number].length) this.#suggestion(one.outlines[this.view.number]);
     if (pending) this.#pending(pending, colorOf(active));
-  }
-
-  #suggestion(outline) {
-    const shape = this.#path(outline, true);
-    this.context.lineWidth = 3;
-    for (const [color, dash] of [["#000", []], [SUGGESTED, [8, 8]]]) {
-      this.context.strokeStyle = color;
-      this.context.setLineDash(dash);
-      this.context.stroke(shape);
-    }
-    this.context.setLineDash([]);
   }
 
   #pane(pane, answer, isActive) {

@@ -42,23 +42,14 @@ export class Marking {
     this.changed();
   }
 
-  // A new pane, with marks of its four corners where some are known: [{photograph: [x, y]}, ...].
-  addPane(corners = [{}, {}, {}, {}]) {
+  addPane() {
     this.change((document) => {
       const used = document.panes.map((pane) => pane.label);
       let label = 1;
       while (used.includes(label)) label += 1;
-      document.panes.push({ label, material: "glass", shape: "rectangle", corners, edges: [{}, {}, {}, {}], strokes: {} });
+      document.panes.push({ label, material: "glass", shape: "rectangle", corners: [{}, {}, {}, {}], edges: [{}, {}, {}, {}], strokes: {} });
       this.active = label;
     });
-  }
-
-  // Corners that were suggested, as a pane; in place of the active one if nothing is marked of that.
-  takeSuggestion(corners) {
-    const pane = this.pane;
-    const isEmpty = pane && [...pane.corners, ...pane.edges, pane.strokes].every((places) => !Object.keys(places).length);
-    if (isEmpty) this.change(() => { pane.corners = corners; });
-    else this.addPane(corners);
   }
 
   removePane(label) {

@@ -67,7 +67,6 @@ async function send() {
 function refresh() {
   drawViews();
   drawPanes();
-  drawSuggestions();
   element("undo").disabled = !marking.done.length;
   element("redo").disabled = !marking.undone.length;
   document.querySelectorAll("[data-tool]").forEach((button) => button.setAttribute("aria-pressed", button.dataset.tool === tool));
@@ -103,7 +102,7 @@ const view = () => capture.views[current];
 
 function draw() {
   drawing.upcoming = tool === "corner" && marking.pane ? upcoming() : null;
-  drawing.draw(marking.document.panes, answers, marking.active, pending, capture.suggestions);
+  drawing.draw(marking.document.panes, answers, marking.active, pending);
 }
 
 function suggested() {
@@ -134,31 +133,6 @@ function choice(pane, key, values) {
   values.forEach((value) => select.append(make("option", { value, textContent: value, selected: pane[key] === value })));
   select.addEventListener("change", () => marking.set(pane.label, key, select.value));
   return select;
-}
-
-function drawSuggestions() {
-  element("suggestions").replaceChildren(...capture.suggestions.map((one) => {
-    const take = make("button", { textContent: "take it", title: "Y: makes a pane of it, whose corners can be dragged" });
-    const drop = make("button", { textContent: "no", title: "X: drops it" });
-    take.addEventListener("click", (event) => { event.stopPropagation(); takeSuggestion(one); });
-    drop.addEventListener("click", (event) => { event.stopPropagation(); dropSuggestion(one); });
-    const card = make("div", { className: "pane suggestion" }, make("h2", { textContent: "suggested pane" }), make("p", { textContent: one.text }), take, " ", drop);
-    card.addEventListener("click", () => show(one.view));
-    return card;
-  }));
-}
-
-function dropSuggestion(one) {
-  capture.suggestions = capture.suggestions.filter((other) => other !== one);
-  refresh();
-}
-
-// A pane with no mark, as the page begins with, makes room.
-function takeSuggestion(one) {
-  capture.suggestions = capture.suggestions.filter((other) => other !== one);
-  marking.takeSuggestion(structuredClone(one.corners));
-  unskip();
-  show(one.view);
 }
 
 function drawPanes() {
@@ -317,8 +291,6 @@ const KEYS = {
   s: () => { const next = suggested()[0]; if (next) show(next.view); },
   a: () => { marking.addPane(); unskip(); refresh(); },
   n: skip,
-  y: () => { if (capture.suggestions.length) takeSuggestion(capture.suggestions[0]); },
-  x: () => { if (capture.suggestions.length) dropSuggestion(capture.suggestions[0]); },
   0: () => { drawing.fit(); draw(); },
   1: () => choose("corner"),
   2: () => choose("edge"),
@@ -408,7 +380,7 @@ async function begin() {
   drawing = new Drawing(element("canvas"));
   listen();
   if (!marking.document.panes.length) marking.addPane(); else send();
-  await show(capture.suggestions.length ? capture.suggestions[0].view : capture.first);
+  await show(capture.first);
   document.body.dataset.ready = "yes";
 }
 

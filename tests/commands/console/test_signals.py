@@ -15,7 +15,6 @@ import pytest
 from glassplat.cli import main
 from glassplat.commands.console.signals import Interrupted, held_signals, raised_signals
 from glassplat.commands.looking.render import Render
-from glassplat.commands.measuring.bench import Bench, BenchScenes
 from glassplat.commands.measuring.demo import SCENE, Demo
 from glassplat.commands.measuring.evaluate import Evaluate
 from glassplat.commands.publishing.dereflect import Dereflect
@@ -173,11 +172,10 @@ def test_each_command_says_what_it_leaves_behind(tmp_path: Path) -> None:
         Render(run, output),
         Dereflect(run, output),
         Demo(output),
-        Bench(BenchScenes((tmp_path,), output)),
     ]
     said = [command.left_behind() for command in commands]
     assert all("repeat the command" in text for text in said)
-    assert [str(run) in text or str(output) in text for text in said] == [False, True, True, True, True, True]
+    assert [str(run) in text or str(output) in text for text in said] == [False, True, True, True, True]
     assert "no checkpoint was written yet" in said[0] and "--resume" not in said[0]
     run.mkdir()
     train_checkpoint = run / "checkpoint.safetensors"

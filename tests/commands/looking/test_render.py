@@ -12,7 +12,7 @@ from glassplat.cli import main
 from glassplat.commands.runs.scene_edits import SceneEdits
 from glassplat.data.errors import InputError
 from glassplat.files.images import read_image
-from glassplat.interface.layers import CURVED_LAYERS, DISC_LAYERS, LAYERS, Layer
+from glassplat.interface.layers import DISC_LAYERS, LAYERS, Layer
 from glassplat.render.layers import PHOTOGRAPHED
 from glassplat.scene.plane_edits import as_mirrors, shifted, tilted, with_reflectance, without_glass
 from glassplat.scene.scene import Scene
@@ -83,7 +83,7 @@ def test_layers_that_a_method_lacks_are_refused_before_anything_is_rendered(
 
 def test_layers_that_are_listed_can_be_asked_for() -> None:
     assert set(LAYERS) == set(RECIPES)
-    known = (*LAYERS.values(), CURVED_LAYERS, DISC_LAYERS, [PHOTOGRAPHED])
+    known = (*LAYERS.values(), DISC_LAYERS, [PHOTOGRAPHED])
     assert {layer for layers in known for layer in layers} == set(get_args(Layer))
 
 

@@ -94,7 +94,7 @@ def test_an_output_that_is_a_link_to_a_folder_is_that_folder(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("name", ["file", "file/below", "nowhere"])
-@pytest.mark.parametrize("command", ["dereflect", "render", "train", "demo", "bench"])
+@pytest.mark.parametrize("command", ["dereflect", "render", "train", "demo"])
 def test_an_output_that_can_be_no_folder_is_one_message(
     command: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -106,7 +106,6 @@ def test_an_output_that_can_be_no_folder_is_one_message(
         "render": ["render", str(run)],
         "train": ["train", "splat", "--data", capture],
         "demo": ["demo"],
-        "bench": ["bench", "scenes", "--data", capture],
     }
     before = contents(tmp_path)
     assert main([*begins[command], "--output", str(tmp_path / name)]) == 2

@@ -82,8 +82,6 @@ def test_a_wrong_option_ends_with_one_message(
     [
         ["demo", "--iterations", "0"],
         ["demo", "--seed", "-1"],
-        ["bench", "scenes", "--data", "x", "--output", "y", "--seeds", "0", LARGE],
-        ["bench", "ablation", "--data", "x", "--output", "y", "--downscale", "nan"],
         ["render", "run", "--output", "y", "--shift", "1", "nan"],
         ["render", "run", "--output", "y", "--tilt", "1", "inf", "0"],
         ["render", "run", "--output", "y", "--reflectance", "1", "2"],

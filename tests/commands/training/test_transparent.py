@@ -50,12 +50,3 @@ def test_a_run_is_resumed_over_the_background_it_began_with(capture: Path) -> No
     run = train(capture)
     assert train(capture, "--resume") == run
     assert json.loads((run / "recipe.json").read_text())["background"] == [1.0, 1.0, 1.0]
-
-
-def test_a_bench_over_transparent_photographs_is_not_repeated(
-    capture: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    options = ["--data", str(capture), "--iterations", "3", "--methods", "splat"]
-    for _ in range(2):
-        assert main(["bench", "scenes", *options, "--output", str(capture.parent / "bench")]) == 0
-    assert "1 of 1 runs are finished already" in capsys.readouterr().out

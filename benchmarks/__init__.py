@@ -1,0 +1,1 @@
+"""Measurements over scenes: `python -m benchmarks.compare`."""

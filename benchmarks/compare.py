@@ -1,0 +1,398 @@
+"""Compare methods and variants of them over scenes: train, evaluate, and write the tables of docs/results.md.
+
+    python -m benchmarks.compare rooms/1 rooms/2 --methods splat planar --iterations 7000 --output runs/rooms
+    python -m benchmarks.compare rooms/* --variant no-conflict="--weights.conflict 0" --variant paper="--preset paper"
+    python -m benchmarks.compare rooms/* --variant planar:srgb="--blend srgb" --options "--downscale 2" --table
+
+Every run is `glassplat train` and `glassplat eval` in a process of its own, in OUTPUT/SCENE/NAME-seedN. Repeat the
+command to go on after an interrupt: finished runs are skipped, begun ones go on from their checkpoint. A run that fails
+does not stop the others. The tables are printed and kept in OUTPUT/tables.md, with all results in OUTPUT/results.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import signal
+import statistics
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+BASELINE = "splat"
+COMMAND, LOG, RESULTS = "command.json", "output.log", "results.json"
+
+
+class Column(NamedTuple):
+    """A metric: its title, its name in `results.json`, how it is written, and how two runs are compared by it.
+
+    `of_panes` marks what is a mean over the scene's panes; `is_ratio` what is compared by quotient, because absolute
+    values differ between scenes and machines.
+    """
+
+    title: str
+    name: str
+    style: str
+    of_panes: bool = False
+    is_ratio: bool = False
+
+
+COLUMNS = (
+    Column("image", "psnr", ".2f"),
+    Column("ssim", "ssim", ".4f"),
+    Column("lpips", "lpips", ".4f"),
+    Column("pane", "pane_psnr", ".2f"),
+    Column("transmission", "transmission_psnr", ".2f"),
+    Column("reflection", "reflection_psnr", ".2f"),
+    Column("reflective", "reflective_psnr", ".2f"),
+    Column("normal error, deg", "normal_error_deg", ".2f"),
+    Column("reflective normal error, deg", "reflective_normal_error_deg", ".2f"),
+    Column("strength error", "strength_error", ".3f"),
+    Column("environment", "environment_psnr", ".2f"),
+    Column("R0 error", "base_reflectance_error", ".3f", of_panes=True),
+    Column("pane normal error, deg", "normal_error_deg", ".2f", of_panes=True),
+    Column("offset error", "offset_error", ".2%", of_panes=True),
+    Column("Gaussians", "num_gaussians", ",.0f", is_ratio=True),
+    Column("training, s", "train_seconds", ".0f", is_ratio=True),
+    Column("frame, s", "seconds_per_frame", ".4f", is_ratio=True),
+)
+IMAGE, PANE = COLUMNS[0], COLUMNS[3]
+GAINED, REACHED = (IMAGE, PANE, COLUMNS[4]), (COLUMNS[5], COLUMNS[11])
+"""What a method gains over the baseline, and what the baseline has none of: reflections and R0."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training and its evaluation.
+
+    Attributes:
+        scene: name of the capture in the tables.
+        name: of the method, with that of the variant: `planar`, `planar:no-conflict`.
+        seed: of the training.
+        directory: of the run.
+        train: arguments of `glassplat train`, but for the output.
+    """
+
+    scene: str
+    name: str
+    seed: int
+    directory: Path
+    train: tuple[str, ...]
+
+    @property
+    def title(self) -> str:
+        """What messages call it."""
+        return f"{self.scene}, {self.name}, seed {self.seed}"
+
+    def results(self) -> dict[str, Any] | None:
+        """The metrics of the finished run; None before it is finished.
+
+        Raises:
+            SystemExit: the folder holds a run of other options.
+        """
+        self.check()
+        file = self.directory / RESULTS
+        return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
+
+    def check(self) -> None:
+        """Refuse a folder that holds a run of other options."""
+        file = self.directory / COMMAND
+        if file.is_file() and (begun := json.loads(file.read_text(encoding="utf-8"))) != list(self.train):
+            raise SystemExit(
+                f"{self.directory} holds a run of `{shlex.join(begun)}`; expected `{shlex.join(self.train)}`. Choose "
+                "another --output, or move the run away"
+            )
+
+    def start(self) -> subprocess.Popen[bytes]:
+        """Begins the training, or goes on with it."""
+        self.directory.mkdir(parents=True, exist_ok=True)
+        (self.directory / COMMAND).write_text(json.dumps(self.train, indent=2) + "\n", encoding="utf-8")
+        begun = ["--resume"] if (self.directory / "checkpoint.safetensors").is_file() else []
+        return self._glassplat("train", *self.train, "--output", str(self.directory), *begun)
+
+    def evaluate(self) -> subprocess.Popen[bytes]:
+        """Begins the evaluation of the trained run."""
+        return self._glassplat("eval", str(self.directory))
+
+    def said(self) -> str:
+        """The last lines of what its commands said, without the frame of a message."""
+        file = self.directory / LOG
+        lines = file.read_text(encoding="utf-8", errors="replace").split("\n") if file.is_file() else []
+        words = [line.strip("│╭╮╰╯─ \r") for line in lines]
+        return " ".join([line for line in words if line][-3:]) or "nothing was said"
+
+    def _glassplat(self, *arguments: str) -> subprocess.Popen[bytes]:
+        # A session of its own: Ctrl-C reaches this process alone, which then asks the others to end.
+        with (self.directory / LOG).open("ab") as log:
+            return subprocess.Popen(
+                [sys.executable, "-m", "glassplat", *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+
+def planned_runs(arguments: argparse.Namespace) -> list[Run]:
+    """A run for each scene, seed, and method or variant, scene by scene."""
+    common = ("--iterations", str(arguments.iterations), *shlex.split(arguments.options))
+    scenes = zip(scene_names(arguments.scenes), arguments.scenes, strict=True)
+    named = named_options(arguments.methods, arguments.variant)
+    return [
+        Run(
+            scene,
+            name,
+            seed,
+            arguments.output / scene / f"{name.replace(':', '-')}-seed{seed}",
+            (method, "--data", str(data.resolve()), "--seed", str(seed), *common, *options),
+        )
+        for (scene, data), seed, (name, method, options) in product(scenes, arguments.seeds, named)
+    ]
+
+
+def named_options(methods: Sequence[str], variants: Sequence[str]) -> list[tuple[str, str, list[str]]]:
+    """Name, method and options of all that is compared: the methods as they are, and each variant of them.
+
+    Args:
+        methods: names.
+        variants: `[METHOD:]NAME=OPTIONS`; without a method it is one of every method but `splat`.
+    """
+    named: list[tuple[str, str, list[str]]] = [(method, method, []) for method in methods]
+    for variant in variants:
+        title, is_given, options = variant.partition("=")
+        method, colon, name = title.rpartition(":")
+        if not (name and is_given) or (colon and method not in methods):
+            raise SystemExit(f"--variant {variant!r}: expected [METHOD:]NAME=OPTIONS, METHOD one of {list(methods)}")
+        chosen = [method] if colon else [one for one in methods if one != BASELINE]
+        named += [(f"{one}:{name}", one, shlex.split(options)) for one in chosen]
+    if len({name for name, _, _ in named}) < len(named):
+        raise SystemExit("a method or variant is named twice")
+    return named
+
+
+def scene_names(captures: Sequence[Path]) -> list[str]:
+    """A short name for every capture: its folder, with as many folders above as tell them apart."""
+    folders = [path.resolve() for path in captures]
+    missing = [str(path) for path in captures if not path.is_dir()]
+    if missing or len(set(folders)) < len(folders):
+        raise SystemExit(f"no such folder: {', '.join(missing)}" if missing else "a scene is named twice")
+    depth = 1
+    while len({path.parts[-depth:] for path in folders}) < len(folders):
+        depth += 1
+    return ["-".join(part.strip("/") for part in path.parts[-depth:]) for path in folders]
+
+
+def execute(runs: Sequence[Run], jobs: int, after_each: Callable[[], object]) -> list[str]:
+    """Trains and evaluates what is not finished, `jobs` at a time; returns why runs failed."""
+    waiting = deque(run for run in runs if run.results() is None)
+    print(f"{len(runs) - len(waiting)} of {len(runs)} runs are finished", flush=True)
+    running: dict[Run, tuple[str, float, subprocess.Popen[bytes]]] = {}
+    failures: list[str] = []
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                run = waiting.popleft()
+                running[run] = ("train", time.monotonic(), run.start())
+            time.sleep(0.1)
+            for run, (command, since, process) in list(running.items()):
+                if (code := process.poll()) is None:
+                    continue
+                del running[run]
+                if code:
+                    failures.append(f"{run.title}: {command} ended with {code}: {run.said()}")
+                    print(f"failed: {failures[-1]}", flush=True)
+                elif command == "train":
+                    running[run] = ("eval", since, run.evaluate())
+                else:
+                    print(f"{run.title}: {described(run, time.monotonic() - since)}", flush=True)
+                    after_each()
+    finally:
+        for _, _, process in running.values():
+            process.terminate()  # As Ctrl-C would: a checkpoint is written.
+        for _, _, process in running.values():
+            process.wait()
+    return failures
+
+
+def described(run: Run, seconds: float) -> str:
+    """The image's and the pane's metric of a run that has just ended, and how long it took."""
+    values = values_of(run.results() or {})
+    shown = [f"{column.title} {values[column]:.2f}" for column in (IMAGE, PANE) if values[column] is not None]
+    return ", ".join([*shown, f"{seconds:.0f} s"])
+
+
+Values = Mapping[Column, float | None]
+Measured = dict[tuple[str, str, int], Values]
+"""By scene, name and seed."""
+
+
+def values_of(results: Mapping[str, Any]) -> dict[Column, float | None]:
+    """The columns' values in `results.json`."""
+    panes = results.get("planes") or []
+    return {
+        column: mean([pane.get(column.name) for pane in panes]) if column.of_panes else results.get(column.name)
+        for column in COLUMNS
+    }
+
+
+def mean(values: Iterable[float | None]) -> float | None:
+    """Of the values that there are; None without any."""
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if known else None
+
+
+def compared(measured: Measured, name: str, baseline: str) -> dict[str, list[Values]]:
+    """What `name` has more than `baseline`, or how many times as much, by scene, seed against equal seed."""
+    found: dict[str, list[Values]] = {}
+    for (scene, other, seed), values in measured.items():
+        if other == name and (scene, baseline, seed) in measured:
+            found.setdefault(scene, []).append(difference(values, measured[scene, baseline, seed]))
+    return found
+
+
+def difference(mine: Values, other: Values) -> dict[Column, float | None]:
+    """Differences, and quotients of what is a ratio; None where one has no value."""
+    result: dict[Column, float | None] = {}
+    for column in COLUMNS:
+        a, b = mine[column], other[column]
+        if a is None or b is None or (column.is_ratio and b == 0):
+            result[column] = None
+        else:
+            result[column] = a / b if column.is_ratio else a - b
+    return result
+
+
+def tables(measured: Measured) -> str:
+    """All tables, as markdown."""
+    names = list(dict.fromkeys(name for _, name, _ in measured))
+    parts = ["### Scenes", "", *value_table(measured), ""]
+    above = [name for name in names if name != BASELINE and compared(measured, name, BASELINE)]
+    if above:
+        parts += [f"### Gain over {BASELINE}", "", *gain_table(measured, above), ""]
+    pairs = [(name, name.partition(":")[0]) for name in names if ":" in name]
+    pairs = [(name, plain) for name, plain in pairs if compared(measured, name, plain)]
+    if pairs:
+        parts += ["### Variants, minus the method as it is", "", *variant_table(measured, pairs), ""]
+    return "\n".join(parts)
+
+
+def value_table(measured: Measured) -> list[str]:
+    """What each run reached: means over seeds, with their standard deviation."""
+    rows = {
+        key: [v for (s, n, _), v in measured.items() if (s, n) == key] for key in dict.fromkeys(k[:2] for k in measured)
+    }
+    used = [column for column in COLUMNS if any(v[column] is not None for values in rows.values() for v in values)]
+    return markdown(
+        ["scene", "method", *(column.title for column in used)],
+        [[*key, *(spread([v[column] for v in values], column) for column in used)] for key, values in rows.items()],
+    )
+
+
+def gain_table(measured: Measured, names: Sequence[str]) -> list[str]:
+    """Means over scenes of what methods gain, their worst scene and how many scenes are below the baseline.
+
+    Of reflections and of R0, which the baseline has none of, it is the value itself.
+    """
+    rows = []
+    for name in names:
+        gains = compared(measured, name, BASELINE)
+        own = [values for (scene, other, _), values in measured.items() if other == name and scene in gains]
+        cells = [written(mean(mean(v[c] for v in values) for values in gains.values()), c, "+") for c in GAINED]
+        cells += [written(mean(values[c] for values in own), c) for c in REACHED]
+        images = {scene: value for scene, v in gains.items() if (value := mean(one[IMAGE] for one in v)) is not None}
+        worst = min(images, key=lambda scene: images[scene]) if images else ""
+        below = sum(value < 0 for value in images.values())
+        cells += [f"{worst} {written(images.get(worst), IMAGE, '+')}", f"{below} of {len(images)}"]
+        rows.append([name, str(len(gains)), *cells])
+    titles = [*(f"{c.title} gain" for c in GAINED), *(c.title for c in REACHED), "worst scene", f"below {BASELINE}"]
+    return markdown(["method", "scenes", *titles], rows)
+
+
+def variant_table(measured: Measured, pairs: Sequence[tuple[str, str]]) -> list[str]:
+    """Means over scenes of what a variant has more than its method, or how many times as much."""
+    found = {name: compared(measured, name, plain) for name, plain in pairs}
+    used = [c for c in COLUMNS if any(v[c] is not None for by in found.values() for vs in by.values() for v in vs)]
+    rows = []
+    for name, by_scene in found.items():
+        images = [mean(v[IMAGE] for v in values) for values in by_scene.values()]
+        worst = min((value for value in images if value is not None), default=None)
+        means = [mean(mean(v[column] for v in values) for values in by_scene.values()) for column in used]
+        cells = [
+            written(value, column._replace(style=".3f")) if column.is_ratio else written(value, column, "+")
+            for column, value in zip(used, means, strict=True)
+        ]
+        rows.append([name, str(len(by_scene)), *cells, written(worst, IMAGE, "+")])
+    titles = [f"{c.title.partition(',')[0]}, ratio" if c.is_ratio else c.title for c in used]
+    return markdown(["variant", "scenes", *titles, "image, worst scene"], rows)
+
+
+def spread(values: Sequence[float | None], column: Column) -> str:
+    """The mean, and the standard deviation of several."""
+    known = [value for value in values if value is not None]
+    deviation = f" ± {statistics.stdev(known):{column.style}}" if len(known) > 1 else ""
+    return written(mean(known), column) + deviation
+
+
+def written(value: float | None, column: Column, sign: str = "") -> str:
+    """A value as its column has it; a dash where there is none."""
+    return "-" if value is None else f"{value:{sign}{column.style}}"
+
+
+def markdown(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a table."""
+    return [f"| {' | '.join(cells)} |" for cells in (titles, ["---"] * len(titles), *rows)]
+
+
+def write_tables(output: Path, runs: Sequence[Run]) -> str:
+    """Writes the tables and the results of all finished runs; returns the tables."""
+    finished = [(run, results) for run in runs if (results := run.results()) is not None]
+    if not finished:
+        return "nothing is finished"
+    text = tables({(run.scene, run.name, run.seed): values_of(results) for run, results in finished})
+    kept = [{"scene": r.scene, "name": r.name, "train": r.train} | results for r, results in finished]
+    (output / RESULTS).write_text(json.dumps(kept, indent=2) + "\n", encoding="utf-8")
+    (output / "tables.md").write_text(text, encoding="utf-8")
+    return text
+
+
+def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The options."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", type=Path, nargs="+", help="folders of captures")
+    parser.add_argument("--methods", nargs="+", default=["splat", "planar"])
+    parser.add_argument(
+        "--variant", action="append", default=[], metavar="[METHOD:]NAME=OPTIONS", help="may be given several times"
+    )
+    parser.add_argument("--iterations", type=int, default=7000)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--options", default="", help='of every training, such as "--downscale 2"')
+    parser.add_argument("--output", type=Path, default=Path("runs/compare"))
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time; set NUMBA_NUM_THREADS with it")
+    parser.add_argument("--table", action="store_true", help="only write the tables of what is finished")
+    return parser.parse_args(arguments)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs what is missing and prints the tables; returns the exit code."""
+    options = parsed(arguments)
+    runs = planned_runs(options)
+    failures = [] if options.table else execute(runs, options.jobs, lambda: write_tables(options.output, runs))
+    print(write_tables(options.output, runs))
+    for failure in failures:
+        print(f"failed: {failure}", file=sys.stderr)
+    return int(bool(failures))
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        sys.exit("interrupted: repeat the command to go on")

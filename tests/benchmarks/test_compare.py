@@ -1,0 +1,119 @@
+"""Comparisons over scenes: what is run, that it is run once, and what the tables say."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks import compare
+from benchmarks.compare import COLUMNS, Measured, compared, main, named_options, parsed, planned_runs, tables, values_of
+from tests.train.tiny_capture import write_tiny_capture
+
+
+def results(psnr: float, **more: object) -> dict:
+    return {"psnr": psnr, "num_gaussians": 100, **more}
+
+
+def measured(**by_run: list[dict]) -> Measured:
+    """Values of runs, by name of method with a scene per entry."""
+    return {
+        (f"room-{number}", name.replace("_", ":"), 0): values_of(one)
+        for name, ones in by_run.items()
+        for number, one in enumerate(ones)
+    }
+
+
+def row(text: str, *begin: str) -> list[str]:
+    """The cells of the only line that begins with some."""
+    (line,) = [line for line in text.splitlines() if line.startswith(f"| {' | '.join(begin)} |")]
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_runs_are_trained_and_evaluated_once_and_failures_stop_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [str(write_tiny_capture(tmp_path / "tiny")), "--methods", "splat", "--iterations", "8"]
+    arguments += ["--variant", "splat:broken=--no-such-option", "--output", str(tmp_path / "runs")]
+    assert main(arguments) == 1
+    said = capsys.readouterr()
+    assert "tiny, splat:broken, seed 0: train ended with 2: " in said.err and "no-such-option" in said.err
+    assert row(said.out, "tiny", "splat")[2] == f"{kept(tmp_path)['psnr']:.2f}"
+    assert (tmp_path / "runs" / "tables.md").read_text().rstrip() in said.out
+
+    monkeypatch.setattr(compare.Run, "start", lambda run: pytest.fail(f"{run.title} is begun again"))
+    assert main(arguments[:-4] + arguments[-2:]) == 0
+    assert "1 of 1 runs are finished" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match=r"holds a run of `splat --data .* --iterations 8`"):
+        main([*arguments, "--iterations", "9"])
+
+
+def kept(folder: Path) -> dict:
+    """The only finished run."""
+    (one,) = json.loads((folder / "runs" / "results.json").read_text())
+    return one
+
+
+def test_a_begun_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "room").mkdir()
+    options = parsed([str(tmp_path / "room"), "--methods", "planar", "--output", str(tmp_path / "runs")])
+    (run,) = planned_runs(options)
+    asked: list[tuple[str, ...]] = []
+    monkeypatch.setattr(compare.Run, "_glassplat", lambda run, *arguments: asked.append(arguments))
+    run.start()
+    (run.directory / "checkpoint.safetensors").touch()
+    run.start()
+    first, second = asked
+    assert first[:2] == ("train", "planar") and "--resume" not in first
+    assert second == (*first, "--resume")
+
+
+def test_variants_are_of_a_method_or_of_all_but_the_baseline() -> None:
+    named = named_options(["splat", "planar", "traced"], ["dark=--a 0 --b 1", "splat:wide=--c"])
+    assert [name for name, _, _ in named] == ["splat", "planar", "traced", "planar:dark", "traced:dark", "splat:wide"]
+    assert named[3][1:] == ("planar", ["--a", "0", "--b", "1"])
+    for wrong in ("nothing", "=--a", "deferred:dark=--a"):
+        with pytest.raises(SystemExit, match="expected"):
+            named_options(["splat", "planar"], [wrong])
+    with pytest.raises(SystemExit, match="twice"):
+        named_options(["planar"], ["dark=--a", "dark=--b"])
+
+
+def test_scenes_are_named_by_what_tells_them_apart(tmp_path: Path) -> None:
+    folders = [tmp_path / "a" / "room", tmp_path / "b" / "room"]
+    for folder in folders:
+        folder.mkdir(parents=True)
+    assert compare.scene_names(folders) == ["a-room", "b-room"]
+    assert compare.scene_names(folders[:1]) == ["room"]
+    with pytest.raises(SystemExit, match="twice"):
+        compare.scene_names([folders[0], folders[0]])
+    with pytest.raises(SystemExit, match="no such folder"):
+        compare.scene_names([tmp_path / "c"])
+
+
+def test_gains_are_means_over_scenes_with_the_worst_and_the_share_below() -> None:
+    text = tables(
+        measured(
+            splat=[results(30.0, transmission_psnr=20.0), results(30.0), results(30.0)],
+            planar=[
+                results(33.0, transmission_psnr=26.0, reflection_psnr=25.0, planes=[{"base_reflectance_error": 0.01}]),
+                results(29.0, planes=[{"base_reflectance_error": 0.02}, {"base_reflectance_error": 0.04}]),
+                results(31.0),
+            ],
+        )
+    )
+    # image, pane, transmission, reflection, R0 error, worst, below
+    assert row(text, "planar", "3")[2:] == ["+1.00", "-", "+6.00", "25.00", "0.020", "room-1 -1.00", "1 of 3"]
+
+
+def test_variants_are_set_against_their_method_seed_by_seed() -> None:
+    runs = measured(planar=[results(30.0)], planar_dark=[results(29.5) | {"num_gaussians": 50}])
+    runs["room-0", "planar", 1] = values_of(results(31.0))
+    runs["room-0", "planar:dark", 1] = values_of(results(31.0))
+    runs["room-0", "planar:dark", 2] = values_of(results(90.0))
+    (differences,) = compared(runs, "planar:dark", "planar").values()
+    assert [values[COLUMNS[0]] for values in differences] == [-0.5, 0.0]
+    text = tables(runs)
+    assert row(text, "planar:dark", "1")[2:] == ["-0.25", "0.750", "-0.25"]
+    assert row(text, "room-0", "planar")[2] == "30.50 ± 0.71"
