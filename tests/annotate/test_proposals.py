@@ -10,7 +10,7 @@ import pytest
 
 from glassplat.annotate.document import parsed_document
 from glassplat.annotate.session import Session, opened_session
-from tests.annotate.conftest import marked_document, true_corners
+from tests.annotate.conftest import marked_document, saved, true_corners
 from tests.annotate.suggested import suggestions
 from tests.init.pane_scene import FRONT
 
@@ -40,7 +40,7 @@ def test_a_proposal_shows_where_it_is_in_every_view(session: Session) -> None:
 
 
 def test_what_is_marked_already_is_not_proposed(session: Session) -> None:
-    session.update(marked_document())
+    saved(session, marked_document())
     assert session.described()["suggestions"] == []
 
 
@@ -48,5 +48,5 @@ def test_another_plane_is_still_proposed(room: Path) -> None:
     (one,) = suggestions()
     away = replace(one, corners=one.corners + 0.5 * FRONT.normal)
     session = opened_session(room, lambda dataset: [away])
-    session.update(marked_document())
+    saved(session, marked_document())
     assert len(session.described()["suggestions"]) == 1
