@@ -14,22 +14,20 @@ import asyncio
 import contextlib
 import os
 import random
+import re
 import sys
 import tempfile
 import time
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-import msgspec.msgpack
 import numpy as np
-import viser
-import zstandard
-from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
 from tests.viewer.free_port import free_port
+from tools.viewer_client import ViewerClient
 
 SIZES = ((640, 480), (1280, 720), (390, 844))
 PAUSE = 0.25
@@ -53,81 +51,66 @@ class Count:
     refused: list[str] = field(default_factory=list)
 
 
-class Browser:
+class Looker:
     """One client that does what people do, and some things that they do not."""
 
     def __init__(self, address: str, seed: int, count: Count) -> None:
         self._address, self._random, self._count = address, random.Random(seed), count
-        self._controls: dict[str, dict[str, Any]] = {}
-        self._gizmos: dict[str, dict[str, Any]] = {}
         self._angle, self._size = self._random.uniform(0, 6.28), self._random.choice(SIZES)
         self.rests, self.pictures = False, 0
 
     async def live(self) -> None:
         """Connects, acts and connects again, until it is cancelled."""
         while True:
-            self._controls, self._gizmos = {}, {}
             try:
-                async with connect(
-                    self._address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None, open_timeout=60
-                ) as connection:
+                async with ViewerClient(self._address) as client:
                     self._count.connections += 1
-                    await self._look(connection)
-                    hearing = asyncio.create_task(self._hear(connection))
+                    before = client.pictures
                     try:
-                        await self._act(connection)
+                        await self._look(client)
+                        await self._act(client)
                     finally:
-                        hearing.cancel()
-                        await asyncio.gather(hearing, return_exceptions=True)
+                        self._count.pictures += client.pictures - before
                         if self._random.random() < 0.5:
-                            connection.transport.abort()  # As when a laptop is closed.
+                            client.connection.transport.abort()  # As when a laptop is closed.
             except (ConnectionClosed, OSError, TimeoutError) as error:
                 self._count.refused.append(f"{type(error).__name__}: {error}")
                 await asyncio.sleep(1)
 
-    async def _act(self, connection: ClientConnection) -> None:
+    async def _act(self, client: ViewerClient) -> None:
         """Acts until it leaves; while it rests, it only listens."""
-        rested = False
+        before: int | None = None
         while True:
             await asyncio.sleep(self._random.expovariate(1 / PAUSE))
             if self.rests:
-                if not rested:
-                    self.pictures, rested = 0, True
-                    await self._look(connection)
+                if before is None:
+                    before = client.pictures
+                    await self._look(client)
+                self.pictures = client.pictures - before
                 continue
-            rested = False
+            before = None
             if self._random.random() < LEAVES:
                 return
             self._count.actions += 1
-            await self._random.choice((self._look, self._look, self._click, self._drag))(connection)
+            await self._random.choice((self._look, self._look, self._click, self._drag))(client)
 
-    async def _send(self, connection: ClientConnection, kind: str, **fields: Any) -> None:
-        await connection.send(msgspec.msgpack.encode({"type": kind, **fields}))
-
-    async def _look(self, connection: ClientConnection) -> None:
+    async def _look(self, client: ViewerClient) -> None:
         """The camera moves on a circle round the origin."""
         self._angle += self._random.gauss(0, 0.1)
         half = self._angle / 2
-        width, height = self._size
-        await self._send(
-            connection,
-            "ViewerCameraMessage",
+        await client.look(
             wxyz=(float(np.cos(half)), 0.0, float(np.sin(half)), 0.0),
             position=(float(-2 * np.sin(self._angle)), 0.0, float(-2 * np.cos(self._angle))),
             fov=self._random.uniform(0.5, 1.5),
-            near=0.01,
-            far=1000.0,
-            image_height=height,
-            image_width=width,
-            look_at=(0.0, 0.0, 0.0),
-            up_direction=(0.0, -1.0, 0.0),
+            image_width=self._size[0],
+            image_height=self._size[1],
         )
 
-    async def _click(self, connection: ClientConnection) -> None:
+    async def _click(self, client: ViewerClient) -> None:
         """One control of the page, whichever."""
-        if not self._controls:
+        if not client.controls:
             return
-        uuid, made = self._random.choice(list(self._controls.items()))
+        uuid, made = self._random.choice(list(client.controls.items()))
         properties = made["props"]
         if "options" in properties:
             value: Any = self._random.choice(properties["options"])
@@ -137,40 +120,21 @@ class Browser:
             value = self._random.uniform(properties["min"], properties["max"])
         else:
             return
-        await self._send(connection, "GuiUpdateMessage", uuid=uuid, updates={"value": value})
+        await client.send("GuiUpdateMessage", uuid=uuid, updates={"value": value})
 
-    async def _drag(self, connection: ClientConnection) -> None:
+    async def _drag(self, client: ViewerClient) -> None:
         """A pane is moved and turned a little."""
-        if not self._gizmos:
+        if not client.gizmos:
             return
-        name, made = self._random.choice(list(self._gizmos.items()))
+        name, made = self._random.choice(list(client.gizmos.items()))
         turn = np.array([1.0, *(self._random.gauss(0, 0.1) for _ in range(3))])
-        await self._send(
-            connection,
+        await client.send(
             "TransformControlsUpdateMessage",
             name=name,
             owner=made.get("owner", ""),
             wxyz=(turn / np.linalg.norm(turn)).tolist(),
             position=[self._random.gauss(0, 0.5) for _ in range(3)],
         )
-
-    async def _hear(self, connection: ClientConnection) -> None:
-        unpack = zstandard.ZstdDecompressor()
-        async for data in connection:
-            assert isinstance(data, bytes)
-            size, packed = (int.from_bytes(data[at : at + 8], "little") for at in (0, 8))
-            for message in msgspec.msgpack.decode(unpack.decompress(data[16 : 16 + packed], size))["messages"]:
-                self._learn(message)
-
-    def _learn(self, message: dict[str, Any]) -> None:
-        kind = message["type"]
-        if kind == "BackgroundImageMessage":
-            self._count.pictures += 1
-            self.pictures += 1
-        elif kind in ("GuiDropdownMessage", "GuiSliderMessage", "GuiButtonMessage", "GuiButtonGroupMessage"):
-            self._controls[message["uuid"]] = message
-        elif kind == "TransformControlsMessage":
-            self._gizmos[message["name"]] = message
 
 
 @dataclass
@@ -203,8 +167,8 @@ async def soak(run: Path, clients: int, minutes: float, say: Any = print) -> Soa
         command = ["-m", "glassplat", "view", str(run), "--port", str(port), "--output", kept]
         viewer = await asyncio.create_subprocess_exec(sys.executable, *command, stdout=log, stderr=log)
         try:
-            await until_it_listens(port, viewer)
-            browsers = [Browser(f"ws://127.0.0.1:{port}", seed, count) for seed in range(clients)]
+            address = await printed_address(log, viewer)
+            browsers = [Looker(address, seed, count) for seed in range(clients)]
             tasks = [asyncio.create_task(browser.live()) for browser in browsers]
             samples = await sampled(viewer.pid, 60 * minutes, count, say)
             for browser in browsers:
@@ -227,13 +191,12 @@ async def soak(run: Path, clients: int, minutes: float, say: Any = print) -> Soa
     return Soaked(samples, count, missing, complaints, seconds)
 
 
-async def until_it_listens(port: int, viewer: asyncio.subprocess.Process) -> None:
-    """Waits for the viewer; raises RuntimeError if it ends."""
+async def printed_address(log: IO[str], viewer: asyncio.subprocess.Process) -> str:
+    """What the viewer says where it is to be looked at; raises RuntimeError if it ends before."""
     while viewer.returncode is None:
-        with contextlib.suppress(OSError):
-            _, writer = await asyncio.open_connection("127.0.0.1", port)
-            writer.close()
-            return
+        found = re.search(r"look at (http\S+)", os.pread(log.fileno(), 1_000_000, 0).decode())
+        if found:
+            return found[1]
         await asyncio.sleep(0.2)
     raise RuntimeError("the viewer ended before it listened; try `glassplat view` with the same run")
 

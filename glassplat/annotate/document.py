@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -147,6 +148,11 @@ def read_document(folder: Path) -> Any:
     value = read_json(path)
     parsed_document(value, str(path))
     return value
+
+
+def version_of(value: Any) -> str:
+    """What tells a document from others: a digest of all that is in it."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:24]
 
 
 def write_document(folder: Path, value: Any) -> None:

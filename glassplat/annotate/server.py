@@ -8,24 +8,20 @@ from __future__ import annotations
 
 import errno
 import json
-import secrets
 from collections.abc import Callable
 from functools import cached_property
 from http import HTTPStatus
-from http.cookies import CookieError, SimpleCookie
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from threading import Thread
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import urlsplit
 
-from glassplat.annotate.session import SHOWN, THUMBNAIL, Session
+from glassplat.annotate.session import SHOWN, THUMBNAIL, ChangedElsewhereError, Session
 from glassplat.data.errors import InputError
 from glassplat.files.json_text import parse_json
+from glassplat.serving.access import LOCAL, Access, RefusedError
 
-LOCAL = "127.0.0.1"
-LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
-"""Of the host that a browser may say that it talks to, with any port: over SSH it is another one than ours."""
 LARGEST_BODY = 8_000_000
 PAGE_FILES = {
     "/page.js": ("page.js", "text/javascript"),
@@ -34,15 +30,6 @@ PAGE_FILES = {
     "/style.css": ("style.css", "text/css"),
 }
 POLICY = "default-src 'self'; img-src 'self' blob: data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
-COOKIE = "glassplat_annotate"
-
-
-class RefusedError(Exception):
-    """A request that is not answered; `status` says why."""
-
-    def __init__(self, status: HTTPStatus, text: str) -> None:
-        super().__init__(text)
-        self.status = status
 
 
 class AnnotationServer(ThreadingHTTPServer):
@@ -50,7 +37,7 @@ class AnnotationServer(ThreadingHTTPServer):
 
     Attributes:
         session: the capture that is marked.
-        key: what a browser has to know.
+        access: who may come in.
         is_finished: whether the page asked for the end.
     """
 
@@ -63,7 +50,7 @@ class AnnotationServer(ThreadingHTTPServer):
             InputError: the port is taken, or may not be listened on.
         """
         self.session = session
-        self.key = secrets.token_urlsafe(16)
+        self.access = Access()
         self.is_finished = False
         try:
             super().__init__((LOCAL, port), PageHandler)
@@ -74,7 +61,7 @@ class AnnotationServer(ThreadingHTTPServer):
     @property
     def address(self) -> str:
         """What to open in the browser."""
-        return f"http://{LOCAL}:{self.server_address[1]}/?key={self.key}"
+        return f"http://{LOCAL}:{self.server_address[1]}/?key={self.access.key}"
 
     def finish(self) -> None:
         """Stops serving; from any thread."""
@@ -111,6 +98,8 @@ class PageHandler(BaseHTTPRequestHandler):
         except RefusedError as refused:
             self.close_connection = True
             self._send_json({"error": str(refused)}, refused.status)
+        except ChangedElsewhereError as error:
+            self._send_json({"error": str(error), **error.answer}, HTTPStatus.CONFLICT)
         except (ValueError, OSError) as error:
             self._send_json({"error": str(error)}, HTTPStatus.BAD_REQUEST)
 
@@ -133,12 +122,12 @@ class PageHandler(BaseHTTPRequestHandler):
             raise RefusedError(HTTPStatus.NOT_FOUND, "there is no such page")
 
     def _post(self) -> None:
-        self._check_origin()
+        self.server.access.check_origin(self.headers.get("Origin"), self._host)
         self._check_key()
         path, session = self._path.path, self.server.session
         body = self._body()
         if path == "/document":
-            self._send_json(session.update(parse_json(body, "the document of the page")))
+            self._send_json(session.save(parse_json(body, "the document of the page")))
         elif path == "/grab":
             self._send_json(session.grab(parse_json(body, "the outline of the page")))
         elif path == "/results":
@@ -155,27 +144,15 @@ class PageHandler(BaseHTTPRequestHandler):
         return urlsplit(self.path)
 
     def _check_host(self) -> None:
-        """Refuse names that somebody else's name server may let point to this computer."""
         self.__dict__.pop("_path", None)  # A connection is used for more than one request.
-        host = (self.headers.get("Host") or "").lower()
-        name = host.rpartition(":")[0] if host.rpartition(":")[2].isdecimal() else host
-        if name not in LOCAL_NAMES:
-            raise RefusedError(HTTPStatus.FORBIDDEN, "this page is served to this computer only")
+        self.server.access.check_host(self._host)
 
-    def _check_origin(self) -> None:
-        """Refuse what pages of other sites have a browser send."""
-        origin = self.headers.get("Origin")
-        if origin is None or urlsplit(origin).netloc.lower() != (self.headers.get("Host") or "").lower():
-            raise RefusedError(HTTPStatus.FORBIDDEN, "a request of another site")
+    @property
+    def _host(self) -> str:
+        return self.headers.get("Host") or ""
 
     def _check_key(self) -> None:
-        try:
-            cookie = SimpleCookie(self.headers.get("Cookie") or "").get(COOKIE)
-        except CookieError:
-            cookie = None
-        known = "" if cookie is None else cookie.value
-        if not secrets.compare_digest(known.encode(), self.server.key.encode()):
-            raise RefusedError(HTTPStatus.FORBIDDEN, "open the address that the command printed, with its key")
+        self.server.access.check_cookie(self.headers.get("Cookie") or "", self._host)
 
     def _body(self) -> str:
         length = self.headers.get("Content-Length", "")
@@ -184,13 +161,9 @@ class PageHandler(BaseHTTPRequestHandler):
         return self.rfile.read(int(length)).decode("utf-8")
 
     def _send_page(self) -> None:
-        given = parse_qs(self._path.query).get("key", [""])[0]
-        if given:
-            if not secrets.compare_digest(given.encode(), self.server.key.encode()):
-                raise RefusedError(HTTPStatus.FORBIDDEN, "the key is that of another session; take the printed address")
-            # The key leaves the address bar and the history.
-            cookie = f"{COOKIE}={self.server.key}; HttpOnly; SameSite=Strict; Path=/"
-            self._send(b"", "text/plain", HTTPStatus.SEE_OTHER, {"Set-Cookie": cookie, "Location": "/"})
+        entry = self.server.access.entry(self.path, self._host)
+        if entry is not None:
+            self._send(b"", "text/plain", HTTPStatus.SEE_OTHER, entry)
             return
         self._check_key()
         self._send((resources.files("glassplat.annotate") / "page" / "index.html").read_bytes(), "text/html")

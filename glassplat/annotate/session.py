@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from glassplat.annotate.document import PLACE, MarkedPane, parsed_document, read_document, write_document
+from glassplat.annotate.document import PLACE, MarkedPane, parsed_document, read_document, version_of, write_document
 from glassplat.annotate.grab import grabbed
+from glassplat.annotate.merging import merged
 from glassplat.annotate.outline import seen_outline
 from glassplat.annotate.pane_fit import Marks, PaneFit, TooFewMarksError, fitted_pane
 from glassplat.annotate.results import earlier_masks, write_results
@@ -22,7 +23,7 @@ from glassplat.annotate.view_advice import first_view, second_views, settling_vi
 from glassplat.data.dataset import Dataset, load_dataset
 from glassplat.data.errors import InputError, input_checked
 from glassplat.data.view import View
-from glassplat.files.fields import Field, Items, Whole, checked
+from glassplat.files.fields import Field, Items, Text, Whole, checked
 from glassplat.files.folders import check_folder
 from glassplat.scene.eye import Eye
 
@@ -39,7 +40,17 @@ POOR_RECTANGLE = 1.5
 POINTS_USED = 20_000
 MOST_GRABBED = 2000
 """Points of an outline that is drawn by hand."""
+KNOWN_VERSIONS = 200
+"""Of the document, that a page may still have when it saves."""
 GRABBED: dict[str, Field] = {"view": Whole(0, 10**9), "points": Items(PLACE)}
+
+
+class ChangedElsewhereError(ValueError):
+    """A page saves what it began with an older document than the one that is there; `answer` is for the page."""
+
+    def __init__(self, changes: Sequence[str], document: Any, version: str) -> None:
+        super().__init__(f"the marks were changed elsewhere ({', '.join(changes)}); both are kept")
+        self.answer = {"document": document, "version": version}
 
 
 @dataclass(frozen=True)
@@ -69,8 +80,10 @@ class Session:
         self._numbers = {view.name: number for number, view in enumerate(self.views)}
         self._lock = Lock()
         self._pictures: OrderedDict[tuple[int, int], bytes] = OrderedDict()
+        self._versions: OrderedDict[str, Any] = OrderedDict()
         with input_checked():
             self._document: Any = read_document(self.root)
+        self._remember(self._document)
 
     @property
     def document(self) -> Any:
@@ -85,7 +98,7 @@ class Session:
                 {"name": view.name, "width": view.camera.width, "height": view.camera.height} for view in self.views
             ],
             "first": first_view(self.eyes, self._points),
-            "document": self._document,
+            **self._current(),
         }
 
     def picture(self, number: int, longest: int) -> bytes:
@@ -109,18 +122,43 @@ class Session:
                 self._pictures.popitem(last=False)
         return encoded.getvalue()
 
-    def update(self, document: Any) -> dict[str, Any]:
+    def save(self, asked: Any) -> dict[str, Any]:
         """Takes a changed document over, saves it, and says what follows from it.
 
+        Args:
+            asked: `document`, and `version`, that of the document in which the page has made its changes.
+
         Raises:
+            ChangedElsewhereError: another page, or program, has saved since; nothing is written.
             ValueError: it is no document.
             OSError: it cannot be saved.
         """
+        fields = checked(asked, {"version": Text()}, "what the page saves")
+        document = asked.get("document")
         panes = parsed_document(document, "the document of the page")
         with self._lock:
+            there = read_document(self.root)
+            if version_of(there) != fields["version"]:
+                base = self._versions.get(fields["version"], {"version": 1, "panes": []})
+                self._remember(there)
+                together, changes = merged(base, there, document)
+                raise ChangedElsewhereError(changes, together, version_of(there))
             write_document(self.root, document)
-            self._document = document
-        return {"panes": [self._answer(self.solve(pane)) for pane in panes]}
+            self._remember(document)
+        return {"panes": [self._answer(self.solve(pane)) for pane in panes], "version": version_of(document)}
+
+    def _current(self) -> dict[str, Any]:
+        """The document on disk and its version: what another program has saved counts."""
+        with self._lock:
+            self._remember(read_document(self.root))
+            return {"document": self._document, "version": version_of(self._document)}
+
+    def _remember(self, document: Any) -> None:
+        """What is on disk now."""
+        self._document = self._versions[version_of(document)] = document
+        self._versions.move_to_end(version_of(document))
+        while len(self._versions) > KNOWN_VERSIONS:
+            self._versions.popitem(last=False)
 
     def grab(self, asked: Any) -> dict[str, Any]:
         """The outlines of what stands within a rough outline in a photograph.

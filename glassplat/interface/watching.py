@@ -108,8 +108,12 @@ class WatchedTraining:
         while self._is_save_asked or (self._is_paused and not self._training.is_stopping):
             if self._is_save_asked:
                 self._is_save_asked = False
-                self._training.save()
-                viewer.refresh(f"{self._status(message)}, saved")
+                try:
+                    self._training.save()
+                    told = "saved"
+                except OSError as error:  # The training does not end by a click.
+                    told = f"not saved: {error}"
+                viewer.refresh(f"{self._status(message)}, {told}")
             if self._is_paused and not viewer.loop.serve():
                 viewer.loop.wait(PAUSE_SECONDS)
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from glassplat.data.errors import InputError
 from glassplat.scene.camera import Camera
+from glassplat.viewer.callbacks import survived
 from glassplat.viewer.drawing import ERROR, Wish, edited
 from glassplat.viewer.keyframe_controls import KeyframeControls
 from glassplat.viewer.pane_controls import PaneControls
@@ -20,7 +21,7 @@ from glassplat.viewer.render_loop import RenderLoop
 from glassplat.viewer.rotations import matrix_of
 from glassplat.viewer.shown import Shown, Viewpoints
 
-LARGEST_HEIGHT = 1080
+LARGEST_HEIGHT, MOST_PIXELS = 1080, 4_000_000
 SHARP_QUALITY, COARSE_QUALITY = 90, 60
 LEAST_AHEAD = 0.1
 """Of the extent: how far before the camera the point is, at least, that the mouse turns it about."""
@@ -52,20 +53,27 @@ class Client:
         self._layer: Any = None
         self._panes: PaneControls | None = None
         self.keyframes = KeyframeControls(handle, viewer.shown.scene.extent, self.camera)
+        self._failure = ""
         self._waiting: Any = handle.add_notification(*WAITING, loading=True, with_close_button=False)
         self.lay_out()
         self.stand_at(viewer.first)
-        handle.camera.on_update(lambda _: self.ask())
+        handle.camera.on_update(survived(lambda _: self.ask()))
 
     def show(self, picture: NDArray[np.uint8], is_sharp: bool) -> None:
         """Puts a picture on the screen, and with a sharp one the photograph that is nearest to it."""
         quality = SHARP_QUALITY if is_sharp else COARSE_QUALITY
         self._handle.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
-        if self._waiting is not None:
-            self._waiting.remove()
-            self._waiting = None
+        self._stop_waiting()
+        self._failure = ""
         if is_sharp:
             self._photographs.show_nearest(self._nearest)
+
+    def say_failed(self, reason: str) -> None:
+        """Says why there is no picture, once until there is one again."""
+        self._stop_waiting()
+        if reason != self._failure:
+            self._failure = reason
+            self._notify("No picture", reason, "red")
 
     def tell(self, status: str) -> None:
         """Shows a line above the controls."""
@@ -82,7 +90,8 @@ class Client:
         wish = self.wish()
         if wish is None:
             return
-        rows = max(1, min(int(self._handle.camera.image_height), LARGEST_HEIGHT))
+        most = min(LARGEST_HEIGHT, int((MOST_PIXELS / wish.aspect) ** 0.5))
+        rows = max(1, min(int(self._handle.camera.image_height), most))
         self._viewer.loop.ask(self._handle.client_id, wish, (max(1, round(wish.aspect * rows)), rows))
 
     def wish(self) -> Wish | None:
@@ -130,9 +139,9 @@ class Client:
         gui.reset()
         self._told = gui.add_markdown(self._status) if self._viewer.buttons else None
         for name, act in self._viewer.buttons.items():
-            gui.add_button(name).on_click(lambda _, act=act: act())
+            gui.add_button(name).on_click(survived(lambda _, act=act: act()))
         self._layer = gui.add_dropdown("Layer", layers, initial_value=chosen)
-        self._layer.on_update(lambda _: self.ask())
+        self._layer.on_update(survived(lambda _: self.ask()))
         panes = shown.scene.planes
         if self._panes is not None:
             self._panes.remove()
@@ -162,7 +171,7 @@ class Client:
         gui = self._handle.gui
         with gui.add_folder("Edited scene", expand_by_default=False):
             text = gui.add_text("Name", name)
-            gui.add_button("Save as a run").on_click(lambda _: self.keep_scene(text.value))
+            gui.add_button("Save as a run").on_click(survived(lambda _: self.keep_scene(text.value)))
 
     def _keep(self, write: Callable[[], str]) -> None:
         """Writes in the thread that draws: what is written may need kernels."""
@@ -170,10 +179,15 @@ class Client:
         def work() -> None:
             try:
                 self._notify("Saved", write(), "green")
-            except (InputError, ValueError, OSError) as error:
+            except (InputError, ValueError, OSError, RuntimeError) as error:
                 self._notify("Not saved", str(error), "red")
 
         self._viewer.loop.call(work)
+
+    def _stop_waiting(self) -> None:
+        if self._waiting is not None:
+            self._waiting.remove()
+            self._waiting = None
 
     def _notify(self, title: str, body: str, color: str) -> None:
         self._handle.add_notification(title, body, color=color)

@@ -10,6 +10,7 @@ import numpy as np
 
 from glassplat.publish.camera_paths import interpolated
 from glassplat.scene.camera import Camera
+from glassplat.viewer.callbacks import survived
 from glassplat.viewer.rotations import wxyz_of
 
 MOST_KEYFRAMES = 200
@@ -48,12 +49,12 @@ class KeyframeControls:
         gui = self._handle.gui
         with gui.add_folder("Keyframes", expand_by_default=False):
             self._count = gui.add_markdown(self._counted())
-            gui.add_button("Add this view").on_click(lambda _: self.add())
-            gui.add_button("Remove the last").on_click(lambda _: self.remove())
-            gui.add_button("Play or stop").on_click(lambda _: self.play(go))
+            gui.add_button("Add this view").on_click(survived(lambda _: self.add()))
+            gui.add_button("Remove the last").on_click(survived(lambda _: self.remove()))
+            gui.add_button("Play or stop").on_click(survived(lambda _: self.play(go)))
             if save is not None:
                 name = gui.add_text("Name", "keyframes")
-                gui.add_button("Save keyframes").on_click(lambda _: save(name.value))
+                gui.add_button("Save keyframes").on_click(survived(lambda _: save(name.value)))
 
     def add(self) -> None:
         """One more keyframe, where the client stands."""

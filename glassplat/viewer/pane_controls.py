@@ -11,6 +11,7 @@ import torch
 
 from glassplat.evaluate.colormap import LABEL_COLORS
 from glassplat.scene.plane import Planes
+from glassplat.viewer.callbacks import survived
 from glassplat.viewer.drawing import LEAST_GAIN, MOST_GAIN, PaneMove, Wish
 from glassplat.viewer.rotations import matrix_of, wxyz_of
 
@@ -55,7 +56,7 @@ class PaneGizmo:
 
     def listen(self, changed: Callable[[], None]) -> None:
         """From now on `changed` is called whenever it is moved."""
-        self._handle.on_update(lambda _: changed())
+        self._handle.on_update(survived(lambda _: changed()))
 
     def show(self, visible: bool) -> None:
         """Shows or hides it; where it stands counts in either case."""
@@ -106,22 +107,22 @@ class PaneControls:
     def listen(self, changed: Callable[[], None]) -> None:
         """From now on `changed` is called whenever something else is wished for, and arrows show as they are chosen."""
         for control in (self._glass, *self._reflectances.values(), self._gain):
-            control.on_update(lambda _: changed())
+            control.on_update(survived(lambda _: changed()))
         for gizmo in self._gizmos:
             gizmo.listen(changed)
-        self._chosen.on_update(lambda _: self._show_gizmo())
-        self._back.on_click(lambda _: self._put_back(changed))
+        self._chosen.on_update(survived(lambda _: self._show_gizmo()))
+        self._back.on_click(survived(lambda _: self._put_back(changed)))
 
     def applied(self, wish: Wish) -> Wish:
         """The wish, with the panes as the controls say."""
-        sliders = self._reflectances.items()
-        changed = [(label, slider.value) for label, slider in sliders if slider.value != round(self._own[label], 3)]
+        sliders = {label: within(slider.value, 0.0, 1.0) for label, slider in self._reflectances.items()}
+        changed = [(label, value) for label, value in sliders.items() if value != round(self._own[label], 3)]
         moves = [move for gizmo in self._gizmos if (move := gizmo.move()) is not None]
         return replace(
             wish,
             glass=self._glass.value,
             reflectances=tuple(changed),
-            gain=self._gain.value,
+            gain=within(self._gain.value, LEAST_GAIN, MOST_GAIN),
             moves=tuple(moves),
         )
 
@@ -138,3 +139,8 @@ class PaneControls:
         for gizmo in self._gizmos:
             gizmo.put_back()
         changed()
+
+
+def within(value: float, least: float, most: float) -> float:
+    """The value within a range, which a client need not keep to; the least where it is no number."""
+    return min(max(value, least), most) if value == value else least

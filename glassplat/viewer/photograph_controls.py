@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from glassplat.viewer.callbacks import survived
 from glassplat.viewer.shown import Shown
 
 PHOTO_WIDTH = 360
+NO_PHOTOGRAPH = np.zeros((2, 3, 3), dtype=np.uint8)
 
 
 class PhotographControls:
@@ -30,15 +32,15 @@ class PhotographControls:
             self._steps = gui.add_button_group("Step", ("previous", "next"))
             self._photo = None
             if shown.photographs:
-                self._photo = gui.add_image(np.zeros((2, 3, 3), dtype=np.uint8), label="Nearest photograph")
+                self._photo = gui.add_image(NO_PHOTOGRAPH, label="Nearest photograph")
 
     def listen(self, stand_at: Callable[[int], None]) -> None:
         """From now on they move the camera to where a photograph was taken, with `stand_at`."""
         names, steps = self._names, self._steps
         self._name.on_update(
-            lambda event: stand_at(names.index(self._name.value)) if event.client is not None else None
+            survived(lambda event: stand_at(names.index(self._name.value)) if event.client is not None else None)
         )
-        steps.on_click(lambda _: stand_at((self._at + (1 if steps.value == "next" else -1)) % len(names)))
+        steps.on_click(survived(lambda _: stand_at((self._at + (1 if steps.value == "next" else -1)) % len(names))))
 
     def stands_at(self, index: int) -> None:
         """The camera is where a photograph was taken."""
@@ -46,12 +48,17 @@ class PhotographControls:
         self._name.value = self._shown.cameras[index][0]
 
     def show_nearest(self, index: int) -> None:
-        """Shows a photograph, unless it is there already."""
+        """Shows a photograph, unless it is there already; where it is gone or broken, says so in its place."""
         name = self._shown.cameras[index][0]
         if self._photo is None or index == self._on_screen or name not in self._shown.photographs:
             return
         self._at = self._on_screen = index
-        photo = self._shown.photographs[name]()
+        try:
+            photo = self._shown.photographs[name]()
+        except (OSError, ValueError) as error:
+            self._photo.image = NO_PHOTOGRAPH
+            self._photo.label = f"Nearest photograph: {name} cannot be read ({error})"
+            return
         step = max(1, photo.shape[1] // PHOTO_WIDTH)
         self._photo.image = photo[::step, ::step].numpy()
         self._photo.label = f"Nearest photograph: {name}"

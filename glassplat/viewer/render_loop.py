@@ -54,19 +54,26 @@ class Request(Generic[Wanted]):
 class RenderLoop(Generic[Wanted]):
     """Knows the newest wish of each client, and draws the next picture when it is told to."""
 
-    def __init__(self, draw: Callable[[Wanted, int], Picture], show: Callable[[int, Picture, bool], None]) -> None:
+    def __init__(
+        self,
+        draw: Callable[[Wanted, int], Picture],
+        show: Callable[[int, Picture, bool], None],
+        fail: Callable[[int, str], None] = lambda client, reason: None,
+    ) -> None:
         """Begins to wait for wishes.
 
         Args:
             draw: the picture of a wish with so many rows; called by `serve` only.
             show: sends a picture to a client, and says whether it is the sharp one.
+            fail: tells a client why its picture could not be drawn.
         """
-        self._draw, self._show = draw, show
+        self._draw, self._show, self._fail = draw, show, fail
         self._requests: dict[int, Request[Wanted]] = {}
         self._calls: list[Callable[[], None]] = []
         self._changed = threading.Condition()
         self._generation, self._turn = 0, 0
         self._seconds_per_pixel = 1e-7
+        self._complaint = ""
 
     def ask(self, client: int, wish: Wanted, size: tuple[int, int]) -> None:
         """Replaces what a client wants to see."""
@@ -93,10 +100,13 @@ class RenderLoop(Generic[Wanted]):
             if call is None and not self._requests:
                 return False
             waiting = None if call else self._next()
-        if waiting is not None:
-            self._serve(*waiting)
-        elif call is not None:
-            call()
+        try:
+            if waiting is not None:
+                self._serve(*waiting)
+            elif call is not None:
+                call()
+        except Exception as error:  # noqa: BLE001 - Of one client or picture; the thread, maybe a training, goes on.
+            self._complain(error)
         return True
 
     def wait(self, seconds: float) -> None:
@@ -138,7 +148,7 @@ class RenderLoop(Generic[Wanted]):
         coarse = self.coarse_height(request.size)
         is_sharp = request.is_coarse_shown or coarse >= height
         rows = height if is_sharp else coarse
-        picture = self._timed(request.wish, rows)
+        picture = self._timed(client, request.wish, rows)
         with self._changed:
             current = self._requests.get(client)
             if current is None or current.generation != request.generation:
@@ -150,17 +160,25 @@ class RenderLoop(Generic[Wanted]):
         if picture is not None:
             self._show(client, picture, is_sharp)
 
-    def _timed(self, wish: Wanted, rows: int) -> Picture | None:
+    def _timed(self, client: int, wish: Wanted, rows: int) -> Picture | None:
         """A picture; what goes wrong with one must not end the others."""
         begun = time.perf_counter()
         try:
             picture = self._draw(wish, rows)
-        except (RuntimeError, ValueError) as error:
-            logger.warning("a view could not be drawn: %s", error)
+        except Exception as error:  # noqa: BLE001 - A photograph that is gone, no memory: whatever it was.
+            self._fail(client, self._complain(error))
             return None
         seconds = (time.perf_counter() - begun) / (picture.shape[0] * picture.shape[1])
         self._seconds_per_pixel += SMOOTHING * (seconds - self._seconds_per_pixel)
         return picture
+
+    def _complain(self, error: Exception) -> str:
+        """The error as text, which is logged unless the last one was the same."""
+        text = str(error) or type(error).__name__
+        if text != self._complaint:
+            logger.warning("a view could not be drawn: %s", text)
+        self._complaint = text
+        return text
 
 
 class RenderThread:

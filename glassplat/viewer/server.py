@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import logging
+import socket
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
@@ -22,9 +23,11 @@ from glassplat.data.errors import InputError
 from glassplat.publish.surveyed import best_view, surveyed
 from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
+from glassplat.serving.access import Access, is_local
+from glassplat.viewer.callbacks import survived
 from glassplat.viewer.client import Client
 from glassplat.viewer.drawing import Wish, drawn, error_drawn
-from glassplat.viewer.ports import LOCAL, check_port
+from glassplat.viewer.ports import check_port
 from glassplat.viewer.render_loop import RenderLoop, RenderThread
 from glassplat.viewer.shown import Shown, Viewpoints
 
@@ -39,7 +42,7 @@ class Viewer:
 
         Args:
             shown: what there is to look at.
-            host: who may look; 127.0.0.1 is this machine alone.
+            host: who may look, with the key of the address; 127.0.0.1 is this machine alone.
             port: where the browser finds it.
             buttons: further ones by what is written on them, and what they do; called from other threads.
 
@@ -48,21 +51,21 @@ class Viewer:
         """
         check_port(host, port)
         try:
-            import viser
+            from glassplat.viewer.gate import guarded_server
         except ImportError as error:
             raise InputError(
                 f"the viewer needs viser, which is not installed ({error}); pip install 'glassplat[view]', or look at "
                 "the page of `glassplat export`, which needs nothing"
             ) from error
         self.shown, self.host, self.buttons = shown, host, buttons or {}
-        self.loop: RenderLoop[Wish] = RenderLoop(self._draw, self._show)
+        self.loop: RenderLoop[Wish] = RenderLoop(self._draw, self._show, self._fail)
         self._thread: RenderThread | None = None
         self._clients: dict[int, Client] = {}
         logging.getLogger("websockets").setLevel(logging.CRITICAL)
         # A browser that leaves in the middle of something is nothing that anybody needs to know.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-        with redirect_stdout(io.StringIO()):  # It prints a table of addresses, which the commands say themselves.
-            self._server = viser.ViserServer(host=host, port=port, label=shown.title, verbose=False)
+        self.access = Access(host)
+        self._server = guarded_server(self.access, host=host, port=port, title=shown.title)
         cameras = [camera for _, camera in shown.cameras]
         survey = surveyed(cameras, shown.scene.extent)
         self._server.scene.set_up_direction(tuple(survey.up.tolist()))
@@ -71,9 +74,9 @@ class Viewer:
         self.viewpoints = Viewpoints(cameras, shown.scene.extent)
         # The error layer asks for the same one with every edit.
         self._photograph = lru_cache(maxsize=2)(self._read_photograph)
-        self._server.gui.configure_theme(dark_mode=True, show_logo=False)
-        self._server.on_client_connect(self._connected)
-        self._server.on_client_disconnect(self._gone)
+        self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        self._server.on_client_connect(survived(self._connected))
+        self._server.on_client_disconnect(survived(self._gone))
 
     @property
     def port(self) -> int:
@@ -82,8 +85,10 @@ class Viewer:
 
     @property
     def address(self) -> str:
-        """What to open in the browser."""
-        return f"http://{'localhost' if self.host == LOCAL else self.host}:{self.port}"
+        """What to open in the browser: with the key, without which there is no answer."""
+        everywhere = self.host in ("0.0.0.0", "::")
+        name = "localhost" if is_local(self.host) else socket.gethostname() if everywhere else self.host
+        return f"http://{name}:{self.port}/?key={self.access.key}"
 
     @property
     def is_watched(self) -> bool:
@@ -107,13 +112,13 @@ class Viewer:
         self.shown = replace(self.shown, scene=scene, renderer=renderer)
         if scene.planes.labels != had:
             for client in list(self._clients.values()):
-                client.lay_out()
+                survived(client.lay_out)()
 
     def refresh(self, status: str = "") -> None:
         """Asks for everybody's picture again, and tells them something."""
         for client in list(self._clients.values()):
-            client.tell(status)
-            client.ask()
+            survived(client.tell)(status)
+            survived(client.ask)()
 
     def _connected(self, handle: Any) -> None:
         client = self._clients[handle.client_id] = Client(handle, self)
@@ -138,12 +143,17 @@ class Viewer:
         """[H, W, 3] uint8.
 
         Raises:
-            ValueError: the photograph is not there.
+            ValueError, OSError: the photograph is not there, or cannot be read.
         """
         name = self.shown.cameras[index][0]
         if name not in self.shown.photographs:
             raise ValueError(f"there is no photograph {name} to compare with")
         return self.shown.photographs[name]()
+
+    def _fail(self, client: int, reason: str) -> None:
+        found = self._clients.get(client)
+        if found is not None:
+            found.say_failed(reason)
 
     def _show(self, client: int, picture: NDArray[np.uint8], is_sharp: bool) -> None:
         found = self._clients.get(client)

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from glassplat.annotate.server import AnnotationServer
-from glassplat.annotate.session import opened_session
+from glassplat.annotate.session import Session, opened_session
 from glassplat.scene.camera import Camera
 from tests.init.pane_scene import FRONT, camera_from, label_image
 
@@ -55,6 +55,11 @@ def marked_document(views: tuple[int, ...] = (0, 1, 2), **more: object) -> dict:
     corners = [{NAMES[view]: true_corners(view)[corner].tolist() for view in views} for corner in range(4)]
     pane = {"label": 1, "material": "glass", "shape": "rectangle", "corners": corners, "edges": [{}] * 4, "strokes": {}}
     return {"version": 1, "panes": [pane | more]}
+
+
+def saved(session: Session, document: dict) -> dict:
+    """The answer to a page that has seen all that is saved."""
+    return session.save({"document": document, "version": session.described()["version"]})
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from PIL import Image
 
 from glassplat.data.dataset import load_dataset
 from glassplat.files.images import read_image
-from tests.annotate.conftest import NAMES, true_corners
+from tests.annotate.conftest import NAMES, marked_document, saved, true_corners
 from tests.browser_needed import needs_browser
 from tests.init.pane_scene import FRONT
 from tools.browser import wait_until
@@ -222,3 +222,15 @@ def test_done_ends_the_command(page: Page) -> None:
     page.window.press("#close")
     page.window.wait("document.body.dataset.state === 'closed'", "the end")
     assert page.server.is_finished
+
+
+def test_what_another_tab_marks_is_kept_beside_what_is_marked_here(page: Page) -> None:
+    page.mark_true(0)
+    saved(page.server.session, marked_document(material="mirror"))
+    page.mark_true(1)
+    page.window.wait("document.querySelectorAll('#panes .pane').length === 2", "both panes")
+    page.saved()
+    assert "pane 1 changed" in page.window.run("return document.getElementById('elsewhere').textContent")
+    both = json.loads((page.root / "annotations.json").read_text())["panes"]
+    assert [(pane["label"], pane["material"]) for pane in both] == [(1, "mirror"), (2, "glass")]
+    assert all(len(places) == 2 for places in both[1]["corners"])

@@ -21,13 +21,13 @@ from glassplat.data.view import PhotoFile
 from glassplat.files.images import read_image
 from glassplat.init.planes import fit_planes
 from glassplat.scene.eye import Eye
-from tests.annotate.conftest import NAMES, PLACES, marked_document
+from tests.annotate.conftest import NAMES, PLACES, marked_document, saved
 from tests.init.pane_scene import FRONT, Pane, camera_from, label_image, normal_error, offset_error
 
 
 def finish(root: Path, document: dict) -> None:
     session = opened_session(root)
-    session.update(document)
+    saved(session, document)
     session.finish()
 
 
@@ -181,14 +181,14 @@ def test_the_wrong_order_of_corners_is_called_into_question(room: Path) -> None:
     document = marked_document()
     corners = document["panes"][0]["corners"]
     corners[1], corners[2] = corners[2], corners[1]
-    answer = session.update(document)["panes"][0]
+    answer = saved(session, document)["panes"][0]
     assert "do not form a rectangle" in answer["message"] or "pixels off" in answer["message"]
 
 
 def test_the_suggested_photograph_lowers_the_doubt(room: Path) -> None:
     session = opened_session(room)
-    two = session.update(marked_document((0, 2)))["panes"][0]
+    two = saved(session, marked_document((0, 2)))["panes"][0]
     best = two["next"][0]
     assert best["doubt"] < two["doubt"]
-    three = session.update(marked_document((0, 2, best["view"])))["panes"][0]
+    three = saved(session, marked_document((0, 2, best["view"])))["panes"][0]
     assert three["doubt"] == pytest.approx(best["doubt"], rel=0.3)

@@ -12,9 +12,10 @@ from typing import Any
 import pytest
 
 from glassplat.annotate.document import MOST_CORNERS
-from glassplat.annotate.server import COOKIE, LARGEST_BODY, AnnotationServer
+from glassplat.annotate.server import LARGEST_BODY, AnnotationServer
 from glassplat.annotate.session import opened_session
 from glassplat.data.errors import InputError
+from glassplat.serving.access import cookie_name
 from tests.annotate.conftest import NAMES, marked_document, serving
 
 
@@ -29,10 +30,11 @@ def ask(
 ) -> tuple[int, bytes]:
     """Status and body of one request; as the page sends it, unless headers say otherwise."""
     port = server.server_address[1]
+    host = headers.get("Host", f"127.0.0.1:{port}")
     known = {
-        "Host": f"127.0.0.1:{port}",
+        "Host": host,
         "Origin": f"http://127.0.0.1:{port}",
-        "Cookie": f"{COOKIE}={server.key if key is None else key}",
+        "Cookie": f"{cookie_name(host)}={server.access.key if key is None else key}",
     }
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
     data = None if body is None else body if isinstance(body, bytes) else json.dumps(body).encode()
@@ -50,12 +52,20 @@ def ask(
         connection.close()
 
 
+def save(server: AnnotationServer, document: Any, version: str | None = None) -> tuple[int, Any]:
+    """Status and answer of a save, by a page that has seen a version; the newest one if none is given."""
+    if version is None:
+        version = json.loads(ask(server, "/capture")[1])["version"]
+    status, body = ask(server, "/document", {"document": document, "version": version})
+    return status, json.loads(body)
+
+
 def test_it_listens_on_this_computer_only(server: AnnotationServer) -> None:
     assert server.server_address[0] == "127.0.0.1"
 
 
 def test_the_key_becomes_a_cookie_and_leaves_the_address(server: AnnotationServer) -> None:
-    status, _ = ask(server, f"/?key={server.key}", key="")
+    status, _ = ask(server, f"/?key={server.access.key}", key="")
     assert status == 303
     assert ask(server, "/")[0] == 200
     assert ask(server, "/?key=guessed")[0] == 403
@@ -112,8 +122,8 @@ def test_photographs_are_jpegs(server: AnnotationServer) -> None:
 
 
 def test_a_document_is_saved_and_answered(server: AnnotationServer) -> None:
-    status, body = ask(server, "/document", marked_document())
-    answer = json.loads(body)["panes"][0]
+    status, body = save(server, marked_document())
+    answer = body["panes"][0]
     assert status == 200 and answer["solved"] and answer["error"] < 0.1
     assert len(answer["outlines"]) == len(answer["corners"]) == len(NAMES)
     assert json.loads((server.session.root / "annotations.json").read_text()) == marked_document()
@@ -121,7 +131,7 @@ def test_a_document_is_saved_and_answered(server: AnnotationServer) -> None:
 
 
 def test_one_view_gives_sight_lines_and_the_next_photograph(server: AnnotationServer) -> None:
-    answer = json.loads(ask(server, "/document", marked_document((0,)))[1])["panes"][0]
+    answer = save(server, marked_document((0,)))[1]["panes"][0]
     assert not answer["solved"] and "second photograph" in answer["message"]
     assert answer["next"] and all(one["view"] != 0 for one in answer["next"])
     assert all(line is not None for line in answer["lines"][0][1:]) and answer["lines"][0][0] is None
@@ -136,6 +146,8 @@ def too_many_corners() -> dict:
     [
         (b"{", 400),
         (b"[1]", 400),
+        (b"{}", 400),
+        ([1], 400),
         (b"\xff\xfe", 400),
         (b"[" * 5000, 400),
         ({"version": 2, "panes": []}, 400),
@@ -148,10 +160,43 @@ def too_many_corners() -> dict:
     ],
 )
 def test_nonsense_changes_nothing(body: Any, status: int, server: AnnotationServer) -> None:
-    ask(server, "/document", marked_document())
-    found, message = ask(server, "/document", body)
-    assert found == status and json.loads(message)["error"]
+    save(server, marked_document())
+    if isinstance(body, bytes):
+        found, answer = ask(server, "/document", body)
+        message = json.loads(answer)
+    else:
+        found, message = save(server, body)
+    assert found == status and message["error"]
     assert server.session.document == marked_document()
+
+
+def panes(*labels: int, **more: Any) -> dict:
+    """A document with panes of these labels, marked alike."""
+    return {"version": 1, "panes": [marked_document(label=label, **more)["panes"][0] for label in labels]}
+
+
+def on_disk(server: AnnotationServer) -> dict:
+    return json.loads((server.session.root / "annotations.json").read_text())
+
+
+def test_the_save_of_a_second_tab_drops_nothing_of_the_first(server: AnnotationServer) -> None:
+    version = json.loads(ask(server, "/capture")[1])["version"]
+    assert save(server, panes(1), version)[0] == 200
+    status, answer = save(server, panes(1, material="mirror"), version)
+    assert status == 409 and "pane 1 added" in answer["error"]
+    assert on_disk(server) == panes(1)
+    kept = answer["document"]["panes"]
+    assert [(pane["label"], pane["material"]) for pane in kept] == [(1, "glass"), (2, "mirror")]
+    assert save(server, answer["document"], answer["version"])[0] == 200
+    assert on_disk(server) == answer["document"]
+
+
+def test_what_another_program_has_marked_counts_too(server: AnnotationServer) -> None:
+    _, answer = save(server, panes(1))
+    (server.session.root / "annotations.json").write_text(json.dumps(panes(1, 2)))
+    status, refused = save(server, panes(1, 3), answer["version"])
+    assert status == 409 and [pane["label"] for pane in refused["document"]["panes"]] == [1, 2, 3]
+    assert on_disk(server) == panes(1, 2)
 
 
 def test_a_body_that_is_too_long_is_not_read(server: AnnotationServer) -> None:

@@ -44,7 +44,7 @@ def watched(folder: Path) -> Iterator[tuple[Viewer, Client, Browser]]:
     viewer = Viewer(shown, "127.0.0.1", free_port())
     viewer.start()
     try:
-        with Browser(f"http://127.0.0.1:{viewer.port}/", *WINDOW) as browser:
+        with Browser(viewer.address, *WINDOW) as browser:
             eventually(lambda: bool(viewer._clients))
             (client,) = viewer._clients.values()
             eventually(lambda: "Edited scene" in browser.evaluate("document.body.innerText"))

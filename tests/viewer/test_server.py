@@ -47,7 +47,7 @@ def test_a_browser_is_shown_sharp_pictures_and_may_leave() -> None:
     show = viewer._show
     viewer.loop._show = lambda client, picture, is_sharp: (shown.append(is_sharp), show(client, picture, is_sharp))
     try:
-        with Browser(f"http://127.0.0.1:{viewer.port}/", 400, 300) as browser:
+        with Browser(viewer.address, 400, 300) as browser:
             eventually(lambda: any(shown))
             eventually(lambda: WAITING[1] not in browser.evaluate("document.body.innerText"))
             (client,) = viewer._clients.values()
@@ -77,7 +77,7 @@ def test_a_port_in_use_gets_a_message(tmp_path: Path, capsys: pytest.CaptureFixt
 def test_who_waits_for_the_first_picture_is_told_so() -> None:
     viewer = Viewer(SHOWN, "127.0.0.1", free_port())  # Nobody draws before it starts.
     try:
-        with Browser(f"http://127.0.0.1:{viewer.port}/", 400, 300) as browser:
+        with Browser(viewer.address, 400, 300) as browser:
             eventually(lambda: WAITING[1] in browser.evaluate("document.body.innerText"))
     finally:
         viewer.stop()

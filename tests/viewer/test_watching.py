@@ -87,7 +87,7 @@ def test_a_training_is_drawn_paused_and_saved_while_it_goes_on(tmp_path: Path) -
         before = found.training.step
         eventually(lambda: found.training.step > before + 20)
         assert not drawn
-        with Browser(f"http://127.0.0.1:{viewer.port}/", 400, 300) as browser:
+        with Browser(viewer.address, 400, 300) as browser:
             eventually(lambda: len(set(drawn)) > 1)
             eventually(lambda: "step" in browser.evaluate("document.body.innerText"))
             viewer.buttons["pause"]()

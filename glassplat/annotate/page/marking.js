@@ -29,6 +29,12 @@ export class Marking {
     this.changed();
   }
 
+  // A document that the server has put together of this one and another; earlier steps lead to before that.
+  takeOver(together) {
+    this.change((document) => { Object.assign(document, together); });
+    if (!this.pane) this.active = this.document.panes.length ? this.document.panes[0].label : null;
+  }
+
   undo() { this.#travel(this.done, this.undone); }
 
   redo() { this.#travel(this.undone, this.done); }

@@ -25,7 +25,7 @@ async function ask(path, body) {
   const options = body === undefined ? {} : { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
   const response = await fetch(path, options);
   const answer = await response.json();
-  if (!response.ok) throw new Error(answer.error || response.statusText);
+  if (!response.ok) throw Object.assign(new Error(answer.error || response.statusText), { answer });
   return answer;
 }
 
@@ -48,7 +48,8 @@ async function send() {
   sending = true;
   const sent = revision;
   try {
-    const answer = await ask("/document", marking.document);
+    const answer = await ask("/document", { document: marking.document, version: capture.version });
+    capture.version = answer.version;
     answers = Object.fromEntries(answer.panes.map((pane) => [pane.label, pane]));
     // What changed while the answer was on its way is not saved yet, whether or not its own sending has begun.
     if (revision === sent) {
@@ -56,12 +57,27 @@ async function send() {
       tell("saved");
     }
   } catch (error) {
-    document.body.dataset.state = "failed";
-    tell(`not saved: ${error.message}`, true);
+    if (error.answer && error.answer.document && revision === sent) {
+      takeOver(error.answer, error.message);
+    } else if (error.answer && error.answer.document) {
+      waiting = true; // The next sending is refused too, with what changed in the meantime.
+    } else {
+      document.body.dataset.state = "failed";
+      tell(`not saved: ${error.message}`, true);
+    }
   }
   sending = false;
   if (waiting) { waiting = false; send(); }
   refresh();
+}
+
+// Another page has saved since: the server has put both together, which is shown here and saved next.
+function takeOver(answer, message) {
+  capture.version = answer.version;
+  pending = drag = null;
+  element("elsewhere").textContent = message;
+  marking.takeOver(answer.document);
+  changed();
 }
 
 function refresh() {

@@ -25,7 +25,7 @@ class View:
     Attributes:
         scene: a run's directory, an imported scene, or a splat file.
         port: where the browser finds it.
-        host: who may look; 127.0.0.1 is this machine alone, 0.0.0.0 everybody who can reach it.
+        host: who may look with the link; 127.0.0.1 is this machine alone, 0.0.0.0 everybody who can reach it.
         output: folder for edited scenes and keyframes that are saved in the browser; the one that holds the scene if
             not given. Where others may look, too, nothing can be saved unless it is given.
         edits: changes to the panes.

@@ -18,8 +18,8 @@ from glassplat.interface.keeping import KeptBeside
 from glassplat.interface.loading import load
 from glassplat.interface.model import Model
 from glassplat.interface.watching import shown_of
+from glassplat.serving.access import is_local
 from glassplat.train.run_directory import RunDirectory
-from glassplat.viewer.ports import LOCAL
 from glassplat.viewer.server import Viewer
 
 
@@ -40,7 +40,7 @@ def serve(command: View, console: Console) -> None:
 
 def keeper(command: View, model: Model) -> KeptBeside | None:
     """Who may look from elsewhere must not write here unless that was asked for."""
-    if command.output is None and command.host != LOCAL:
+    if command.output is None and not is_local(command.host):
         return None
     return KeptBeside(model, command.output or Path(os.path.abspath(command.scene)).parent)
 
@@ -48,7 +48,7 @@ def keeper(command: View, model: Model) -> KeptBeside | None:
 def announce(viewer: Viewer, console: Console) -> None:
     """Says where to look."""
     say(console, f"look at {viewer.address}")
-    if viewer.host == LOCAL:
+    if is_local(viewer.host):
         say(console, f"from elsewhere: ssh -L {viewer.port}:localhost:{viewer.port} <this machine>, then the same")
 
 

@@ -1,0 +1,193 @@
+"""What stands between viser and whoever connects to it.
+
+viser accepts any websocket connection and believes every message. It makes its server by
+`websockets.asyncio.server.serve(handler, host, port, ...)`; while it does, that name stands for one that adds three
+documented parameters: `process_request`, so that nobody is let in who may not be; `create_connection`, so that messages
+are checked before viser sees them; and a smaller `max_size`. A viser that begins otherwise is stopped at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
+from http import HTTPStatus
+from typing import Any
+
+import msgspec
+import viser
+from websockets.asyncio import server as websockets_server
+from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+from glassplat.files.fields import COORDINATE, ByName, Field, Items, Number, Optional, Whole, checked
+from glassplat.serving.access import Access, RefusedError
+
+LARGEST_MESSAGE = 64 * 1024
+"""Bytes; a page sends cameras and what is typed into controls."""
+LONGEST_TEXT = 1000
+LARGEST_WINDOW = 16_384
+"""Pixels of a side of the browser's window."""
+LEAST_TURN, MOST_TURN = 1e-3, 1e3
+"""Length of a quaternion."""
+POSITION, TURN = Items(COORDINATE, 3), Items(Number(-MOST_TURN, MOST_TURN), 4)
+HEADERS = {"X-Frame-Options": "DENY", "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
+_SERVE = threading.Lock()
+logger = logging.getLogger(__name__)
+
+
+class ShortText:
+    """A text of a name or of what somebody typed."""
+
+    expected = f"a text of at most {LONGEST_TEXT} characters"
+
+    def read(self, value: Any, where: str) -> str:
+        """The text as it is; may be empty."""
+        if not isinstance(value, str) or len(value) > LONGEST_TEXT:
+            raise ValueError(f"{where} is no text of at most {LONGEST_TEXT} characters")
+        return value
+
+
+class ControlValue:
+    """What a control may be set to."""
+
+    expected = "a number, true, false or a short text"
+
+    def read(self, value: Any, where: str) -> Any:
+        """The value as it is."""
+        if isinstance(value, bool):
+            return value
+        return (ShortText() if isinstance(value, str) else COORDINATE).read(value, where)
+
+
+GIZMO: dict[str, Field] = {"name": ShortText(), "owner": Optional(ShortText(), "")}
+MESSAGES: dict[str, dict[str, Field]] = {
+    "ViewerCameraMessage": {
+        "wxyz": TURN,
+        "position": POSITION,
+        "fov": Number(1e-3, 3.14),
+        "near": COORDINATE,
+        "far": COORDINATE,
+        "image_height": Whole(1, LARGEST_WINDOW),
+        "image_width": Whole(1, LARGEST_WINDOW),
+        "look_at": POSITION,
+        "up_direction": POSITION,
+    },
+    "GuiUpdateMessage": {"uuid": ShortText(), "updates": ByName(ControlValue())},
+    "TransformControlsUpdateMessage": {**GIZMO, "wxyz": TURN, "position": POSITION},
+    "TransformControlsDragStartMessage": GIZMO,
+    "TransformControlsDragEndMessage": GIZMO,
+}
+"""What browsers may say, by viser's names, and within which bounds; nothing else is heard.
+
+Among what is not heard: that the scene be shared through a public server, uploads, and pictures of other views.
+"""
+
+
+def understood(data: str | bytes) -> bytes | None:
+    """A message with nothing in it but what `MESSAGES` names; None for one that is not to be heard."""
+    try:
+        message = msgspec.msgpack.decode(data if isinstance(data, bytes) else b"")
+        kind = message["type"]
+        fields = checked(message, MESSAGES[kind], kind)
+        turn = fields.get("wxyz", (1.0,))
+        if sum(part * part for part in turn) < LEAST_TURN**2 or fields.get("updates", {"value": 0}).keys() != {"value"}:
+            return None
+    except (ValueError, TypeError, KeyError, RecursionError):  # msgspec's errors are ValueErrors.
+        return None
+    return msgspec.msgpack.encode({"type": kind, **fields})
+
+
+class GuardedConnection(ServerConnection):
+    """A connection on which only messages arrive that are understood."""
+
+    async def recv(self, decode: bool | None = None) -> Any:
+        """The next message that is."""
+        while (message := understood(await super().recv(decode))) is None:
+            pass
+        return message
+
+
+def admission(access: Access, page: Callable[..., Any] | None) -> Callable[[ServerConnection, Request], Any]:
+    """A function for `process_request` that answers with `page` whoever may come in, and refuses others."""
+
+    def answer(connection: ServerConnection, request: Request) -> Any:
+        try:
+            entry = admitted(access, request)
+        except RefusedError as refused:
+            return replied(refused.status, {"Content-Type": "text/plain; charset=utf-8"}, str(refused))
+        if entry is not None:
+            return replied(HTTPStatus.SEE_OTHER, entry)
+        response = None if page is None else page(connection, request)
+        if isinstance(response, Response):
+            for name, value in HEADERS.items():
+                response.headers[name] = value
+        return response
+
+    return answer
+
+
+def admitted(access: Access, request: Request) -> Mapping[str, str] | None:
+    """None if a request may be answered; for one that brings the key, the headers of the answer.
+
+    Raises:
+        RefusedError: it may not.
+    """
+    hosts, origins, upgrades = (request.headers.get_all(name) for name in ("Host", "Origin", "Upgrade"))
+    if len(hosts) != 1 or len(origins) > 1:
+        raise RefusedError(HTTPStatus.BAD_REQUEST, "expected one host, and at most one origin")
+    access.check_host(hosts[0])
+    if upgrades or origins:
+        access.check_origin(origins[0] if origins else None, hosts[0])
+    entry = access.entry(request.path, hosts[0])
+    if entry is None:
+        access.check_cookie("; ".join(request.headers.get_all("Cookie")), hosts[0])
+    return entry
+
+
+def replied(status: HTTPStatus, headers: Mapping[str, str], text: str = "") -> Response:
+    """An answer with nothing of viser in it."""
+    body = text.encode()
+    length = {"Content-Length": str(len(body)), "Cache-Control": "no-store", "Connection": "close"}
+    return Response(status, status.phrase, Headers({**HEADERS, **length, **headers}), body)
+
+
+def guarded_server(access: Access, *, host: str, port: int, title: str) -> viser.ViserServer:
+    """A server of viser that serves only whom `access` lets in, and hears only what it understands.
+
+    Raises:
+        RuntimeError: viser makes its server in another way than this package knows.
+    """
+    made: list[str] = []
+    with _SERVE, redirect_stdout(io.StringIO()):  # viser prints a table of addresses; the commands say them.
+        serve: Any = websockets_server.serve
+
+        def guarded(handler: Callable[..., Any], *where: Any, **options: Any) -> Any:
+            if not (getattr(handler, "__module__", None) or "").startswith("viser."):
+                return serve(handler, *where, **options)
+            made.append(handler.__module__)
+            page = admission(access, options.get("process_request"))
+            more = {"create_connection": GuardedConnection, "process_request": page, "max_size": LARGEST_MESSAGE}
+            return serve(handler, *where, **options | more)
+
+        websockets_server.serve = guarded  # type: ignore[assignment, misc]
+        try:
+            found = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+        finally:
+            websockets_server.serve = serve  # type: ignore[misc]
+        if not made:
+            found.stop()
+            raise RuntimeError(
+                f"viser {viser.__version__} makes its server in a way that glassplat cannot guard; install viser 1.1.1"
+            )
+    found.get_event_loop().set_exception_handler(_noted)
+    return found
+
+
+def _noted(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """What goes wrong with one message is noted, not printed with a traceback."""
+    logger.debug("a message of a browser was not followed: %s", context.get("exception") or context.get("message"))

@@ -1,0 +1,37 @@
+"""Marks of two pages are put together so that nothing of either is lost."""
+
+from __future__ import annotations
+
+import pytest
+
+from glassplat.annotate.document import MOST_PANES
+from glassplat.annotate.merging import merged
+
+
+def document(**panes: str) -> dict:
+    """A document of panes a=1, b=2, ..., each with a text for what is marked of it."""
+    return {"version": 1, "panes": [{"label": ord(name) - 96, "marks": marks} for name, marks in panes.items()]}
+
+
+@pytest.mark.parametrize(
+    ("theirs", "ours", "together", "told"),
+    [
+        (document(a="1", b="2"), document(a="1", c="3"), document(a="1", b="2", c="3"), ["pane 2 added"]),
+        (document(a="2"), document(a="1", b="2"), document(a="2", b="2"), ["pane 1 changed"]),
+        (document(a="2"), document(a="3"), document(a="2", b="3"), ["pane 1 changed"]),
+        (document(a="2"), document(a="2"), document(a="2"), ["pane 1 changed"]),
+        (document(), document(a="3"), document(b="3"), ["pane 1 removed"]),
+        (document(), document(a="1", b="2"), document(b="2"), ["pane 1 removed"]),
+        (document(a="2"), document(), document(a="2"), ["pane 1 changed"]),
+        (document(a="1", b="2"), document(), document(b="2"), ["pane 2 added"]),
+    ],
+)
+def test_both_are_kept(theirs: dict, ours: dict, together: dict, told: list[str]) -> None:
+    assert merged(document(a="1"), theirs, ours) == (together, told)
+
+
+def test_more_panes_than_fit_are_refused() -> None:
+    full = {"version": 1, "panes": [{"label": label, "marks": "1"} for label in range(1, MOST_PANES + 1)]}
+    ours = {"version": 1, "panes": [{"label": 1, "marks": "2"}]}
+    with pytest.raises(ValueError, match="all 64 labels are in use"):
+        merged(document(), full, ours)

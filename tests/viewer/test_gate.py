@@ -1,0 +1,250 @@
+"""Who is let in to a viewer, what is heard of it, and what of that can do harm: nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+import pytest
+import torch
+import viser
+from websockets.exceptions import InvalidStatus
+
+from glassplat.viewer import gate
+from glassplat.viewer.client import MOST_PIXELS
+from glassplat.viewer.gate import LARGEST_MESSAGE, MESSAGES, understood
+from glassplat.viewer.server import Viewer
+from tests.viewer.free_port import free_port
+from tests.viewer.test_server import SHOWN
+from tools.viewer_client import ViewerClient, page
+
+
+@pytest.fixture(scope="module")
+def viewer() -> Iterator[Viewer]:
+    made = Viewer(SHOWN, "127.0.0.1", free_port())
+    made.start()
+    yield made
+    made.stop()
+
+
+def with_client(viewer: Viewer, work: Callable[[ViewerClient], Awaitable[None]]) -> None:
+    async def connected() -> None:
+        async with ViewerClient(viewer.address) as client:
+            await client.picture()
+            await work(client)
+
+    asyncio.run(connected())
+
+
+@pytest.mark.parametrize(
+    "stranger",
+    [
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"origin": None},
+        {"origin": "http://localhost:1"},
+        {"host": "evil.example:80", "origin": "http://evil.example:80"},
+        {"key": ""},
+        {"key": "guessed"},
+    ],
+    ids=str,
+)
+def test_a_stranger_is_not_let_in(stranger: dict[str, Any], viewer: Viewer) -> None:
+    async def tried() -> int:
+        try:
+            async with ViewerClient(viewer.address, **stranger):
+                return 101
+        except InvalidStatus as refused:
+            return refused.response.status_code
+
+    assert asyncio.run(tried()) == 403
+
+
+def test_through_ssh_the_port_is_another_one(viewer: Viewer) -> None:
+    async def looked(host: str) -> None:
+        async with ViewerClient(viewer.address, host=host, origin=f"http://{host}") as client:
+            await client.picture()
+
+    for host in ("localhost:9999", "127.0.0.1:9999", "[::1]:9999", "localhost"):
+        asyncio.run(looked(host))
+
+
+def test_the_page_needs_the_key_which_leaves_the_address(viewer: Viewer) -> None:
+    assert page(viewer.address)[0] == 403
+    assert page(viewer.address, "/?key=guessed")[0] == 403
+    status, headers, _ = page(viewer.address, f"/?key={viewer.access.key}")
+    assert status == 303 and headers["Location"] == "/"
+    assert "HttpOnly" in headers["Set-Cookie"] and "SameSite=Strict" in headers["Set-Cookie"]
+    cookie = headers["Set-Cookie"].split(";")[0]
+    status, headers, body = page(viewer.address, Cookie=cookie)
+    assert status == 200 and b"<html" in body and headers["X-Frame-Options"] == "DENY"
+    assert page(viewer.address, Cookie=cookie, Host="evil.example")[0] == 403
+    assert page(viewer.address, Cookie=cookie, Origin="http://evil.example")[0] == 403
+
+
+def test_others_may_look_by_any_name_where_the_host_says_so() -> None:
+    viewer = Viewer(SHOWN, "0.0.0.0", free_port())
+    viewer.start()
+    try:
+        address = f"http://localhost:{viewer.port}/?key={viewer.access.key}"
+        assert page(address, Host="gpu.lan:80")[0] == 403
+        assert page(address, Host="gpu.lan:80", Cookie=f"glassplat_80={viewer.access.key}")[0] == 200
+        assert "0.0.0.0" not in viewer.address
+    finally:
+        viewer.stop()
+
+
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": [1.0, 0, 0, 0], "position": [0.0, 0, 0], "fov": 1.0, "near": 0.1, "far": 9.0,
+    "image_height": 10, "image_width": 10, "look_at": [0.0, 0, 1], "up_direction": [0.0, 1, 0],
+}  # fmt: skip
+POISON = (0, -1.0, math.nan, math.inf, -math.inf, 1e300, "1", None, [], {}, True)
+BAD_CAMERAS = [
+    *({"fov": value} for value in (*POISON, 3.2)),
+    *({name: value} for name in ("image_height", "image_width") for value in (*POISON[:-1], 1.5, 2**40)),
+    *({"wxyz": [value, 0.0, 0.0, 0.0]} for value in POISON if value != -1.0 and value is not True),
+    *({"position": [0.0, value, 0.0]} for value in POISON[2:]),
+    {"wxyz": [1.0, 0, 0]},
+    {"type": "ShareUrlRequest"},
+    {"type": 5},
+    {"type": ["ViewerCameraMessage"]},
+]
+
+
+@pytest.mark.parametrize("change", BAD_CAMERAS, ids=str)
+def test_a_camera_out_of_bounds_is_not_heard(change: dict[str, Any]) -> None:
+    assert understood(msgspec.msgpack.encode(CAMERA)) is not None
+    assert understood(msgspec.msgpack.encode(CAMERA | change)) is None
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        "text", b"", b"\xff", b"\x91" * 60_000, msgspec.msgpack.encode([1]), msgspec.msgpack.encode({}),
+        msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": [1]}}),
+        msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "a", "updates": {"update_cb": 1}}),
+        msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": "x" * 1001}}),
+        msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": math.nan}}),
+        msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "a", "updates": {}}),
+    ],
+)  # fmt: skip
+def test_what_is_no_message_of_a_page_is_not_heard(message: str | bytes) -> None:
+    assert understood(message) is None
+
+
+def test_every_message_that_is_heard_is_one_of_viser_s_with_these_fields() -> None:
+    kinds = viser._messages.Message._subclass_from_type_string()
+    for name, fields in MESSAGES.items():
+        assert set(fields) <= set(kinds[name].__dataclass_fields__), name
+
+
+def test_a_client_that_sends_nonsense_harms_nobody(
+    viewer: Viewer, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    async def work(client: ViewerClient) -> None:
+        for change in BAD_CAMERAS:
+            await client.connection.send(msgspec.msgpack.encode(CAMERA | change))
+        for fov in (1e-3, 3.14):
+            await client.look(fov=fov)
+        await client.look(image_width=16_384, image_height=1)
+        await client.look(image_width=1, image_height=16_384)
+        await client.look(position=(1e12, -1e12, 1e12))
+        await client.set("Layer", "rgb")
+        for label in client.labels():
+            for value in ("", "nan", "inf", "no such", -1e9, 1e9, True, "\x1b[31m<script>"):
+                await client.set(label, value)
+        for name in client.gizmos:
+            await client.send("TransformControlsUpdateMessage", name=name, wxyz=[1e-3, 0, 0, 0], position=[1e12, 0, 0])
+        await asyncio.sleep(0.5)
+
+    with_client(viewer, work)
+    with_client(viewer, lambda client: client.picture())
+    output = "".join(capfd.readouterr())
+    assert "Traceback" not in output and "Task failed" not in output
+    assert not [record for record in caplog.records if record.exc_info]
+
+
+def test_a_message_that_is_too_long_ends_its_connection_only(viewer: Viewer) -> None:
+    async def work(client: ViewerClient) -> None:
+        await client.connection.send(b"\x00" * (LARGEST_MESSAGE + 1))
+        await client.connection.wait_closed()
+        assert client.connection.close_code == 1009
+
+    with_client(viewer, work)
+    with_client(viewer, lambda client: client.picture())
+
+
+def test_a_window_of_any_shape_gets_a_picture_of_bounded_size(viewer: Viewer) -> None:
+    drawn: list[tuple[int, ...]] = []
+    show = viewer.loop._show
+    viewer.loop._show = lambda client, picture, is_sharp: (drawn.append(picture.shape), show(client, picture, is_sharp))
+
+    async def work(client: ViewerClient) -> None:
+        for size in ((16_384, 1080), (100, 16_384)):
+            drawn.clear()
+            await client.look(image_width=size[0], image_height=size[1])
+            async with asyncio.timeout(60):
+                while not drawn:
+                    await asyncio.sleep(0.02)
+            assert all(shape[0] * shape[1] <= 1.01 * MOST_PIXELS for shape in drawn)
+
+    try:
+        with_client(viewer, work)
+    finally:
+        viewer.loop._show = show
+
+
+def test_a_photograph_that_is_gone_ends_nobody_s_drawing(capfd: pytest.CaptureFixture[str]) -> None:
+    """It is renamed, or its disk unplugged, while somebody looks."""
+    gone = False
+
+    def photograph() -> torch.Tensor:
+        if gone:
+            raise FileNotFoundError("no such photograph")
+        return torch.zeros(28, 28, 3, dtype=torch.uint8)
+
+    photographs = dict.fromkeys(SHOWN.photographs, photograph)
+    shown = replace(SHOWN, photographs=photographs, layers=("rgb", "error"))
+    viewer = Viewer(shown, "127.0.0.1", free_port())
+    viewer.start()
+
+    async def work(client: ViewerClient) -> None:
+        nonlocal gone
+        gone = True
+        await client.set("Stand at", shown.cameras[2][0])
+        await client.picture()
+        await client.set("Layer", "error")
+        async with asyncio.timeout(60):
+            while not any("no such photograph" in note for note in client.notes):
+                await asyncio.sleep(0.02)
+        await client.set("Layer", "rgb")
+        await client.picture()
+
+    try:
+        with_client(viewer, work)
+        with_client(viewer, lambda client: client.picture())
+    finally:
+        viewer.stop()
+    assert "Traceback" not in "".join(capfd.readouterr())
+
+
+def test_a_viser_that_cannot_be_guarded_is_not_served(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As should a later one make its server by another function."""
+    stopped: list[bool] = []
+
+    class Elsewhere:
+        def __init__(self, **options: Any) -> None:
+            pass
+
+        def stop(self) -> None:
+            stopped.append(True)
+
+    serve = gate.websockets_server.serve
+    monkeypatch.setattr(gate.viser, "ViserServer", Elsewhere)
+    with pytest.raises(RuntimeError, match="cannot guard"):
+        Viewer(SHOWN, "127.0.0.1", free_port())
+    assert stopped and gate.websockets_server.serve is serve
