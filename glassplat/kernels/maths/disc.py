@@ -228,7 +228,7 @@ def _clamped_ellipse() -> Scalar:
 
 
 def meet_maths(real: type) -> tuple[Scalar, Scalar]:
-    """Builds what pixels need: `meet` and `slopes`; offsets may be vectors of numbers (`kernels/cpu/vector.py`).
+    """Builds what pixels need: `meet` and `slopes`; offsets may be vectors of numbers (`backend/cpu_vector.py`).
 
     `meet` gives the numerators of u and v, and e. `slopes` turns the gradients of all three into that of the offset.
     """
