@@ -8,7 +8,6 @@ from typing import Annotated
 from glassplat.data.ranges import (
     Count,
     LearningRate,
-    NotNegative,
     PositiveShare,
     Range,
     ShDegree,
@@ -23,12 +22,10 @@ class PhotoExposure:
     Attributes:
         rate: learning rate at the start; 0 takes all photographs as exposed alike.
         rate_end: that at the end of the run, as a share of `rate`.
-        weight: of the departure from the scene's own colours in the objective.
     """
 
     rate: LearningRate = 0.0
     rate_end: PositiveShare = 0.1
-    weight: NotNegative = 0.01
 
 
 @dataclass(frozen=True)
