@@ -58,7 +58,8 @@ class TracedRecipe:
         mirrors: what is mirrored: `surroundings` (paper), an `environment` infinitely far away (ablation), or `both`,
             the environment behind the surroundings.
         joint: reflections also move the surfaces; without, they only teach the surroundings (ablation).
-        least_strength: rays are traced where the strength is larger; elsewhere the environment alone is mirrored.
+        least_strength: rays are traced where the strength is larger; elsewhere the environment alone is mirrored. Where
+            there is none, training traces them everywhere.
         least_iterations: of the shortest run in which anything reflects; a shorter one trains like `splat`.
         bootstrap: share of the run without reflection, a run of `splat` if mirrors are searched for at its end.
         surroundings: how the Gaussians learn that reflections show.

@@ -64,7 +64,9 @@ def _tracing(recipe: TracedRecipe, stage: Stage) -> Stage:
 
 def _rendered(recipe: TracedRecipe, stage: Stage) -> Stage:
     """A stage of `deferred` with this method's renderer, which propagation looks through as well."""
-    renderer = Traced(recipe.background or BLACK, recipe.least_strength, faintest=0.0, joint=recipe.joint)
+    # What no ray leaves and no environment lights mirrors nothing, and a strength that mirrors nothing cannot grow.
+    least_strength = 0.0 if recipe.mirrors == "surroundings" else recipe.least_strength
+    renderer = Traced(recipe.background or BLACK, least_strength, faintest=0.0, joint=recipe.joint)
     kept = [a for a in stage.actions if recipe.mirrors != "surroundings" or not isinstance(a, RefineEnvironment)]
     actions = [replace(action, renderer=renderer) if isinstance(action, Propagate) else action for action in kept]
     return replace(stage, renderer=renderer, actions=tuple(actions))

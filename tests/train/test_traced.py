@@ -214,6 +214,17 @@ def test_the_preset_resets_surroundings_where_it_resets_the_scene() -> None:
     assert {a.part for a in resets} == {"primary"}
 
 
+def test_what_hardly_reflects_learns_to_without_an_environment() -> None:
+    recipe = replace(RECIPE, mirrors="surroundings", least_strength=0.02)
+    state = surrounded_state()
+    faint = {"logit_strength": torch.full((len(state.scene.primary),), -6.0)}
+    scene = replace(state.scene, primary=replace(state.scene.primary, channels=faint))
+    for stage in recipe.stages(0)[1:]:
+        found = differentiate(stage, scene, tiny_capture().train[0], probed=False)
+        assert bool(found.gradients["primary.logit_strength"].any())
+    assert recipe.renderer().least_strength == 0.02
+
+
 def test_a_scene_without_surroundings_is_refused() -> None:
     scene = replace(surrounded_state().scene, surroundings=Gaussians.empty(), environment=Environment.empty())
     with pytest.raises(ValueError, match="has no surroundings; expected one trained with `traced`"):
