@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -223,6 +224,18 @@ def test_what_hardly_reflects_learns_to_without_an_environment() -> None:
         found = differentiate(stage, scene, tiny_capture().train[0], probed=False)
         assert bool(found.gradients["primary.logit_strength"].any())
     assert recipe.renderer().least_strength == 0.02
+
+
+def test_surroundings_that_are_too_large_are_pruned() -> None:
+    state = surrounded_state()
+    large = state.scene.surroundings.log_scales.clone()
+    large[:3] = math.log(2.5 * state.scene.extent)
+    state.scene = state.scene.with_parameters({"surroundings.log_scales": large})
+    count = len(state.scene.surroundings)
+    state.statistics["surroundings"] = ScreenStatistics.zeros(count)
+    densifier = DefaultDensify(prune_large_start=0.1, prune_scale_fraction=2.0, prune_opacity=1e-6)
+    Densify(densifier, "surroundings").apply(state, tiny_capture(), Clock(20, 40, 6))
+    assert len(state.scene.surroundings) == count - 3
 
 
 def test_a_scene_without_surroundings_is_refused() -> None:
