@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from glassplat.kernels.trace import Rays
 from glassplat.render.frame import Frame
 from glassplat.render.mirror_images import half_spaces_of
 from glassplat.render.seen_panes import SeenPanes, nearest_hits, panes_in_camera, seen_panes
@@ -24,20 +25,20 @@ from glassplat.scene.scene import Scene
 class Shades(NamedTuple):
     """Surfaces with what they mirror.
 
-    surfaces of C cameras; images and reflections [H, W, 3] of each; places [R, 3] from which rays went off.
+    surfaces of C cameras; images and reflections [H, W, 3] of each; the rays that went off.
     """
 
     surfaces: tuple[Surface, ...]
     images: tuple[Tensor, ...]
     reflections: tuple[Tensor, ...]
-    places: Tensor
+    rays: Rays
 
 
 def shades_of(curved: Traced, scene: Scene, cameras: Sequence[Camera], surfaces: Sequence[Surface]) -> Shades:
     """Shades what cameras see, one surface each."""
-    shaded, places = curved.shaded(scene, cameras, surfaces)
+    shaded, rays = curved.shaded(scene, cameras, surfaces)
     images, reflections = zip(*shaded, strict=True)
-    return Shades(tuple(surfaces), images, reflections, places)
+    return Shades(tuple(surfaces), images, reflections, rays)
 
 
 def mirrored_cameras(camera: Camera, planes: Planes) -> list[Camera]:

@@ -20,6 +20,7 @@ from glassplat.kernels.panes import PaneHits, Panes
 from glassplat.kernels.project import GradientSum
 from glassplat.kernels.shade_environment.shaded import SURFACE_CHANNELS
 from glassplat.kernels.splats import Deviation, Projected, Splats
+from glassplat.kernels.trace import Rays
 from glassplat.render.choices import Blend
 from glassplat.render.curved import (
     Shades,
@@ -301,7 +302,7 @@ class Planar:
         shades = [each.curved for each in passes if each.curved is not None]
         if not probed or not shades or not len(scene.surroundings):
             return ()
-        return (space_pass(scene, torch.cat([each.places for each in shades])),)
+        return (space_pass(scene, Rays(*map(torch.cat, zip(*(each.rays for each in shades), strict=True)))),)
 
     def _glazed(
         self, first: FirstPass, seen: SeenPanes, masks: Sequence[Tensor], second: SecondPass, camera: Camera
