@@ -16,6 +16,8 @@ from glassplat.scene.scene import Scene
 def with_corrected_cameras(dataset: Dataset, scene: Scene) -> Dataset:
     """The capture with the cameras of its photographs corrected as the scene says; itself where nothing is.
 
+    Nobody has looked where the cameras of test views are: they move as those of the photographs before and after them.
+
     Args:
         dataset: as it was read.
         scene: whose `poses` were learned on it.
@@ -24,7 +26,7 @@ def with_corrected_cameras(dataset: Dataset, scene: Scene) -> Dataset:
         return dataset
 
     def corrected(view: View) -> View:
-        camera = scene.poses.corrected(view.camera, view.name, scene.extent)
+        camera = scene.poses.interpolated(view.name).corrected(view.camera, view.name, scene.extent)
         return view if camera is view.camera else view.with_camera(plain(camera))
 
     return replace(dataset, train=tuple(map(corrected, dataset.train)), test=tuple(map(corrected, dataset.test)))

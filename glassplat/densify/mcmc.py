@@ -81,8 +81,8 @@ def exploring_noise(
     """[N, 3] offsets of the centres in world units: the noise term of the paper's Langevin dynamics.
 
     noise_rate * rate * sigmoid(-noise_sharpness (opacity - dead_opacity)) * covariance @ eta, eta standard normal.
-    The published factor multiplies an area by a length-like rate and so depends on the capture's units; here
-    lengths are measured in scene extents, which is the same where the extent is one.
+    The published factor multiplies an area by a rate that is a length, both in world units (`noise_units`), and so
+    depends on the capture's; else both are in scene extents, which is the same where the extent is one.
 
     Args:
         options: how strong it is, and where.
@@ -96,7 +96,8 @@ def exploring_noise(
     rotations = rotation_from_quat(gaussians.quats)
     variances = gaussians.deviations.square()
     along_axes = (rotations.transpose(1, 2) @ unit[..., None]).squeeze(-1) * variances
-    directions = (rotations @ along_axes[..., None]).squeeze(-1) / extent
+    directions = (rotations @ along_axes[..., None]).squeeze(-1)
+    directions = directions * extent if options.noise_units == "world" else directions / extent
     opacities = torch.sigmoid(gaussians.logit_opacities)
     gate = torch.sigmoid(-options.noise_sharpness * (opacities - options.dead_opacity))
     return options.noise_rate * rate * gate[:, None] * directions

@@ -105,6 +105,8 @@ class McmcDensify:
         dead_opacity: Gaussians at most this opaque are relocated.
         noise_rate: noise on the positions, as a multiple of their learning rate; 0 switches it
             off.
+        noise_units: in which variances and learning rate are multiplied: scene `extents`, so that the noise is the same
+            whatever the capture's units, or as published `world` units.
         noise_sharpness: how fast the noise fades above `dead_opacity`.
         opacity_weight: lambda_o, weight of the mean opacity in the objective.
         scale_weight: lambda_Sigma, weight of the mean standard deviation in the objective.
@@ -122,6 +124,7 @@ class McmcDensify:
     growth: Annotated[float, Range(1, 100)] = 1.05
     dead_opacity: InnerShare = 0.005
     noise_rate: NotNegative = 5e5
+    noise_units: Literal["extents", "world"] = "extents"
     noise_sharpness: NotNegative = 100.0
     opacity_weight: NotNegative = 0.01
     scale_weight: NotNegative = 0.01
@@ -132,7 +135,7 @@ class McmcDensify:
     @staticmethod
     def published() -> McmcDensify:
         """As 3DGS-MCMC does it."""
-        return McmcDensify(reach="all", initial_spread=0.1)
+        return McmcDensify(reach="all", noise_units="world", initial_spread=0.1)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -32,12 +33,16 @@ from glassplat.evaluate.surface_metrics import surface_metrics
 from glassplat.evaluate.surface_truth import TrueSurface, true_surface
 from glassplat.evaluate.truth import GroundTruth, TrueView, load_truth
 from glassplat.render.frame import Frame, Renderer
+from glassplat.scene.exposure import Exposures
 from glassplat.scene.scene import Scene
 
 MIRROR_STRENGTH = 0.999
 """From this true strength on, nothing is transmitted."""
 ALL_IGNORED = f"all but fewer than {SMALLEST_REGION} pixels are ignored"
 TOO_FEW = f"fewer than {SMALLEST_REGION} pixels show a pane"
+
+SCENE_COLORS, NEIGHBOURS_COLORS = "the scene's own", "mean of the neighbouring photographs, in the order of names"
+"""How test views are taken to be exposed."""
 
 Truths = tuple[GroundTruth | None, TrueView | None]
 """What is known of the data set, and of one view."""
@@ -62,10 +67,11 @@ class EvaluatedView:
 
     Attributes:
         view: the photograph and its camera.
-        frame: what was rendered, on the CPU.
+        frame: what was rendered, on the CPU, in the scene's colours.
         truth: the true layers, where they are known.
         surface: the true surface, where it is known.
         metrics: as in `Evaluation.per_view`, without the reflection's, which needs all views.
+        exposures: of the photographs, with the one that this view is taken to have.
     """
 
     view: View
@@ -73,9 +79,23 @@ class EvaluatedView:
     truth: TrueView | None
     surface: TrueSurface | None
     metrics: Mapping[str, Any]
+    exposures: Exposures = field(default_factory=Exposures.neutral)
+
+    @property
+    def photographed(self) -> Frame:
+        """The frame with its image in the colours of the photograph, as it was measured."""
+        return in_photograph_colors(self.frame, self.exposures, self.view.name)
 
 
 ViewListener = Callable[[EvaluatedView], None]
+
+
+def in_photograph_colors(frame: Frame, exposures: Exposures, name: str) -> Frame:
+    """The frame with a layer `photographed` in the colours of that photograph; itself where it has the scene's."""
+    if name not in exposures.names:
+        return frame
+    image = exposures.applied(frame.photographed, name)
+    return replace(frame, layers={**frame.layers, "photographed": image})
 
 
 def _nobody(evaluated: EvaluatedView) -> None:
@@ -115,6 +135,9 @@ def evaluate(
     difference of the layer `strength` from the true one. `environment_psnr` compares the learned environment with the
     capture's `environment.exr` or `.png`, after one gain. `peak_memory_mib` is that of the whole process so far.
 
+    Images are compared in the colours of their photographs, layers in the scene's: where exposures were learned, a test
+    view is taken to be exposed as the mean of its neighbours in the order of names; `test_exposures` says so.
+
     Pixels that a view ignores are left out; `ssim` and `lpips`, which are taken over windows, take them for right.
 
     Args:
@@ -134,15 +157,17 @@ def evaluate(
     regions = regions or (RenderedRegions() if truth is None else TrueRegions())
     # The first frame may wait for the compiler; it must not count.
     timed_render(renderer, scene, dataset.test[0])
-    measurements = {}
+    measurements, learned = {}, scene.exposures.to("cpu")
     for view in dataset.test:
         frame, seconds = timed_render(renderer, scene, view)
         true_view = truth.view(view.name, view.camera.width, view.camera.height) if truth else None
         surface = true_surface(view)
         pane = regions.of(view, frame, true_view)
-        measured = _measure(frame, seconds, view, pane, truth=(truth, true_view), surface=surface, lpips=lpips)
+        exposures = learned.interpolated(view.name)
+        shown = in_photograph_colors(frame, exposures, view.name)
+        measured = _measure(shown, seconds, view, pane, truth=(truth, true_view), surface=surface, lpips=lpips)
         measurements[view.name] = measured
-        listen(EvaluatedView(view, frame, true_view, surface, plain(measured.metrics)))
+        listen(EvaluatedView(view, frame, true_view, surface, plain(measured.metrics), exposures))
     gain = _add_reflection(measurements.values())
     per_view = {name: plain(m.metrics) | {"seconds": m.seconds} for name, m in measurements.items()}
     results = _description(scene, dataset)
@@ -288,6 +313,7 @@ def _description(scene: Scene, dataset: Dataset) -> dict[str, Any]:
         "resolution": ", ".join(sizes),
         "split": dataset.split,
         "num_test_views": len(dataset.test),
+        "test_exposures": NEIGHBOURS_COLORS if len(scene.exposures) else SCENE_COLORS,
         "num_gaussians": sum(len(part) for part in scene.gaussian_sets().values()),
         "num_glass_gaussians": len(scene.glass),
         "num_surroundings_gaussians": len(scene.surroundings),

@@ -51,10 +51,14 @@ class Report:
 
     def add(self, evaluated: EvaluatedView) -> None:
         """Draws one view; for `evaluate` to call."""
-        view, frame = evaluated.view, evaluated.frame
-        subtitle = _metrics_line(evaluated.metrics)
+        view, subtitle = evaluated.view, _metrics_line(evaluated.metrics)
         sheet = comparison_sheet(
-            frame, view.photo, evaluated.truth, surface=evaluated.surface, title=view.name, subtitle=subtitle
+            evaluated.photographed,
+            view.photo,
+            evaluated.truth,
+            surface=evaluated.surface,
+            title=view.name,
+            subtitle=subtitle,
         )
         write_image(self._folder / self._sheets[view.name], sheet)
         if self._uses is not None:

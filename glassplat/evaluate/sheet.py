@@ -101,7 +101,7 @@ def _image_row(frame: Frame, photo: Tensor) -> list[Panel]:
         Panel(f"error (brightest: {ERROR_SCALE:g} and more)", error_colors(frame.photographed, photo)),
     ]
     if "photographed" in frame.layers:
-        row.append(Panel("without the photographer", frame.rgb))
+        row.append(Panel("the scene itself", frame.rgb))
     if "depth" in frame.layers:
         row.append(Panel("depth (near is bright)", depth_colors(frame.layers["depth"], frame.layers.get("alpha"))))
     return row

@@ -25,7 +25,8 @@ def surface_metrics(frame: Frame, photo: Tensor, truth: TrueSurface | None) -> d
     """`reflective_psnr`, `normal_error_deg`, `reflective_normal_error_deg` and `strength_error` of one view.
 
     Args:
-        frame: its image, and its layers `normal` [H, W, 3], world axes, of any length, and `strength` [H, W].
+        frame: its image as photographed, and its layers `normal` [H, W, 3], world axes, of any length, and `strength`
+            [H, W].
         photo: [H, W, 3] uint8.
         truth: the true surface at the frame's size, None where nothing is known.
     """
@@ -52,7 +53,7 @@ def _reflective_psnr(frame: Frame, photo: Tensor, truth: TrueSurface) -> Outcome
     region = _reflective(truth)
     if isinstance(region, str):
         return region
-    return psnr(frame.rgb, photo, region) if int(region.sum()) >= SMALLEST_REGION else UNREFLECTIVE
+    return psnr(frame.photographed, photo, region) if int(region.sum()) >= SMALLEST_REGION else UNREFLECTIVE
 
 
 def _normal_errors(frame: Frame, truth: TrueSurface) -> Tensor | str:

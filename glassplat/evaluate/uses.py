@@ -30,9 +30,10 @@ class Uses:
         share = float((frame.layers["strength"] > 0).float().mean())
         if share < SMALLEST_SHARE:
             return
+        plain = dereflected_photo(frame, photo, self._blend, exposures=evaluated.exposures, name=evaluated.view.name)
         row = [
             Panel(f"photograph {evaluated.view.name}", photo),
-            Panel("without reflections (glassplat dereflect)", dereflected_photo(frame, photo, self._blend)),
+            Panel("without reflections (glassplat dereflect)", plain),
             Panel("pane as a mirror (glassplat render --as-mirror)", quantized(as_mirror_image(frame, self._blend))),
         ]
         self._rows = sorted([*self._rows, (share, row)], key=lambda kept: -kept[0])[:MOST_VIEWS]

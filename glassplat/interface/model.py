@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from glassplat.data.corrected_views import with_corrected_cameras
 from glassplat.data.dataset import Dataset
 from glassplat.evaluate.layer_image import layer_image
 from glassplat.init.glass import with_pane
@@ -108,11 +109,12 @@ class Model:
     def evaluate(self, dataset: Dataset) -> dict[str, Any]:
         """Metrics over the test views of a data set, by name: `psnr`, `ssim`, `pane_psnr` ...
 
+        Where cameras were corrected, those of the test views move as their neighbours'.
         Where one is None, `<name>_reason` says why.
         """
         from glassplat.evaluate.evaluate import evaluate  # Training imports this file, and may never need it.
 
-        return evaluate(self.scene, self.renderer, dataset).results
+        return evaluate(self.scene, self.renderer, with_corrected_cameras(dataset, self.scene)).results
 
     def to(self, device: torch.device | str) -> Model:
         """The same on another device."""

@@ -46,7 +46,7 @@ class SpacePass:
 
     Attributes:
         part: name of the scene part, as in `Scene.gaussian_sets`.
-        distances: [N] from the mean origin of the rays, world units.
+        distances: [N] at which rays met them, world units; means by how much they added to each ray.
     """
 
     part: str

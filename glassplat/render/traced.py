@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -27,6 +28,11 @@ from glassplat.scene.scene import Scene
 START_PER_EXTENT = 0.005
 """Distance from a surface, as a share of the scene extent, before which a reflected ray meets nothing: the surroundings
 hold the surface too."""
+EVERY_RAY = 4
+"""Of so many rays one tells densification how far away things are."""
+SH_ONE = math.sqrt(3 / (4 * math.pi))
+"""Normalisation of the harmonics of degree 1."""
+WEIGHT_MIN = 1e-12
 
 
 @dataclass(frozen=True)
@@ -71,7 +77,7 @@ class Traced:
         check_mirrored(scene)
         camera = camera.to(scene.primary.means.device)
         surface = seen_surface(scene, camera, background=self.background, probed=probed)
-        rgb, reflection, places = self._shaded(scene, camera, surface)
+        rgb, reflection, rays = self._shaded(scene, camera, surface)
         layers = surface.layers() | {"reflection": reflection}
         if self.surroundings:
             layers["surroundings"] = self.behind(scene, camera)
@@ -80,11 +86,11 @@ class Traced:
             layers=layers,
             direct=surface.direct,
             screen=surface.screen,
-            space=(space_pass(scene, places),) if probed and len(scene.surroundings) else (),
+            space=(space_pass(scene, rays),) if probed and len(scene.surroundings) else (),
         )
 
-    def _shaded(self, scene: Scene, camera: Camera, surface: Surface) -> tuple[Tensor, Tensor, Tensor]:
-        """The image and what it mirrors, [H, W, 3] each, and the places [R, 3] that mirror things near (Eq. 5)."""
+    def _shaded(self, scene: Scene, camera: Camera, surface: Surface) -> tuple[Tensor, Tensor, Rays]:
+        """The image and what it mirrors, [H, W, 3] each, and the rays along which things near are met (Eq. 5)."""
         chosen = self._mirrors_near(scene, surface)
         places, directions = reflected_rays(surface, camera, chosen)
         if not self.joint:
@@ -98,7 +104,7 @@ class Traced:
         reflection = reflection.index_put(torch.where(chosen), colors)
         strength = surface.strength[..., None]
         share = torch.where(mirrors[..., None], strength, 0)
-        return (1 - share) * surface.base + share * reflection, reflection, places
+        return (1 - share) * surface.base + share * reflection, reflection, Rays(places, directions)
 
     def _mirrors_near(self, scene: Scene, surface: Surface) -> Tensor:
         """[H, W] bool: where rays are traced."""
@@ -148,13 +154,40 @@ def traced_surroundings(part: Gaussians, origins: Tensor, directions: Tensor, ne
     return trace(raw, Rays(origins, directions), bvh, sh_degree=part.active_sh_degree, near=near)
 
 
-@torch.no_grad()
-def space_pass(scene: Scene, places: Tensor) -> SpacePass:
-    """The record that densification reads of surroundings which were mirrored at `places` [R, 3]."""
-    means = scene.surroundings.means
-    if not len(places):
-        return SpacePass("surroundings", torch.zeros_like(means[:, 0]))
-    return SpacePass("surroundings", (means - places.mean(dim=0)).norm(dim=1))
+def space_pass(scene: Scene, rays: Rays) -> SpacePass:
+    """The record that densification reads of surroundings which rays have met.
+
+    Of every `EVERY_RAY`th ray alone, since distances differ little from one pixel to the next. What none of them meets
+    counts as far away as it is from the middle of their origins.
+    """
+    part, few = scene.surroundings, Rays(*(each.detach()[::EVERY_RAY] for each in rays))
+    if not len(few.origins):
+        return SpacePass("surroundings", torch.zeros_like(part.means[:, 0]))
+    weights, distances = hit_distances(
+        part.with_tensors({n: t.detach() for n, t in part.tensors().items()}), few, START_PER_EXTENT * scene.extent
+    )
+    from_middle = (part.means.detach() - few.origins.mean(dim=0)).norm(dim=1)
+    return SpacePass("surroundings", torch.where(weights > 0, distances, from_middle))
+
+
+def hit_distances(part: Gaussians, rays: Rays, near: float) -> tuple[Tensor, Tensor]:
+    """Sums [N] of the blending weights with which rays meet Gaussians, and the means [N] of the distances by them.
+
+    A ray o + t d meets a Gaussian at t = (mean - o) . d, where it comes closest. With weights w the mean needs the sums
+    of w, of w d and of w o . d. They are gradients of harmonics up to the first degree: of one channel that counts each
+    ray once, and of one that counts it o . d times.
+    """
+    sh = torch.zeros(len(part), 4, 3).to(part.means)
+    sh[:, 0] = 0.5 / SH_ZERO  # Colours of 1, far from where they would be cut off.
+    along = (rays.origins * rays.directions).sum(dim=1)
+    with torch.enable_grad():
+        sh.requires_grad_()
+        found = traced_surroundings(replace(part, sh=sh, active_sh_degree=1), rays.origins, rays.directions, near)
+        (sums,) = torch.autograd.grad((found.colors[:, 0] + along * found.colors[:, 1]).sum(), sh)
+    weights, from_origins = sums[:, 0, 0] / SH_ZERO, sums[:, 0, 1] / SH_ZERO
+    y, z, x = (sums[:, 1:, 0] * sums.new_tensor([-1.0, 1.0, -1.0]) / SH_ONE).unbind(dim=1)
+    distances = (part.means * torch.stack([x, y, z], dim=1)).sum(dim=1) - from_origins
+    return weights, distances / weights.clamp(min=WEIGHT_MIN)
 
 
 def mirrored_contributions(scene: Scene, camera: Camera) -> Tensor:

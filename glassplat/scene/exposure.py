@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from glassplat.scene.neighbours import neighbours
+
 TRAINABLE = ("affine",)
 
 
@@ -40,6 +42,16 @@ class Exposures:
     def of(self, name: str) -> Tensor | None:
         """[3, 4] that of a photograph; None for one that has none, whose colours are the scene's."""
         return self.affine[self.names.index(name)] if name in self.names else None
+
+    def interpolated(self, name: str) -> Exposures:
+        """The same with a transform for a photograph that has none: the mean of its neighbours' in the order of names.
+
+        Itself where the photograph has its own, or no neighbours.
+        """
+        rows = [] if name in self.names else neighbours(name, self.names)
+        if not rows:
+            return self
+        return Exposures(torch.cat([self.affine, self.affine[rows].mean(dim=0, keepdim=True)]), (*self.names, name))
 
     def applied(self, image: Tensor, name: str) -> Tensor:
         """An image [..., 3] of the scene in the colours of a photograph; differentiable in both."""

@@ -9,18 +9,22 @@ import torch
 from torch import Tensor
 
 from glassplat.scene.camera import Camera
+from glassplat.scene.neighbours import neighbours
 
 TRAINABLE = ("twists",)
 
 
 @dataclass(frozen=True)
 class PoseCorrections:
-    """For each photograph a small motion of its camera: cam_from_world becomes exp(twist) cam_from_world.
+    """For each photograph a small motion of its camera about its own centre, in axes parallel to the world's.
+
+    cam_from_world = [R | t] becomes exp(twist turned by R) cam_from_world. In these axes a motion that all cameras have
+    in common is the mean of their twists, and that of a camera between two others the mean of theirs.
 
     Attributes:
         twists: [V, 6] rotation vector in radians, and translation in scene extents, so that both are small numbers
-            whatever the capture's units; camera axes. Zero for a camera that stays.
-        names: of the V photographs; one that is missing keeps its camera, and so holds the frame.
+            whatever the capture's units. Zero for a camera that stays.
+        names: of the V photographs; one that is missing keeps its camera.
     """
 
     twists: Tensor
@@ -48,7 +52,20 @@ class PoseCorrections:
         if name not in self.names:
             return camera
         twist = self.twists[self.names.index(name)]
-        return moved_camera(camera, twist, extent)
+        cam_axes_from_world = camera.cam_from_world[:3, :3].to(twist)
+        return moved_camera(camera, (twist.reshape(2, 3) @ cam_axes_from_world.T).reshape(6), extent)
+
+    def interpolated(self, name: str) -> PoseCorrections:
+        """The same with a motion for a photograph that has none: the mean of its neighbours' in the order of names.
+
+        Itself where the photograph has its own, or no neighbours.
+        """
+        rows = [] if name in self.names else neighbours(name, self.names)
+        if not rows:
+            return self
+        return PoseCorrections(
+            torch.cat([self.twists, self.twists[rows].mean(dim=0, keepdim=True)]), (*self.names, name)
+        )
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name."""

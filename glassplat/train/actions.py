@@ -31,6 +31,8 @@ GAUSSIANS_PER_PIXEL = 0.5
 """Where `McmcDensify` stops to grow unless told otherwise; default densification ends near it (docs/experiments.md)."""
 GROWTH_SHARE = 1 / 300
 """Share of the run in which `McmcDensify` grows by its factor: 100 of the published 30,000 iterations."""
+LARGE_ARE_PRUNED = ("primary", "surroundings")
+"""The sets from which what is too large is removed; glass is as large as its pane."""
 MOST_GROWTH = 2.0
 """Largest factor of one relocation, however short the run."""
 
@@ -115,7 +117,7 @@ class Densify:
             extent=state.scene.extent,
             generator=state.generator(self.name),
             part=self.part,
-            prune_large=self.part == "primary" and clock.progress > self.densifier.prune_large_start,
+            prune_large=self.part in LARGE_ARE_PRUNED and clock.progress > self.densifier.prune_large_start,
         )
         put_in_order(state, edited, moments, self.part)
         return True

@@ -71,7 +71,7 @@ class SurroundingsOptions:
         sh_degree: highest degree of the colours that turn with the ray.
         rates: learning rates.
         densify: when and how Gaussians are added and pruned, by gradients in space times half of the distance.
-        reset: also reset their opacities when those of the scene are (paper).
+        reset: share of the run between two resets of their opacities, while they are densified; 0 never resets them.
     """
 
     start: SurroundingsStart = field(default_factory=SurroundingsStart)
@@ -82,4 +82,4 @@ class SurroundingsOptions:
             DefaultDensify, split_by="gradient", stop=0.7, least_contribution=0.02, contribution_moments=(0.8,)
         )
     )
-    reset: bool = False
+    reset: Share = 0.0

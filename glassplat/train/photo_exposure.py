@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from torch import Tensor
+
 from glassplat.data.dataset import Dataset
-from glassplat.losses.exposure import exposure_departure
-from glassplat.losses.term import LossTerm, weighted
 from glassplat.scene.exposure import Exposures
 from glassplat.scene.scene import Scene
 from glassplat.train.photograph_options import PhotoExposure
 from glassplat.train.rates import Rate
-from glassplat.train.stage import Stage
+from glassplat.train.stage import Clock, Stage
+from glassplat.train.state import TrainState
 
 
 def exposures_begun(options: PhotoExposure, scene: Scene, dataset: Dataset) -> Scene:
@@ -25,5 +26,15 @@ def exposures_learnt(options: PhotoExposure, stages: tuple[Stage, ...]) -> tuple
     if not options.rate:
         return stages
     rate = {"exposures.affine": Rate(options.rate, options.rate * options.rate_end)}
-    terms = weighted(LossTerm("exposure", options.weight, exposure_departure))
-    return tuple(replace(s, rates={**s.rates, **rate}, losses=(*s.losses, *terms)) for s in stages)
+    # Before the motions that take means over steps.
+    return tuple(replace(s, rates={**s.rates, **rate}, motions=(center_exposures, *s.motions)) for s in stages)
+
+
+def center_exposures(state: TrainState, clock: Clock, visible: Tensor | None) -> None:
+    """Takes the mean of all transforms off each of them.
+
+    What all photographs have in common belongs to the scene: were it twice as bright and all photographs half as much,
+    training would see no difference, and views that nobody photographed would have the wrong colours.
+    """
+    affine = state.scene.exposures.affine.detach()
+    affine -= affine.mean(dim=0)

@@ -6,9 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from glassplat.data.ranges import (
-    Count,
     LearningRate,
-    NotNegative,
     PositiveShare,
     Range,
     ShDegree,
@@ -23,12 +21,10 @@ class PhotoExposure:
     Attributes:
         rate: learning rate at the start; 0 takes all photographs as exposed alike.
         rate_end: that at the end of the run, as a share of `rate`.
-        weight: of the departure from the scene's own colours in the objective.
     """
 
     rate: LearningRate = 0.0
     rate_end: PositiveShare = 0.1
-    weight: NotNegative = 0.01
 
 
 @dataclass(frozen=True)
@@ -38,12 +34,10 @@ class PoseRefinement:
     Attributes:
         rate: learning rate at the start, radians and extents; 0 takes the capture's cameras as they are.
         rate_end: that at the end of the run, as a share of `rate`.
-        fixed: the first so many photographs keep their cameras, and with them the scene its place.
     """
 
     rate: LearningRate = 0.0
     rate_end: PositiveShare = 0.1
-    fixed: Count = 1
 
 
 @dataclass(frozen=True)

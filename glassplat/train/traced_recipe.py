@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from glassplat.train.stage import Stage
 
 
-CODE_ITERATIONS = 60_000
-"""Length of the longest runs of the public code."""
+CODE_ITERATIONS = 40_000
+"""Length of a run of the public code, but for two captures, whose runs are longer."""
 Mirrors = Literal["both", "surroundings", "environment"]
 
 
@@ -51,14 +51,16 @@ class TracedRecipe:
 
     Attributes:
         primitive: what scene and surroundings are made of: ellipsoids, or discs (paper).
-        sh_degree: highest degree of the view-dependent colour, which grows once propagation has ended.
+        sh_degree: highest degree of the view-dependent colour.
+        harmonics_from_start: let it grow from the first step on (its code), and not once propagation has ended.
         ssim_weight: lambda, share of D-SSIM in the photometric loss.
         view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
         background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         mirrors: what is mirrored: `surroundings` (paper), an `environment` infinitely far away (ablation), or `both`,
             the environment behind the surroundings.
         joint: reflections also move the surfaces; without, they only teach the surroundings (ablation).
-        least_strength: rays are traced where the strength is larger; elsewhere the environment alone is mirrored.
+        least_strength: rays are traced where the strength is larger; elsewhere the environment alone is mirrored. Where
+            there is none, training traces them everywhere.
         least_iterations: of the shortest run in which anything reflects; a shorter one trains like `splat`.
         bootstrap: share of the run without reflection, a run of `splat` if mirrors are searched for at its end.
         surroundings: how the Gaussians learn that reflections show.
@@ -74,7 +76,8 @@ class TracedRecipe:
         outside_weight: weight of the mean strength outside of the region in the objective.
         strength_weight: of the mean strength of all Gaussians in the objective, which the paper does not have.
         consistency_weight: weight of the difference between normals and the slope of the depths.
-        consistency_to_end: keep that term after propagation (paper).
+        normals_throughout: keep that term after propagation, and where the Gaussians are discs, have it and that of
+            estimated normals from the first step on (paper).
         monocular_weight: of the difference between normals and those that lie in `normals/` beside the photographs;
             nothing where there are none (paper: 0.01).
         propagation: how normals spread and colours are sabotaged.
@@ -98,6 +101,7 @@ class TracedRecipe:
 
     primitive: Annotated[Primitive, ESSENTIAL] = "ellipsoid"
     sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
+    harmonics_from_start: bool = False
     ssim_weight: Share = 0.2
     view_dependence_weight: NotNegative = 0.0
     background: Annotated[Color | None, ESSENTIAL] = None
@@ -117,7 +121,7 @@ class TracedRecipe:
     outside_weight: NotNegative = 0.4
     strength_weight: NotNegative = 0.005
     consistency_weight: NotNegative = 0.3
-    consistency_to_end: bool = False
+    normals_throughout: bool = False
     monocular_weight: NotNegative = 0.5
     propagation: NormalPropagation = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
@@ -141,6 +145,7 @@ class TracedRecipe:
         return cls(
             primitive="disc",
             sh_degree=2,
+            harmonics_from_start=True,
             mirrors="surroundings",
             least_strength=0.0,
             least_iterations=1,
@@ -155,16 +160,18 @@ class TracedRecipe:
                     start=3000 / CODE_ITERATIONS,
                     stop=21_000 / CODE_ITERATIONS,
                     gradient_threshold=1e-4,
+                    prune_opacity=0.05,
+                    prune_large_start=6000 / CODE_ITERATIONS,
                     cap=630_000,
                     contribution_moments=(0.8,),
                 ),
-                reset=True,
+                reset=6000 / CODE_ITERATIONS,
             ),
             search=MirrorSearch(begin_found=False, estimated_normals=False),
             find_region=False,
             strength_weight=0.0,
             consistency_weight=0.04,
-            consistency_to_end=True,
+            normals_throughout=True,
             monocular_weight=0.01,
             propagation=NormalPropagation(sabotage=0.4 * SH_ZERO),
             schedule=PropagationSchedule(end="fixed", stop=18_000 / CODE_ITERATIONS, pause=200, last_reset=False),
@@ -175,14 +182,14 @@ class TracedRecipe:
             rhythm=Rhythm(
                 beat=1000 / CODE_ITERATIONS,
                 least=150,
-                reset_stop=15_000 / CODE_ITERATIONS,
+                reset_stop=21_000 / CODE_ITERATIONS,
                 sh=1000 / CODE_ITERATIONS,
                 averaged_passes=0.0,
             ),
             densify=replace(
                 published,
                 start=500 / CODE_ITERATIONS,
-                stop=15_000 / CODE_ITERATIONS,
+                stop=21_000 / CODE_ITERATIONS,
                 prune_opacity=0.05,
                 prune_large_start=3000 / CODE_ITERATIONS,
             ),

@@ -8,6 +8,7 @@ from glassplat.data.backgrounds import BLACK
 from glassplat.data.dataset import Dataset
 from glassplat.init.points import as_discs
 from glassplat.render.deferred import Deferred
+from glassplat.render.splat import Splat
 from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene.scene import Scene
 from glassplat.train.actions import Densify, GrowSh, PruneIdle, ResetOpacity
@@ -17,6 +18,8 @@ from glassplat.train.rates import PUBLISHED_ITERATIONS
 from glassplat.train.stage import Action, Every, Stage
 from glassplat.train.surroundings_entry import AddSurroundings
 from glassplat.train.traced_recipe import TracedRecipe
+
+NORMAL_TERMS = ("consistency", "monocular normals")
 
 
 def first_scene(recipe: TracedRecipe, dataset: Dataset) -> Scene:
@@ -37,18 +40,34 @@ def stages_of(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHED_ITERA
     known = recipe.distant().stages(seed, iterations)
     if len(known) == 1:
         return known
+    if recipe.harmonics_from_start:
+        known = tuple(_with_harmonics(stage, Every(recipe.rhythm.sh)) for stage in known)
     bootstrap, distant, refinement = known
     if recipe.primitive == "disc":
         distant, refinement = _rendered(recipe, distant), _rendered(recipe, refinement)
-    if recipe.consistency_to_end:
+    if recipe.normals_throughout:
+        bootstrap = _with_normal_terms(recipe, bootstrap, distant) if recipe.primitive == "disc" else bootstrap
         refinement = replace(refinement, losses=distant.losses, renderer=distant.renderer)
     if recipe.mirrors == "environment":
         return bootstrap, distant, refinement
     entry = first_reflections(recipe.distant())
     around = AddSurroundings(recipe.surroundings.start, recipe.surroundings.sh_degree)
-    environment = None if recipe.mirrors == "surroundings" else entry.environment
-    near = replace(_tracing(recipe, distant), entry=replace(entry, environment=environment, surroundings=around))
+    entry = replace(entry, surroundings=around, harmonics_wait=not recipe.harmonics_from_start)
+    entry = replace(entry, environment=None) if recipe.mirrors == "surroundings" else entry
+    near = replace(_tracing(recipe, distant), entry=entry)
     return bootstrap, near, _tracing(recipe, refinement)
+
+
+def _with_harmonics(stage: Stage, when: Every) -> Stage:
+    """The stage, in which colours begin to turn with the view whether normals spread or not."""
+    kept = tuple(action for action in stage.actions if not isinstance(action, GrowSh))
+    return replace(stage, actions=(*kept, GrowSh(when)))
+
+
+def _with_normal_terms(recipe: TracedRecipe, bootstrap: Stage, reflecting: Stage) -> Stage:
+    """The first stage of a scene of discs, with what a later one asks of normals."""
+    terms = tuple(term for term in reflecting.losses if term.name in NORMAL_TERMS)
+    return replace(bootstrap, renderer=Splat(recipe.background or BLACK), losses=(*bootstrap.losses, *terms))
 
 
 def _tracing(recipe: TracedRecipe, stage: Stage) -> Stage:
@@ -57,26 +76,28 @@ def _tracing(recipe: TracedRecipe, stage: Stage) -> Stage:
     return replace(
         stage,
         rates={**stage.rates, **recipe.surroundings.rates.of("surroundings")},
-        actions=(*stage.actions, *_surroundings_actions(recipe, stage)),
+        actions=(*stage.actions, *_surroundings_actions(recipe)),
         densify_until=max(stage.densify_until, recipe.surroundings.densify.stop),
     )
 
 
 def _rendered(recipe: TracedRecipe, stage: Stage) -> Stage:
     """A stage of `deferred` with this method's renderer, which propagation looks through as well."""
-    renderer = Traced(recipe.background or BLACK, recipe.least_strength, faintest=0.0, joint=recipe.joint)
+    # What no ray leaves and no environment lights mirrors nothing, and a strength that mirrors nothing cannot grow.
+    least_strength = 0.0 if recipe.mirrors == "surroundings" else recipe.least_strength
+    renderer = Traced(recipe.background or BLACK, least_strength, faintest=0.0, joint=recipe.joint)
     kept = [a for a in stage.actions if recipe.mirrors != "surroundings" or not isinstance(a, RefineEnvironment)]
     actions = [replace(action, renderer=renderer) if isinstance(action, Propagate) else action for action in kept]
     return replace(stage, renderer=renderer, actions=tuple(actions))
 
 
-def _surroundings_actions(recipe: TracedRecipe, stage: Stage) -> list[Action]:
+def _surroundings_actions(recipe: TracedRecipe) -> list[Action]:
     """What changes the surroundings, but for learning."""
     options = recipe.surroundings
-    resets = [a for a in stage.actions if isinstance(a, ResetOpacity)] if options.reset else []
+    reset = ResetOpacity(Every(options.reset, stop=options.densify.stop), part="surroundings")
     return [
         Densify(options.densify, "surroundings"),
         PruneIdle(options.densify, "surroundings", mirrored_contributions),
         GrowSh(Every(recipe.rhythm.sh), "surroundings"),
-        *(ResetOpacity(reset.when, reset.ceiling, "surroundings") for reset in resets),
+        *([reset] if options.reset else []),
     ]

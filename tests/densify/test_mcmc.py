@@ -192,6 +192,16 @@ def test_noise_does_not_depend_on_the_units_of_the_capture() -> None:
     assert torch.allclose(large, 1000 * small, rtol=1e-4)
 
 
+def test_published_noise_is_in_world_units() -> None:
+    gaussians, extent, rate = make_gaussians([0.005] * 5), 6.6, 1.6e-4
+    published = exploring_noise(McmcDensify.published(), gaussians, rate=rate, extent=extent, generator=rng())
+    eta = torch.randn(gaussians.means.shape, generator=rng(), dtype=gaussians.means.dtype)
+    rotations = rotation_from_quat(gaussians.quats)
+    covariances = rotations @ torch.diag_embed((2 * gaussians.log_scales).exp()) @ rotations.transpose(1, 2)
+    expected = 5e5 * (rate * extent) * 0.5 * (covariances @ eta[..., None]).squeeze(-1)
+    torch.testing.assert_close(published, expected, rtol=1e-3, atol=1e-6)
+
+
 def test_ranks_count_earlier_equals() -> None:
     assert rank_among_equals(torch.tensor([4, 7, 4, 4, 7, 1])).tolist() == [0, 0, 1, 2, 1, 0]
     assert rank_among_equals(torch.zeros(0, dtype=torch.int64)).shape == (0,)

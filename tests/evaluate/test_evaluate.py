@@ -16,6 +16,7 @@ from glassplat.evaluate.plane_errors import plane_table
 from glassplat.evaluate.truth import load_truth
 from glassplat.render.frame import Frame
 from glassplat.scene.camera import Camera
+from glassplat.scene.exposure import Exposures
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.plane import Planes
 from glassplat.scene.scene import Scene
@@ -235,3 +236,20 @@ def test_peak_memory_is_a_number_where_the_system_tells_it(monkeypatch: pytest.M
     assert isinstance(peak, float) and 50 < peak < 1e6
     monkeypatch.setitem(sys.modules, "resource", None)
     assert peak_memory_mib() == f"{sys.platform} does not tell"
+
+
+def test_test_views_are_compared_as_their_neighbours_were_exposed(case) -> None:
+    affine = torch.zeros(2, 3, 4)
+    affine[0, :, 3], affine[1, :, 3] = 0.06, 0.02
+    scene = replace(case.scene, exposures=Exposures(affine, ("a1.jpg", "z.jpg")))
+    seen: list[EvaluatedView] = []
+    results = evaluate(scene, case.renderer, case.dataset, listen=seen.append).results
+    plainly = evaluate(case.scene, case.renderer, case.dataset).results
+    assert "neighbouring" in results["test_exposures"] and "scene" in plainly["test_exposures"]
+    offsets = [float((e.photographed.photographed - e.frame.rgb).mean()) for e in seen]
+    # Before a1, and twice between a1 and z.
+    assert offsets == pytest.approx([0.06, 0.04, 0.04], abs=1e-6)
+    expected = [psnr(e.frame.rgb + offset, e.view.photo) for e, offset in zip(seen, offsets, strict=True)]
+    assert results["psnr"] == pytest.approx(sum(expected) / 3)
+    for layer in ("transmission_psnr", "reflection_psnr"):
+        assert results[layer] == plainly[layer]

@@ -8,10 +8,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from glassplat.kernels.trace import Rays
 from glassplat.render.deferred import INVISIBLE, Deferred
 from glassplat.render.splat import Splat
 from glassplat.render.surface import view_directions
-from glassplat.render.traced import Traced, mirrored_contributions
+from glassplat.render.traced import Traced, hit_distances, mirrored_contributions, space_pass
 from glassplat.scene.camera import Camera
 from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import Gaussians
@@ -111,6 +112,47 @@ def test_layers_recombine() -> None:
     found = (1 - strength) * frame.layers["base"] + strength * frame.layers["reflection"]
     torch.testing.assert_close(found, frame.rgb)
     assert float(frame.layers["reflection"].max()) > 0.05
+
+
+def test_densification_is_told_how_far_away_rays_meet_things() -> None:
+    """Over a wide mirror the middle of all places that mirror says nothing of where one thing is mirrored."""
+    origins = torch.tensor([[-5.0, 0, 0], [5.0, 0, 0], [5.0, 0, 1.0]], dtype=torch.float64)
+    directions = torch.tensor([[0.0, 0, 1.0]] * 3, dtype=torch.float64)
+    small = Gaussians(
+        means=torch.tensor([[-5.0, 0.01, 2.0], [5.0, 0.0, 3.0], [0.0, 0, 4.0]], dtype=torch.float64),
+        quats=torch.tensor([[1.0, 0, 0, 0]] * 3, dtype=torch.float64),
+        log_scales=torch.full((3, 3), -2.0, dtype=torch.float64),
+        logit_opacities=torch.zeros(3, dtype=torch.float64),
+        sh=torch.zeros(3, 1, 3, dtype=torch.float64),
+        channels={},
+    )
+    weights, distances = hit_distances(small, Rays(origins, directions), 0.0)
+    torch.testing.assert_close(weights[1:], torch.tensor([1.0, 0.0], dtype=torch.float64))
+    torch.testing.assert_close(distances[:2], torch.tensor([2.0, 2.5], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_hit_distances_are_means_by_blending_weight(flat: bool) -> None:
+    part = flattened(surroundings()) if flat else surroundings()
+    generator = torch.Generator().manual_seed(5)
+    origins = 0.1 * torch.randn(40, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0, 3])
+    aims = part.means.mean(dim=0) + 0.3 * torch.randn(40, 3, generator=generator, dtype=torch.float64)
+    directions = torch.nn.functional.normalize(aims - origins, dim=1)
+    weights, distances = hit_distances(part, Rays(origins, directions), 0.0)
+    sums, products = torch.zeros_like(weights), torch.zeros_like(weights)
+    for origin, direction in zip(origins, directions, strict=True):
+        alone, along = hit_distances(part, Rays(origin[None], direction[None]), 0.0)
+        met = alone > 1e-9
+        torch.testing.assert_close(along[met], ((part.means - origin) @ direction)[met], atol=1e-6, rtol=1e-6)
+        sums, products = sums + alone, products + alone * along
+    torch.testing.assert_close(weights, sums)
+    assert float(sums.max()) > 1
+    torch.testing.assert_close((weights * distances), products)
+
+
+def test_places_that_mirror_nothing_tell_of_no_distance() -> None:
+    scene, none = glossy(), torch.zeros(0, 3, dtype=torch.float64)
+    assert not bool(space_pass(scene, Rays(none, none)).distances.any())
 
 
 def test_pixels_that_reflect_less_than_asked_keep_their_base() -> None:

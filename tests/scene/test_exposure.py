@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from glassplat.losses.exposure import exposure_departure
 from glassplat.losses.photometric import PhotometricLoss
 from glassplat.render.frame import Frame
 from glassplat.scene.exposure import Exposures
@@ -55,19 +54,14 @@ def test_the_loss_compares_in_the_colours_of_the_photograph() -> None:
     assert float(PhotometricLoss(0.2)(Frame(2 * photo), view, scene)) > 0.05
 
 
-def test_the_departure_holds_the_mean_and_each() -> None:
-    view, scene = tiny_capture().train[0], true_scene()
-    affine = torch.zeros(2, 3, 4)
-    affine[0, 0, 0], affine[1, 0, 0] = 0.2, -0.2
-    found = exposure_departure(
-        Frame(torch.zeros(1, 1, 3)), view, replace(scene, exposures=Exposures(affine, (view.name, "b")))
-    )
-    assert float(found) == pytest.approx(0.04 / 2)
-    both = exposure_departure(
-        Frame(torch.zeros(1, 1, 3)), view, replace(scene, exposures=Exposures(affine.abs(), (view.name, "b")))
-    )
-    assert float(both) == pytest.approx(0.04 / 2 + 0.04)
-    assert exposure_departure(Frame(torch.zeros(1, 1, 3)), view, scene) is None
+def test_a_view_without_a_transform_gets_the_mean_of_its_neighbours() -> None:
+    exposures = Exposures(drawn(4, 3, 4), ("x/8.png", "x/10.png", "y/9.png", "x/12.png"))
+    found = exposures.interpolated("x/9.png")
+    torch.testing.assert_close(found.of("x/9.png"), exposures.affine[:2].mean(dim=0))
+    torch.testing.assert_close(exposures.interpolated("x/20.png").of("x/20.png"), exposures.affine[3])
+    assert exposures.interpolated("x/10.png") is exposures
+    assert exposures.interpolated("z/9.png") is exposures
+    assert len(Exposures.neutral().interpolated("a")) == 0
 
 
 def test_what_an_exposure_does_can_be_undone() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,14 +15,14 @@ from glassplat.densify.options import DefaultDensify, MirrorSearch
 from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import Gaussians
-from glassplat.train.actions import Densify, PruneIdle, ResetOpacity
+from glassplat.train.actions import Densify, GrowSh, PruneIdle, ResetOpacity
 from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone
 from glassplat.train.mirror_options import PropagationSchedule, SurroundingsOptions, SurroundingsStart
-from glassplat.train.propagation import Propagate, RefineEnvironment
+from glassplat.train.propagation import GrowShAfterPropagation, Propagate, RefineEnvironment
 from glassplat.train.recipe import recipe_from_json, recipe_to_json
 from glassplat.train.rhythm import Rhythm
-from glassplat.train.stage import Clock, Every
+from glassplat.train.stage import Clock, Every, stage_starts
 from glassplat.train.state import TrainState
 from glassplat.train.surroundings_entry import AddSurroundings
 from glassplat.train.traced_recipe import TracedRecipe
@@ -212,6 +213,64 @@ def test_the_preset_resets_surroundings_where_it_resets_the_scene() -> None:
     assert parts(TracedRecipe.paper()) == {"primary", "surroundings"}
     resets = [a for s in RECIPE.stages(0) for a in s.actions if isinstance(a, ResetOpacity)]
     assert {a.part for a in resets} == {"primary"}
+
+
+def test_the_preset_is_that_of_the_public_configuration() -> None:
+    recipe = TracedRecipe.paper()
+    stages = recipe.stages(0, 40_000)
+
+    def steps(kind: type, part: str) -> list[int]:
+        starts = stage_starts(stages, 40_000)
+        return [
+            step
+            for stage, start, end in zip(stages, starts, starts[1:], strict=False)
+            for step in range(start + 1, end + 1)
+            for action in stage.actions
+            if isinstance(action, kind) and getattr(action, "part", "primary") == part
+            if action.due(Clock(step, 40_000, 100))
+        ]
+
+    assert steps(ResetOpacity, "surroundings") == [6000, 12_000, 18_000]
+    assert steps(Densify, "surroundings")[0] == 3500 and steps(Densify, "surroundings")[-1] == 21_000
+    assert steps(Densify, "primary")[-1] == 21_000
+    assert steps(GrowSh, "primary")[:4] == [1000, 2000, 3000, 4000]
+    assert steps(Propagate, "primary")[-1] <= 18_000 < steps(Propagate, "primary")[-1] + 2000
+    assert not any(isinstance(a, GrowShAfterPropagation) for stage in stages for a in stage.actions)
+    assert recipe.surroundings.densify.prune_opacity == 0.05
+    for stage in stages:
+        assert {"consistency", "monocular normals"} <= {term.name for term in stage.losses}
+
+
+def test_normals_of_discs_can_learn_from_the_first_step_on() -> None:
+    recipe = replace(DISCS, normals_throughout=True, consistency_weight=1.0)
+    scene = fresh_state(recipe).scene
+    # Depths count where most of a pixel is covered.
+    scene = scene.with_parameters({"primary.logit_opacities": torch.full((len(scene.primary),), 3.0)})
+    found = differentiate(recipe.stages(0)[0], scene, tiny_capture().train[0], probed=False)
+    assert found.losses["consistency"] > 0 and bool(found.gradients["primary.quats"].any())
+
+
+def test_surroundings_that_are_too_large_are_pruned() -> None:
+    state = surrounded_state()
+    large = state.scene.surroundings.log_scales.clone()
+    large[:3] = math.log(2.5 * state.scene.extent)
+    state.scene = state.scene.with_parameters({"surroundings.log_scales": large})
+    count = len(state.scene.surroundings)
+    state.statistics["surroundings"] = ScreenStatistics.zeros(count)
+    densifier = DefaultDensify(prune_large_start=0.1, prune_scale_fraction=2.0, prune_opacity=1e-6)
+    Densify(densifier, "surroundings").apply(state, tiny_capture(), Clock(20, 40, 6))
+    assert len(state.scene.surroundings) == count - 3
+
+
+def test_what_hardly_reflects_learns_to_without_an_environment() -> None:
+    recipe = replace(RECIPE, mirrors="surroundings", least_strength=0.02)
+    state = surrounded_state()
+    faint = {"logit_strength": torch.full((len(state.scene.primary),), -6.0)}
+    scene = replace(state.scene, primary=replace(state.scene.primary, channels=faint))
+    for stage in recipe.stages(0)[1:]:
+        found = differentiate(stage, scene, tiny_capture().train[0], probed=False)
+        assert bool(found.gradients["primary.logit_strength"].any())
+    assert recipe.renderer().least_strength == 0.02
 
 
 def test_a_scene_without_surroundings_is_refused() -> None:

@@ -19,6 +19,8 @@ from glassplat.render.planar import Planar, with_photographer
 from glassplat.train.checkpoint import recorded_seconds
 from glassplat.train.run_directory import write_text
 
+UNMOVED = "as the capture has them"
+
 
 def evaluate_run(stored: StoredRun, panes: PaneSource = "auto", *, align: Align = "auto") -> dict:
     """Evaluates a run, writes `results.json`, `per_view.json`, sheets and overview; returns the results.
@@ -47,13 +49,20 @@ def evaluate_run(stored: StoredRun, panes: PaneSource = "auto", *, align: Align 
         "seed": settings.seed,
         "downscale": settings.downscale,
         "train_seconds": seconds,
-        "test_cameras": "aligned with their photographs" if aligned else "as the capture has them",
+        "test_cameras": cameras_of_test_views(stored, aligned),
         **evaluation.results,
     }
     write_text(path / "results.json", json.dumps(results, indent=2))
     write_text(path / "per_view.json", json.dumps(evaluation.per_view, indent=2))
     report.finish(results, evaluation.per_view)
     return results
+
+
+def cameras_of_test_views(stored: StoredRun, aligned: bool) -> str:
+    """Where the cameras of test views are taken to be, in words."""
+    if aligned:
+        return "aligned with their photographs"
+    return "moved as the neighbouring photographs', in the order of names" if len(stored.scene.poses) else UNMOVED
 
 
 def train_seconds(stored: StoredRun) -> float | None:
