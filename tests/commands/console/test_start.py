@@ -92,7 +92,6 @@ REFUSED = {
     "video begun --output film.gif --path keyframes --keyframes none.json": "no file none.json",
     "export none --output new": "none is not a run directory",
     "export begun --output capture": "capture is not empty",
-    "export begun --output new --layer transmission --bake-reflections": "no reflections to bake",
     "import none.ply --output new": "no file none.ply",
     "import splats.ply --output capture": "capture is not empty",
     "info none": "there is nothing at none",
