@@ -1,8 +1,7 @@
 """Compiles every CUDA kernel without a GPU and says what each of them takes: python -m tools.compile_kernels.
 
 NVVM makes PTX for a compute capability, and nvJitLink, which is what Numba links with on a GPU, makes machine code of
-it and reports registers, spills and shared memory; nvdisasm shows the machine code, in which loops and their
-instructions are counted. None of them needs a driver.
+it and reports registers, spills and shared memory. Neither needs a driver.
 """
 
 from __future__ import annotations
@@ -22,16 +21,11 @@ from unittest import mock
 import numpy as np
 
 from glassplat.kernels.backend.devices import has_library
-from tools.machine_loops import Loops, loops_of
 
 CAPABILITIES = ((8, 0), (9, 0), (12, 0))
 SUPPORTED = ((7, 5), (8, 0), (8, 6), (8, 9), (9, 0), (10, 0), (12, 0))
 PACKAGE = "glassplat.kernels"
-COSTS = ("shared bytes", "local bytes", "instructions of a turn", "float64 in loops")
-
-
-COUNTED = (9, 0)
-"""The compute capability whose machine code is counted."""
+COSTS = ("shared bytes", "local bytes")
 
 
 class Resources(NamedTuple):
@@ -43,13 +37,6 @@ class Resources(NamedTuple):
     spilled: int
     shared: int
     local: int
-
-
-class Linked(NamedTuple):
-    """Machine code of a kernel, and what it takes."""
-
-    cubin: bytes
-    resources: Resources
 
 
 def all_kernels(real: type = np.float32) -> list[Any]:
@@ -111,8 +98,8 @@ def ptx_of(kernel: Any, capabilities: Sequence[tuple[int, int]] = CAPABILITIES) 
         return ["".join(library.get_asm_strs(cc=capability)) for capability in capabilities]
 
 
-def linked(ptx: str, capability: tuple[int, int]) -> Linked:
-    """Links PTX into machine code and reads the linker's report."""
+def linked(ptx: str, capability: tuple[int, int]) -> Resources:
+    """Links PTX into machine code and reads the linker's report: what the kernel takes."""
     from cuda.bindings import nvjitlink
 
     handle = nvjitlink.create(2, [f"-arch=sm_{capability[0]}{capability[1]}", "-verbose"])
@@ -122,11 +109,9 @@ def linked(ptx: str, capability: tuple[int, int]) -> Linked:
         nvjitlink.complete(handle)
         report = bytearray(nvjitlink.get_info_log_size(handle))
         nvjitlink.get_info_log(handle, report)
-        cubin = bytearray(nvjitlink.get_linked_cubin_size(handle))
-        nvjitlink.get_linked_cubin(handle, cubin)
     finally:
         nvjitlink.destroy(handle)
-    return Linked(bytes(cubin), read_report(report.decode()))
+    return read_report(report.decode())
 
 
 def read_report(report: str) -> Resources:
@@ -145,20 +130,11 @@ def table(kernels: Sequence[Any]) -> list[str]:
     heads = ["kernel", *(f"sm_{major}{minor}" for major, minor in CAPABILITIES), *COSTS]
     lines = ["| " + " | ".join(heads) + " |", "| --- " * len(heads) + "|"]
     for kernel in kernels:
-        made = {cc: linked(ptx, cc) for ptx, cc in zip(ptx_of(kernel), CAPABILITIES, strict=True)}
-        found = [one.resources for one in made.values()]
+        found = [linked(ptx, cc) for ptx, cc in zip(ptx_of(kernel), CAPABILITIES, strict=True)]
         cells = [f"{r.registers}" + (f" ({r.spilled} B spilled)" if r.spilled else "") for r in found]
-        cells += [str(found[-1].shared), str(found[-1].local), *loop_cells(loops_of(made[COUNTED].cubin))]
+        cells += [str(found[-1].shared), str(found[-1].local)]
         lines.append("| " + " | ".join([kernel.name, *cells]) + " |")
     return lines
-
-
-def loop_cells(loops: Loops | None) -> tuple[str, str]:
-    """The cheapest and the dearest turn of the dearest innermost loop, and float64 instructions in all loops."""
-    if loops is None:
-        return "?", "?"
-    least, most = loops.dearest
-    return (f"{least} to {most}" if most else ""), str(loops.float64 or "")
 
 
 def main() -> int:

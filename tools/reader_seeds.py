@@ -36,7 +36,6 @@ from glassplat.files.ply import write_gaussians
 from glassplat.files.scene_folder import read_scene, write_scene
 from glassplat.files.splat_files import drawable, read_splats
 from glassplat.files.spz import HEADER, MAGIC, write_spz
-from glassplat.publish.kept_pictures import KeptPictures
 from glassplat.scene.camera import Camera
 from glassplat.scene.environment import Environment
 from glassplat.scene.exposure import Exposures
@@ -211,17 +210,6 @@ def _annotations(path: Path) -> None:
     read_document(path.parent)
 
 
-def _film_seeds(folder: Path) -> None:
-    (folder / "a.json").write_text(json.dumps({"--layers": ["rgb"], "--fps": 30}))
-
-
-def _film(path: Path) -> None:
-    kept = KeptPictures(path.parent / "film.mp4")
-    kept.folder.mkdir(exist_ok=True)
-    shutil.copy(path, kept.folder / path.name)
-    kept.check_same({"--layers": ["rgb"], "--fps": 30})
-
-
 def _picture_seeds(folder: Path) -> None:
     pixels = np.random.default_rng(0).integers(0, 256, (5, 7, 4), dtype=np.uint8)
     color = Image.fromarray(pixels[..., :3])
@@ -278,7 +266,6 @@ READERS: dict[str, Reader] = {
     "settings": Reader("settings.json", lambda path: RunDirectory(path.parent).settings(), _settings_seeds),
     "log": Reader("log.jsonl", lambda path: lines_until(path, 10), _log_seeds),
     "annotations": Reader(FILE, _annotations, _annotations_seeds),
-    "film": Reader("film.json", _film, _film_seeds),
     "photograph": Reader("a.png", read_image, _picture_seeds, most_mib=LARGEST_PICTURE_MIB),
     "mask": Reader("a.png", read_mask_values, _mask_seeds, most_mib=LARGEST_PICTURE_MIB),
     "panorama": Reader(

@@ -78,10 +78,10 @@ def _write_animation(path: Path, first: Picture, rest: Iterator[Picture], fps: i
             count += 1
             yield Image.fromarray(picture)
 
-    duration = round(1000 / fps)
-    Image.fromarray(first).save(
-        path, save_all=True, append_images=images(), duration=duration, loop=0, quality=WEBP_QUALITY
-    )
+    options = {"duration": round(1000 / fps), "loop": 0, "quality": WEBP_QUALITY}
+    with path.open("wb") as file:  # Pillow leaves a file open that it opens itself, where Ctrl-C ends it.
+        kind = path.suffix.removeprefix(".").upper()
+        Image.fromarray(first).save(file, kind, save_all=True, append_images=images(), **options)
     return count
 
 

@@ -1,10 +1,9 @@
-"""What `glassplat video` does: renders the pictures of a film, keeps them until it is whole, and encodes it."""
+"""What `glassplat video` does: renders the pictures of a film and encodes them."""
 
 from __future__ import annotations
 
-import hashlib
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -25,7 +24,6 @@ from glassplat.interface.model import Model
 from glassplat.prepare.messages import Progress as Step
 from glassplat.publish.camera_paths import interpolated, keyframes_of, widened
 from glassplat.publish.film import side_by_side, wiped, write_film
-from glassplat.publish.kept_pictures import KeptPictures
 from glassplat.render.layers import renderer_with
 from glassplat.scene.camera import Camera
 
@@ -34,51 +32,15 @@ WIPE_SPAN = 0.9
 
 
 def film(command: Video, console: Console) -> None:
-    """Renders, keeping every picture, and encodes them."""
-    kept = KeptPictures(command.output)
+    """Renders the pictures and encodes them one by one."""
     model = load(command.scene, device=command.device)
     check_layers(command.layers, model.recipe)
     model = model.with_scene(command.edits.applied(model.scene))
     cameras = _cameras(command, model)
-    described = _described(command, model, cameras)
-    if command.resume:
-        kept.check_same(described)
-    else:
-        kept.begin(described)
-    with WorkProgress(console) as progress:
-        _film(command, kept, model, cameras, progress)
-        pictures = followed("encoding", kept.pictures(len(cameras)), 0, len(cameras), progress)
-        with atomic_write(command.output) as temporary:
-            count = write_film(temporary, pictures, command.fps)
-    kept.remove()
+    with WorkProgress(console) as progress, atomic_write(command.output) as temporary:
+        pictures = followed("filming", _pictures(command, model, cameras), len(cameras), progress)
+        count = write_film(temporary, pictures, command.fps)
     say(console, f"{count} pictures, {command.output.stat().st_size / 1e6:.2f} MB -> {command.output}")
-
-
-def _described(command: Video, model: Model, cameras: Sequence[Camera]) -> dict[str, object]:
-    """By the names of options, all that the pictures depend on."""
-    poses = torch.stack([camera.cam_from_world for camera in cameras])
-    lenses = torch.stack([camera.intrinsics for camera in cameras])
-    return {
-        "the scene with its edits": digest(
-            model.scene.parameters(), repr((model.renderer, model.scene.planes.mirrors))
-        ),
-        "--layers": list(command.layers),
-        "--layout": command.layout,
-        "--fps": command.fps,
-        "--seconds": command.seconds,
-        "--width": command.width,
-        "--path": command.path,
-        "the cameras of the path": digest({"poses": poses, "lenses": lenses}),
-    }
-
-
-def _film(command: Video, kept: KeptPictures, model: Model, cameras: Sequence[Camera], progress: WorkProgress) -> None:
-    """Renders the pictures that are not there yet."""
-    done = kept.count
-    indices = range(done, len(cameras))
-    rendered = _pictures(command, model, [(index, cameras[index]) for index in indices], len(cameras))
-    for index, picture in zip(indices, followed("filming", rendered, done, len(cameras), progress), strict=True):
-        kept.write(index, picture)
 
 
 def _cameras(command: Video, model: Model) -> list[Camera]:
@@ -93,17 +55,15 @@ def _cameras(command: Video, model: Model) -> list[Camera]:
     return [widened(camera, command.width + command.width % 2) for camera in cameras]
 
 
-def _pictures(
-    command: Video, model: Model, cameras: Iterable[tuple[int, Camera]], frames: int
-) -> Iterator[NDArray[np.uint8]]:
-    """One picture per numbered camera; rendered when it is asked for."""
+def _pictures(command: Video, model: Model, cameras: Sequence[Camera]) -> Iterator[NDArray[np.uint8]]:
+    """One picture per camera; rendered when it is asked for."""
     renderer = renderer_with(model.renderer, command.layers)
-    for index, camera in cameras:
+    for index, camera in enumerate(cameras):
         with torch.no_grad():
             frame = renderer(model.scene, camera)
             shown = [_picture(layer_image(frame, layer)) for layer in command.layers]
         if command.layout == "wipe":
-            share = 0.5 + WIPE_SPAN / 2 * math.sin(2 * math.pi * index / frames)
+            share = 0.5 + WIPE_SPAN / 2 * math.sin(2 * math.pi * index / len(cameras))
             yield wiped(shown[0], shown[1], share)
         else:
             yield side_by_side(shown)
@@ -118,19 +78,10 @@ def _picture(image: torch.Tensor) -> NDArray[np.uint8]:
 
 
 def followed(
-    what: str, pictures: Iterable[NDArray[np.uint8]], done: int, total: int, progress: WorkProgress
+    what: str, pictures: Iterable[NDArray[np.uint8]], total: int, progress: WorkProgress
 ) -> Iterator[NDArray[np.uint8]]:
-    """The pictures, with a progress shown as they are taken, of which some are done already."""
-    progress.show(Step(what, done, total))
-    for number, picture in enumerate(pictures, start=done + 1):
+    """The pictures, with a progress shown as they are taken."""
+    progress.show(Step(what, 0, total))
+    for number, picture in enumerate(pictures, start=1):
         yield picture
         progress.show(Step(what, number, total))
-
-
-def digest(tensors: Mapping[str, torch.Tensor], *more: str) -> str:
-    """Changes when any value does."""
-    found = hashlib.sha256("\n".join(more).encode())
-    for name in sorted(tensors):
-        found.update(name.encode())
-        found.update(tensors[name].detach().cpu().contiguous().numpy().tobytes())
-    return found.hexdigest()

@@ -18,7 +18,6 @@ from glassplat.data.ranges import Range
 from glassplat.interface.layers import Layer
 from glassplat.kernels.backend.devices import DeviceName
 from glassplat.publish.film import check_encoder
-from glassplat.publish.kept_pictures import KeptPictures
 
 
 @dataclass(frozen=True)
@@ -36,8 +35,7 @@ class Video:
         seconds: length.
         fps: pictures per second.
         width: of one layer's picture, pixels.
-        force: replace a film of that name, or one that was interrupted.
-        resume: go on with a film that was interrupted, with the same options.
+        force: replace a film of that name.
         edits: changes to the panes.
         device: where to render; auto takes an NVIDIA GPU where one can be used.
     """
@@ -52,13 +50,11 @@ class Video:
     fps: Annotated[int, Range(1, 120)] = 30
     width: Annotated[int, Range(16, 8192)] = 960
     force: bool = False
-    resume: bool = False
     edits: Annotated[SceneEdits, tyro.conf.arg(name="")] = field(default_factory=SceneEdits)
     device: DeviceName = "auto"
 
     def ready(self) -> None:
         """Refuses everything that can be known to be wrong before it takes long, and imports what renders."""
-        kept = KeptPictures(self.output)
         try:
             with input_checked():
                 check_encoder(self.output)
@@ -68,13 +64,6 @@ class Video:
             ) from error
         if os.path.lexists(self.output) and not self.force:
             raise InputError(f"{self.output} is already there; pass --force to replace it, or choose another --output")
-        if self.resume and not kept.is_there:
-            raise InputError(f"no film was interrupted at {self.output}; begin without --resume")
-        if kept.is_there and not self.resume and not self.force:
-            raise InputError(
-                f"{kept.folder} holds {kept.count} pictures of a film that was interrupted; pass --resume to go on, or "
-                "--force to begin again"
-            )
         if self.layout == "wipe" and len(self.layers) != 2:
             raise InputError(f"a wipe takes two --layers, not {len(self.layers)}, such as rgb transmission")
         if (self.path == "keyframes") != (self.keyframes is not None):
@@ -86,14 +75,11 @@ class Video:
         import_now("glassplat.commands.looking.filming")
 
     def run(self, console: Console) -> None:
-        """Renders, keeping every picture, and encodes them."""
+        """Renders the pictures and encodes them."""
         from glassplat.commands.looking.filming import film
 
         film(self, console)
 
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""
-        kept = KeptPictures(self.output)
-        if kept.is_there:
-            return f"{kept.count} pictures are kept in {kept.folder}: repeat the command with --resume to go on"
         return "nothing was written: repeat the command"

@@ -8,8 +8,6 @@ from pathlib import Path
 from rich.console import Console
 
 from glassplat.commands.console.messages import say
-from glassplat.commands.console.signals import held_signals
-from glassplat.commands.measuring.beside import beside
 from glassplat.commands.runs.output_folder import check_targets
 from glassplat.commands.training.train import Train
 from glassplat.data.errors import InputError
@@ -44,7 +42,7 @@ class Demo:
     def ready(self) -> None:
         """Refuses an output that cannot be written, and a run that is too short for the stages of `planar`."""
         check_folder(self.output)
-        check_targets(self.output, [self.log, *self.folders], [])
+        check_targets(self.output, self.folders, [])
         if self.iterations < LEAST_ITERATIONS:
             raise InputError(f"--iterations is {self.iterations}; expected at least {LEAST_ITERATIONS}")
 
@@ -53,43 +51,20 @@ class Demo:
         """Of the two runs."""
         return [self.output / method for method in (PlanarRecipe.method, SplatRecipe.method)]
 
-    @property
-    def log(self) -> Path:
-        """What the training beside this one says."""
-        return self.output / "splat.log"
-
     def run(self, console: Console) -> None:
-        """Trains both methods, each in a process of its own, evaluates them and says where the pictures are."""
-        with beside(self._arguments(SplatRecipe.method), self.log) as splat:
-            say(console, f"planar is trained here, and splat beside it: {self.log}")
-            here = Train(PlanarRecipe(), SCENE, self.folders[0], self.iterations, seed=self.seed, device=self.device)
-            self._trained(here.resuming(begun(self.folders[0])), console)
-            with console.status("waiting for splat"):
-                splat.wait()
+        """Trains both methods, evaluates them and says where the pictures are."""
+        for recipe, folder in zip((PlanarRecipe(), SplatRecipe()), self.folders, strict=True):
+            run = Train(recipe, SCENE, folder, self.iterations, seed=self.seed, device=self.device)
+            run = run.resuming(RunDirectory(folder).checkpoint.is_file())
+            say(console, f"training {recipe.method}")
+            run.ready()
+            run.run(console)
         from glassplat.commands.measuring.evaluation import evaluate_run, print_results
         from glassplat.commands.runs.stored_run import open_run
 
         print_results(console, *(evaluate_run(open_run(folder, self.device)) for folder in self.folders))
         say(console, f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
 
-    @staticmethod
-    def _trained(train: Train[PlanarRecipe], console: Console) -> None:
-        """Trains; Ctrl-C waits for PyTorch to be imported, so that the other process is told to end."""
-        with held_signals():
-            train.ready()
-        train.run(console)
-
-    def _arguments(self, method: str) -> list[str]:
-        """Of the command line that trains one method, or goes on where it was interrupted."""
-        folder = self.output / method
-        run = ["train", method, "--data", str(SCENE), "--output", str(folder), "--iterations", str(self.iterations)]
-        return [*run, "--seed", str(self.seed), "--device", self.device, *(["--resume"] if begun(folder) else [])]
-
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""
         return f"what is finished stays in {self.output}: repeat the command to go on"
-
-
-def begun(folder: Path) -> bool:
-    """Whether there is a run to go on with."""
-    return RunDirectory(folder).checkpoint.is_file()

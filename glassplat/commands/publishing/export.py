@@ -30,8 +30,6 @@ class Export:
             by itself and without a server.
         layer: all is the scene with its panes beside it, as planes.json and glass.ply; transmission is the place
             without its panes and what they reflect.
-        bake_reflections: put what the panes reflect behind them, as Gaussians, for viewers that know nothing of
-            panes; says how far that is from the true render.
         title: of the page; the run's name if not given.
         spz_version: 3, which every reader knows, or 4.
         edits: changes to the panes.
@@ -42,7 +40,6 @@ class Export:
     output: Path
     formats: tuple[Format, ...] = ("ply", "spz", "html")
     layer: Literal["all", "transmission"] = "all"
-    bake_reflections: bool = False
     title: str | None = None
     spz_version: Literal[3, 4] = 3
     edits: Annotated[SceneEdits, tyro.conf.arg(name="")] = field(default_factory=SceneEdits)
@@ -52,8 +49,6 @@ class Export:
         """Refuses what contradicts itself, what is no scene, and an output that holds something else."""
         if not self.formats:
             raise InputError("nothing to write without --formats; expected ply, spz, glb or html")
-        if self.layer == "transmission" and self.bake_reflections:
-            raise InputError("--layer transmission has no reflections to bake; give one of the two")
         check_scene(self.run_directory)
         check_claim(self.output, "export")
         say_scene(self.run_directory)

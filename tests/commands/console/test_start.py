@@ -92,7 +92,6 @@ REFUSED = {
     "video begun --output film.gif --path keyframes --keyframes none.json": "no file none.json",
     "export none --output new": "none is not a run directory",
     "export begun --output capture": "capture is not empty",
-    "export begun --output new --layer transmission --bake-reflections": "no reflections to bake",
     "import none.ply --output new": "no file none.ply",
     "import splats.ply --output capture": "capture is not empty",
     "info none": "there is nothing at none",
@@ -146,7 +145,7 @@ sys.exit(main({arguments!r}))
 FIRST_WORDS = {
     "train splat --data SCENE --output new": "a COLMAP capture of 96 photographs",
     "train planar --preset paper --data=SCENE --output new": "8 masks of panes",
-    "demo --output new": "planar is trained here, and splat beside it",
+    "demo --output new": "training planar",
     "info SCENE": "a capture format: COLMAP points: 6048",
     "info run": "a planar run capture: gone iterations: 3000",
     "eval run": "run: a planar run of 3000 iterations on gone",

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from glassplat.cli import main
-from glassplat.publish.kept_pictures import KeptPictures
+from glassplat.commands.looking import filming
 from tests.commands.tiny_run import write_run
 
 SHORT = ["--seconds", "0.4", "--fps", "10", "--width", "64"]
@@ -38,93 +38,21 @@ def test_keyframes_are_those_of_an_export(tmp_path: Path) -> None:
     assert film.stat().st_size > 100
 
 
-class Stop:
-    """Ctrl-C after so many pictures; counts those that are kept."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, after: int) -> None:
-        self.after, self.indices, self._write = after, list[int](), KeptPictures.write
-        stop = self
-
-        def write(kept: KeptPictures, index: int, picture: np.ndarray) -> None:
-            stop.write(kept, index, picture)
-
-        monkeypatch.setattr(KeptPictures, "write", write)
-
-    def write(self, kept: KeptPictures, index: int, picture: np.ndarray) -> None:
-        if len(self.indices) == self.after:
-            raise KeyboardInterrupt
-        self.indices.append(index)
-        self._write(kept, index, picture)
-
-
-@pytest.mark.parametrize("after", [0, 2])
-def test_an_interrupted_film_goes_on_where_it_stopped(
-    after: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run, film, whole = write_run(tmp_path / "run"), tmp_path / "film.webp", tmp_path / "whole.webp"
-    options = [*SHORT, "--layers", "rgb", "transmission", "--layout", "wipe"]
-    stop = Stop(monkeypatch, after)
-    assert main(["video", str(run), "--output", str(film), *options]) == 130
-    told = " ".join(capsys.readouterr().err.split())
-    assert f"{after} pictures are kept" in told and "--resume" in told and not film.exists()
-    assert main(["video", str(run), "--output", str(film), *options]) == 2
-    assert "pass --resume to go on" in " ".join(capsys.readouterr().err.split())
-    stop.after = 100
-    assert main(["video", str(run), "--output", str(film), *options, "--resume"]) == 0
-    assert stop.indices == [0, 1, 2, 3]
-    assert main(["video", str(run), "--output", str(whole), *options]) == 0
-    assert film.read_bytes() == whole.read_bytes()
-    assert {path.name for path in tmp_path.iterdir()} == {"run", "capture", "film.webp", "whole.webp"}
-
-
-@pytest.mark.parametrize(
-    ("changed", "named"),
-    [
-        (["--layers", "transmission"], "--layers"),
-        (["--seconds", "0.8"], "--seconds, the cameras of the path"),
-        (["--path", "interpolate"], "--path, the cameras of the path"),
-        (["--as-mirror", "1"], "the scene with its edits"),
-        (["--reflectance", "1", "0.5"], "the scene with its edits"),
-    ],
-)
-def test_another_film_does_not_go_on_with_the_pictures_of_one(
-    changed: list[str], named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run, film = write_run(tmp_path / "run"), tmp_path / "film.webp"
-    command = ["video", str(run), "--output", str(film), *SHORT]
-    stop = Stop(monkeypatch, 1)
-    assert main(command) == 130
-    stop.after = 100
-    assert main([*command, *changed, "--resume"]) == 2
-    assert f"{named} {'are' if ', ' in named else 'is'} no longer" in " ".join(capsys.readouterr().err.split())
-    assert main([*command, *changed, "--force"]) == 0
-    assert stop.indices[:2] == [0, 0] and not film.with_name("film.webp.pictures").exists()
-
-
-def test_only_what_a_film_left_is_gone_on_with_or_deleted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run, film = write_run(tmp_path / "run"), tmp_path / "film.webp"
-    command = ["video", str(run), "--output", str(film), *SHORT]
-    assert main([*command, "--resume"]) == 2
-    assert "no film was interrupted" in " ".join(capsys.readouterr().err.split())
-    folder = tmp_path / "film.webp.pictures"
-    folder.mkdir()
-    (folder / "000000.png").write_text("mine")
-    assert main([*command, "--force"]) == 2
-    assert "not from an interrupted film" in " ".join(capsys.readouterr().err.split())
-    assert (folder / "000000.png").read_text() == "mine"
-
-
-def test_a_damaged_picture_is_named(
+def test_an_interrupted_film_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    def stop(pictures: list[np.ndarray]) -> np.ndarray:
+        if len(taken) == 2:
+            raise KeyboardInterrupt
+        taken.append(pictures[0])
+        return pictures[0]
+
+    taken: list[np.ndarray] = []
     run, film = write_run(tmp_path / "run"), tmp_path / "film.webp"
-    command = ["video", str(run), "--output", str(film), *SHORT]
-    stop = Stop(monkeypatch, 2)
-    assert main(command) == 130
-    stop.after = 100
-    (tmp_path / "film.webp.pictures" / "000001.png").write_text("damaged")
-    assert main([*command, "--resume"]) == 2
-    assert "000001.png" in " ".join(capsys.readouterr().err.split()) and not film.exists()
+    monkeypatch.setattr(filming, "side_by_side", stop)
+    assert main(["video", str(run), "--output", str(film), *SHORT]) == 130
+    assert "nothing was written: repeat the command" in " ".join(capsys.readouterr().err.split())
+    assert len(taken) == 2 and {path.name for path in tmp_path.iterdir()} == {"run", "capture"}
 
 
 @pytest.mark.parametrize(

@@ -48,20 +48,9 @@ def test_another_program_reads_the_ply(tmp_path: Path) -> None:
     np.testing.assert_array_equal(theirs.sh0, scene.primary.sh[:, 0])
 
 
-def test_baking_adds_gaussians_and_says_what_is_gained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output = exported(tmp_path, "--bake-reflections", "--formats", "ply")
-    text = " ".join(capsys.readouterr().out.split())
-    assert "Gaussians added behind the panes" in text and "dB" in text
-    gaussians = read_gaussians(output / "scene.ply")
-    assert len(gaussians) > len(true_scene().primary) and not gaussians.channels
-    assert not (output / "planes.json").exists()
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ("--layer transmission --bake-reflections", "give one of the two"),
-        ("--remove-glass --bake-reflections", "no panes whose reflections"),
         ("--as-mirror 4", "no pane 4"),
     ],
 )
