@@ -7,6 +7,7 @@ from typing import Annotated
 
 from glassplat.data.ranges import (
     Count,
+    Internal,
     LearningRate,
     NotNegative,
     PositiveShare,
@@ -27,7 +28,7 @@ class PhotoExposure:
     """
 
     rate: LearningRate = 0.0
-    rate_end: PositiveShare = 0.1
+    rate_end: Internal[PositiveShare] = 0.1
     weight: NotNegative = 0.01
 
 
@@ -42,7 +43,7 @@ class PoseRefinement:
     """
 
     rate: LearningRate = 0.0
-    rate_end: PositiveShare = 0.1
+    rate_end: Internal[PositiveShare] = 0.1
     fixed: Count = 1
 
 
@@ -60,6 +61,6 @@ class Photographer:
 
     learn: bool = False
     upright: bool = True
-    count: Annotated[int, Range(1, 1_000_000)] = 500
-    sh_degree: ShDegree = 0
-    rates: GaussianRates = field(default_factory=GaussianRates)
+    count: Internal[Annotated[int, Range(1, 1_000_000)]] = 500
+    sh_degree: Internal[ShDegree] = 0
+    rates: Internal[GaussianRates] = field(default_factory=GaussianRates)
