@@ -36,6 +36,8 @@ LAYERS = (
     *("rgb", "transmission", "without_panes", "reflection", "strength", "mask", "depth", "alpha", "base", "normal"),
     *("environment", "surroundings", "median_depth", "photographed"),
 )
+NAMES_RUN = "glassplat.json"
+"""Says where the run lies, which is another place each time."""
 FORMATS = ("ply", "spz", "glb", "html")
 BLOCK = re.compile(r'<script type="([^"]+)" id="([^"]+)">(.*?)</script>', re.DOTALL)
 Hashes = dict[str, str]
@@ -117,7 +119,7 @@ def hashes_of_file(path: Path, name: str) -> Iterator[tuple[str, str]]:
 def hashes_of_folder(folder: Path, name: str) -> Iterator[tuple[str, str]]:
     """Hashes of all its files."""
     for path in sorted(folder.rglob("*")):
-        if path.is_file():
+        if path.is_file() and path.name != NAMES_RUN:
             yield from hashes_of_file(path, f"{name}/{path.relative_to(folder)}")
 
 
