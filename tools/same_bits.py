@@ -36,6 +36,8 @@ LAYERS = (
     *("rgb", "transmission", "without_panes", "reflection", "strength", "mask", "depth", "alpha", "base", "normal"),
     *("environment", "surroundings", "median_depth", "photographed"),
 )
+NAMES_RUN = "glassplat.json"
+"""Says where the run lies, which is another place each time."""
 FORMATS = ("ply", "spz", "glb", "html")
 BLOCK = re.compile(r'<script type="([^"]+)" id="([^"]+)">(.*?)</script>', re.DOTALL)
 Hashes = dict[str, str]
@@ -117,7 +119,7 @@ def hashes_of_file(path: Path, name: str) -> Iterator[tuple[str, str]]:
 def hashes_of_folder(folder: Path, name: str) -> Iterator[tuple[str, str]]:
     """Hashes of all its files."""
     for path in sorted(folder.rglob("*")):
-        if path.is_file():
+        if path.is_file() and path.name != NAMES_RUN:
             yield from hashes_of_file(path, f"{name}/{path.relative_to(folder)}")
 
 
@@ -134,11 +136,11 @@ def hashes_of_log(path: Path, name: str) -> Iterator[tuple[str, str]]:
         yield f"{name}/{term}", digest(json.dumps(values))
 
 
-def hashes_of_case(name: str, scenes: Path, work: Path) -> Hashes:
+def hashes_of_case(name: str, scenes: Path, work: Path, iterations: int) -> Hashes:
     """Trains, renders and exports one case."""
     case, run = CASES[name], work / name
     method, *options = case.arguments.split()
-    common = ["--data", str(scenes / case.scene), "--output", str(run), "--iterations", str(ITERATIONS)]
+    common = ["--data", str(scenes / case.scene), "--output", str(run), "--iterations", str(iterations)]
     failure = glassplat(["train", method, *common, "--device", "cpu", *options])
     if failure:
         return {f"{name}/failed": failure}
@@ -227,18 +229,19 @@ def main() -> int:
     parser.add_argument("--compare", type=Path, help="file of hashes to compare with")
     parser.add_argument("--scenes", type=Path, default=Path(tempfile.gettempdir()) / "same_bits_scenes")
     parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES), help="cases")
+    parser.add_argument("--iterations", type=int, default=ITERATIONS, help="length of each run")
     arguments = parser.parse_args()
     make_scenes(arguments.scenes)
     found: Hashes = {}
     with tempfile.TemporaryDirectory() as work:
         for name in arguments.only:
             start = time.perf_counter()
-            hashes = hashes_of_case(name, arguments.scenes, Path(work))
+            hashes = hashes_of_case(name, arguments.scenes, Path(work), arguments.iterations)
             found |= hashes
+            if arguments.write:
+                arguments.write.write_text(json.dumps(found, indent=1))
             told = next((f"FAILED: {said}" for key, said in hashes.items() if key.endswith("/failed")), "")
             print(f"{name}: {len(hashes)} values, {time.perf_counter() - start:.1f} s {told}", flush=True)
-    if arguments.write:
-        arguments.write.write_text(json.dumps(found, indent=1))
     if not arguments.compare:
         return 0
     before = json.loads(arguments.compare.read_text())

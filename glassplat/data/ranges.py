@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Any, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
+
+import tyro
 
 MOST = 1_000_000_000
 """Of anything that is counted: more than a machine holds, and few enough for every integer type."""
@@ -103,3 +105,7 @@ class Essential(NamedTuple):
 
 
 ESSENTIAL = Essential()
+
+T = TypeVar("T")
+Internal = Annotated[T, tyro.conf.Fixed, tyro.conf.Suppress]
+"""A value that recipes hold and the command line does not set: a constant of a method, or what its preset decides."""

@@ -12,6 +12,7 @@ from glassplat.data.ranges import (
     Ascending,
     Count,
     InnerShare,
+    Internal,
     NotNegative,
     Positive,
     PositiveShare,
@@ -59,23 +60,23 @@ class DefaultDensify:
             once more when nothing is perturbed any longer.
     """
 
-    split_by: Literal["pull", "gradient"] = "pull"
-    interval: Several = 100
-    whole_passes: bool = True
-    adapt_to_size: bool = True
-    start: Share = 500 / 30_000
+    split_by: Internal[Literal["pull", "gradient"]] = "pull"
+    interval: Internal[Several] = 100
+    whole_passes: Internal[bool] = True
+    adapt_to_size: Internal[bool] = True
+    start: Internal[Share] = 500 / 30_000
     stop: Share = 15_000 / 30_000
     gradient_threshold: Positive = 2e-4
     pull_threshold: Positive = 1.2e-3
-    dense_fraction: Positive = 0.01
+    dense_fraction: Internal[Positive] = 0.01
     prune_opacity: Share = 0.005
-    prune_large_start: Share = 1.0
-    prune_scale_fraction: Positive = 0.1
-    prune_radius_fraction: PositiveShare | None = None
+    prune_large_start: Internal[Share] = 1.0
+    prune_scale_fraction: Internal[Positive] = 0.1
+    prune_radius_fraction: Internal[PositiveShare | None] = None
     cap: Annotated[Count | None, ESSENTIAL] = None
     per_pixel: NotNegative = 0.02
     least_contribution: NotNegative = 0.2
-    contribution_moments: Annotated[tuple[Share, ...], Ascending()] = (0.5, 0.8)
+    contribution_moments: Internal[Annotated[tuple[Share, ...], Ascending()]] = (0.5, 0.8)
 
     @staticmethod
     def published() -> DefaultDensify:
@@ -118,19 +119,19 @@ class McmcDensify:
     """
 
     cap: Annotated[Count | None, ESSENTIAL, tyro.conf.arg(aliases=("--cap",))] = None
-    interval: Several = 100
-    start: Share = 500 / 30_000
-    stop: Share = 25_000 / 30_000
-    growth: Annotated[float, Range(1, 100)] = 1.05
-    dead_opacity: InnerShare = 0.005
+    interval: Internal[Several] = 100
+    start: Internal[Share] = 500 / 30_000
+    stop: Internal[Share] = 25_000 / 30_000
+    growth: Internal[Annotated[float, Range(1, 100)]] = 1.05
+    dead_opacity: Internal[InnerShare] = 0.005
     noise_rate: NotNegative = 5e5
-    noise_units: Literal["extents", "world"] = "extents"
-    noise_sharpness: NotNegative = 100.0
+    noise_units: Internal[Literal["extents", "world"]] = "extents"
+    noise_sharpness: Internal[NotNegative] = 100.0
     opacity_weight: NotNegative = 0.01
     scale_weight: NotNegative = 0.01
-    reach: Literal["shown", "all"] = "shown"
-    initial_opacity: InnerShare = 0.5
-    initial_spread: Positive = 1.0
+    reach: Internal[Literal["shown", "all"]] = "shown"
+    initial_opacity: Internal[InnerShare] = 0.5
+    initial_spread: Internal[Positive] = 1.0
 
     @staticmethod
     def published() -> McmcDensify:

@@ -8,6 +8,7 @@ from typing import Annotated
 from glassplat.data.ranges import (
     ESSENTIAL,
     InnerShare,
+    Internal,
     PaneLabel,
     PositiveShare,
     Range,
@@ -41,12 +42,12 @@ class PlaneFit:
 
     mirror_labels: Annotated[tuple[PaneLabel, ...], ESSENTIAL] = ()
     glass_reflectance: InnerShare = 0.2
-    mirror_reflectance: InnerShare = 0.999
-    band: PositiveShare = 20 / 1200
-    inlier_distance: PositiveShare = 0.01
-    hypotheses: Annotated[int, Range(1, 1_000_000)] = 1000
-    refined: Annotated[int, Range(1, 1000)] = 4
-    most_views: Annotated[int, Range(2, 1000)] = 12
+    mirror_reflectance: Internal[InnerShare] = 0.999
+    band: Internal[PositiveShare] = 20 / 1200
+    inlier_distance: Internal[PositiveShare] = 0.01
+    hypotheses: Internal[Annotated[int, Range(1, 1_000_000)]] = 1000
+    refined: Internal[Annotated[int, Range(1, 1000)]] = 4
+    most_views: Internal[Annotated[int, Range(2, 1000)]] = 12
     least_agreement: Share = 0.5
-    margin: Annotated[float, Range(0.1, 10)] = 1.08
-    seed: Seed = 0
+    margin: Internal[Annotated[float, Range(0.1, 10)]] = 1.08
+    seed: Internal[Seed] = 0

@@ -12,6 +12,7 @@ from glassplat.data.ranges import (
     Color,
     Finite,
     InnerShare,
+    Internal,
     NotNegative,
     Positive,
     Several,
@@ -94,27 +95,27 @@ class DeferredRecipe:
     ssim_weight: Share = 0.2
     view_dependence_weight: NotNegative = 0.0
     background: Annotated[Color | None, ESSENTIAL] = None
-    shading: Shading = "deferred"
+    shading: Internal[Shading] = "deferred"
     bootstrap: Share = 0.06
     texels: Annotated[Texels, ESSENTIAL] = 64
     first_texels: Texels = 16
-    refinements: Annotated[tuple[Share, Share], Ascending()] = (0.45, 0.65)
-    first_strength: InnerShare = 1e-3
-    search: MirrorSearch = field(default_factory=MirrorSearch)
+    refinements: Internal[Annotated[tuple[Share, Share], Ascending()]] = (0.45, 0.65)
+    first_strength: Internal[InnerShare] = 1e-3
+    search: Internal[MirrorSearch] = field(default_factory=MirrorSearch)
     region: Annotated[tuple[Finite, Finite, Finite, Positive] | None, ESSENTIAL] = None
-    find_region: bool = True
+    find_region: Internal[bool] = True
     outside_weight: NotNegative = 0.4
     strength_weight: NotNegative = 0.005
     consistency_weight: NotNegative = 0.3
     monocular_weight: NotNegative = 0.5
-    propagation: NormalPropagation = field(default_factory=NormalPropagation)
+    propagation: Internal[NormalPropagation] = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
     least_iterations: Several = 6000
-    hurry_matte: bool = True
-    hurry_found: bool = True
-    propagation_interval: Several | None = None
+    hurry_matte: Internal[bool] = True
+    hurry_found: Internal[bool] = True
+    propagation_interval: Internal[Several | None] = None
     rates: GaussianRates = field(default_factory=partial(GaussianRates, short_run_power=0.0))
-    reflection_rates: ReflectionRates = field(default_factory=ReflectionRates)
+    reflection_rates: Internal[ReflectionRates] = field(default_factory=ReflectionRates)
     rhythm: Rhythm = field(default_factory=lambda: Rhythm(beat=0.005, least=150))
     strategy: Annotated[Strategy, ESSENTIAL] = "default"
     densify: DefaultDensify = field(default_factory=DefaultDensify)

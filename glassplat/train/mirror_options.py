@@ -10,6 +10,7 @@ from glassplat.data.ranges import (
     ESSENTIAL,
     Count,
     InnerShare,
+    Internal,
     Range,
     Several,
     Share,
@@ -35,11 +36,11 @@ class PropagationSchedule:
             resets go on as if nothing had been propagated.
     """
 
-    end: Literal["settled", "fixed"] = "settled"
+    end: Internal[Literal["settled", "fixed"]] = "settled"
     stop: Share = 0.75
-    patience: Several = 5
-    pause: Count = 100
-    last_reset: bool = True
+    patience: Internal[Several] = 5
+    pause: Internal[Count] = 100
+    last_reset: Internal[bool] = True
 
 
 @dataclass(frozen=True)
@@ -57,9 +58,9 @@ class SurroundingsStart:
 
     source: Annotated[Literal["box", "scene", "both"], ESSENTIAL] = "scene"
     cells: Annotated[int, Range(1, 256)] | None = None
-    per_cell: Annotated[int, Range(1, 1000)] = 5
-    outside: Annotated[float, Range(0, 0.45)] = 0.005
-    opacity: InnerShare = 0.1
+    per_cell: Internal[Annotated[int, Range(1, 1000)]] = 5
+    outside: Internal[Annotated[float, Range(0, 0.45)]] = 0.005
+    opacity: Internal[InnerShare] = 0.1
 
 
 @dataclass(frozen=True)
@@ -76,10 +77,10 @@ class SurroundingsOptions:
 
     start: SurroundingsStart = field(default_factory=SurroundingsStart)
     sh_degree: ShDegree = 1
-    rates: GaussianRates = field(default_factory=GaussianRates)
-    densify: DefaultDensify = field(
+    rates: Internal[GaussianRates] = field(default_factory=GaussianRates)
+    densify: Internal[DefaultDensify] = field(
         default_factory=partial(
             DefaultDensify, split_by="gradient", stop=0.7, least_contribution=0.02, contribution_moments=(0.8,)
         )
     )
-    reset: Share = 0.0
+    reset: Internal[Share] = 0.0

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from glassplat.data.ranges import (
+    Internal,
     LearningRate,
     PositiveShare,
     Range,
@@ -24,7 +25,7 @@ class PhotoExposure:
     """
 
     rate: LearningRate = 0.0
-    rate_end: PositiveShare = 0.1
+    rate_end: Internal[PositiveShare] = 0.1
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class PoseRefinement:
     """
 
     rate: LearningRate = 0.0
-    rate_end: PositiveShare = 0.1
+    rate_end: Internal[PositiveShare] = 0.1
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,6 @@ class Photographer:
 
     learn: bool = False
     upright: bool = True
-    count: Annotated[int, Range(1, 1_000_000)] = 500
-    sh_degree: ShDegree = 0
-    rates: GaussianRates = field(default_factory=GaussianRates)
+    count: Internal[Annotated[int, Range(1, 1_000_000)]] = 500
+    sh_degree: Internal[ShDegree] = 0
+    rates: Internal[GaussianRates] = field(default_factory=GaussianRates)

@@ -10,6 +10,7 @@ from glassplat.data.ranges import (
     Ascending,
     Color,
     InnerShare,
+    Internal,
     NotNegative,
     Positive,
     Range,
@@ -62,8 +63,8 @@ class Perturbation:
     """
 
     amplitude: Share = 0.4
-    stop: Share = 0.8
-    bounds: Annotated[tuple[InnerShare, InnerShare], Ascending()] = (0.01, 0.99)
+    stop: Internal[Share] = 0.8
+    bounds: Internal[Annotated[tuple[InnerShare, InnerShare], Ascending()]] = (0.01, 0.99)
 
 
 @dataclass(frozen=True)
@@ -118,29 +119,29 @@ class PlanarRecipe:
     ssim_weight: Share = 0.2
     view_dependence_weight: NotNegative = 0.1
     background: Annotated[Color | None, ESSENTIAL] = None
-    stage_shares: tuple[Positive, Positive, Positive] = (0.1, 0.1, 0.8)
-    multi_stage: bool = True
-    fresnel: Fresnel = "pane"
-    intensity: bool = True
-    blend: Blend = "linear"
-    panes: Literal["all", "nearest"] = "all"
+    stage_shares: Internal[tuple[Positive, Positive, Positive]] = (0.1, 0.1, 0.8)
+    multi_stage: Internal[bool] = True
+    fresnel: Internal[Fresnel] = "pane"
+    intensity: Internal[bool] = True
+    blend: Internal[Blend] = "linear"
+    panes: Internal[Literal["all", "nearest"]] = "all"
     detect_mirrors: Annotated[bool, ESSENTIAL] = True
-    fixed_mirrors: bool = True
-    seed_reflections: bool = True
+    fixed_mirrors: Internal[bool] = True
+    seed_reflections: Internal[bool] = True
     tint: bool = False
     tint_weight: NotNegative = 0.01
     glass_count: Annotated[int, Range(1, 1_000_000)] = 1000
     weights: ReflectionWeights = field(default_factory=ReflectionWeights)
-    moving_mean: bool = False
+    moving_mean: Internal[bool] = False
     perturbation: Perturbation = field(default_factory=Perturbation)
     rates: GaussianRates = field(default_factory=GaussianRates)
-    plane_rates: PlaneRates = field(default_factory=PlaneRates)
+    plane_rates: Internal[PlaneRates] = field(default_factory=PlaneRates)
     plane_fit: PlaneFit = field(default_factory=PlaneFit)
     rhythm: Rhythm = field(default_factory=Rhythm)
     strategy: Annotated[Strategy, ESSENTIAL] = "default"
-    early_growth: bool = False
-    early_resets: bool = False
-    densify_by: Literal["direct", "all"] = "direct"
+    early_growth: Internal[bool] = False
+    early_resets: Internal[bool] = False
+    densify_by: Internal[Literal["direct", "all"]] = "direct"
     densify: DefaultDensify = field(default_factory=DefaultDensify)
     mcmc: McmcDensify = field(default_factory=McmcDensify)
     exposure: PhotoExposure = field(default_factory=PhotoExposure)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from glassplat.data.ranges import (
+    Internal,
     LearningRate,
     PositiveShare,
     Range,
@@ -68,14 +69,14 @@ class GaussianRates:
     """
 
     means: LearningRate = 1.6e-4
-    means_end: PositiveShare = 1.6e-6
-    decay: PositiveShare = 1.0
+    means_end: Internal[PositiveShare] = 1.6e-6
+    decay: Internal[PositiveShare] = 1.0
     sh: LearningRate = 2.5e-3
     opacity: LearningRate = 5e-2
     scale: LearningRate = 5e-3
     rotation: LearningRate = 1e-3
-    intensity: LearningRate = 5e-3
-    short_run_power: Annotated[float, Range(0, 2)] = 0.5
+    intensity: Internal[LearningRate] = 5e-3
+    short_run_power: Internal[Annotated[float, Range(0, 2)]] = 0.5
 
     def of(self, part: str) -> dict[str, Rate]:
         """The rates by dotted parameter name."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from glassplat.data.ranges import (
+    Internal,
     PositiveShare,
     Range,
     Several,
@@ -33,8 +34,8 @@ class Rhythm:
             last step.
     """
 
-    beat: PositiveShare = 1 / 30
-    least: Several = 250
-    reset_stop: Share = 0.45
-    sh: PositiveShare = 1 / 30
+    beat: Internal[PositiveShare] = 1 / 30
+    least: Internal[Several] = 250
+    reset_stop: Internal[Share] = 0.45
+    sh: Internal[PositiveShare] = 1 / 30
     averaged_passes: Annotated[float, Range(0, 1000)] = 1.0

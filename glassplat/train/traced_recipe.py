@@ -12,6 +12,7 @@ from glassplat.data.ranges import (
     Color,
     Finite,
     InnerShare,
+    Internal,
     NotNegative,
     Positive,
     Several,
@@ -106,30 +107,30 @@ class TracedRecipe:
     view_dependence_weight: NotNegative = 0.0
     background: Annotated[Color | None, ESSENTIAL] = None
     mirrors: Annotated[Mirrors, ESSENTIAL] = "both"
-    joint: bool = True
+    joint: Internal[bool] = True
     least_strength: Annotated[Share, ESSENTIAL] = 0.02
     least_iterations: Several = 6000
     bootstrap: Share = 0.25
     surroundings: SurroundingsOptions = field(default_factory=SurroundingsOptions)
     texels: Annotated[Texels, ESSENTIAL] = 64
     first_texels: Texels = 16
-    refinements: Annotated[tuple[Share, Share], Ascending()] = (0.45, 0.65)
-    first_strength: InnerShare = 1e-3
-    search: MirrorSearch = field(default_factory=MirrorSearch)
+    refinements: Internal[Annotated[tuple[Share, Share], Ascending()]] = (0.45, 0.65)
+    first_strength: Internal[InnerShare] = 1e-3
+    search: Internal[MirrorSearch] = field(default_factory=MirrorSearch)
     region: Annotated[tuple[Finite, Finite, Finite, Positive] | None, ESSENTIAL] = None
-    find_region: bool = True
+    find_region: Internal[bool] = True
     outside_weight: NotNegative = 0.4
     strength_weight: NotNegative = 0.005
     consistency_weight: NotNegative = 0.3
-    normals_throughout: bool = False
+    normals_throughout: Internal[bool] = False
     monocular_weight: NotNegative = 0.5
-    propagation: NormalPropagation = field(default_factory=NormalPropagation)
+    propagation: Internal[NormalPropagation] = field(default_factory=NormalPropagation)
     schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
-    hurry_matte: bool = True
-    hurry_found: bool = True
-    propagation_interval: Several | None = None
+    hurry_matte: Internal[bool] = True
+    hurry_found: Internal[bool] = True
+    propagation_interval: Internal[Several | None] = None
     rates: GaussianRates = field(default_factory=partial(GaussianRates, short_run_power=0.0))
-    reflection_rates: ReflectionRates = field(default_factory=ReflectionRates)
+    reflection_rates: Internal[ReflectionRates] = field(default_factory=ReflectionRates)
     rhythm: Rhythm = field(default_factory=lambda: Rhythm(beat=0.0214, least=150))
     strategy: Annotated[Strategy, ESSENTIAL] = "default"
     densify: DefaultDensify = field(default_factory=DefaultDensify)

@@ -1,10 +1,10 @@
-"""The recipes as published: the documents name what restores the paper's way, and each such option does it."""
+"""The recipes as published: the documents name what restores the paper's way, and each such field does it."""
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import re
-import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import torch
 
 from glassplat import cli
 from glassplat.commands.measuring.demo import SCENE
+from glassplat.data.options import check_options
 from glassplat.densify.options import DefaultDensify, McmcDensify
 from glassplat.kernels.maths.color import linear_from_srgb
 from glassplat.render.planar import Planar
@@ -39,16 +40,22 @@ from tests.train.progress_of import finished
 from tests.train.tiny_capture import tiny_capture, true_scene
 
 DOCS = Path(__file__).parents[2] / "docs"
-OPTION = re.compile(r"`(--[^`]+)`")
+ASSIGNED = re.compile(r"`(\w[\w.]*) = ([^`]+)`")
 
 
-def documented(page: str) -> list[str]:
-    """What the column "the paper's way" of a page's tables says to type; N and K stand for a number of one's own."""
+def documented(page: str) -> dict[str, Any]:
+    """What the column "the paper's way" of a page's tables sets, by the dotted names of a recipe's fields."""
     rows = [line.split(" | ") for line in (DOCS / page).read_text().splitlines() if line.startswith("| ")]
     cells = [row[3] for row in rows if len(row) == 5]
-    calls = [call for cell in cells for call in OPTION.findall(cell)]
-    assert len(calls) > 5
-    return [word for call in calls if not re.search(r" [A-Z]\b|mirror-labels", call) for word in shlex.split(call)]
+    found = {name: ast.literal_eval(value) for cell in cells for name, value in ASSIGNED.findall(cell)}
+    assert len(found) > 5
+    return found
+
+
+def with_value(options: Any, name: str, value: Any) -> Any:
+    """Options of which the field with this dotted name has another value."""
+    first, _, rest = name.partition(".")
+    return replace(options, **{first: with_value(getattr(options, first), rest, value) if rest else value})
 
 
 def parsed(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
@@ -73,10 +80,12 @@ def values_of(options: Any, name: str = "", *, rounded: bool = False) -> dict[st
 
 
 @pytest.mark.parametrize("method", RECIPES)
-def test_the_options_that_the_documents_name_are_the_preset(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    pages = dict.fromkeys(["splat.md", f"{method}.md"])
-    options = [word for page in pages for word in documented(page)]
-    recipe = parsed([method, *options], monkeypatch)
+def test_the_fields_that_the_documents_name_are_the_preset(method: str) -> None:
+    recipe = recipe_of(method)
+    for page in dict.fromkeys(["splat.md", f"{method}.md"]):
+        for name, value in documented(page).items():
+            recipe = with_value(recipe, name, value)
+    check_options(recipe)
     assert values_of(recipe) == values_of(recipe_of(method, "paper"), rounded=True)
 
 
@@ -86,8 +95,8 @@ def test_the_preset_gives_defaults_that_options_override(method: str, monkeypatc
     assert parsed([method], monkeypatch) == recipe_of(method) != paper
     assert parsed([method, "--preset", "paper"], monkeypatch) == paper
     assert parsed([method, "--preset=paper"], monkeypatch) == paper
-    changed = parsed([method, "--sh-degree", "1", "--preset", "paper", "--densify.split-by", "pull"], monkeypatch)
-    assert changed == replace(paper, sh_degree=1, densify=replace(paper.densify, split_by="pull"))
+    changed = parsed([method, "--sh-degree", "1", "--preset", "paper", "--densify.stop", "0.3"], monkeypatch)
+    assert changed == replace(paper, sh_degree=1, densify=replace(paper.densify, stop=0.3))
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])

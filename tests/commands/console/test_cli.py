@@ -11,7 +11,6 @@ import torch
 
 from glassplat.cli import main
 from glassplat.commands.measuring.demo import SCENE
-from glassplat.kernels.maths.pane import LAWS
 
 PROMISED = {
     "method", "iterations", "resolution", "split", "seed", "num_gaussians", "train_seconds", "seconds_per_frame",
@@ -120,12 +119,12 @@ def test_an_unknown_option_is_refused(capsys: pytest.CaptureFixture[str]) -> Non
     assert "no-such-option" in capsys.readouterr().err
 
 
-def test_a_law_of_reflection_that_there_is_not_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_strategy_that_there_is_not_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stopped:
-        train("planar", Path("run"), "--fresnel", "metal")
+        train("planar", Path("run"), "--strategy", "metal")
     assert stopped.value.code == 2
     message = capsys.readouterr().err
-    assert "metal" in message and all(law in message for law in LAWS)
+    assert "metal" in message and "default" in message and "mcmc" in message
 
 
 def test_a_broken_scene_file_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
