@@ -1,4 +1,4 @@
-"""What the readers of files are fuzzed with: small files of every kind, as this package and others write them."""
+"""What readers of files are tried with, once it is damaged: small files of every kind, as we and others write them."""
 
 from __future__ import annotations
 

@@ -3,15 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from glassplat.annotate.document import MOST_PANES
 
 Panes = Mapping[int, Any]
 
 
-def merged(base: Any, theirs: Any, ours: Any) -> tuple[Any, list[str]]:
-    """A document with the changes of both, and in words what the others have changed.
+class Merged(NamedTuple):
+    """A document with the changes of both sides.
+
+    Attributes:
+        document: as JSON.
+        changes: what the others have changed, in words.
+        renamed: new labels of our panes by the ones that they had.
+    """
+
+    document: Any
+    changes: list[str]
+    renamed: dict[int, int]
+
+
+def merged(base: Any, theirs: Any, ours: Any) -> Merged:
+    """Puts together what two sides have made of one document.
 
     A pane that one side has changed or added is as that side has it. One that both have changed stays as they
     have it, and ours is added under a label that is free; so is one that they have removed and we have changed.
@@ -25,7 +39,7 @@ def merged(base: Any, theirs: Any, ours: Any) -> tuple[Any, list[str]]:
         ValueError: there are too many panes for both to be kept.
     """
     before, there, here = (_by_label(document) for document in (base, theirs, ours))
-    kept = dict(there)
+    kept, renamed = dict(there), dict[int, int]()
     for label in sorted({*before, *here}):
         ours_now, old = here.get(label), before.get(label)
         if ours_now == old or ours_now == there.get(label):
@@ -33,10 +47,10 @@ def merged(base: Any, theirs: Any, ours: Any) -> tuple[Any, list[str]]:
         if there.get(label) == old:
             kept[label] = ours_now
         elif ours_now is not None:
-            new = _free_label({*kept, *here})
+            new = renamed[label] = _free_label({*kept, *here})
             kept[new] = {**ours_now, "label": new}
     panes = [pane for _, pane in sorted(kept.items()) if pane is not None]
-    return {**theirs, "panes": panes}, _changes(before, there)
+    return Merged({**theirs, "panes": panes}, _changes(before, there), renamed)
 
 
 def _by_label(document: Any) -> dict[int, Any]:

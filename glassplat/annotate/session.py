@@ -16,7 +16,7 @@ from PIL import Image
 
 from glassplat.annotate.document import PLACE, MarkedPane, parsed_document, read_document, version_of, write_document
 from glassplat.annotate.grab import grabbed
-from glassplat.annotate.merging import merged
+from glassplat.annotate.merging import Merged, merged
 from glassplat.annotate.outline import seen_outline
 from glassplat.annotate.pane_fit import Marks, PaneFit, TooFewMarksError, fitted_pane
 from glassplat.annotate.results import earlier_masks, write_results
@@ -49,9 +49,9 @@ GRABBED: dict[str, Field] = {"view": Whole(0, 10**9), "points": Items(PLACE)}
 class ChangedElsewhereError(ValueError):
     """A page saves what it began with an older document than the one that is there; `answer` is for the page."""
 
-    def __init__(self, changes: Sequence[str], document: Any, version: str) -> None:
-        super().__init__(f"the marks were changed elsewhere ({', '.join(changes)}); both are kept")
-        self.answer = {"document": document, "version": version}
+    def __init__(self, both: Merged, version: str) -> None:
+        super().__init__(f"the marks were changed elsewhere ({', '.join(both.changes)}); both are kept")
+        self.answer = {"document": both.document, "renamed": both.renamed, "version": version}
 
 
 @dataclass(frozen=True)
@@ -142,8 +142,7 @@ class Session:
             if version_of(there) != fields["version"]:
                 base = self._versions.get(fields["version"], {"version": 1, "panes": []})
                 self._remember(there)
-                together, changes = merged(base, there, document)
-                raise ChangedElsewhereError(changes, together, version_of(there))
+                raise ChangedElsewhereError(merged(base, there, document), version_of(there))
             write_document(self.root, document)
             self._remember(document)
         return {"panes": [self._answer(self.solve(pane)) for pane in panes], "version": version_of(document)}

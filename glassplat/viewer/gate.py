@@ -24,6 +24,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
+from glassplat.data.errors import InputError
 from glassplat.files.fields import COORDINATE, ByName, Field, Items, Number, Optional, Whole, checked
 from glassplat.serving.access import Access, RefusedError
 
@@ -160,7 +161,7 @@ def guarded_server(access: Access, *, host: str, port: int, title: str) -> viser
     """A server of viser that serves only whom `access` lets in, and hears only what it understands.
 
     Raises:
-        RuntimeError: viser makes its server in another way than this package knows.
+        InputError: viser makes its server in another way than this package knows.
     """
     made: list[str] = []
     with _SERVE, redirect_stdout(io.StringIO()):  # viser prints a table of addresses; the commands say them.
@@ -181,8 +182,9 @@ def guarded_server(access: Access, *, host: str, port: int, title: str) -> viser
             websockets_server.serve = serve  # type: ignore[misc]
         if not made:
             found.stop()
-            raise RuntimeError(
-                f"viser {viser.__version__} makes its server in a way that glassplat cannot guard; install viser 1.1.1"
+            raise InputError(
+                f"viser {viser.__version__} makes its server in a way that glassplat cannot guard: anybody could look; "
+                "pip install viser==1.1.1"
             )
     found.get_event_loop().set_exception_handler(_noted)
     return found

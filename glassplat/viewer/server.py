@@ -47,7 +47,7 @@ class Viewer:
             buttons: further ones by what is written on them, and what they do; called from other threads.
 
         Raises:
-            InputError: viser is not installed, or the port cannot be used.
+            InputError: viser is not installed or cannot be guarded, or the port cannot be used.
         """
         check_port(host, port)
         try:

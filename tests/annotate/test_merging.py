@@ -27,7 +27,11 @@ def document(**panes: str) -> dict:
     ],
 )
 def test_both_are_kept(theirs: dict, ours: dict, together: dict, told: list[str]) -> None:
-    assert merged(document(a="1"), theirs, ours) == (together, told)
+    found = merged(document(a="1"), theirs, ours)
+    assert (found.document, found.changes) == (together, told)
+    for old, new in found.renamed.items():
+        (pane,) = (pane for pane in together["panes"] if pane["label"] == new)
+        assert {**pane, "label": old} in ours["panes"]
 
 
 def test_more_panes_than_fit_are_refused() -> None:

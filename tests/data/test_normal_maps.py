@@ -82,7 +82,7 @@ def test_what_is_no_map_of_normals_is_refused(tmp_path: Path) -> None:
         write(tmp_path, "a.npy", vectors)
         with pytest.raises(InputError, match=message):
             estimated_normals(view)
-    # The second was found by `python -m tools.fuzz_readers normals`: NumPy evaluates the head as a part of a program.
+    # The second was found by damaging files at random: NumPy evaluates the head as a part of a program.
     head = b"\x93NUMPY\x01\x00v\x00\xd8'descr': '<f4', 'fortran_order': False, 'shape': (2, 3, 3), }" + b" " * 60
     for damaged in (b"no", head):
         (tmp_path / "normals" / "a.npy").write_bytes(damaged)

@@ -14,6 +14,7 @@ import torch
 import viser
 from websockets.exceptions import InvalidStatus
 
+from glassplat.data.errors import InputError
 from glassplat.viewer import gate
 from glassplat.viewer.client import MOST_PIXELS
 from glassplat.viewer.gate import LARGEST_MESSAGE, MESSAGES, understood
@@ -245,6 +246,6 @@ def test_a_viser_that_cannot_be_guarded_is_not_served(monkeypatch: pytest.Monkey
 
     serve = gate.websockets_server.serve
     monkeypatch.setattr(gate.viser, "ViserServer", Elsewhere)
-    with pytest.raises(RuntimeError, match="cannot guard"):
+    with pytest.raises(InputError, match="cannot guard"):
         Viewer(SHOWN, "127.0.0.1", free_port())
     assert stopped and gate.websockets_server.serve is serve

@@ -30,8 +30,9 @@ export class Marking {
   }
 
   // A document that the server has put together of this one and another; earlier steps lead to before that.
-  takeOver(together) {
+  takeOver(together, renamed) {
     this.change((document) => { Object.assign(document, together); });
+    this.active = renamed[this.active] || this.active; // Who goes on marking marks the same pane.
     if (!this.pane) this.active = this.document.panes.length ? this.document.panes[0].label : null;
   }
 

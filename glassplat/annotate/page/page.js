@@ -76,7 +76,7 @@ function takeOver(answer, message) {
   capture.version = answer.version;
   pending = drag = null;
   element("elsewhere").textContent = message;
-  marking.takeOver(answer.document);
+  marking.takeOver(answer.document, answer.renamed);
   changed();
 }
 

@@ -1,0 +1,118 @@
+"""Machines unlike ours: no home, other locales, odd names, a damaged cache of kernels, few and many threads."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import stat
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from tests.commands.tiny_run import write_run
+from tools.trial import Case
+from tools.trial_process import run
+
+KINDS = ("home", "locale", "name", "cache", "two", "threads", "columns", "temporary")
+LOCALES = ("C", "POSIX", "tr_TR.UTF-8", "de_DE.ISO-8859-1", "C.UTF-8", "nonsense", "")
+NAMES = ("a b", "a\nb", "\N{GRINNING FACE}", "[bold]x[/bold]", "-x", "a'b\"c", "%s{0}", "é" * 80, "a\tb", "\udcff")
+
+
+def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
+    """Renders of one small run, each on another machine, compared with what ours renders."""
+    scene = write_run(place / "run")
+    ended = run(["render", scene, "--output", place / "ours", "--device", "cpu"])
+    if ended.code != 0:
+        raise RuntimeError(f"nothing is rendered at all: {ended.output[-500:]}")
+    truth = pictures(place / "ours")
+    for number in range(cases):
+        draw, folder = random.Random(f"{seed} {number}"), place / f"case {number}"
+        folder.mkdir()
+        kind = KINDS[number % len(KINDS)]
+        what, environment, source = machine(kind, draw, folder, scene)
+        yield Case(f"{number} {kind} {what!r}", tried(environment, source, folder, truth, twice=kind == "two"))
+        for path in folder.rglob("*"):
+            if path.is_dir() and not path.is_symlink():
+                path.chmod(stat.S_IRWXU)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def pictures(folder: Path) -> dict[str, bytes]:
+    """The pictures in a folder by name."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*.png"))}
+
+
+def machine(kind: str, draw: random.Random, folder: Path, scene: Path) -> tuple[str, Mapping[str, str], Path]:
+    """What is odd about it, its environment, and the run that it renders."""
+    known = dict(os.environ)
+    kernels = folder / "kernels"
+    if kind == "home":
+        what = draw.choice(("", "/nowhere", "/proc", "relative", "none"))
+        known.pop("HOME") if what == "none" else known.update(HOME=what)
+        known.update(XDG_CACHE_HOME="/proc/none")
+    elif kind == "locale":
+        what = draw.choice(LOCALES)
+        known.update(LC_ALL=what, LANG=what, PYTHONUTF8=draw.choice(("0", "1")))
+        known.pop("PYTHONIOENCODING", None)
+    elif kind == "name":
+        what = draw.choice(NAMES)
+        place = folder / os.fsencode(what).decode("utf-8", "surrogateescape")
+        shutil.copytree(scene, place)
+        return what, known, place
+    elif kind == "cache":
+        what = draw.choice(("cut", "garbage", "empty", "read-only", "a file"))
+        damaged_cache(what, draw, kernels)
+        known.update(NUMBA_CACHE_DIR=str(kernels))
+    elif kind == "two":
+        what = "a fresh cache"
+        known.update(NUMBA_CACHE_DIR=str(kernels))
+    elif kind == "threads":
+        what = draw.choice(("1", "2", "3", "7"))
+        known.update(NUMBA_NUM_THREADS=what, OMP_NUM_THREADS=what)
+    elif kind == "columns":
+        what = draw.choice(("0", "1", "-5", "100000", "x"))
+        known.update(COLUMNS=what, TERM=draw.choice(("dumb", "", "xterm-256color", "nonsense")))
+    else:
+        what = draw.choice(("/nowhere", str(folder / "none"), "/proc"))
+        known.update(TMPDIR=what)
+    return what, known, scene
+
+
+def damaged_cache(what: str, draw: random.Random, kernels: Path) -> None:
+    """A cache that was filled by us, and then damaged."""
+    if what == "a file":
+        kernels.write_text("x")
+        return
+    shared = kernels.parent.parent / "filled"
+    if not shared.exists():
+        scene = kernels.parent.parent / "run"
+        run(
+            ["render", scene, "--output", shared.with_name("filling"), "--device", "cpu"],
+            environment=dict(os.environ) | {"NUMBA_CACHE_DIR": str(shared)},
+        )
+    shutil.copytree(shared, kernels)
+    files = [path for path in kernels.rglob("*") if path.is_file()]
+    for path in files if what == "empty" else draw.sample(files, max(1, len(files) // 2)):
+        data = path.read_bytes()
+        if what == "read-only":
+            path.chmod(0o400)
+        elif what == "garbage":
+            path.write_bytes(draw.randbytes(len(data)))
+        else:
+            path.write_bytes(b"" if what == "empty" else data[: draw.randrange(len(data) + 1)])
+
+
+def tried(environment: Mapping[str, str], scene: Path, folder: Path, truth: dict[str, bytes], *, twice: bool) -> str:
+    """What is wrong with renders in an environment, one or two at once."""
+    outputs = [folder / "one", folder / "other"][: 2 if twice else 1]
+
+    def rendered(output: Path) -> str:
+        # An absolute path: a name that begins with a dash is an option otherwise.
+        ended = run(["render", scene.absolute(), "--output", output, "--device", "cpu"], environment=environment)
+        if ended.fault() or ended.code != 0:
+            return ended.fault() or f"code {ended.code}: {ended.output[-300:]}"
+        return "" if pictures(output) == truth else "other pictures than elsewhere"
+
+    with ThreadPoolExecutor(2) as pool:
+        return "; ".join(fault for fault in pool.map(rendered, outputs) if fault)

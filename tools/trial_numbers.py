@@ -1,0 +1,174 @@
+"""Values that nobody should give, through the Python interface: a finite picture, or an error that says what is wrong.
+
+Any field of a scene and of a camera gets NaN, infinities, zeros and 1e30; cameras stand in Gaussians and on panes; a
+hundred thousand Gaussians lie in one tile; and trainings begin with photographs in which nothing can be learned.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import glassplat
+from glassplat import Camera, Dataset, Scene, Training, View
+from glassplat.data.point_cloud import PointCloud
+from glassplat.render.frame import Renderer
+from tests.render.tiny_scene import camera_at, pane
+from tests.train.tiny_capture import tiny_capture, true_scene
+from tools.trial import Case
+
+POISON = (math.nan, math.inf, -math.inf, 0.0, 1e30, -1e30, 1e-30, 3e38)
+MOST_SECONDS = 60.0
+"""Of the processor."""
+METHODS = ("splat", "planar", "deferred", "traced")
+
+
+def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
+    """Nine of ten are pictures, the tenth is a training of a few steps."""
+    warnings.simplefilter("ignore")
+    for method in METHODS:
+        with torch.no_grad():
+            renderer, scene = rendered(method)
+            renderer(scene, tiny_capture().train[1].camera)  # Kernels are compiled.
+    for number in range(cases):
+        draw = random.Random(f"{seed} {number}")
+        what, work = training(draw) if number % 10 == 9 else picture(draw)
+        yield Case(f"{number} {what}", fault_of(work))
+
+
+def fault_of(work: Callable[[], Any]) -> str:
+    """What is wrong with how it ends; nothing if it does, or raises an error with a text."""
+    begun = time.process_time()
+    try:
+        work()
+    except (ValueError, glassplat.InputError) as error:
+        return "" if str(error).strip() else "an error without a text"
+    except Exception as error:  # noqa: BLE001 - Any other error is what is looked for.
+        return f"{type(error).__name__}: {str(error)[:300]}"
+    seconds = time.process_time() - begun
+    return f"it took {seconds:.0f} s" if seconds > MOST_SECONDS else ""
+
+
+def picture(draw: random.Random) -> tuple[str, Callable[[], None]]:
+    """A picture of a poisoned scene, or from a poisoned camera."""
+    renderer, scene = rendered(draw.choice(METHODS))
+    camera = replace(tiny_capture().train[1].camera)
+    kind = draw.choice(("scene", "scene", "camera", "inside", "pane", "crowd"))
+    if kind == "scene":
+        name, scene = poisoned(scene, draw)
+    elif kind == "camera":
+        name, camera = poisoned_camera(camera, draw)
+    elif kind == "inside":
+        name, camera = "inside", at(scene.primary.means[draw.randrange(len(scene.primary))])
+    elif kind == "pane":
+        name = draw.choice(("in the pane", "edge on"))
+        camera = camera_at(0.1, -0.05, 2.0) if name == "in the pane" else camera_at(2.0, 0.0, 2.0)
+        camera = replace(camera, cam_from_world=camera.cam_from_world.float())
+        scene = replace(scene, planes=pane(2.0).to(torch.float32)) if hasattr(scene.planes, "to") else scene
+    else:
+        name, scene = crowded(scene, draw)
+
+    def work() -> None:
+        with torch.no_grad():
+            rgb = renderer(scene, camera).rgb
+        if not bool(torch.isfinite(rgb).all()):
+            raise ArithmeticError("the picture is not finite")
+
+    return f"{type(renderer).__name__} {kind} {name}", work
+
+
+def rendered(method: str) -> tuple[Renderer, Scene]:
+    """A renderer of a method, and the tiny scene with what it needs."""
+    scene = true_scene()
+    if method == "planar":
+        return glassplat.Planar(), scene
+    count = len(scene.primary)
+    if method == "splat":
+        return glassplat.Splat(), Scene(scene.primary, scene.extent)
+    primary = replace(scene.primary, channels={"logit_strength": torch.zeros(count)})
+    if method == "traced":
+        return glassplat.Traced(), Scene(primary, scene.extent, surroundings=replace(scene.primary, channels={}))
+    distant = glassplat.Environment.random(8, generator=torch.Generator().manual_seed(2))
+    return glassplat.Deferred(), Scene(primary, scene.extent, environment=distant)
+
+
+def poisoned(scene: Scene, draw: random.Random) -> tuple[str, Scene]:
+    """One to all values of one field become something else."""
+    name, tensor = draw.choice([(name, tensor) for name, tensor in scene.parameters().items() if tensor.numel()])
+    value, changed = draw.choice(POISON), tensor.detach().clone()
+    flat = changed.view(-1)
+    chosen = range(len(flat)) if draw.random() < 0.2 else [draw.randrange(len(flat))]
+    flat[list(chosen)] = value
+    return f"{name} {value} x{len(chosen)}", scene.with_parameters({name: changed})
+
+
+def poisoned_camera(camera: Camera, draw: random.Random) -> tuple[str, Camera]:
+    """One value of a camera becomes something else."""
+    value = draw.choice(POISON)
+    if draw.random() < 0.5:
+        pose, row, column = camera.cam_from_world.clone(), draw.randrange(3), draw.randrange(4)
+        pose[row, column] = value
+        return f"pose {row} {column} {value}", replace(camera, cam_from_world=pose)
+    name = draw.choice(("fx", "fy", "cx", "cy"))
+    return f"{name} {value}", replace(camera, **{name: value})
+
+
+def at(place: torch.Tensor) -> Camera:
+    """A camera in the middle of a Gaussian."""
+    camera = camera_at(*place.tolist())
+    return replace(camera, cam_from_world=camera.cam_from_world.float())
+
+
+def crowded(scene: Scene, draw: random.Random) -> tuple[str, Scene]:
+    """A hundred thousand Gaussians in one place."""
+    times = 100_000 // len(scene.primary)
+    tensors = {
+        name: tensor.repeat(times, *[1] * (tensor.dim() - 1)) for name, tensor in scene.primary.tensors().items()
+    }
+    tensors["means"] = torch.zeros_like(tensors["means"]) + torch.tensor([0.0, 0.0, draw.uniform(1, 4)])
+    return "100,000 in one place", replace(scene, primary=scene.primary.with_tensors(tensors))
+
+
+def training(draw: random.Random) -> tuple[str, Callable[[], None]]:
+    """A few steps on photographs in which little can be learned."""
+    method, kind = (
+        draw.choice(METHODS),
+        draw.choice(("8x8", "one", "equal cameras", "black", "masked", "unmasked", "far")),
+    )
+    views = list(tiny_capture().train)
+    points = tiny_capture().points
+    if kind == "8x8":
+        views = [
+            changed(view, camera=view.camera.resized(8, 8), photo=view.photo[:8, :8].contiguous()) for view in views
+        ]
+    elif kind == "one":
+        views = views[:1]
+    elif kind == "equal cameras":
+        views = [changed(view, camera=views[0].camera) for view in views]
+    elif kind == "black":
+        views = [changed(view, photo=torch.zeros_like(view.photo)) for view in views]
+    elif kind in ("masked", "unmasked"):
+        views = [changed(view, fill=int(kind == "masked")) for view in views]
+    else:
+        points = PointCloud(points.positions * 1e12, points.colors)
+    data = Dataset(Path("trial"), tuple(views), tuple(views[:1]), points, 2.0, pane_labels=(1,))
+
+    def work() -> None:
+        Training(data, method, iterations=20, device="cpu").run()
+
+    return f"training {method} {kind}", work
+
+
+def changed(view: View, *, camera: Camera | None = None, photo: Any = None, fill: int | None = None) -> View:
+    """A view with another camera, photograph, or a mask of one label."""
+    photo = view.photo if photo is None else photo
+    labels = None if fill is None else torch.full(photo.shape[:2], fill, dtype=torch.uint8)
+    return View.in_memory(view.name, camera or view.camera, photo=photo, pane_labels=labels)

@@ -1,0 +1,104 @@
+"""Commands in processes of their own, bounded in memory and time, for `tools/trial.py`."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+MOST_BYTES, MOST_SECONDS = 8 << 30, 600
+GOOD_CODES = (0, 1, 2, 129, 130, 141, 143)
+COMPLAINTS = ("Traceback (most recent call last)", "did not foresee", "Fatal Python error", "terminate called")
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended; `code` is None where it was killed, here or for its time."""
+
+    code: int | None
+    output: str
+    is_late: bool = False
+
+    def fault(self) -> str:
+        """What is wrong with such an end; nothing if it was asked for, or gave one readable message."""
+        if self.is_late:
+            return f"it did not end in {MOST_SECONDS} s: {self.output[-300:]!r}"
+        if any(word in self.output for word in COMPLAINTS):
+            return f"a traceback: {self.output[-1500:]}"
+        if self.code is not None and self.code not in GOOD_CODES:
+            return f"code {self.code}: {self.output[-300:]!r}"
+        return "it failed and said nothing" if self.code in (1, 2) and not self.output.strip() else ""
+
+
+@dataclass(frozen=True)
+class Sent:
+    """Signals to a command: after so many seconds of its work, so many times, with so many seconds between."""
+
+    signal: int
+    after: float
+    times: int = 1
+    between: float = 0.1
+
+
+def run(
+    options: Sequence[str | Path],
+    *,
+    sent: Sent | None = None,
+    environment: Mapping[str, str] | None = None,
+    largest_file: int | None = None,
+) -> Ended:
+    """Runs `glassplat` with these options.
+
+    Args:
+        options: of the command line.
+        sent: signals that it gets on the way.
+        environment: in place of ours; PYTHONPATH is added.
+        largest_file: bytes after which a write fails, as on a full disk.
+    """
+
+    def bound() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES))
+        if largest_file is not None:
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
+
+    known = dict(os.environ if environment is None else environment) | {"PYTHONPATH": str(ROOT)}
+    with tempfile.TemporaryFile() as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "glassplat", *map(str, options)],
+            stdout=subprocess.PIPE if largest_file is not None else log,  # A pipe has no size.
+            stderr=subprocess.STDOUT,
+            stdin=subprocess.DEVNULL,
+            env=known,
+            preexec_fn=bound,  # noqa: PLW1509 - Nothing else runs here.
+        )
+        begun = time.monotonic()
+        if sent is not None:
+            _send(process, sent)
+        try:
+            piped = process.communicate(timeout=MOST_SECONDS - (time.monotonic() - begun))[0] or b""
+            is_late = False
+        except subprocess.TimeoutExpired:
+            process.kill()
+            piped, is_late = process.communicate()[0] or b"", True
+        log.seek(0)
+        output = (piped + log.read()).decode(errors="replace")
+    code = process.returncode
+    return Ended(None if is_late or code == -signal.SIGKILL else code, output, is_late)
+
+
+def _send(process: subprocess.Popen[bytes], sent: Sent) -> None:
+    try:
+        process.wait(sent.after)
+    except subprocess.TimeoutExpired:
+        for _ in range(sent.times):
+            process.send_signal(sent.signal)
+            time.sleep(sent.between)

@@ -1,0 +1,295 @@
+"""Strangers and nonsense at `view` and `annotate`: nobody gets in, nothing is written, and the next client is served.
+
+The servers run in this process. After every case a client with the link has to be served, nothing may have been printed
+with a traceback, and the marks of the capture are what they were. The first case is a capture whose photographs have
+names that are HTML, through training, `eval` and `export`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import random
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from threading import Thread
+from typing import Any
+from urllib.parse import urlsplit
+
+import msgspec
+import torch
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+
+from glassplat.annotate.server import AnnotationServer
+from glassplat.annotate.session import opened_session
+from glassplat.render.planar import Planar
+from glassplat.serving.access import cookie_name
+from glassplat.viewer.gate import LARGEST_MESSAGE, MESSAGES
+from glassplat.viewer.server import Viewer
+from glassplat.viewer.shown import Shown
+from tests.annotate.conftest import write_room
+from tests.train.tiny_capture import tiny_capture, true_scene, write_tiny_capture
+from tests.viewer.free_port import free_port
+from tools.trial import Case
+from tools.trial_process import run
+from tools.viewer_client import ViewerClient, page
+
+HTML = "<img src=x onerror=alert(1)>.png"
+MANY = 100
+VALUES: tuple[Any, ...] = (
+    0, -1, 1.5, 1e308, float("nan"), float("inf"), "", "x" * 5000, "\x00", "<script>", None, [], {}, [[]] * 9, True,
+    2**63, b"\xff" * 9, [1.0, 0.0, 0.0, 0.0], "../../x",
+)  # fmt: skip
+METHODS = ("GET", "POST", "PUT", "DELETE", "OPTIONS", "HEAD", "TRACE", "CONNECT", "\x00", "GET GET", "PRI")
+PATHS = (
+    "/", "/../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/document", "/capture", "/photo/0", "/photo/-1", "*", "",
+    "/photo/" + "9" * 400, "//evil.example/", "/?key=", "/?key=\xff", "/?" + "a&" * 5000, "http://[", "/results",
+    "/close", "/grab",
+)  # fmt: skip
+HEADERS = (
+    "Origin: null", "Upgrade: websocket", "Connection: Upgrade", "Content-Length: 5", "Content-Length: -1",
+    "Content-Length: 99999999999", "Transfer-Encoding: chunked", "no colon", "\x00: \x00",
+)  # fmt: skip
+
+
+def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
+    """Half of them at `view`, half at `annotate`."""
+    yield Case("names that are HTML", names_fault(place / "names"))
+    draw = random.Random(seed)
+    root = write_room(place / "room")
+    with viewed() as viewer, annotated(root) as annotation:
+        for number in range(1, cases):
+            what, fault = at_view(viewer, draw, number) if number % 2 else at_annotate(annotation, draw)
+            yield Case(f"{number} {what}", fault)
+
+
+def names_fault(place: Path) -> str:
+    """What is wrong with pages about a photograph that is called HTML."""
+    data = write_tiny_capture(place / "capture")
+    for folder in ("images", "masks"):
+        (data / folder / "0.png").rename(data / folder / HTML)
+    file = data / "transforms.json"
+    file.write_text(file.read_text().replace("images/0.png", f"images/{HTML}"))
+    out = place / "run"
+    told = [run(["train", "splat", "--data", data, "--output", out, "--iterations", "3", "--device", "cpu"])]
+    told += [
+        run(["eval", out, "--device", "cpu"]),
+        run(["export", out, "--output", place / "exported", "--device", "cpu"]),
+    ]
+    faults = [one.fault() or ("" if one.code == 0 else one.output[-300:]) for one in told]
+    faults += [f"{path} has the name as HTML" for path in place.rglob("*.html") if "<img src=x on" in path.read_text()]
+    return "; ".join(fault for fault in faults if fault)
+
+
+@contextmanager
+def viewed() -> Iterator[Viewer]:
+    """A viewer of the tiny scene."""
+    views = tiny_capture().train
+    photographs = {view.name: lambda: torch.zeros(28, 40, 3, dtype=torch.uint8) for view in views}
+    cameras = [(view.name, view.camera) for view in views]
+    viewer = Viewer(
+        Shown("trial", true_scene(), Planar(), ("rgb", "depth"), cameras, photographs), "127.0.0.1", free_port()
+    )
+    viewer.start()
+    try:
+        yield viewer
+    finally:
+        viewer.stop()
+
+
+@contextmanager
+def annotated(root: Path) -> Iterator[AnnotationServer]:
+    """The page for marking, of a capture."""
+    with AnnotationServer(opened_session(root), 0) as server:
+        thread = Thread(target=server.serve_forever, args=(0.02,))
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def at_view(viewer: Viewer, draw: random.Random, number: int) -> tuple[str, str]:
+    """One case at the viewer, and what is wrong with how it ended."""
+    kind = draw.choice(("stranger", "messages", "messages", "long", "slow", "garbage"))
+    if number in (1, 3):
+        kind = "many" if number == 1 else "silent"
+    errors, there = sys.stderr, io.StringIO()
+    sys.stderr = there
+    try:
+        fault = asyncio.run(asyncio.wait_for(VIEWED[kind](viewer, draw), 120)) or asyncio.run(served(viewer))
+    except Exception as error:  # noqa: BLE001 - A client that is not served ends in whatever error.
+        fault = f"{type(error).__name__}: {error}"
+    finally:
+        sys.stderr = errors
+    printed = there.getvalue()
+    return f"view {kind}", fault or (printed if "Traceback" in printed else "")
+
+
+async def served(viewer: Viewer) -> str:
+    """A client with the link gets a picture."""
+    async with ViewerClient(viewer.address) as client:
+        await client.picture(60)
+    return ""
+
+
+async def stranger(viewer: Viewer, draw: random.Random) -> str:
+    """Another origin, host or key than that of the page."""
+    local = f"localhost:{viewer.port}"
+    origins = (
+        "http://evil.example",
+        "null",
+        None,
+        f"https://evil.{local}",
+        f"http://{local}.evil.example",
+        "http://[",
+        "",
+    )
+    hosts = (local, "evil.example", f"evil.example:{viewer.port}", "127.0.0.1.evil.example", f"{local}.evil.example")
+    keys = ("", "x", viewer.access.key[:-1], viewer.access.key + "x", viewer.access.key.swapcase(), viewer.access.key)
+    given: dict[str, Any] = {"origin": draw.choice(origins), "host": draw.choice(hosts), "key": draw.choice(keys)}
+    if given["key"] == viewer.access.key and given["host"] == local and given["origin"] == "":
+        return ""
+    try:
+        async with ViewerClient(viewer.address, **given):
+            return f"was let in with {given}"
+    except (InvalidHandshake, ConnectionClosed, OSError, ValueError):
+        return ""
+
+
+async def messages(viewer: Viewer, draw: random.Random) -> str:
+    """Fifty messages with fields that are anything, and values of controls that are anything."""
+    async with ViewerClient(viewer.address) as client:
+        await client.picture()
+        for _ in range(50):
+            kind = draw.choice((*MESSAGES, "ShareUrlRequest", "FileTransferPart", "GetRenderResponseMessage", "None"))
+            fields = {name: draw.choice(VALUES) for name in MESSAGES.get(kind, {"uuid": 0}) if draw.random() < 0.8}
+            if draw.random() < 0.3 and client.labels():
+                label = draw.choice(list(client.labels()))
+                await client.set(label, draw.choice([value for value in VALUES if value != 2**64]))
+            elif draw.random() < 0.1:
+                await client.connection.send(draw.choice(("text", b"\x91" * 999, msgspec.msgpack.encode([1]))))
+            elif draw.random() < 0.5:
+                await client.look(**{draw.choice(list(MESSAGES["ViewerCameraMessage"])): draw.choice(VALUES)})
+            else:
+                await client.send(kind, **fields)
+    return ""
+
+
+async def long(viewer: Viewer, draw: random.Random) -> str:
+    """A message that is too long."""
+    async with ViewerClient(viewer.address) as client:
+        with suppress(ConnectionClosed):
+            await client.connection.send(bytes(LARGEST_MESSAGE * draw.choice((2, 50))))
+            await asyncio.wait_for(client.connection.wait_closed(), 30)
+    return "" if client.connection.close_code is not None else "it was heard"
+
+
+async def slow(viewer: Viewer, draw: random.Random) -> str:
+    """A client that asks for much, reads nothing, and is cut off."""
+    async with ViewerClient(viewer.address) as client:
+        client._hearing.cancel()
+        for step in range(30):
+            await client.look(position=(0.0, 0.0, -2.0 + 0.01 * step), image_width=1920, image_height=1080)
+        await asyncio.sleep(draw.uniform(0, 1))
+        client.connection.transport.abort()
+    return ""
+
+
+async def many(viewer: Viewer, draw: random.Random) -> str:
+    """A hundred clients at once; each gets a picture."""
+
+    async def one() -> None:
+        async with ViewerClient(viewer.address) as client:
+            await client.picture(100)
+
+    results = await asyncio.gather(*(one() for _ in range(MANY)), return_exceptions=True)
+    failed = [result for result in results if isinstance(result, BaseException)]
+    return f"{len(failed)} of {MANY} got no picture: {failed[0]!r}" if failed else ""
+
+
+async def silent(viewer: Viewer, draw: random.Random) -> str:
+    """A hundred connections that say nothing, while somebody looks."""
+    writers = [(await asyncio.open_connection("127.0.0.1", viewer.port))[1] for _ in range(MANY)]
+    try:
+        return await served(viewer)
+    finally:
+        for writer in writers:
+            writer.close()
+
+
+async def garbage(viewer: Viewer, draw: random.Random) -> str:
+    """A request that is none."""
+    return answered_well(viewer.port, request(draw, viewer.port, ""))
+
+
+VIEWED = {
+    "stranger": stranger, "messages": messages, "long": long, "slow": slow, "many": many, "silent": silent,
+    "garbage": garbage,
+}  # fmt: skip
+
+
+def at_annotate(server: AnnotationServer, draw: random.Random) -> tuple[str, str]:
+    """One case at the page for marking: with the key, or without, and what is wrong with how it ended."""
+    file = server.session.root / "annotations.json"
+    before = file.read_bytes() if file.is_file() else b""
+    port = int(server.server_address[1])
+    has_key = draw.random() < 0.5
+    cookie = f"{cookie_name(f'127.0.0.1:{port}')}={server.access.key}" if has_key else ""
+    errors, there = sys.stderr, io.StringIO()
+    sys.stderr = there
+    try:
+        sent = request(draw, port, cookie)
+        fault = answered_well(port, sent, let_in=has_key)
+        status, _, body = page(
+            server.address, "/capture", Cookie=f"{cookie_name(urlsplit(server.address).netloc)}={server.access.key}"
+        )
+        if status != 200 or "views" not in json.loads(body):
+            fault = fault or f"afterwards /capture answers {status}"
+    except Exception as error:  # noqa: BLE001 - Whatever it is, the next client was not served.
+        fault = f"{type(error).__name__}: {error}"
+    finally:
+        sys.stderr = errors
+    if (file.read_bytes() if file.is_file() else b"") != before:
+        fault = fault or "the marks were changed"
+    printed = there.getvalue()
+    if server.is_finished:
+        server.is_finished = False
+    return f"annotate {'with' if has_key else 'without'} key {sent[:60]!r}", fault or (
+        printed if "Traceback" in printed else ""
+    )
+
+
+def request(draw: random.Random, port: int, cookie: str) -> bytes:
+    """Bytes that are nearly a request."""
+    path = draw.choice([path for path in PATHS if not (cookie and path in ("/close", "/results"))])
+    lines = [f"{draw.choice(METHODS)} {path} HTTP/{draw.choice(('1.1', '1.0', '9.9', 'x'))}"]
+    lines.append(f"Host: {draw.choice((f'127.0.0.1:{port}', 'evil.example', '', '[::1]', ':' * 99))}")
+    lines += (
+        [f"Cookie: {cookie}"] if cookie else [f"Cookie: glassplat_{port}={draw.choice(('x', '', chr(255), ';' * 99))}"]
+    )
+    more = [f"Origin: http://127.0.0.1:{port}", "X: " + "y" * draw.choice((10, 70_000)), *HEADERS]
+    lines += draw.sample(more, draw.randint(0, 5))
+    body = draw.choice(("", "{}", "[" * 5000, "null", '{"document": {}, "version": 1}', "\xff\xfe"))
+    return ("\r\n".join(lines) + "\r\n\r\n" + body).encode("latin-1")
+
+
+def answered_well(port: int, sent: bytes, *, let_in: bool = False) -> str:
+    """What is wrong with the answer to bytes: it is one for those who have the key, or an error of ours."""
+    with socket.create_connection(("127.0.0.1", port), timeout=20) as connection, suppress(ConnectionError):
+        connection.sendall(sent)
+        connection.shutdown(socket.SHUT_WR)
+        answer = b""
+        while part := connection.recv(65536):
+            answer += part
+        status = answer.split(b" ")[1:2]
+        if status and status[0] in (b"200", b"101", b"303") and not let_in:
+            return f"was answered: {answer[:100]!r}"
+        if status and status[0] == b"500":
+            return f"an error of the server: {answer[:300]!r}"
+    return ""
