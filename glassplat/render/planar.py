@@ -17,7 +17,7 @@ from glassplat.kernels.records import Deviation, PaneHits, Panes, Splats
 from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.choices import Blend
 from glassplat.render.frame import Frame, Renderer, ScreenPass
-from glassplat.render.glazing import Glazed, glazed, own_masks, visibilities
+from glassplat.render.glazing import Glazed, gated_transmission, glazed, own_masks, visibilities
 from glassplat.render.mirror_images import project_mirrored, project_photographer
 from glassplat.render.rasterize import (
     NEAR_PER_EXTENT,
@@ -110,6 +110,8 @@ class Planar:
             the image without.
         tells_mirrored: whether the records of a probed frame tell mirror images from what is seen directly, and how
             much is left of either; if not, all of them count alike.
+        gate: how much the gradient of the transmission is held back where panes mirror edges, for training; see
+            `gated_transmission`.
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -122,6 +124,7 @@ class Planar:
     nearest_only: bool = False
     photographer: Shown = "absent"
     tells_mirrored: bool = True
+    gate: float = 0.0
 
     def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are."""
@@ -231,7 +234,7 @@ class Planar:
     ) -> Glazed:
         """Lays the panes and what they mirror before the image."""
         return glazed(
-            first.image,
+            gated_transmission(first.image, seen, second.reflections, self.gate),
             seen,
             masks,
             second.reflections,
