@@ -15,6 +15,7 @@ from glassplat.data.ranges import Seed, Several
 from glassplat.files.folders import check_folder
 from glassplat.kernels.backend.devices import DeviceName
 from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.train.recipe import Recipe
 from glassplat.train.run_directory import RunDirectory
 from glassplat.train.splat_recipe import SplatRecipe
 
@@ -53,7 +54,8 @@ class Demo:
 
     def run(self, console: Console) -> None:
         """Trains both methods, evaluates them and says where the pictures are."""
-        for recipe, folder in zip((PlanarRecipe(), SplatRecipe()), self.folders, strict=True):
+        recipes: tuple[Recipe, ...] = (PlanarRecipe(), SplatRecipe())
+        for recipe, folder in zip(recipes, self.folders, strict=True):
             run = Train(recipe, SCENE, folder, self.iterations, seed=self.seed, device=self.device)
             run = run.resuming(RunDirectory(folder).checkpoint.is_file())
             say(console, f"training {recipe.method}")
