@@ -117,7 +117,9 @@ def _packed_positions(means: NDArray[np.float32], bits: int) -> Bytes:
 
 def _unpacked_positions(section: Bytes, layout: Layout) -> NDArray[np.float32]:
     if layout.version == 1:
-        return section.view("<f2").reshape(layout.number, 3).astype(np.float32)
+        halves = section.view("<f2").reshape(layout.number, 3)
+        # Of a signalling NaN NumPy warns in any arithmetic; who draws leaves out what is no number.
+        return np.where(np.isnan(halves), np.float32(np.nan), halves.astype(np.float32))
     padded = np.zeros((3 * layout.number, 4), dtype=np.uint8)
     padded[:, 1:] = section.reshape(-1, 3)
     # Three bytes at the top of four carry their sign with them on the way down.

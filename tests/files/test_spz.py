@@ -104,6 +104,15 @@ def test_older_versions_are_read(tmp_path: Path) -> None:
         torch.testing.assert_close(read.quats[0].abs(), torch.tensor([0.0, 1.0, 0.0039, 0.0039]), rtol=0, atol=1e-3)
 
 
+@pytest.mark.parametrize("bits", [0x7C01, 0x7DFF, 0xFC01, 0x7E00], ids=hex)
+def test_a_position_that_is_no_number_is_read_without_a_warning(bits: int, tmp_path: Path) -> None:
+    """Found by `tools/trial.py readers`: NumPy warns of arithmetic with signalling NaNs, which halves may be."""
+    half = np.array([bits, 0x3C00, 0x3C00], dtype="<u2").tobytes()
+    (tmp_path / "a.spz").write_bytes(packed(1, half, bytes(1 + 3 + 3 + 3)))
+    means = read_spz(tmp_path / "a.spz").means[0]
+    assert torch.isnan(means[0]) and means[1:].abs().tolist() == [1.0, 1.0]
+
+
 def test_harmonics_of_the_fourth_degree_are_left_out(tmp_path: Path) -> None:
     (tmp_path / "a.spz").write_bytes(packed(3, bytes(9 + 1 + 3 + 3 + 4), bytes(range(72)), degree=4))
     read = read_spz(tmp_path / "a.spz")
