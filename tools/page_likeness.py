@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from glassplat.commands.publishing.exporting import cameras_of
+from glassplat.data.dataset import TEST_EVERY
 from glassplat.evaluate.metrics import psnr
 from glassplat.files.spz_sections import FLIP
 from glassplat.interface.loading import load
@@ -51,8 +51,8 @@ def pixels_of(text: str, width: int, height: int) -> torch.Tensor:
 
 
 def likenesses(browser: Browser, model: Model) -> list[float]:
-    """PSNR of the page's pictures against the renders of some test cameras."""
-    cameras = cameras_of(model, "test")
+    """PSNR of the page's pictures against the renders of some cameras of test views, every eighth by name."""
+    cameras = [model.cameras[name] for name in sorted(model.cameras)[::TEST_EVERY]]
     found = []
     for camera in cameras[:: max(1, len(cameras) // VIEWS)][:VIEWS]:
         with torch.no_grad():
