@@ -16,12 +16,12 @@ from torch import Tensor
 from bench.kernels import HEIGHT, WIDTH
 from bench.scene import bench_camera, room
 from bench.timing import Work
-from glassplat.files.markdown_table import Table
+from glassplat.files.writing import Table
 from glassplat.kernels.composite import composite
 from glassplat.kernels.records import Splats
 from glassplat.kernels.tiles import bin_tiles
-from glassplat.render.discs import blended_discs, projected_discs
-from glassplat.render.rasterize import joined_splats, project_gaussians
+from glassplat.render.frame import joined_splats, project_gaussians
+from glassplat.render.splat import blended_discs, projected_discs
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 

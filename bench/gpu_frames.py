@@ -14,17 +14,17 @@ from torch import Tensor
 from bench.methods import frame_work, step_work, view_of
 from bench.scene import bench_camera, bench_scene, mirroring_scene
 from bench.timing import Work, interleaved_seconds, paired_ratio
-from glassplat.data.dataset import View
-from glassplat.files.markdown_table import Table
+from glassplat.captures.view import View
+from glassplat.files.writing import Table
 from glassplat.kernels.photometric import photometric
+from glassplat.methods.glossy_recipes import TracedRecipe
+from glassplat.methods.planar_recipe import PlanarRecipe
+from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.render.traced import Traced
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
-from glassplat.train.planar_recipe import PlanarRecipe
-from glassplat.train.splat_recipe import SplatRecipe
-from glassplat.train.traced_recipe import TracedRecipe
 
 WIDTH, HEIGHT, REPEATS = 960, 720, 15
 

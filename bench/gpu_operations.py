@@ -16,14 +16,14 @@ from bench.kernels import backward, batch_of, raw_of, visited_pixels
 from bench.rays import operation_works
 from bench.scene import bench_camera, bench_scene
 from bench.timing import Work, interleaved_seconds
-from glassplat.files.markdown_table import Table
+from glassplat.files.writing import Table
 from glassplat.kernels.backend.devices import kernels_for
 from glassplat.kernels.composite import composite
 from glassplat.kernels.photometric import photometric
 from glassplat.kernels.project import project
 from glassplat.kernels.records import Splats, TileBins
 from glassplat.kernels.tiles import bin_tiles
-from glassplat.render.rasterize import joined_splats
+from glassplat.render.frame import joined_splats
 
 RAYS_WIDTH = 1024
 """Of the square image of a mirror ball that throws the rays, in pixels."""

@@ -10,12 +10,12 @@ from typing import Any
 
 from rich.console import Console
 
-from glassplat.commands.measuring.evaluation import evaluate_run
-from glassplat.commands.runs.stored_run import open_run
-from glassplat.commands.training.train import Train
-from glassplat.files.markdown_table import Table
+from glassplat.cli.evaluation import evaluate_run
+from glassplat.cli.runs import open_run
+from glassplat.cli.train import Train
+from glassplat.files.writing import Table
 from glassplat.kernels.backend.devices import DeviceName
-from glassplat.train.planar_recipe import PlanarRecipe
+from glassplat.methods.planar_recipe import PlanarRecipe
 
 METRICS = ("psnr", "ssim", "lpips", "pane_psnr", "transmission_psnr", "reflection_psnr")
 SAME = ("method", "iterations", "seed", "downscale")

@@ -12,7 +12,7 @@ from torch import Tensor
 from bench.peak import peak_multiply_adds
 from bench.scene import bench_camera, room
 from bench.timing import Work, interleaved_seconds, median_seconds, paired_ratio
-from glassplat.files.markdown_table import Table
+from glassplat.files.writing import Table
 from glassplat.kernels import tiles as bin_tiles_module
 from glassplat.kernels.composite import composite
 from glassplat.kernels.composite import reference as composite_twin
@@ -24,7 +24,7 @@ from glassplat.kernels.project import project
 from glassplat.kernels.project import reference as project_twin
 from glassplat.kernels.records import CameraBatch, Projected, RawGaussians, Splats, TileBins
 from glassplat.kernels.tiles import bin_tiles
-from glassplat.render.rasterize import joined_splats
+from glassplat.render.frame import joined_splats
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 

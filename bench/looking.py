@@ -17,11 +17,11 @@ from PIL import Image
 
 from bench.methods import doublings, thread_count
 from bench.scene import bench_camera, bench_scene
-from glassplat.files.markdown_table import Table
+from glassplat.files.writing import Table
 from glassplat.render.planar import Planar
-from glassplat.viewer.client import COARSE_QUALITY, SHARP_QUALITY
 from glassplat.viewer.drawing import Wish, drawn
 from glassplat.viewer.render_loop import Picture, RenderLoop, RenderThread
+from glassplat.viewer.server import COARSE_QUALITY, SHARP_QUALITY
 
 WIDTH, HEIGHT, COUNT = 640, 480, 100_000
 MOST_FIRST, MOST_FULL = 100, 400

@@ -11,26 +11,22 @@ import torch
 
 from bench.scene import bench_camera, bench_scene, glossy_scene
 from bench.timing import Work, interleaved_seconds, median_seconds, paired_ratio
-from glassplat.data.dataset import View
-from glassplat.files.markdown_table import Table
+from glassplat.captures.view import View
+from glassplat.files.writing import Table
 from glassplat.kernels.composite import composite
 from glassplat.kernels.tiles import bin_tiles
+from glassplat.methods.glossy_recipes import DeferredRecipe
+from glassplat.methods.planar_recipe import PlanarRecipe
+from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.render.deferred import INVISIBLE, Deferred
-from glassplat.render.frame import Renderer
-from glassplat.render.mirror_images import half_spaces_of
+from glassplat.render.frame import NEAR_PER_EXTENT, Renderer, joined_splats, project_gaussians
+from glassplat.render.panes import half_spaces_of, nearest_hits, panes_in_camera
 from glassplat.render.planar import Planar
-from glassplat.render.rasterize import NEAR_PER_EXTENT, joined_splats, project_gaussians
-from glassplat.render.seen_panes import nearest_hits, panes_in_camera
 from glassplat.render.splat import Splat
-from glassplat.scene.camera import Camera
-from glassplat.scene.pose import mirror_matrices
+from glassplat.scene.camera import Camera, mirror_matrices
 from glassplat.scene.scene import Scene
-from glassplat.train.deferred_recipe import DeferredRecipe
-from glassplat.train.planar_recipe import PlanarRecipe
-from glassplat.train.splat_recipe import SplatRecipe
-from glassplat.train.stage import Stage
-from glassplat.train.state import TrainState
-from glassplat.train.trainer import differentiate, update
+from glassplat.training.loop import differentiate, update
+from glassplat.training.stage import Stage, TrainState
 
 WIDTH, HEIGHT, COUNT = 480, 360, 100_000
 PANES = ((1, 0.5), (3, 0.5), (1, 1.0))

@@ -18,15 +18,14 @@ from unittest import mock
 import numba
 import torch
 
-from glassplat.commands.measuring.demo import SCENE
-from glassplat.data.dataset import load_dataset
-from glassplat.files.markdown_table import Table
+from glassplat.captures.dataset import load_dataset
+from glassplat.cli.demo import SCENE
+from glassplat.files.writing import Table
 from glassplat.kernels.backend.cpu import Kernel
-from glassplat.train.background import photo_background, settled
-from glassplat.train.messages import Message, StageEntered, StepDone
-from glassplat.train.recipe import RECIPES, recipe_of
-from glassplat.train.state import TrainState
-from glassplat.train.trainer import train
+from glassplat.methods.recipe import RECIPES, photo_background, recipe_of, settled
+from glassplat.training.loop import train
+from glassplat.training.messages import Message, StageEntered, StepDone
+from glassplat.training.stage import TrainState
 
 BEFORE, BETWEEN, TOTAL, STEPS = "before its first step", "between kernels", "all of it", "steps"
 LEAST_SHARE = 0.005

@@ -24,7 +24,7 @@ from torch import Tensor
 from bench.kernels import backward
 from bench.timing import Work
 from bench.twin import compiled_library
-from glassplat.files.markdown_table import Table
+from glassplat.files.writing import Table
 from glassplat.kernels.records import Bvh, RawGaussians, Rays, Shapes
 from glassplat.kernels.trace import build_bvh, cpu, reach, shapes_of, trace
 from glassplat.kernels.trace.bvh import morton_codes

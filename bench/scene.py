@@ -8,10 +8,9 @@ from dataclasses import replace
 import torch
 
 from glassplat.scene.camera import Camera
-from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.plane import Planes
-from glassplat.scene.scene import Scene
+from glassplat.scene.panes import Planes
+from glassplat.scene.scene import Environment, Scene
 
 PANE_DEPTH = 2.0
 

@@ -15,17 +15,16 @@ import numba
 
 from bench.methods import doublings, thread_count
 from bench.timing import clocks_of
-from glassplat.commands.measuring.demo import SCENE
-from glassplat.commands.runs.stored_run import open_run
-from glassplat.data.dataset import Dataset, load_dataset
-from glassplat.files.markdown_table import Table
-from glassplat.train.background import photo_background, settled
-from glassplat.train.checkpoint import load_checkpoint
-from glassplat.train.messages import Message, StepDone
-from glassplat.train.splat_recipe import SplatRecipe
-from glassplat.train.stage import stage_starts
-from glassplat.train.state import TrainState
-from glassplat.train.trainer import train
+from glassplat.captures.dataset import Dataset, load_dataset
+from glassplat.cli.demo import SCENE
+from glassplat.cli.runs import open_run
+from glassplat.files.writing import Table
+from glassplat.methods.recipe import photo_background, settled
+from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.training.checkpoint import load_checkpoint
+from glassplat.training.loop import train
+from glassplat.training.messages import Message, StepDone
+from glassplat.training.stage import TrainState, stage_starts
 
 ITERATIONS = 7000
 """Length of the run of which the first steps are timed."""

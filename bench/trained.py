@@ -11,8 +11,8 @@ import numba
 
 from bench.methods import doublings, frame_work, thread_count
 from bench.timing import clocks_of
-from glassplat.commands.runs.stored_run import StoredRun, open_run
-from glassplat.files.markdown_table import Table
+from glassplat.cli.runs import StoredRun, open_run
+from glassplat.files.writing import Table
 from glassplat.render.deferred import Deferred
 from glassplat.render.splat import Splat
 

@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 
 from bench.scene import bench_camera, room
 from bench.timing import Work
-from glassplat.files.markdown_table import Table
+from glassplat.files.writing import Table
 from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.composite.cpu_backward import composite_backward
 from glassplat.kernels.composite.cpu_forward import composite_forward
 from glassplat.kernels.records import Splats, TileBins
 from glassplat.kernels.tiles import bin_tiles
-from glassplat.render.rasterize import joined_splats, project_gaussians
+from glassplat.render.frame import joined_splats, project_gaussians
 
 SOURCE = Path(__file__).with_name("composite_twin.cpp")
 COMPILERS = ("c++", "g++")

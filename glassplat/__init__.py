@@ -18,29 +18,27 @@ import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from glassplat.data.dataset import Dataset, load_dataset
-    from glassplat.data.errors import InputError
-    from glassplat.data.view import View
-    from glassplat.interface.loading import load
-    from glassplat.interface.model import Model
-    from glassplat.interface.training import Training
-    from glassplat.losses.term import LossTerm
+    from glassplat.captures.dataset import Dataset, load_dataset
+    from glassplat.captures.view import View
+    from glassplat.errors import InputError
+    from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
+    from glassplat.methods.planar_recipe import PlanarRecipe
+    from glassplat.methods.splat_recipe import SplatRecipe
+    from glassplat.model.loading import load
+    from glassplat.model.model import Model
+    from glassplat.model.training import Training
     from glassplat.render.deferred import Deferred
     from glassplat.render.frame import Frame
     from glassplat.render.planar import Planar
     from glassplat.render.splat import Splat
     from glassplat.render.traced import Traced
     from glassplat.scene.camera import Camera
-    from glassplat.scene.environment import Environment
     from glassplat.scene.gaussians import Gaussians
-    from glassplat.scene.plane import Planes
-    from glassplat.scene.scene import Scene
-    from glassplat.train.deferred_recipe import DeferredRecipe
-    from glassplat.train.messages import ActionDone, CheckpointWritten, RunBegun, StageEntered, StepDone, Working
-    from glassplat.train.planar_recipe import PlanarRecipe
-    from glassplat.train.splat_recipe import SplatRecipe
-    from glassplat.train.stage import Stage
-    from glassplat.train.traced_recipe import TracedRecipe
+    from glassplat.scene.panes import Planes
+    from glassplat.scene.scene import Environment, Scene
+    from glassplat.training.losses import LossTerm
+    from glassplat.training.messages import ActionDone, CheckpointWritten, RunBegun, StageEntered, StepDone, Working
+    from glassplat.training.stage import Stage
 
 # PyTorch and Numba each keep a pool of threads. Waiting threads that spin, as OpenMP's do unless told otherwise, take
 # the cores from the other pool: a training step then costs up to twice as much. It is read once, when OpenMP loads.
@@ -80,29 +78,43 @@ __all__ = [  # noqa: RUF022 - In the order in which the documentation tells of t
 ]
 
 HOMES = {
-    "data.dataset": ("Dataset", "load_dataset"),
-    "data.errors": ("InputError",),
-    "data.view": ("View",),
-    "interface.loading": ("load",),
-    "interface.model": ("Model",),
-    "interface.training": ("Training",),
-    "losses.term": ("LossTerm",),
+    "captures.dataset": (
+        "Dataset",
+        "load_dataset",
+    ),
+    "captures.view": ("View",),
+    "errors": ("InputError",),
+    "methods.glossy_recipes": (
+        "DeferredRecipe",
+        "TracedRecipe",
+    ),
+    "methods.planar_recipe": ("PlanarRecipe",),
+    "methods.splat_recipe": ("SplatRecipe",),
+    "model.loading": ("load",),
+    "model.model": ("Model",),
+    "model.training": ("Training",),
     "render.deferred": ("Deferred",),
     "render.frame": ("Frame",),
     "render.planar": ("Planar",),
     "render.splat": ("Splat",),
     "render.traced": ("Traced",),
     "scene.camera": ("Camera",),
-    "scene.environment": ("Environment",),
     "scene.gaussians": ("Gaussians",),
-    "scene.plane": ("Planes",),
-    "scene.scene": ("Scene",),
-    "train.deferred_recipe": ("DeferredRecipe",),
-    "train.messages": ("ActionDone", "CheckpointWritten", "RunBegun", "StageEntered", "StepDone", "Working"),
-    "train.planar_recipe": ("PlanarRecipe",),
-    "train.splat_recipe": ("SplatRecipe",),
-    "train.stage": ("Stage",),
-    "train.traced_recipe": ("TracedRecipe",),
+    "scene.panes": ("Planes",),
+    "scene.scene": (
+        "Environment",
+        "Scene",
+    ),
+    "training.losses": ("LossTerm",),
+    "training.messages": (
+        "ActionDone",
+        "CheckpointWritten",
+        "RunBegun",
+        "StageEntered",
+        "StepDone",
+        "Working",
+    ),
+    "training.stage": ("Stage",),
 }
 """Where each public name lives; its module is imported, and PyTorch with it, when the name is first used."""
 

@@ -2,6 +2,6 @@
 
 import sys
 
-from glassplat.cli import main
+from glassplat.cli.main import main
 
 sys.exit(main())

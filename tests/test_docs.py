@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from glassplat import cli
+from glassplat.cli import main
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
@@ -50,7 +50,7 @@ def test_the_readme_shows_how_to_start() -> None:
 
 @pytest.mark.parametrize("arguments", commands("glassplat"), ids=" ".join)
 def test_the_command_line_takes_every_command_shown(arguments: list[str]) -> None:
-    assert type(cli.parsed(arguments)).__name__.startswith(cli.COMMANDS[arguments[0]].kind)
+    assert type(main.parsed(arguments)).__name__.startswith(main.COMMANDS[arguments[0]].kind)
 
 
 @pytest.mark.parametrize("arguments", commands("make"), ids=" ".join)

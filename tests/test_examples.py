@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import glassplat
-from glassplat.data.normal_maps import estimated_normals
+from glassplat.captures.view import estimated_normals
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 DEMO = Path(glassplat.__file__).parent / "demo_scene"

@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from glassplat.commands.runs.stored_run import StoredRun, open_run
-from glassplat.data.dataset import Dataset
-from glassplat.data.view import View
+from glassplat.captures.dataset import Dataset
+from glassplat.captures.view import View
+from glassplat.cli.runs import StoredRun, open_run
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.evaluate.metrics import quantized
 from glassplat.evaluate.truth import TrueView, load_truth
-from glassplat.files.markdown_table import Table
+from glassplat.files.writing import Table
 from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
 
 BANDS = ("all", "coarse", "fine")

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from glassplat.prepare.report_page import PAGE
-from glassplat.scene.eye import Eye
+from glassplat.scene.camera import Eye
 from tools.browser import Browser
 from tools.marking_page import MarkingPage, marking_page
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from glassplat.commands.runs.stored_run import open_run
-from glassplat.evaluate.colormap import normal_colors
+from glassplat.cli.runs import open_run
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.evaluate.metrics import quantized
 from glassplat.evaluate.sheet import TITLE_HEIGHT, Panel, composed
 from glassplat.files.images import write_image
+from glassplat.render.layers import normal_colors
 
 PARTS = {
     "transmission": "behind the glass",

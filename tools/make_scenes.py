@@ -22,8 +22,8 @@ import tyro
 from numpy.typing import NDArray
 from PIL import Image
 
-from glassplat.data.normal_maps import FOLDER
-from glassplat.data.random_points import points_in_box
+from glassplat.captures.transforms import points_in_box
+from glassplat.captures.view import FOLDER
 from glassplat.files.ply_table import write_table
 from tools.estimated_normals import estimated_normals
 from tools.make_demo_scene import srgb_from_linear

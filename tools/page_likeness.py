@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from glassplat.data.dataset import TEST_EVERY
+from glassplat.captures.dataset import TEST_EVERY
 from glassplat.evaluate.metrics import psnr
-from glassplat.files.spz_sections import FLIP
-from glassplat.interface.loading import load
-from glassplat.interface.model import Model
+from glassplat.files.spz import FLIP
+from glassplat.model.loading import load
+from glassplat.model.model import Model
 from glassplat.scene.camera import Camera
 from tools.browser import Browser
 

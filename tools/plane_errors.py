@@ -18,13 +18,13 @@ from pathlib import Path
 
 from torch import Tensor
 
-from glassplat.data.dataset import Dataset, load_dataset
-from glassplat.evaluate.plane_errors import plane_table
+from glassplat.captures.dataset import Dataset, load_dataset
+from glassplat.evaluate.metrics import plane_table
 from glassplat.evaluate.truth import GroundTruth, load_truth
-from glassplat.files.markdown_table import Table
 from glassplat.files.ply import read_gaussians
-from glassplat.init.plane_options import PlaneFitError
-from glassplat.init.planes import fit_planes
+from glassplat.files.writing import Table
+from glassplat.panes.fit import fit_planes
+from glassplat.panes.options import PlaneFitError
 
 COLUMNS = ("scene / pane", "fits", "refused", "good", "degrees, median (max)", "% of extent, median (max)", "seconds")
 LEAST_SHARE = 0.01

@@ -19,35 +19,37 @@ import torch
 from PIL import Image
 
 from glassplat.annotate.document import FILE, read_document
-from glassplat.data.colmap_model import read_model
-from glassplat.data.dataset import View
-from glassplat.data.mask_values import read_mask_values
-from glassplat.data.normal_maps import estimated_normals
-from glassplat.data.transforms import load_transforms
-from glassplat.densify.default import ScreenStatistics
-from glassplat.files.cameras_json import read_cameras, write_cameras
-from glassplat.files.environment_file import read_environment, write_environment
-from glassplat.files.environment_image import read_equirect, write_equirect
-from glassplat.files.exposures_json import read_exposures, write_exposures
+from glassplat.captures.colmap import read_model
+from glassplat.captures.masks import read_mask_values
+from glassplat.captures.transforms import load_transforms
+from glassplat.captures.view import View, estimated_normals
 from glassplat.files.glb import write_glb
 from glassplat.files.images import read_image
-from glassplat.files.planes_json import read_planes, write_planes
 from glassplat.files.ply import write_gaussians
-from glassplat.files.scene_folder import read_scene, write_scene
-from glassplat.files.splat_files import drawable, read_splats
+from glassplat.files.scene_folder import drawable, read_scene, read_splats, write_scene
+from glassplat.files.sidecars import (
+    read_cameras,
+    read_environment,
+    read_equirect,
+    read_exposures,
+    read_planes,
+    write_cameras,
+    write_environment,
+    write_equirect,
+    write_exposures,
+    write_planes,
+)
 from glassplat.files.spz import HEADER, MAGIC, write_spz
+from glassplat.methods.recipe import RECIPES, recipe_to_json
+from glassplat.model.run_directory import RunDirectory, RunSettings, lines_until
 from glassplat.scene.camera import Camera
-from glassplat.scene.environment import Environment
-from glassplat.scene.exposure import Exposures
+from glassplat.scene.corrections import Exposures
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.plane import Planes
-from glassplat.scene.scene import Scene
-from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
-from glassplat.train.optimizer import Optimizer
-from glassplat.train.recipe import RECIPES, recipe_to_json
-from glassplat.train.run_directory import RunDirectory, RunSettings
-from glassplat.train.run_log import lines_until
-from glassplat.train.state import TrainState
+from glassplat.scene.panes import Planes
+from glassplat.scene.scene import Environment, Scene
+from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
+from glassplat.training.densify import ScreenStatistics
+from glassplat.training.stage import Optimizer, TrainState
 
 LARGEST_PICTURE_MIB = 2048
 """At the 134 megapixels that are the most which is read."""

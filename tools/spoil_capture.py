@@ -25,7 +25,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from glassplat.data.dataset import TEST_EVERY
+from glassplat.captures.dataset import TEST_EVERY
 from glassplat.files.images import read_image, write_image
 from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
 

@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from tests.train.tiny_capture import write_tiny_capture
+from tests.training.tiny_capture import write_tiny_capture
 from tools.trial import Case
 from tools.trial_process import Ended, Sent, run
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from tests.commands.tiny_run import write_run
+from tests.cli.tiny_run import write_run
 from tools.trial import Case
 from tools.trial_process import run
 

@@ -19,10 +19,10 @@ import torch
 
 import glassplat
 from glassplat import Camera, Dataset, Scene, Training, View
-from glassplat.data.point_cloud import PointCloud
+from glassplat.captures.view import PointCloud
 from glassplat.render.frame import Renderer
 from tests.render.tiny_scene import camera_at, pane
-from tests.train.tiny_capture import tiny_capture, true_scene
+from tests.training.tiny_capture import tiny_capture, true_scene
 from tools.trial import Case
 
 POISON = (math.nan, math.inf, -math.inf, 0.0, 1e30, -1e30, 1e-30, 3e38)

@@ -24,15 +24,15 @@ import msgspec
 import torch
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
+from glassplat.access import cookie_name
 from glassplat.annotate.server import AnnotationServer
 from glassplat.annotate.session import opened_session
 from glassplat.render.planar import Planar
-from glassplat.serving.access import cookie_name
+from glassplat.viewer.drawing import Shown
 from glassplat.viewer.gate import LARGEST_MESSAGE, MESSAGES
 from glassplat.viewer.server import Viewer
-from glassplat.viewer.shown import Shown
 from tests.annotate.conftest import write_room
-from tests.train.tiny_capture import tiny_capture, true_scene, write_tiny_capture
+from tests.training.tiny_capture import tiny_capture, true_scene, write_tiny_capture
 from tests.viewer.free_port import free_port
 from tools.trial import Case
 from tools.trial_process import run

@@ -15,7 +15,7 @@ import viser
 import zstandard
 from websockets.asyncio.client import ClientConnection, connect
 
-from glassplat.serving.access import cookie_name
+from glassplat.access import cookie_name
 
 CONTROLS = ("GuiDropdownMessage", "GuiSliderMessage", "GuiButtonMessage", "GuiButtonGroupMessage", "GuiTextMessage")
 

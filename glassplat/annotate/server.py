@@ -17,10 +17,10 @@ from threading import Thread
 from typing import Any
 from urllib.parse import urlsplit
 
+from glassplat.access import LOCAL, Access, RefusedError
 from glassplat.annotate.session import SHOWN, THUMBNAIL, ChangedElsewhereError, Session
-from glassplat.data.errors import InputError
-from glassplat.files.json_text import parse_json
-from glassplat.serving.access import LOCAL, Access, RefusedError
+from glassplat.errors import InputError
+from glassplat.files.records import parse_json
 
 LARGEST_BODY = 8_000_000
 PAGE_FILES = {

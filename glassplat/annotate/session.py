@@ -1,33 +1,156 @@
-"""A capture while its panes are being marked."""
+"""A capture while its panes are being marked, and which photograph to mark next."""
 
 from __future__ import annotations
 
 import io
 from collections import OrderedDict
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from glassplat.annotate.document import PLACE, MarkedPane, parsed_document, read_document, version_of, write_document
-from glassplat.annotate.grab import grabbed
-from glassplat.annotate.merging import Merged, merged
-from glassplat.annotate.outline import seen_outline
-from glassplat.annotate.pane_fit import Marks, PaneFit, TooFewMarksError, fitted_pane
-from glassplat.annotate.results import earlier_masks, write_results
-from glassplat.annotate.view_advice import first_view, second_views, settling_views
-from glassplat.data.dataset import Dataset, load_dataset
-from glassplat.data.errors import InputError, input_checked
-from glassplat.data.view import View
-from glassplat.files.fields import Field, Items, Text, Whole, checked
-from glassplat.files.folders import check_folder
-from glassplat.scene.eye import Eye
+from glassplat.annotate.document import (
+    MOST_PANES,
+    PLACE,
+    MarkedPane,
+    filled,
+    parsed_document,
+    read_document,
+    seen_outline,
+    version_of,
+    write_document,
+)
+from glassplat.annotate.fit import Marks, PaneFit, TooFewMarksError, corner_information, fitted_pane, tilt_deviation
+from glassplat.annotate.results import earlier_masks, grabbed, write_results
+from glassplat.captures.dataset import Dataset, load_dataset
+from glassplat.captures.view import View
+from glassplat.errors import InputError, input_checked
+from glassplat.files.records import Field, Items, Text, Whole, checked
+from glassplat.files.writing import check_folder
+from glassplat.scene.camera import Eye
 
 Array = NDArray[np.float64]
+
+WANTED_ANGLE = np.radians(25)
+"""Between the sight lines of two photographs on a pane, from which on more adds little, and corners look different."""
+MARGIN = 0.1
+LEAST_CORNERS = 3
+OFFERED = 3
+
+
+def settling_views(fit: PaneFit, eyes: Sequence[Eye], marked: Collection[int]) -> list[tuple[int, float]]:
+    """Views that would make a plane surest if their corners were marked, with the doubt in degrees after that."""
+    corners = fit.shape.corners()
+    found = []
+    for number, eye in enumerate(eyes):
+        if number in marked or eye.holds(corners, MARGIN).sum() < min(LEAST_CORNERS, len(corners)):
+            continue
+        found.append((number, tilt_deviation(fit.information + corner_information(eye, fit.shape))))
+    return sorted(found, key=lambda pair: pair[1])[:OFFERED]
+
+
+def second_views(outline: Array, view: int, eyes: Sequence[Eye], points: Array) -> list[int]:
+    """Views that show what one view shows inside of an outline [K, 2], from another place; the best first.
+
+    The measured points [P, 3] inside of the outline tell, wherever they lie.
+    """
+    eye = eyes[view]
+    inside = filled(outline, (int(eye.size[0]), int(eye.size[1])))
+    held = eye.holds(points)
+    column, row = np.floor(eye.project(points[held])).astype(np.int64).T
+    through = points[held][inside[row, column]]
+    if not len(through):
+        through = points[held] if held.any() else points
+    if not len(through):
+        return [number for number in range(len(eyes)) if number != view][:OFFERED]
+    worth = {number: _worth(through, eye, other) for number, other in enumerate(eyes) if number != view}
+    best = sorted(worth, key=lambda number: -worth[number])
+    return [number for number in best if worth[number] > 0][:OFFERED]
+
+
+def first_view(eyes: Sequence[Eye], points: Array) -> int:
+    """The view that shows most of what was measured."""
+    return int(np.argmax([eye.holds(points).sum() for eye in eyes])) if len(points) else 0
+
+
+def _worth(points: Array, eye: Eye, other: Eye) -> float:
+    """Share of the points that another view holds, times how different its sight of them is."""
+    one, two = (points - camera.center for camera in (eye, other))
+    cosine = (one * two).sum(1) / (np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1))
+    angle = float(np.median(np.arccos(np.clip(cosine, -1, 1))))
+    return float(other.holds(points).mean()) * min(angle, WANTED_ANGLE)
+
+
+Panes = Mapping[int, Any]
+
+
+class Merged(NamedTuple):
+    """A document with the changes of both sides.
+
+    Attributes:
+        document: as JSON.
+        changes: what the others have changed, in words.
+        renamed: new labels of our panes by the ones that they had.
+    """
+
+    document: Any
+    changes: list[str]
+    renamed: dict[int, int]
+
+
+def merged(base: Any, theirs: Any, ours: Any) -> Merged:
+    """Puts together what two sides have made of one document.
+
+    A pane that one side has changed or added is as that side has it. One that both have changed stays as they
+    have it, and ours is added under a label that is free; so is one that they have removed and we have changed.
+
+    Args:
+        base: the document that both began with.
+        theirs: what is saved.
+        ours: what was to be saved.
+
+    Raises:
+        ValueError: there are too many panes for both to be kept.
+    """
+    before, there, here = (_by_label(document) for document in (base, theirs, ours))
+    kept, renamed = dict(there), dict[int, int]()
+    for label in sorted({*before, *here}):
+        ours_now, old = here.get(label), before.get(label)
+        if ours_now == old or ours_now == there.get(label):
+            continue
+        if there.get(label) == old:
+            kept[label] = ours_now
+        elif ours_now is not None:
+            new = renamed[label] = _free_label({*kept, *here})
+            kept[new] = {**ours_now, "label": new}
+    panes = [pane for _, pane in sorted(kept.items()) if pane is not None]
+    return Merged({**theirs, "panes": panes}, _changes(before, there), renamed)
+
+
+def _by_label(document: Any) -> dict[int, Any]:
+    return {pane["label"]: pane for pane in document["panes"]}
+
+
+def _free_label(used: set[int]) -> int:
+    label = next((label for label in range(1, MOST_PANES + 1) if label not in used), None)
+    if label is None:
+        raise ValueError(f"all {MOST_PANES} labels are in use; remove a pane here before what is marked elsewhere fits")
+    return label
+
+
+def _changes(before: Panes, after: Panes) -> list[str]:
+    words = []
+    for label in sorted({*before, *after}):
+        if before.get(label) != after.get(label):
+            how = "added" if label not in before else "removed" if label not in after else "changed"
+            words.append(f"pane {label} {how}")
+    return words or ["nothing of the panes"]
+
 
 THUMBNAIL = 160
 SHOWN = 2400

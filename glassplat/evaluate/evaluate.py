@@ -7,33 +7,156 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from glassplat.data.dataset import Dataset, View
-from glassplat.data.errors import InputError
-from glassplat.data.ignored import with_ignored_right
-from glassplat.evaluate.environment_metrics import environment_metrics, learned_environment, true_environment
-from glassplat.evaluate.lpips import Lpips, load_lpips
-from glassplat.evaluate.metrics import color_corrected, psnr, quantized, reflection_gain, ssim
-from glassplat.evaluate.outcome import NO_LPIPS, SMALLEST_REGION, Outcome, plain
-from glassplat.evaluate.pane_regions import (
-    NO_TRUTH,
-    NO_VIEW_TRUTH,
-    MarkedRegions,
-    PaneRegions,
-    RenderedRegions,
-    TrueRegions,
+from glassplat.captures.dataset import Dataset, detached_camera
+from glassplat.captures.view import View, with_ignored_right
+from glassplat.errors import InputError
+from glassplat.evaluate.metric_names import NO_LPIPS, SMALLEST_REGION, Outcome, json_values
+from glassplat.evaluate.metrics import (
+    Lpips,
+    color_corrected,
+    environment_metrics,
+    learned_environment,
+    load_lpips,
+    missing_panes,
+    plane_table,
+    psnr,
+    quantized,
+    reflection_gain,
+    ssim,
+    surface_metrics,
+    true_environment,
 )
-from glassplat.evaluate.plane_errors import missing_panes, plane_table
-from glassplat.evaluate.surface_metrics import surface_metrics
-from glassplat.evaluate.surface_truth import TrueSurface, true_surface
-from glassplat.evaluate.truth import GroundTruth, TrueView, load_truth
+from glassplat.evaluate.truth import GroundTruth, TrueSurface, TrueView, load_truth, true_surface
+from glassplat.kernels.photometric import photometric
 from glassplat.render.frame import Frame, Renderer
-from glassplat.scene.exposure import Exposures
+from glassplat.render.panes import nearest_hits, panes_in_camera
+from glassplat.scene.camera import Camera
+from glassplat.scene.corrections import Exposures, moved_camera
+from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
+
+NO_TRUTH = "the data set has no ground truth"
+NO_VIEW_TRUTH = "the ground truth lacks this view"
+
+
+class PaneRegions(Protocol):
+    """One source for the whole data set, so that means do not mix two."""
+
+    @property
+    def source(self) -> str:
+        """What the region is, for whoever reads the metrics."""
+        ...
+
+    def of(self, view: View, frame: Frame, truth: TrueView | None) -> Tensor | str:
+        """The pixels of a view that show a pane, [H, W] bool, or why they are not known."""
+        ...
+
+
+@dataclass(frozen=True)
+class TrueRegions:
+    """What the ground truth says."""
+
+    source: str = "ground-truth pane labels"
+
+    def of(self, view: View, frame: Frame, truth: TrueView | None) -> Tensor | str:
+        """As in `PaneRegions`."""
+        return NO_VIEW_TRUTH if truth is None else truth.labels > 0
+
+
+@dataclass(frozen=True)
+class MarkedRegions:
+    """The view's mask, or without one what the planes fitted to the masks cover; what stands before them included.
+
+    Attributes:
+        planes: fitted to the masks and to measured points, whatever was trained.
+    """
+
+    planes: Planes
+    source: str = "masks, and in views without one the planes fitted to them"
+
+    def of(self, view: View, frame: Frame, truth: TrueView | None) -> Tensor | str:
+        """As in `PaneRegions`."""
+        if view.pane_labels is not None:
+            return view.pane_labels > 0
+        return nearest_hits(panes_in_camera(self.planes, view.camera), view.camera).pane >= 0
+
+
+@dataclass(frozen=True)
+class RenderedRegions:
+    """Where the method itself draws a pane, so that methods may be scored over different pixels."""
+
+    source: str = "rendered mask > 0.5"
+
+    def of(self, view: View, frame: Frame, truth: TrueView | None) -> Tensor | str:
+        """As in `PaneRegions`."""
+        if "mask" in frame.layers:
+            return frame.layers["mask"] > 0.5
+        return f"{NO_TRUTH}, and the method renders no mask"
+
+
+STEPS = 40
+FIRST_STEP, LAST_STEP = 1.5e-3, 5e-5
+"""Radians, and extents; steps shrink from the one to the other."""
+SSIM_SHARE = 0.2
+Listener = Callable[[int, int], None]
+
+
+def with_aligned_test_views(
+    scene: Scene, renderer: Renderer, dataset: Dataset, listen: Listener = lambda done, count: None
+) -> Dataset:
+    """The capture with each test camera moved to where its photograph agrees best with the scene.
+
+    Poses from structure from motion are off, and a scene whose training cameras were refined is at odds with those of
+    the test views through no fault of its own (as is done for NeRF--, BARF and nerfstudio).
+
+    Args:
+        scene: trained; not changed.
+        renderer: how photographs show it.
+        dataset: whose test views are aligned.
+        listen: is told how many views are done.
+    """
+    test = []
+    for done, view in enumerate(dataset.test):
+        listen(done, len(dataset.test))
+        test.append(view.with_camera(aligned_camera(scene, renderer, view)))
+    return replace(dataset, test=tuple(test))
+
+
+def aligned_camera(scene: Scene, renderer: Renderer, view: View, *, steps: int = STEPS) -> Camera:
+    """The camera from which the scene looks most like the view's photograph, starting from the view's own.
+
+    Args:
+        scene: trained; gets no gradient.
+        renderer: how photographs show it.
+        view: photograph and camera.
+        steps: of Adam.
+    """
+    device = scene.primary.means.device
+    still = scene.with_parameters({name: tensor.detach() for name, tensor in scene.parameters().items()})
+    camera, photo = view.camera.to(device), view.photo.to(device)
+    twist = torch.zeros(6, device=device, requires_grad=True)
+    optimizer = torch.optim.Adam([twist], lr=FIRST_STEP, betas=(0.8, 0.95))
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST_STEP / FIRST_STEP) ** (1 / max(steps, 1)))
+    best, lowest = torch.zeros_like(twist), torch.inf
+    for _ in range(steps):
+        optimizer.zero_grad()
+        image = renderer(still, moved_camera(camera, twist, scene.extent)).rgb
+        found = photometric(with_ignored_right(image, view), photo)
+        loss = found.l1.lerp(1 - found.ssim, SSIM_SHARE)
+        if (value := float(loss.detach())) < lowest:
+            best, lowest = twist.detach().clone(), value
+        if not loss.requires_grad:  # Nothing of the scene is in sight.
+            break
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    return detached_camera(moved_camera(camera, best, scene.extent))
+
 
 MIRROR_STRENGTH = 0.999
 """From this true strength on, nothing is transmitted."""
@@ -166,14 +289,14 @@ def evaluate(
         shown = in_photograph_colors(frame, exposures, view.name)
         measured = _measure(shown, seconds, view, pane, truth=(truth, true_view), surface=surface, lpips=lpips)
         measurements[view.name] = measured
-        listen(EvaluatedView(view, frame, true_view, surface, plain(measured.metrics), exposures))
+        listen(EvaluatedView(view, frame, true_view, surface, json_values(measured.metrics), exposures))
     gain = _add_reflection(measurements.values())
-    per_view = {name: plain(m.metrics) | {"seconds": m.seconds} for name, m in measurements.items()}
+    per_view = {name: json_values(m.metrics) | {"seconds": m.seconds} for name, m in measurements.items()}
     results = _description(scene, dataset)
     results["seconds_per_frame"] = statistics.median(m.seconds for m in measurements.values())
-    results |= plain({"peak_memory_mib": peak_memory_mib()})
-    results |= plain(_means([m.metrics for m in measurements.values()]))
-    results |= plain(environment_metrics(learned_environment(scene), true_environment(dataset.root), lpips))
+    results |= json_values({"peak_memory_mib": peak_memory_mib()})
+    results |= json_values(_means([m.metrics for m in measurements.values()]))
+    results |= json_values(environment_metrics(learned_environment(scene), true_environment(dataset.root), lpips))
     results |= _footnotes(results, lpips, regions, gain)
     marked = regions.planes if isinstance(regions, MarkedRegions) else None
     results["planes"] = plane_table(scene.planes, truth, dataset.extent, marked)
@@ -324,12 +447,12 @@ def _footnotes(
 ) -> dict[str, Any]:
     """What the reader of the metrics must know: backbone, region, gain."""
     if isinstance(lpips, str):
-        backbone = plain({"lpips": lpips, "lpips_backbone": lpips})
+        backbone = json_values({"lpips": lpips, "lpips_backbone": lpips})
     else:
         backbone = {"lpips_backbone": lpips.backbone}
     if results["pane_psnr"] is None:
-        region = plain({"pane_region": results["pane_psnr_reason"]})
+        region = json_values({"pane_region": results["pane_psnr_reason"]})
     else:
         region = {"pane_region": regions.source}
     gain_outcome = results["reflection_psnr_reason"] if gain is None else gain
-    return backbone | region | plain({"reflection_gain": gain_outcome})
+    return backbone | region | json_values({"reflection_gain": gain_outcome})

@@ -1,13 +1,32 @@
-"""Image metrics, taken on eight-bit sRGB images as everybody stores and compares them."""
+"""Metrics of images, panes, surfaces and environments.
+
+LPIPS is that of Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric" (CVPR 2018).
+
+How bright an environment is trades off against how strongly surfaces reflect it, so the learned map is first given the
+energy of the true one, by one factor (3DGS-DR, Section 4.1). Energy is the mean over the sphere of the sRGB values, in
+which 3DGS-DR blends the reflection: there the two trade off exactly.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from glassplat.errors import input_checked
+from glassplat.evaluate.metric_names import NO_LPIPS, SMALLEST_REGION, Outcome
+from glassplat.evaluate.truth import NOTHING_KNOWN, GroundTruth, TruePlane, TrueSurface
+from glassplat.files.sidecars import read_equirect
 from glassplat.kernels.photometric import photometric
+from glassplat.render.environment import equirect_from_environment
+from glassplat.render.frame import Frame
+from glassplat.scene.panes import Planes
+from glassplat.scene.scene import Scene
 
 
 def quantized(image: Tensor) -> Tensor:
@@ -105,3 +124,319 @@ def reflection_gain(images: list[Tensor], targets: list[Tensor]) -> float:
 def _check_shapes(image: Tensor, target: Tensor) -> None:
     if image.shape != target.shape or image.shape[-1] != 3:
         raise ValueError(f"expected two images of one shape [..., 3], got {list(image.shape)} and {list(target.shape)}")
+
+
+ERRORS = ("normal_error_deg", "offset_error", "base_reflectance_error")
+
+
+def plane_table(
+    planes: Planes, truth: GroundTruth | None, extent: float, marked: Planes | None = None
+) -> list[dict[str, Any]]:
+    """One entry per fitted plane: label, center, normal, base_reflectance, and its errors.
+
+    `normal_error_deg` is the angle between the normals, whose sign does not matter; `offset_error` the
+    distance of the true centre from the fitted plane over `extent`; `base_reflectance_error` an absolute
+    difference. Without a true pane of that label they are None, with a reason beside each.
+    Glass that may be tinted has its `transmittance` of red, green and blue.
+    `normal_drift_deg` and `offset_drift` compare in the same way with the plane that the masks led to, where known.
+
+    Args:
+        planes: the fitted planes.
+        truth: true panes, matched by label.
+        extent: radius of the capture, world units.
+        marked: planes fitted to masks and measured points, without training.
+    """
+    true_planes = {} if truth is None else {plane.label: plane for plane in truth.planes}
+    missing = "the data set has no ground truth" if truth is None else "the ground truth has no pane of this label"
+    glass = {} if planes.transmittances is None else {"transmittance": planes.transmittances}
+    table = []
+    for index, label in enumerate(planes.labels):
+        entry: dict[str, Any] = {
+            "label": label,
+            "center": planes.centers[index].tolist(),
+            "normal": planes.normals[index].tolist(),
+            "base_reflectance": planes.base_reflectances[index].item(),
+        } | {name: values[index].tolist() for name, values in glass.items()}
+        if label in true_planes:
+            entry |= _errors(entry, true_planes[label], extent)
+        else:
+            entry |= dict.fromkeys(ERRORS) | {f"{name}_reason": missing for name in ERRORS}
+        if marked is not None and label in marked.labels:
+            entry |= _drift(entry, marked, marked.labels.index(label), extent)
+        table.append(entry)
+    return table
+
+
+def missing_panes(planes: Planes, truth: GroundTruth | None) -> list[int]:
+    """Labels of true panes that no fitted plane stands for."""
+    return [] if truth is None else sorted({plane.label for plane in truth.planes} - set(planes.labels))
+
+
+def _errors(fitted: dict[str, Any], true: TruePlane, extent: float) -> dict[str, float]:
+    turn, offset = _difference(fitted, true.center, true.normal)
+    return {
+        "normal_error_deg": turn,
+        "offset_error": offset / extent,
+        "base_reflectance_error": abs(fitted["base_reflectance"] - true.base_reflectance),
+    }
+
+
+def _drift(fitted: dict[str, Any], marked: Planes, row: int, extent: float) -> dict[str, float]:
+    turn, offset = _difference(fitted, marked.centers[row].tolist(), marked.normals[row].tolist())
+    return {"normal_drift_deg": turn, "offset_drift": offset / extent}
+
+
+def _difference(fitted: dict[str, Any], center: Sequence[float], normal: Sequence[float]) -> tuple[float, float]:
+    """Angle between the normals in degrees, and the distance of the other plane's centre from the fitted plane."""
+    own = torch.tensor(fitted["normal"], dtype=torch.float64)
+    other = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
+    # The arc tangent keeps its precision for the small angles that matter here; the arc cosine does not.
+    angle = torch.atan2(torch.linalg.cross(own, other).norm(), (own @ other).abs())
+    apart = torch.tensor(center, dtype=torch.float64) - torch.tensor(fitted["center"], dtype=torch.float64)
+    return torch.rad2deg(angle).item(), (apart @ own).abs().item()
+
+
+REFLECTIVE = 0.5
+"""Above this true strength a pixel mirrors more than it shows of its own."""
+NO_DIRECTION_DEG = 90.0
+"""The error of a vector without direction: what guessing comes to."""
+NO_NORMALS, NO_STRENGTH = "the method renders no normals", "the method renders no strength"
+NO_TRUE_NORMALS = "no true normals lie beside the photograph"
+NO_TRUE_STRENGTH = "no true strength lies beside the photograph"
+UNCOVERED = f"fewer than {SMALLEST_REGION} pixels show a surface"
+UNREFLECTIVE = f"fewer than {SMALLEST_REGION} pixels reflect more than half"
+
+
+def surface_metrics(frame: Frame, photo: Tensor, truth: TrueSurface | None) -> dict[str, Outcome]:
+    """`reflective_psnr`, `normal_error_deg`, `reflective_normal_error_deg` and `strength_error` of one view.
+
+    Args:
+        frame: its image as photographed, and its layers `normal` [H, W, 3], world axes, of any length, and `strength`
+            [H, W].
+        photo: [H, W, 3] uint8.
+        truth: the true surface at the frame's size, None where nothing is known.
+    """
+    truth = truth or NOTHING_KNOWN
+    normal_errors = _normal_errors(frame, truth)
+    return {
+        "reflective_psnr": _reflective_psnr(frame, photo, truth),
+        "normal_error_deg": _mean(normal_errors, truth.covered, UNCOVERED),
+        "reflective_normal_error_deg": _mean(normal_errors, _reflective(truth), UNREFLECTIVE),
+        "strength_error": _mean(_strength_errors(frame, truth), truth.covered, UNCOVERED),
+    }
+
+
+def angular_errors_deg(vectors: Tensor, truth: Tensor) -> Tensor:
+    """Angles [...] in degrees between vectors [..., 3] of any length and others; 90 where one has no direction."""
+    a, b = vectors.to(torch.float64), truth.to(torch.float64)
+    # The arc tangent keeps its precision for small angles; the arc cosine does not.
+    angles = torch.rad2deg(torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(dim=-1)))
+    lengths = a.norm(dim=-1) * b.norm(dim=-1)
+    return torch.where((lengths > 0) & torch.isfinite(lengths), angles, NO_DIRECTION_DEG)
+
+
+def _reflective_psnr(frame: Frame, photo: Tensor, truth: TrueSurface) -> Outcome:
+    region = _reflective(truth)
+    if isinstance(region, str):
+        return region
+    return psnr(frame.photographed, photo, region) if int(region.sum()) >= SMALLEST_REGION else UNREFLECTIVE
+
+
+def _normal_errors(frame: Frame, truth: TrueSurface) -> Tensor | str:
+    if "normal" not in frame.layers:
+        return NO_NORMALS
+    return NO_TRUE_NORMALS if truth.normals is None else angular_errors_deg(frame.layers["normal"], truth.normals)
+
+
+def _strength_errors(frame: Frame, truth: TrueSurface) -> Tensor | str:
+    if "strength" not in frame.layers:
+        return NO_STRENGTH
+    if truth.strength is None:
+        return NO_TRUE_STRENGTH
+    # Where there are panes, `strength` is theirs.
+    return NO_STRENGTH if "mask" in frame.layers else (frame.layers["strength"] - truth.strength).abs()
+
+
+def _reflective(truth: TrueSurface) -> Tensor | str:
+    return NO_TRUE_STRENGTH if truth.strength is None else truth.covered & (truth.strength > REFLECTIVE)
+
+
+def _mean(errors: Tensor | str, region: Tensor | str, too_few: str) -> Outcome:
+    """Mean error over a region, or the first reason why there is none."""
+    if isinstance(errors, str):
+        return errors
+    if isinstance(region, str):
+        return region
+    return float(errors[region].to(torch.float64).mean()) if int(region.sum()) >= SMALLEST_REGION else too_few
+
+
+SMALLEST_SIDE = 32
+
+
+@dataclass(frozen=True)
+class Lpips:
+    """The distance with one backbone.
+
+    Attributes:
+        network: the distance of two batches [1, 3, H, W] in [0, 1].
+        backbone: which network; a value without it means nothing.
+    """
+
+    network: Callable[[Tensor, Tensor], Tensor]
+    backbone: str = "vgg"
+
+    def __call__(self, image: Tensor, target: Tensor) -> float:
+        """The distance of two sRGB images [H, W, 3], uint8 or floating point in [0, 1].
+
+        Images enter the network scaled to [-1, 1], as the authors define it. (3DGS's own script feeds
+        [0, 1], so its published numbers differ slightly.)
+
+        Raises:
+            ValueError: shapes disagree, or a side is shorter than 32 pixels.
+        """
+        if image.shape != target.shape or image.ndim != 3 or image.shape[-1] != 3:
+            raise ValueError(
+                f"expected two images [H, W, 3] of one size, got {list(image.shape)}, {list(target.shape)}"
+            )
+        if min(image.shape[:2]) < SMALLEST_SIDE:
+            raise ValueError(f"LPIPS needs at least {SMALLEST_SIDE} pixels a side, got {list(image.shape[:2])}")
+        with torch.no_grad():
+            return float(self.network(_batch(image), _batch(target)))
+
+
+def load_lpips() -> Lpips | str:
+    """The distance with the backbone that splatting papers report, or why there is none.
+
+    torchmetrics needs torchvision, which gets the weights of the network when they are first used.
+    """
+    try:
+        from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+        network = LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True)
+    except ImportError:
+        return "no LPIPS: torchmetrics or torchvision is not installed; install glassplat[lpips]"
+    except (OSError, RuntimeError) as error:  # torchvision of another build, or weights that cannot be had.
+        return f"no LPIPS: torchmetrics cannot load it: {error}"
+    return Lpips(network)
+
+
+def _batch(image: Tensor) -> Tensor:
+    """[1, 3, H, W] in [0, 1]."""
+    pixels = image.detach().cpu()
+    values = pixels.to(torch.float32) / 255 if pixels.dtype == torch.uint8 else pixels.to(torch.float32).clamp(0, 1)
+    return values.permute(2, 0, 1)[None]
+
+
+NO_ENVIRONMENT = "the method learns no environment"
+NO_TRUE_ENVIRONMENT = "the data set has no true environment"
+
+
+PANORAMA_HEIGHT = 64
+"""Rows at which environments are compared."""
+
+
+def learned_environment(scene: Scene) -> Tensor | None:
+    """The scene's environment as a panorama [H, 2H, 3]; None where it has none."""
+    if scene.environment.is_empty:
+        return None
+    with torch.no_grad():
+        return equirect_from_environment(scene.environment, PANORAMA_HEIGHT).cpu()
+
+
+def true_environment(capture: Path) -> Tensor | None:
+    """The panorama [h, 2h, 3] that a synthetic capture ships as `environment.exr` or `environment.png`, if any.
+
+    Raises:
+        InputError: the file is broken.
+    """
+    for path in (capture / f"environment{suffix}" for suffix in (".exr", ".png")):
+        if path.is_file():
+            with input_checked():
+                return read_equirect(path)
+    return None
+
+
+def environment_metrics(learned: Tensor | None, truth: Tensor | None, lpips: Lpips | str) -> dict[str, Outcome]:
+    """`environment_psnr`, `environment_gain` and `environment_lpips` of a scene.
+
+    Args:
+        learned: [H, 2H, 3] as in `environment_psnr`; None where the method learns none.
+        truth: [h, 2h, 3], or None where it is not known.
+        lpips: the distance, or why there is none.
+    """
+    if learned is None or truth is None:
+        reason = NO_ENVIRONMENT if learned is None else NO_TRUE_ENVIRONMENT
+        return {"environment_psnr": reason, "environment_gain": reason, "environment_lpips": reason}
+    value, gain = environment_psnr(learned, truth)
+    return {
+        "environment_psnr": value,
+        "environment_gain": gain,
+        "environment_lpips": environment_lpips(learned, truth, lpips),
+    }
+
+
+def environment_psnr(learned: Tensor, truth: Tensor) -> tuple[float, float]:
+    """Peak signal-to-noise ratio over the whole sphere in decibels, and the gain that the learned map was given.
+
+    Directions count by their solid angle. Infinite for equal maps.
+
+    Args:
+        learned: [H, 2H, 3] panorama, sRGB, floating point.
+        truth: [h, 2h, 3] panorama, floating point or uint8; averaged down where it is larger.
+
+    Raises:
+        ValueError: a panorama is not twice as wide as high, or holds values that are not finite.
+    """
+    image, target, gain = _equalised(learned, truth)
+    difference = quantized(image).to(torch.float64) - quantized(target).to(torch.float64)
+    mean_square = _mean_over_sphere(difference.square())
+    return math.inf if mean_square == 0 else 10 * math.log10(255**2 / mean_square), gain
+
+
+def environment_lpips(learned: Tensor, truth: Tensor, lpips: Lpips | str) -> Outcome:
+    """The perceptual distance of the panoramas as they are seen, not weighted by solid angle (the paper's measure).
+
+    Args:
+        learned: as in `environment_psnr`.
+        truth: as in `environment_psnr`.
+        lpips: the distance, or why there is none.
+    """
+    if isinstance(lpips, str):
+        return NO_LPIPS
+    image, target, _ = _equalised(learned, truth)
+    return lpips(quantized(image), quantized(target))
+
+
+def _equalised(learned: Tensor, truth: Tensor) -> tuple[Tensor, Tensor, float]:
+    """The learned map at the energy of the true one, the true one at its size, and the factor; 1 for a black map."""
+    image, target = _panorama(learned, "learned"), _panorama(truth, "true")
+    target = _averaged(target, image.shape[0])
+    energy = _mean_over_sphere(image)
+    gain = _mean_over_sphere(target) / energy if energy > 0 else 1.0
+    return gain * image, target, gain
+
+
+def _panorama(pixels: Tensor, which: str) -> Tensor:
+    """The pixels as float64 in [0, 1], not clamped."""
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or not 0 < 2 * pixels.shape[0] == pixels.shape[1]:
+        raise ValueError(f"expected the {which} environment as a panorama [H, 2H, 3], got {list(pixels.shape)}")
+    values = pixels.detach().cpu().to(torch.float64) / (255 if pixels.dtype == torch.uint8 else 1)
+    if not bool(torch.isfinite(values).all()):
+        raise ValueError(f"the {which} environment holds values that are not finite; expected sRGB in [0, 1]")
+    return values
+
+
+def _averaged(panorama: Tensor, height: int) -> Tensor:
+    """A panorama at another height."""
+    if panorama.shape[0] == height:
+        return panorama
+    channels_first = panorama.permute(2, 0, 1)[None]
+    return torch.nn.functional.interpolate(channels_first, (height, 2 * height), mode="area")[0].permute(1, 2, 0)
+
+
+def _mean_over_sphere(values: Tensor) -> float:
+    """Mean of [H, 2H, 3] by solid angle: rows shrink towards the poles with the cosine of their latitude."""
+    height = values.shape[0]
+    latitudes = math.pi * ((torch.arange(height, dtype=torch.float64) + 0.5) / height - 0.5)
+    weights = torch.cos(latitudes)
+    return float((values.mean(dim=(1, 2)) * weights).sum() / weights.sum())

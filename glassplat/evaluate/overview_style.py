@@ -1,4 +1,4 @@
-"""Looks and behaviour of the overview page; inlined, so that the page needs no other file than its pictures."""
+"""Style and script of the overview page, inlined so that the page needs no other file than its pictures."""
 
 STYLE = """
 :root { color-scheme: dark }

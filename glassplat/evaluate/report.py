@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: a comparison sheet per test view and an overview page."""
+"""The overview page of an evaluation."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from glassplat.data.dataset import Dataset
+from glassplat.captures.dataset import Dataset
 from glassplat.evaluate.evaluate import EvaluatedView
 from glassplat.evaluate.metric_names import (
     METRICS,
@@ -19,12 +19,10 @@ from glassplat.evaluate.metric_names import (
     written,
 )
 from glassplat.evaluate.overview_style import SCRIPT, STYLE
-from glassplat.evaluate.sheet import comparison_sheet
-from glassplat.evaluate.uses import Uses
-from glassplat.files.atomic import atomic_write
-from glassplat.files.images import write_image
-from glassplat.files.picture_paths import flat_picture_names
-from glassplat.render.choices import Blend
+from glassplat.evaluate.sheet import Uses, comparison_sheet
+from glassplat.files.images import flat_picture_names, write_image
+from glassplat.files.writing import atomic_write
+from glassplat.options import Blend
 
 USES_FILE = "uses.png"
 SETTINGS = ("iterations", "seed", "resolution", "split", "lpips_backbone", "pane_region")

@@ -1,4 +1,4 @@
-"""The comparison sheet of one test view: everything the renderer made of it, side by side."""
+"""Comparison sheets: everything that the renderer made of a test view, side by side."""
 
 from __future__ import annotations
 
@@ -10,17 +10,13 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from glassplat.evaluate.colormap import (
-    ERROR_SCALE,
-    depth_colors,
-    error_colors,
-    label_colors,
-    normal_colors,
-)
+from glassplat.evaluate.evaluate import EvaluatedView
 from glassplat.evaluate.metrics import quantized
-from glassplat.evaluate.surface_truth import NOTHING_KNOWN, TrueSurface
-from glassplat.evaluate.truth import TrueView
+from glassplat.evaluate.truth import NOTHING_KNOWN, TrueSurface, TrueView
+from glassplat.options import Blend
 from glassplat.render.frame import Frame
+from glassplat.render.layers import ERROR_SCALE, depth_colors, error_colors, label_colors, normal_colors
+from glassplat.render.planar import as_mirror_image, dereflected_photo
 
 NARROWEST_PANEL, WIDEST_PANEL = 280, 640
 MARGIN, GAP = 16, 10
@@ -186,3 +182,35 @@ def _draw_title(draw: ImageDraw.ImageDraw, title: str, subtitle: str, width: int
     # A narrow sheet has no room for the metrics; the overview page lists them anyway.
     if start + draw.textlength(subtitle, font=font) <= width - MARGIN:
         draw.text((start, baseline), subtitle, fill=QUIET_TEXT, font=font, anchor="ls")
+
+
+MOST_VIEWS = 2
+SMALLEST_SHARE = 0.05
+"""Part of the image that must be pane for a view to be worth showing."""
+
+
+class Uses:
+    """Keeps the views that show most of a pane, out of all that pass by, and draws them."""
+
+    def __init__(self, blend: Blend) -> None:
+        """Begins with no view; `blend` is the space in which the run blends the reflection."""
+        self._blend = blend
+        self._rows: list[tuple[float, list[Panel]]] = []
+
+    def add(self, evaluated: EvaluatedView) -> None:
+        """Looks at a view, and keeps its panels if it shows more of a pane than those kept."""
+        frame, photo = evaluated.frame, evaluated.view.photo
+        share = float((frame.layers["strength"] > 0).float().mean())
+        if share < SMALLEST_SHARE:
+            return
+        plain = dereflected_photo(frame, photo, self._blend, exposures=evaluated.exposures, name=evaluated.view.name)
+        row = [
+            Panel(f"photograph {evaluated.view.name}", photo),
+            Panel("without reflections (glassplat dereflect)", plain),
+            Panel("pane as a mirror (glassplat render --as-mirror)", quantized(as_mirror_image(frame, self._blend))),
+        ]
+        self._rows = sorted([*self._rows, (share, row)], key=lambda kept: -kept[0])[:MOST_VIEWS]
+
+    def picture(self) -> NDArray[np.uint8] | None:
+        """The views kept [H, W, 3], one per row; None where no view shows a pane."""
+        return composed([row for _, row in self._rows], "What the layers are good for", "") if self._rows else None

@@ -11,8 +11,8 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from glassplat.files.atomic import atomic_write
-from glassplat.files.reading import reading
+from glassplat.files.records import reading
+from glassplat.files.writing import atomic_write
 
 SCALAR_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",

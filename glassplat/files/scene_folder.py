@@ -1,4 +1,4 @@
-"""A scene as a folder of files: standard PLY, and beside it glass, planes, surroundings and environment."""
+"""Scenes as folders, and splat files of any format."""
 
 from __future__ import annotations
 
@@ -9,17 +9,40 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from glassplat.files.atomic import atomic_write
-from glassplat.files.environment_file import read_environment, write_environment
-from glassplat.files.exposures_json import read_exposures, write_exposures
-from glassplat.files.fields import LARGEST_COORDINATE, Choice, Field, Items, Nullable, Number, Optional, Whole, checked
-from glassplat.files.folders import SCENE
-from glassplat.files.json_text import read_json
-from glassplat.files.planes_json import read_planes, write_planes
-from glassplat.files.ply import read_gaussians, write_gaussians
-from glassplat.files.poses_json import read_poses, write_poses
+import numpy as np
+import torch
+
+from glassplat.files.glb import MAGIC, read_glb
+from glassplat.files.ply import is_compressed, read_compressed, read_gaussians, write_gaussians
+from glassplat.files.ply_table import read_table
+from glassplat.files.records import (
+    LARGEST_COORDINATE,
+    Choice,
+    Field,
+    Items,
+    Nullable,
+    Number,
+    Optional,
+    Whole,
+    checked,
+    read_json,
+    reading,
+)
+from glassplat.files.sidecars import (
+    read_environment,
+    read_exposures,
+    read_planes,
+    read_poses,
+    write_environment,
+    write_exposures,
+    write_planes,
+    write_poses,
+)
+from glassplat.files.spz import GZIP, read_spz
+from glassplat.files.writing import SCENE, SPLAT_SUFFIXES, atomic_write
+from glassplat.scene.activations import SH_ZERO
+from glassplat.scene.corrections import Direction
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.photographer import Direction
 from glassplat.scene.scene import Scene
 
 PRIMARY, GLASS, PLANES = "point_cloud.ply", "glass.ply", "planes.json"
@@ -169,3 +192,78 @@ def _drawable(path: Path) -> Gaussians:
         if bool(broken.any()):
             raise ValueError(f"{path} holds the value {values[broken][0]:g} of {name}; expected at most {most:g}")
     return gaussians
+
+
+SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
+LEAST_SCALE = 1e-12
+
+
+def read_splats(path: Path | str) -> Gaussians:
+    """Reads the Gaussians of a file in the frame of a PLY (y down, z forward), as they are stored.
+
+    What kind of file it is, its first bytes say; a .splat, which begins with anything, its name.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: another kind of file, or one that is damaged or cut off.
+    """
+    path = Path(path)
+    with reading(path), path.open("rb") as stream:
+        head = stream.read(4)
+    if head[:3] == b"ply":
+        table = read_table(path)
+        return read_compressed(path, table) if is_compressed(table) else read_gaussians(path)
+    if head[:2] == GZIP or head == b"NGSP":
+        return read_spz(path)
+    if head == MAGIC:
+        return read_glb(path)
+    if path.suffix.lower() == ".splat":
+        return _read_rows(path)
+    raise ValueError(f"{path} is no splat file that can be read; expected one of {', '.join(SPLAT_SUFFIXES)}")
+
+
+def drawable(gaussians: Gaussians, path: Path | str) -> tuple[Gaussians, int]:
+    """Those that can be drawn, and how many cannot: values that are not finite or absurd, rotations without direction.
+
+    Raises:
+        ValueError: none of them can.
+    """
+    bounds = {"means": LARGEST_COORDINATE, "log_scales": LARGEST_LOG, "sh": LARGEST_COLOR, "quats": LARGEST_COLOR}
+    good = ~torch.isnan(gaussians.logit_opacities) & (gaussians.quats.square().sum(1) > 0)
+    for name, most in bounds.items():
+        values = gaussians.tensors()[name].flatten(1)
+        # A scale may be as small as it likes.
+        good &= ((values if name == "log_scales" else values.abs()) <= most).all(dim=1) & ~values.isnan().any(dim=1)
+    for name, values in gaussians.channels.items():
+        good &= values.abs() <= (LARGEST_LOG if name.startswith("log_") else LARGEST_COLOR)
+    lost = len(gaussians) - int(good.sum())
+    if lost and lost == len(gaussians):
+        raise ValueError(
+            f"none of the {lost} Gaussians in {path} can be drawn: values that are no numbers or too large"
+        )
+    kept = gaussians.select(good) if lost else gaussians
+    held = {
+        "logit_opacities": kept.logit_opacities.clamp(-LARGEST_LOG, LARGEST_LOG),
+        "log_scales": kept.log_scales.clamp(min=-LARGEST_LOG),
+    }
+    return kept.with_tensors(held), lost
+
+
+def _read_rows(path: Path) -> Gaussians:
+    """A .splat: 32 bytes per Gaussian, colour and opacity as seen, scales not logarithmic."""
+    size = os.stat(path).st_size
+    if size == 0 or size % SPLAT_ROW.itemsize:
+        raise ValueError(
+            f"{path} has {size} bytes; expected {SPLAT_ROW.itemsize} per Gaussian: it is cut off, or no .splat"
+        )
+    with reading(path):
+        rows = np.fromfile(path, dtype=SPLAT_ROW)
+    shares = torch.from_numpy(rows["color"].astype(np.float32) / 255)
+    scales = torch.from_numpy(rows["scale"].astype(np.float32))
+    return Gaussians(
+        means=torch.from_numpy(rows["mean"].astype(np.float32)),
+        quats=torch.from_numpy((rows["quat"].astype(np.float32) - 128) / 128),
+        log_scales=scales.clamp(min=LEAST_SCALE).log(),
+        logit_opacities=torch.logit(shares[:, 3].clamp(0.5 / 255, 1 - 0.5 / 255)),
+        sh=((shares[:, None, :3] - 0.5) / SH_ZERO).contiguous(),
+    )

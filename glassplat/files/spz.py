@@ -1,7 +1,10 @@
-"""Gaussians as SPZ, a compressed file of some 20 to 60 bytes each: versions 1 to 4 are read, 3 and 4 written.
+"""Gaussians as SPZ, Niantic's compressed format.
 
 Up to version 3 the whole file is one gzip stream: header and sections. Version 4 has a plain header, a table of the
 sections' sizes, and each section as a stream of its own, compressed with Zstandard.
+
+The frame of an SPZ file has y up and z backwards where a PLY's has y down and z forward; both directions of the way
+turn it.
 """
 
 from __future__ import annotations
@@ -10,22 +13,176 @@ import struct
 import zlib
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+import torch
 import zstandard
+from numpy.typing import NDArray
+from torch import Tensor
 
-from glassplat.files.atomic import atomic_write
-from glassplat.files.reading import reading
-from glassplat.files.spz_sections import (
-    HARMONICS,
-    MOST_FRACTIONAL_BITS,
-    Bytes,
-    Layout,
-    fractional_bits_for,
-    packed_sections,
-    unpacked,
-)
+from glassplat.files.records import reading
+from glassplat.files.writing import atomic_write
 from glassplat.scene.gaussians import Gaussians
+
+Bytes = NDArray[np.uint8]
+
+FLIP = (1.0, -1.0, -1.0)
+FLIPPED_HARMONICS = (1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
+"""How each harmonic changes its sign when y and z do."""
+HARMONICS = (0, 3, 8, 15, 24)
+"""Coefficients beyond the constant one, by degree; those of the fourth degree are read over."""
+MOST_HARMONICS = HARMONICS[3]
+COLOR_SCALE = 0.15
+LOWEST_LOG_SCALE, STEPS_PER_LOG = -10.0, 16.0
+LARGEST_POSITION = 2**23 - 1
+MOST_FRACTIONAL_BITS = 20
+QUAT_STEPS = 511
+"""Of the three smallest components of a quaternion, either side of zero."""
+
+
+class Layout(NamedTuple):
+    """What the header says about the sections.
+
+    Attributes:
+        version: of the format; 1 stores half-precision positions, 3 and later four bytes per rotation.
+        number: of Gaussians.
+        degree: of the harmonics, up to 4.
+        fractional_bits: of the fixed-point positions.
+    """
+
+    version: int
+    number: int
+    degree: int
+    fractional_bits: int
+
+    def sizes(self) -> tuple[int, ...]:
+        """Bytes of each section: positions, opacities, colours, scales, rotations, harmonics."""
+        position = 6 if self.version == 1 else 9
+        rotation = 4 if self.version >= 3 else 3
+        return tuple(self.number * width for width in (position, 1, 3, 3, rotation, 3 * HARMONICS[self.degree]))
+
+
+def fractional_bits_for(means: Tensor) -> int:
+    """As many bits behind the point as the largest coordinate leaves room for."""
+    largest = float(means.abs().max()) if means.numel() else 0.0
+    bits = MOST_FRACTIONAL_BITS
+    while bits > 0 and largest * 2**bits > LARGEST_POSITION:
+        bits -= 1
+    return bits
+
+
+def packed_sections(gaussians: Gaussians, layout: Layout) -> list[Bytes]:
+    """The six sections of a set in the capture's frame, whose layout is of version 3 or 4."""
+    flip = np.asarray(FLIP, dtype=np.float32)
+    means, quats = (_numpy(tensor) for tensor in (gaussians.means, gaussians.quats))
+    harmonics = _numpy(gaussians.sh[:, 1:]) * _harmonic_signs(gaussians.sh.shape[1] - 1)
+    opacities = torch.sigmoid(gaussians.logit_opacities)
+    return [
+        _packed_positions(means * flip, layout.fractional_bits),
+        _rounded(_numpy(opacities) * 255),
+        _rounded(_numpy(gaussians.sh[:, 0]) * (COLOR_SCALE * 255) + 127.5),
+        _rounded((_numpy(_three_log_scales(gaussians)) - LOWEST_LOG_SCALE) * STEPS_PER_LOG),
+        _packed_rotations(quats * np.concatenate([[np.float32(1)], flip])),
+        _rounded(harmonics * 128 + 128),
+    ]
+
+
+def _three_log_scales(gaussians: Gaussians) -> Tensor:
+    """[N, 3] log scales; the format knows no discs, which become as flat as it can say."""
+    if not gaussians.are_discs:
+        return gaussians.log_scales
+    return torch.nn.functional.pad(gaussians.log_scales, (0, 1), value=LOWEST_LOG_SCALE)
+
+
+def unpacked(sections: list[Bytes], layout: Layout) -> Gaussians:
+    """The Gaussians of six sections, in the frame of a PLY; harmonics of the fourth degree are left out."""
+    positions, opacities, colors, scales, rotations, harmonics = sections
+    flip = np.asarray(FLIP, dtype=np.float32)
+    count, kept = layout.number, min(HARMONICS[layout.degree], MOST_HARMONICS)
+    rest = harmonics.reshape(count, HARMONICS[layout.degree], 3)[:, :kept].astype(np.float32) / 128 - 1
+    rest *= _harmonic_signs(kept)
+    constant = (colors.reshape(count, 1, 3).astype(np.float32) / 255 - 0.5) / COLOR_SCALE
+    shares = np.clip(opacities.astype(np.float32) / 255, 0.5 / 255, 1 - 0.5 / 255)
+    quats = _unpacked_rotations(rotations, layout) * np.concatenate([[np.float32(1)], flip])
+    return Gaussians(
+        means=_tensor(_unpacked_positions(positions, layout) * flip),
+        quats=_tensor(quats),
+        log_scales=_tensor(scales.reshape(count, 3).astype(np.float32) / STEPS_PER_LOG + LOWEST_LOG_SCALE),
+        logit_opacities=torch.logit(_tensor(shares)),
+        sh=_tensor(np.concatenate([constant, rest], axis=1)),
+        active_sh_degree=min(layout.degree, 3),
+    )
+
+
+def _harmonic_signs(count: int) -> NDArray[np.float32]:
+    """[count, 1] of the harmonics beyond the constant one."""
+    return np.asarray(FLIPPED_HARMONICS[1 : count + 1], dtype=np.float32)[:, None]
+
+
+def _packed_positions(means: NDArray[np.float32], bits: int) -> Bytes:
+    fixed = np.rint(means.astype(np.float64) * 2**bits).clip(-LARGEST_POSITION, LARGEST_POSITION).astype("<i4")
+    return np.ascontiguousarray(fixed.reshape(-1, 1).view(np.uint8)[:, :3]).reshape(-1)
+
+
+def _unpacked_positions(section: Bytes, layout: Layout) -> NDArray[np.float32]:
+    if layout.version == 1:
+        halves = section.view("<f2").reshape(layout.number, 3)
+        # Of a signalling NaN NumPy warns in any arithmetic; who draws leaves out what is no number.
+        return np.where(np.isnan(halves), np.float32(np.nan), halves.astype(np.float32))
+    padded = np.zeros((3 * layout.number, 4), dtype=np.uint8)
+    padded[:, 1:] = section.reshape(-1, 3)
+    # Three bytes at the top of four carry their sign with them on the way down.
+    fixed = padded.view("<i4").reshape(layout.number, 3) >> 8
+    return fixed.astype(np.float32) / np.float32(2**layout.fractional_bits)
+
+
+def _packed_rotations(quats: NDArray[np.float32]) -> Bytes:
+    """The three smallest components of (x, y, z, w) with ten bits each, below two that say which one is left out."""
+    norms = np.linalg.norm(quats, axis=1, keepdims=True)
+    unit = np.roll(np.divide(quats, norms, out=np.zeros_like(quats), where=norms > 0), -1, axis=1)
+    largest = np.abs(unit).argmax(axis=1)
+    rows = np.arange(len(unit))
+    unit = np.where(unit[rows, largest] < 0, -1, 1)[:, None] * unit
+    packed = largest.astype(np.uint32)
+    for component in range(4):
+        value = unit[:, component]
+        magnitude = np.minimum(np.abs(value) * (np.sqrt(2) * QUAT_STEPS) + 0.5, QUAT_STEPS).astype(np.uint32)
+        pushed = (packed << np.uint32(10)) | ((value < 0).astype(np.uint32) << np.uint32(9)) | magnitude
+        packed = np.where(largest == component, packed, pushed)
+    return packed.astype("<u4").view(np.uint8)
+
+
+def _unpacked_rotations(section: Bytes, layout: Layout) -> NDArray[np.float32]:
+    """Quaternions [N, 4] `wxyz`."""
+    if layout.version < 3:
+        vector = section.reshape(layout.number, 3).astype(np.float32) / 127.5 - 1
+        real = np.sqrt((1 - (vector**2).sum(axis=1, keepdims=True)).clip(min=0))
+        return np.concatenate([real, vector], axis=1).astype(np.float32)
+    packed = section.view("<u4").copy()
+    largest = packed >> np.uint32(30)
+    quats = np.zeros((layout.number, 4), dtype=np.float32)
+    for component in range(3, -1, -1):
+        magnitude = (packed & np.uint32(QUAT_STEPS)).astype(np.float32) / (np.sqrt(2) * QUAT_STEPS)
+        value = np.where(packed & np.uint32(512), -magnitude, magnitude)
+        stored = largest != component
+        quats[:, component] = np.where(stored, value, 0)
+        packed = np.where(stored, packed >> np.uint32(10), packed)
+    quats[np.arange(layout.number), largest] = np.sqrt((1 - (quats**2).sum(axis=1)).clip(min=0))
+    return np.roll(quats, 1, axis=1)
+
+
+def _rounded(values: NDArray[np.float32]) -> Bytes:
+    return np.rint(values).clip(0, 255).astype(np.uint8).reshape(-1)
+
+
+def _numpy(tensor: Tensor) -> NDArray[np.float32]:
+    return tensor.detach().to("cpu", torch.float32).numpy()
+
+
+def _tensor(values: NDArray) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+
 
 MAGIC = 0x5053474E
 GZIP = b"\x1f\x8b"

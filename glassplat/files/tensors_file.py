@@ -13,9 +13,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from glassplat.files.atomic import atomic_write
-from glassplat.files.json_text import parse_json
-from glassplat.files.reading import reading
+from glassplat.files.records import parse_json, reading
+from glassplat.files.writing import atomic_write
 
 HEADER_KEY = "glassplat"
 LONGEST_REASON = 200

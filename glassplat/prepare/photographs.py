@@ -1,4 +1,4 @@
-"""Photographs as cameras and telephones leave them: which there are, what they are called, which way is up."""
+"""Photographs as cameras and telephones leave them, and photographs from a video."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import hashlib
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,11 +14,28 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 
-from glassplat.data.errors import InputError, first_names
-from glassplat.files.images import IMAGE_SUFFIXES, SHADES_16, image_size, opened, read_image
-from glassplat.files.picture_paths import picture_paths
-from glassplat.files.reading import reading
-from glassplat.prepare.messages import Listener, Progress
+from glassplat.errors import InputError, first_names
+from glassplat.files.images import IMAGE_SUFFIXES, SHADES_16, image_size, opened, picture_paths, read_image
+from glassplat.files.records import reading
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far one part of the work is; `done` counts from 0 to `total`."""
+
+    what: str
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
+class Note:
+    """Something that the user should know now, a full sentence."""
+
+    text: str
+
+
+Listener = Callable[[Progress | Note], None]
 
 UNREADABLE = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
 """Photographs that Pillow cannot read: those of telephones that nobody told otherwise, and raw ones."""

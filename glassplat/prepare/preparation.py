@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from glassplat import __version__
-from glassplat.data.colmap_library import quiet_pycolmap
-from glassplat.data.errors import InputError
-from glassplat.files.folders import missing_folders, real_path, remove_empty
-from glassplat.prepare.capture_writer import write_capture
-from glassplat.prepare.messages import Listener
-from glassplat.prepare.photographs import Photograph, photographs_in
-from glassplat.prepare.reconstruction import Settings, best_solution
+from glassplat.captures.colmap_library import quiet_pycolmap
+from glassplat.errors import InputError
+from glassplat.files.writing import missing_folders, real_path, remove_empty
+from glassplat.prepare.photographs import Listener, Photograph, photographs_in
+from glassplat.prepare.reconstruction import Settings, best_solution, write_capture
 from glassplat.prepare.report import Report, report_of
 from glassplat.prepare.video import VIDEO_SUFFIXES, frames_of
 from glassplat.prepare.workplace import Workplace

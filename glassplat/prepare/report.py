@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from glassplat.data.errors import first_names
+from glassplat.errors import first_names
 from glassplat.prepare.photographs import FEWEST, Photograph
 from glassplat.prepare.reconstruction import Solution, image_numbers
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from glassplat.data.errors import InputError
+from glassplat.errors import InputError
 from glassplat.files.images import write_image
-from glassplat.prepare.messages import Listener, Progress
+from glassplat.prepare.photographs import Listener, Progress
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp")
 SMALL_SIDE = 320

@@ -1,4 +1,4 @@
-"""Where a capture is made: a folder beside it, so that nothing that is not whole ever lies under the capture's name."""
+"""The folder beside a capture in which it is made, so that nothing that is not whole ever lies under its name."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from glassplat.data.errors import InputError, first_names
-from glassplat.files.atomic import atomic_write
-from glassplat.files.folders import check_folder, make_folder
-from glassplat.files.json_text import read_json
+from glassplat.errors import InputError, first_names
+from glassplat.files.records import read_json
+from glassplat.files.writing import atomic_write, check_folder, make_folder
 
 RECORD = "prepare.json"
 """In the capture: that it was prepared here, and the report."""

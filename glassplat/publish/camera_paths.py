@@ -11,9 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.publish.surveyed import surveyed
-from glassplat.scene.camera import Camera
-from glassplat.scene.pose import look_at
+from glassplat.publish.web_page import surveyed
+from glassplat.scene.camera import Camera, look_at
 
 MOST_KEYFRAMES = 12
 """Photographs that a path goes through; more of them make it shake as the hand did that took them."""

@@ -1,4 +1,4 @@
-"""Pictures one after the other as a film.
+"""Films: pictures one after the other.
 
 `.mp4` is VP9, which browsers play: OpenCV's wheels bring libvpx (BSD) and FFmpeg without its GPL parts.
 `.webp` and `.gif` need nothing beyond Pillow.

@@ -11,30 +11,146 @@ import gzip
 import html
 import io
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
 
-from glassplat.files.atomic import atomic_write
-from glassplat.files.spz import spz_bytes
-from glassplat.files.spz_sections import FLIP
-from glassplat.publish.surveyed import best_view, surveyed
-from glassplat.render.frame import Renderer
+from glassplat.files.spz import FLIP, spz_bytes
+from glassplat.files.writing import atomic_write
+from glassplat.render.frame import NEAR_PER_EXTENT, Renderer
+from glassplat.render.panes import glass_owners, nearest_hits, panes_in_camera
 from glassplat.render.planar import Planar
-from glassplat.render.rasterize import NEAR_PER_EXTENT
-from glassplat.render.seen_panes import glass_owners
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.plane import Planes
+from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
+
+COUNT = 24
+WIDTH, HEIGHT = 960, 640
+FOV_RAD = math.radians(50)
+ELEVATION = 0.25
+"""Tangent of the angle from which the cameras look down."""
+INNER_SHARE = 0.96
+"""Part of the Gaussians, the middle ones, that the pictures should hold."""
+MOST_SAMPLED = 200_000
+CLOSE = 1.15
+
+
+def cameras_around(gaussians: Gaussians, up: Tensor) -> list[tuple[str, Camera]]:
+    """Named cameras on a circle, which look at the middle of the scene.
+
+    Args:
+        gaussians: at least one, all finite.
+        up: [3] away from the ground.
+    """
+    middle, radius = bounding_ball(gaussians)
+    up = torch.nn.functional.normalize(up.double(), dim=0)
+    aside = torch.nn.functional.normalize(torch.linalg.cross(up, _least_along(up)), dim=0)
+    ahead = torch.linalg.cross(up, aside)
+    distance = CLOSE * radius / math.tan(FOV_RAD / 2)
+    cameras = []
+    for index in range(COUNT):
+        angle = 2 * math.pi * index / COUNT
+        arm = math.cos(angle) * ahead + math.sin(angle) * aside + ELEVATION * up
+        eye = middle + distance * arm
+        camera = Camera.look_at(eye, middle, up=up, fov_rad=FOV_RAD, width=WIDTH, height=HEIGHT)
+        cameras.append((f"{index:03d}.png", camera))
+    return cameras
+
+
+def bounding_ball(gaussians: Gaussians) -> tuple[Tensor, float]:
+    """Middle [3] and radius of a ball around the inner Gaussians; those that are hardly visible do not count."""
+    means = gaussians.means.double()
+    seen = gaussians.logit_opacities > 0
+    means = means[seen] if bool(seen.any()) else means
+    means = means[:: max(1, len(means) // MOST_SAMPLED)]
+    rest = (1 - INNER_SHARE) / 2
+    middle = (means.quantile(rest, dim=0) + means.quantile(1 - rest, dim=0)) / 2
+    distances = (means - middle).norm(dim=1)
+    return middle, max(float(distances.quantile(INNER_SHARE)), 1e-6)
+
+
+def _least_along(up: Tensor) -> Tensor:
+    """The coordinate axis that is furthest from a direction."""
+    return torch.eye(3, dtype=up.dtype)[int(up.abs().argmin())]
+
+
+TOWARDS_MIDDLE = 0.02
+"""Weight of a point before the cameras against where they look: parallel lines of sight meet nowhere."""
+SPACINGS, SHARE_OF_DISTANCE = 2.5, 0.12
+"""How far from a photograph one may go: in distances between neighbours, or of the distance to what they show."""
+FULL_SHARE = 0.55
+"""Part of the picture that a pane should fill in the first view."""
+
+
+class Surveyed(NamedTuple):
+    """A capture seen from above.
+
+    Attributes:
+        focus: [3] the point that the cameras look at.
+        up: [3] unit vector, away from the ground.
+        distance: of the cameras from the focus, the median; world units.
+        reach: how far from the nearest photograph the scene is still known, world units.
+    """
+
+    focus: Tensor
+    up: Tensor
+    distance: float
+    reach: float
+
+
+def surveyed(cameras: Sequence[Camera], extent: float) -> Surveyed:
+    """Looks at the poses of a capture.
+
+    Args:
+        cameras: at least one.
+        extent: of the scene, for captures whose cameras all look the same way.
+    """
+    poses = torch.stack([camera.cam_from_world for camera in cameras]).double().cpu()
+    centers, down, forward = (-(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0], poses[:, 1, :3], poses[:, 2, :3])
+    across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
+    ahead = centers.mean(0) + extent * forward.mean(0)
+    weight = TOWARDS_MIDDLE * len(cameras)
+    total = across.sum(0) + weight * torch.eye(3, dtype=torch.float64)
+    focus = torch.linalg.solve(total, (across @ centers[..., None])[..., 0].sum(0) + weight * ahead)
+    distance = float((centers - focus).norm(dim=1).median())
+    spacing = 0.0
+    if len(cameras) > 1:
+        distances = torch.cdist(centers, centers) + torch.diag(
+            torch.full((len(cameras),), torch.inf, dtype=torch.float64)
+        )
+        spacing = float(distances.amin(dim=1).median())
+    reach = max(SPACINGS * spacing, SHARE_OF_DISTANCE * distance, 1e-6)
+    up = torch.nn.functional.normalize(-down.mean(0), dim=0)
+    return Surveyed(focus, up, distance, reach)
+
+
+@torch.no_grad()
+def best_view(planes: Planes, cameras: Sequence[Camera]) -> int:
+    """The camera to begin with: panes fill about half of its picture, in the middle; without panes the middle one."""
+    if not len(planes):
+        return len(cameras) // 2
+    return min(range(len(cameras)), key=lambda k: _composition(planes, cameras[k]))
+
+
+def _composition(planes: Planes, camera: Camera) -> float:
+    """How far a picture is from one that shows panes well: by their share of it, and by how far off its middle."""
+    small = camera.resized(64, max(1, round(64 * camera.height / camera.width)))
+    rows, columns = (nearest_hits(panes_in_camera(planes, small), small).pane >= 0).nonzero(as_tuple=True)
+    if not len(rows):
+        return math.inf
+    aside = math.hypot(*(float(at.double().mean()) / size - 0.5 for at, size in ((rows, small.height), (columns, 64))))
+    return abs(len(rows) / (64 * small.height) - FULL_SHARE) + 2 * aside
+
 
 SCRIPTS = (
     "vectors.js", "data.js", "sorter.js", "cameras.js", "graphics.js", "renderer.js", "navigation.js", "panel.js",

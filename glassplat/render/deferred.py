@@ -1,20 +1,25 @@
-"""`deferred`: glossy things under distant light (3D Gaussian Splatting with Deferred Reflection)."""
+"""`deferred`: glossy things under distant light (3D Gaussian Splatting with Deferred Reflection), and surfaces to
+shade.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from glassplat.kernels.composite import composite, mean_depth
 from glassplat.kernels.environment import cube_lookup, shade_environment, surface_channels
-from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS, Projected
+from glassplat.kernels.panes.reference import ray_grid
+from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, STRENGTH_AT, SURFACE_CHANNELS, Projected
 from glassplat.kernels.tiles import bin_tiles
-from glassplat.render.choices import Shading
-from glassplat.render.frame import Frame
-from glassplat.render.rasterize import (
+from glassplat.options import Shading
+from glassplat.render.frame import (
     NEAR_PER_EXTENT,
+    Frame,
+    ScreenPass,
     check_colored,
     check_ellipsoids,
     joined_probe,
@@ -24,10 +29,180 @@ from glassplat.render.rasterize import (
     screen_pass,
     shown,
 )
-from glassplat.render.surface import view_directions
+from glassplat.render.splat import blended_discs, disc_layers, projected_discs
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
+
+CELLS_ACROSS = 32
+"""Cells along the longer side of an image; depths and normals are averaged over cells before they are compared."""
+LEAST_COVERAGE = 0.5
+STEEPEST = 0.15
+"""Largest change of depth between neighbouring cells, as a share of the depth, that is a slope and not an edge."""
+
+
+def cell_side(camera: Camera) -> int:
+    """Pixels along the side of a cell."""
+    return max(1, round(max(camera.width, camera.height) / CELLS_ACROSS))
+
+
+def depth_normals(depth: Tensor, alpha: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Normals [h, w, 3] of a depth map's cells, world axes, facing the camera; and [h, w] 1 where they count, else 0.
+
+    Args:
+        depth: [H, W] along the optical axis.
+        alpha: [H, W] coverage.
+        camera: whose pixels they are.
+    """
+    side = cell_side(camera)
+    covered = (alpha > LEAST_COVERAGE).to(depth.dtype)
+    share = cell_means(covered[..., None], side)[..., 0]
+    mean_depth = cell_means((depth * covered)[..., None], side)[..., 0] / share.clamp(min=1e-6)
+    height, width = mean_depth.shape
+    points = mean_depth[..., None] * ray_grid(camera.intrinsics.to(depth) / side, width, height)
+    along, down = torch.zeros_like(points), torch.zeros_like(points)
+    along[:, 1:-1] = points[:, 2:] - points[:, :-2]
+    down[1:-1] = points[2:] - points[:-2]
+    # In a frame with x to the right, y down and z forward, down x along points to the camera.
+    normals = torch.nn.functional.normalize(torch.linalg.cross(down, along), dim=-1)
+    steepness = _most_nearby(mean_depth) + _most_nearby(-mean_depth)
+    whole = (_most_nearby(1 - share) == 0) & (steepness < STEEPEST * mean_depth) & (normals.abs().sum(-1) > 0)
+    rotation = camera.cam_from_world[:3, :3].to(depth)
+    return normals @ rotation, whole.to(depth.dtype)
+
+
+def cell_means(image: Tensor, side: int) -> Tensor:
+    """Means [h, w, D] over the whole cells of an image [H, W, D]."""
+    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), side).permute(1, 2, 0)
+
+
+def _most_nearby(image: Tensor) -> Tensor:
+    """[h, w] largest value among each cell and its eight neighbours."""
+    return torch.nn.functional.max_pool2d(image[None], 3, 1, 1)[0]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The blended surfaces of one view (EnvGS, Eq. 3).
+
+    Attributes:
+        base: [H, W, 3] colour without reflection, over the background.
+        normal: [H, W, 3] blended normal, world axes, turned to the camera, not normalised.
+        strength: [H, W] share of the reflection.
+        depth: [H, W] mean camera z, 0 where nothing is.
+        alpha: [H, W] coverage.
+        direct: [N] bool, which Gaussians reach a pixel.
+        screen: the record of the pass, if it was probed.
+        extra: further layers, of discs those that say how thin the surface is.
+    """
+
+    base: Tensor
+    normal: Tensor
+    strength: Tensor
+    depth: Tensor
+    alpha: Tensor
+    direct: Tensor
+    screen: tuple[ScreenPass, ...] = ()
+    extra: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def layers(self) -> dict[str, Tensor]:
+        """The layers of a frame."""
+        return {
+            **self.extra,
+            "base": self.base,
+            "normal": self.normal,
+            "strength": self.strength,
+            "depth": self.depth,
+            "alpha": self.alpha,
+        }
+
+
+def seen_surface(
+    scene: Scene, camera: Camera, *, background: tuple[float, float, float], probed: bool = False
+) -> Surface:
+    """Blends the surfaces of the primary Gaussians, which have a `logit_strength`: ellipsoids or discs."""
+    near = NEAR_PER_EXTENT * scene.extent
+    seen = _seen_discs if scene.primary.are_discs else _seen_ellipsoids
+    return seen(scene, camera, near, background, probed)
+
+
+def _seen_ellipsoids(
+    scene: Scene, camera: Camera, near: float, background: tuple[float, float, float], probed: bool
+) -> Surface:
+    """Depths are those of the centres."""
+    projected = project_gaussians(scene.primary, camera, near=near)
+    screen = (screen_pass("primary", projected),) if probed else ()
+    channels = _ellipsoid_channels(scene.primary, projected, camera.center)
+    splats = joined_splats(projected)
+    bins = bin_tiles(splats, camera.width, camera.height)
+    result = composite(splats, channels[None], bins, probe=joined_probe(screen))
+    image, alpha = result.image[0], result.alpha[0]
+    return Surface(
+        base=over_background(image[..., :NORMAL_AT], alpha, background),
+        normal=image[..., NORMAL_AT:STRENGTH_AT],
+        strength=image[..., STRENGTH_AT],
+        depth=mean_depth(image[..., SURFACE_CHANNELS], alpha),
+        alpha=alpha,
+        direct=shown(projected),
+        screen=screen,
+    )
+
+
+def _ellipsoid_channels(gaussians: Gaussians, projected: Projected, eye: Tensor) -> Tensor:
+    """[N, 8] colour, normal, strength and depth of each ellipsoid; normals are turned to `eye` [3]."""
+    return surface_channels(
+        projected.colors[0],
+        projected.radii[0],
+        gaussians.quats,
+        gaussians.log_scales,
+        gaussians.means,
+        gaussians.channels["logit_strength"],
+        eye,
+        projected.depths[0, :, None],
+    )
+
+
+def _seen_discs(
+    scene: Scene, camera: Camera, near: float, background: tuple[float, float, float], probed: bool
+) -> Surface:
+    """Depths are those of the places where rays meet the discs."""
+    projected = projected_discs(scene.primary, camera, near=near)
+    screen = (screen_pass("primary", projected),) if probed else ()
+    strengths = torch.sigmoid(scene.primary.channels["logit_strength"])[None, :, None]
+    channels = torch.cat([projected.colors, projected.normals, strengths], dim=-1)
+    blended = blended_discs(projected, channels, camera, near=near, screen=screen)
+    image, extra = blended.image[0], disc_layers(blended, scene.extent)
+    alpha, depth = extra.pop("alpha"), extra.pop("depth")
+    return Surface(
+        base=over_background(image[..., :NORMAL_AT], alpha, background),
+        normal=image[..., NORMAL_AT:STRENGTH_AT],
+        strength=image[..., STRENGTH_AT],
+        depth=depth,
+        alpha=alpha,
+        direct=shown(projected),
+        screen=screen,
+        extra=extra,
+    )
+
+
+def reflected_rays(surface: Surface, camera: Camera, chosen: Tensor) -> tuple[Tensor, Tensor]:
+    """Places [R, 3] of the surface at the chosen pixels [H, W], and unit directions [R, 3] mirrored there (Eq. 4).
+
+    Blended positions need no channels: with d the ray of a pixel whose camera z is 1, x = o + D d, D the blended depth.
+    """
+    d = view_directions(camera)[chosen]
+    places = camera.center + surface.depth[chosen][:, None] * d
+    normal = surface.normal[chosen]
+    normal = normal / normal.norm(dim=-1, keepdim=True).clamp(min=NORMAL_MIN)
+    mirrored = d - 2 * (d * normal).sum(-1, keepdim=True) * normal
+    return places, torch.nn.functional.normalize(mirrored, dim=-1)
+
+
+def view_directions(camera: Camera) -> Tensor:
+    """[H, W, 3] directions from the camera through the pixel centres, world axes, not unit."""
+    rotation = camera.cam_from_world[:3, :3]
+    return ray_grid(camera.intrinsics.to(rotation), camera.width, camera.height) @ rotation
+
 
 INVISIBLE = 1 / 512
 """A pixel that reflects less changes by at most half a step of eight bits, from black to white."""

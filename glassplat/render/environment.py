@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from glassplat.kernels.environment import cube_lookup
-from glassplat.scene.environment import FACES, Environment
+from glassplat.scene.scene import FACES, Environment
 
 COLOR_MARGIN = 1e-3
 """Colours are kept this far from 0 and 1, whose logits are infinite; eight bits do not tell the difference."""

@@ -1,14 +1,19 @@
-"""What a renderer returns."""
+"""Frames, the result of every renderer, and the steps that rasterising renderers share."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
+import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from glassplat.scene.camera import Camera
+from glassplat.kernels.project import GradientSum, project
+from glassplat.kernels.records import CameraBatch, Projected, ProjectedDiscs, RawGaussians, Splats
+from glassplat.scene.camera import Camera, constant
+from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
 
@@ -104,3 +109,106 @@ class Renderer(Protocol):
             ValueError: it lacks something; says what.
         """
         ...
+
+
+NEAR_PER_EXTENT = 0.01
+"""Distance of the near plane as a share of the scene extent."""
+
+
+def project_gaussians(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    near: float,
+    poses: Tensor | None = None,
+    clip_planes: Tensor | None = None,
+    windows: Tensor | None = None,
+    total: GradientSum | None = None,
+) -> Projected:
+    """Projects a set of Gaussians into one camera, or into several that share its intrinsics.
+
+    Args:
+        gaussians: the set to project.
+        camera: intrinsics and image size; its pose is used unless `poses` is given.
+        near: depth below which a Gaussian is culled, world units.
+        poses: [C, 4, 4] `cam_from_world` of the cameras; may be left-handed.
+        clip_planes: [C, 4] world planes (n, d); a Gaussian whose centre has n . x + d <= 0 is culled.
+        windows: [C, 4] left, top, right and bottom edge of the part of each image that is wanted, pixels.
+        total: the same for all projections of one set whose gradients are to be added up; see `project`.
+    """
+    cameras = camera_batch(camera, poses)._replace(clip_planes=clip_planes, windows=windows)
+    return project(raw_gaussians(gaussians), cameras, sh_degree=gaussians.active_sh_degree, near=near, total=total)
+
+
+def raw_gaussians(gaussians: Gaussians) -> RawGaussians:
+    """The tensors of a set as the kernels take them."""
+    return RawGaussians(gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh)
+
+
+def camera_batch(camera: Camera, poses: Tensor | None = None) -> CameraBatch:
+    """One camera as the kernels take it, or several of its intrinsics at the `poses` [C, 4, 4]."""
+    poses = camera.cam_from_world[None] if poses is None else poses
+    intrinsics = camera.intrinsics.expand(poses.shape[0], 4).contiguous()
+    return CameraBatch(poses, intrinsics, camera.width, camera.height)
+
+
+def joined_splats(*parts: Projected) -> Splats:
+    """One list of splats per camera from several projected sets, in the order given."""
+    if len(parts) == 1:
+        only = parts[0]
+        return Splats(only.means2d, only.conics, only.opacities, only.depths, only.radii)
+    names = ("means2d", "conics", "opacities", "depths", "radii")
+    return Splats(*(torch.cat([getattr(part, name) for part in parts], dim=1) for name in names))
+
+
+def shown(projected: Projected | ProjectedDiscs) -> Tensor:
+    """[N] bool: which Gaussians reach a pixel of some of the cameras."""
+    reached = projected.radii[..., 0] > 0
+    return reached[0] if len(reached) == 1 else reached.any(dim=0)
+
+
+def screen_pass(part: str, projected: Projected | ProjectedDiscs, *, direct: bool = True) -> ScreenPass:
+    """The record of a projected scene part, with a probe that asks for a gradient."""
+    probe = torch.zeros_like(projected.means2d).requires_grad_()
+    return ScreenPass(part, projected.means2d, probe, projected.radii, direct=direct)
+
+
+def joined_probe(screen: Sequence[ScreenPass]) -> Tensor | None:
+    """The probe [C, G, 2] that `composite` wants for the parts in this order; None where nothing is probed."""
+    probes = [record.probe for record in screen]
+    return torch.cat(probes, dim=1) if len(probes) > 1 else next(iter(probes), None)
+
+
+def over_background(image: Tensor, alpha: Tensor, background: tuple[float, ...]) -> Tensor:
+    """Adds a constant background [D] behind an image [..., D] with coverage alpha [...]."""
+    if not any(background):
+        return image
+    added: Tensor = _OverBackground.apply(image, alpha, constant(tuple(background), image.dtype, image.device))
+    return added
+
+
+class _OverBackground(torch.autograd.Function):
+    """One node: PyTorch's own four would go through an image for each."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
+        ctx.save_for_backward(background)
+        return torch.addcmul(image, (1 - alpha)[..., None], background)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_image: Tensor) -> tuple[Tensor, Tensor, None]:
+        (background,) = ctx.saved_tensors
+        return v_image, -(v_image @ background), None
+
+
+def check_ellipsoids(gaussians: Gaussians) -> None:
+    """Raises ValueError where a set that is splatted as ellipsoids holds discs."""
+    if gaussians.are_discs:
+        raise ValueError("the Gaussians are discs, with two scales; expected three scales, as this method trains them")
+
+
+def check_colored(gaussians: Gaussians) -> None:
+    """Raises ValueError where a set that is seen has no colours."""
+    if gaussians.max_sh_degree < 0:
+        raise ValueError("the Gaussians have no colours; expected f_dc_0 to f_dc_2, as every trained splat has them")

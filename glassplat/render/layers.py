@@ -1,4 +1,4 @@
-"""Layers that renderers draw only when they are asked for."""
+"""Layers on request, as pictures in false colours, and what each Gaussian adds to a view."""
 
 from __future__ import annotations
 
@@ -6,12 +6,116 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
+import torch
+from torch import Tensor
+
+from glassplat.kernels.composite import composite
+from glassplat.kernels.records import Projected
+from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.deferred import Deferred
-from glassplat.render.frame import Renderer
-from glassplat.render.planar import Planar, with_photographer
-from glassplat.render.shortest_axes import WithNormals
-from glassplat.render.splat import Splat
+from glassplat.render.frame import NEAR_PER_EXTENT, Frame, Renderer, joined_splats, project_gaussians
+from glassplat.render.panes import nearest_hits, panes_in_camera, project_mirrored, seen_panes
+from glassplat.render.planar import Planar, detached, with_photographer
+from glassplat.render.splat import Splat, WithNormals, blended_discs, projected_discs
 from glassplat.render.traced import Traced
+from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Scene
+
+# Lightness rises evenly from black through violet, red and amber to pale yellow, so that brighter always
+# means more, in grey print too.
+HEAT_STOPS = (
+    (0, 0, 4),
+    (31, 12, 72),
+    (85, 15, 109),
+    (136, 34, 106),
+    (186, 54, 85),
+    (227, 89, 51),
+    (249, 140, 10),
+    (249, 201, 50),
+    (252, 255, 164),
+)
+LABEL_COLORS = (
+    (86, 180, 233),
+    (230, 159, 0),
+    (0, 158, 115),
+    (204, 121, 167),
+    (240, 228, 66),
+    (0, 114, 178),
+    (213, 94, 0),
+    (160, 160, 160),
+)
+ERROR_SCALE = 0.2
+"""The colour error that is drawn brightest; the same everywhere, so that pictures can be compared."""
+COVERED = 0.5
+"""Below this coverage a pixel has no depth worth showing."""
+
+
+def heat_colors(values: Tensor) -> Tensor:
+    """Colours [..., 3] in [0, 1] of values [...]; 0 is black, 1 pale yellow, what lies outside is clamped."""
+    stops = torch.tensor(HEAT_STOPS, dtype=torch.float32, device=values.device) / 255
+    position = values.to(torch.float32).nan_to_num(0.0).clamp(0, 1) * (len(HEAT_STOPS) - 1)
+    lower = position.floor().clamp(max=len(HEAT_STOPS) - 2).long()
+    share = (position - lower)[..., None]
+    return stops[lower] * (1 - share) + stops[lower + 1] * share
+
+
+def error_colors(image: Tensor, photo: Tensor) -> Tensor:
+    """Colours [H, W, 3] in [0, 1] of how far an image [H, W, 3] is from a photograph [H, W, 3] of 0 to 255, by mean."""
+    error = (image.clamp(0, 1) - photo.to(image) / 255).abs().mean(dim=-1)
+    return heat_colors(error / ERROR_SCALE)
+
+
+def depth_colors(depth: Tensor, alpha: Tensor | None = None) -> Tensor:
+    """Colours [H, W, 3] in [0, 1] of a depth map [H, W]: near is bright, what is not covered is black.
+
+    Colour is even in inverse depth between its 2nd and 98th percentile in this image.
+
+    Args:
+        depth: camera z, world units; 0 or less is no depth.
+        alpha: [H, W] coverage; None takes every pixel with a depth.
+    """
+    shown = torch.isfinite(depth) & (depth > 0)
+    if alpha is not None:
+        shown &= alpha > COVERED
+    if not bool(shown.any()):
+        return torch.zeros(*depth.shape, 3, device=depth.device)
+    inverse = torch.where(shown, 1 / torch.where(shown, depth, torch.ones_like(depth)), torch.zeros_like(depth))
+    # Every n-th pixel is enough for percentiles, and `quantile` takes no more than 16 million.
+    sample = inverse[shown]
+    low, high = torch.quantile(
+        sample[:: max(1, len(sample) // 100_000)].double(), sample.new_tensor([0.02, 0.98]).double()
+    )
+    span = (high - low).clamp(min=1e-12 + 1e-6 * high)
+    # The dark end is kept for what has no depth.
+    brightness = 0.08 + 0.92 * ((inverse - low) / span).clamp(0, 1)
+    return heat_colors(brightness) * shown[..., None]
+
+
+def normal_colors(normals: Tensor) -> Tensor:
+    """Colours [..., 3] in [0, 1] of normals [..., 3]: (n + 1) / 2, so that what has none is grey."""
+    return (0.5 * normals.nan_to_num(0.0) + 0.5).clamp(0, 1)
+
+
+def label_colors(labels: Tensor) -> Tensor:
+    """Colours [H, W, 3] in [0, 1] of pane labels [H, W]; 0 is black."""
+    palette = torch.tensor(LABEL_COLORS, dtype=torch.float32, device=labels.device) / 255
+    index = labels.long()
+    return palette[(index - 1) % len(palette)] * (index > 0)[..., None]
+
+
+def layer_image(frame: Frame, layer: str) -> Tensor:
+    """A layer as an image [H, W] or [H, W, 3] in [0, 1]; depth is colour-mapped (near bright), normals (n + 1) / 2."""
+    if layer in ("rgb", "photographed"):
+        image: Tensor = getattr(frame, layer)
+        return image.clamp(0, 1)
+    image = frame.layers[layer]
+    if layer == "normal":
+        return normal_colors(image)
+    if layer in ("depth", "median_depth"):
+        return depth_colors(image, frame.layers["alpha"])
+    return image.clamp(0, 1)
+
 
 PHOTOGRAPHED: Final = "photographed"
 """The image with whom the panes of a photograph show, of runs that looked for somebody."""
@@ -25,3 +129,62 @@ def renderer_with(renderer: Renderer, layers: Sequence[str]) -> Renderer:
         return replace(renderer, surroundings=renderer.surroundings or "surroundings" in layers)
     renderer = with_photographer(renderer, "beside") if PHOTOGRAPHED in layers else renderer
     return WithNormals(renderer) if "normal" in layers and isinstance(renderer, Planar | Splat) else renderer
+
+
+def contributions(scene: Scene, camera: Camera) -> Tensor:
+    """[N] how many pixels' worth each primary Gaussian adds to a view: the sum of its blending weights alpha_i T_i.
+
+    That is in the direct image or in those that the panes mirror, wherever it is most; a mirrored pixel counts as much
+    as a direct one, however weak the reflection. After RadSplat (arXiv 2403.13806), which takes the largest weight
+    instead of their sum: what covers a hundredth of a pixel is superfluous however opaque it is there.
+
+    Args:
+        scene: with or without panes.
+        camera: of the view.
+    """
+    camera = camera.to(scene.primary.means.device)
+    # Colours do not matter here.
+    primary, near = replace(detached(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
+    if primary.are_discs:
+        return _disc_sums(primary, camera, near, primary.means.new_ones(camera.height, camera.width, 1))[:, 0]
+    most = _weight_sums(project_gaussians(primary, camera, near=near), camera)
+    seen = seen_panes(scene.planes, camera, nearest_hits(panes_in_camera(scene.planes, camera), camera))
+    if seen is None:
+        return most
+    mirrored = project_mirrored(primary, camera, seen, near=near)
+    return torch.maximum(most, _weight_sums(mirrored, camera, seen.tiles))
+
+
+def gathered(scene: Scene, camera: Camera, values: Tensor) -> Tensor:
+    """[N, D] an image [H, W, D] summed over the pixels of each primary Gaussian, by its blending weights."""
+    camera = camera.to(scene.primary.means.device)
+    primary, near = replace(detached(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
+    if primary.are_discs:
+        return _disc_sums(primary, camera, near, values)
+    return _sums(project_gaussians(primary, camera, near=near), camera, values)[0]
+
+
+def _weight_sums(projected: Projected, camera: Camera, tiles: Tensor | None = None) -> Tensor:
+    """[N] blending weights summed over the pixels of the images."""
+    ones = projected.depths.new_ones(camera.height, camera.width, 1)
+    return _sums(projected, camera, ones, tiles)[..., 0].amax(dim=0)
+
+
+def _sums(projected: Projected, camera: Camera, values: Tensor, tiles: Tensor | None = None) -> Tensor:
+    """[C, N, D] what a constant channel has for a gradient where `values` [H, W, D] are those of the images."""
+    splats = joined_splats(projected)
+    with torch.enable_grad():
+        ones = projected.depths.new_ones(*projected.depths.shape, values.shape[-1]).requires_grad_()
+        image = composite(splats, ones, bin_tiles(splats, camera.width, camera.height, tiles)).image
+        (sums,) = torch.autograd.grad((image * values).sum(), ones)
+    return sums
+
+
+def _disc_sums(discs: Gaussians, camera: Camera, near: float, values: Tensor) -> Tensor:
+    """[N, D] as `_sums`, of discs and one camera."""
+    projected = projected_discs(discs, camera, near=near)
+    with torch.enable_grad():
+        ones = projected.depths.new_ones(*projected.depths.shape, values.shape[-1]).requires_grad_()
+        image = blended_discs(projected, ones, camera, near=near).image
+        (sums,) = torch.autograd.grad((image * values).sum(), ones)
+    return sums[0]

@@ -1,27 +1,131 @@
-"""`splat`: plain Gaussian Splatting, the baseline, of ellipsoids (3DGS) or of discs (2DGS)."""
+"""`splat`: plain Gaussian Splatting, of ellipsoids (3DGS) or discs (2DGS)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
-from glassplat.kernels.composite import composite, mean_depth
+from glassplat.kernels.composite import BlendedDiscs, composite, composite_discs, mean_depth
+from glassplat.kernels.environment import surface_channels
+from glassplat.kernels.project import project_discs
+from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, Discs, ProjectedDiscs
 from glassplat.kernels.tiles import bin_tiles
-from glassplat.render.discs import blended_discs, disc_layers, projected_discs
-from glassplat.render.frame import Frame
-from glassplat.render.rasterize import (
+from glassplat.render.frame import (
     NEAR_PER_EXTENT,
+    Frame,
+    Renderer,
+    ScreenPass,
+    camera_batch,
     check_colored,
     joined_probe,
     joined_splats,
     over_background,
     project_gaussians,
+    raw_gaussians,
     screen_pass,
     shown,
 )
 from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
+
+NDC_NEAR = 0.05
+"""Near plane of the depths whose distortion is measured, in scene extents; 0.2 world units in 2DGS, whose captures have
+an extent of about four."""
+
+
+def projected_discs(gaussians: Gaussians, camera: Camera, *, near: float) -> ProjectedDiscs:
+    """Projects a set of discs into a camera.
+
+    Args:
+        gaussians: the set, of discs.
+        camera: intrinsics, pose and image size.
+        near: depth below which a disc's centre is culled and a hit is left out, world units.
+    """
+    return project_discs(
+        raw_gaussians(gaussians), camera_batch(camera), sh_degree=gaussians.active_sh_degree, near=near
+    )
+
+
+def blended_discs(
+    projected: ProjectedDiscs, channels: Tensor, camera: Camera, *, near: float, screen: Sequence[ScreenPass] = ()
+) -> BlendedDiscs:
+    """Blends channels [1, N, D] of discs over the pixels of a camera; fields of one camera, [1, H, W, ...].
+
+    Args:
+        projected: what `projected_discs` made, with the same `near`.
+        channels: values to blend.
+        camera: image size.
+        near: as for `projected_discs`.
+        screen: the record whose probe to feed, if any.
+    """
+    discs = Discs(projected.means2d, projected.maps, projected.opacities, projected.depths, projected.outlines)
+    bins = bin_tiles(projected.outlines, camera.width, camera.height)
+    return composite_discs(discs, channels, bins, near=near, probe=joined_probe(screen))
+
+
+def disc_layers(blended: BlendedDiscs, extent: float) -> dict[str, Tensor]:
+    """Layers [H, W] that blending discs gives in any case: coverage, depths, distortion.
+
+    The distortion is that of depths in NDC with a near plane at `NDC_NEAR` extents and none far away, so that it does
+    not depend on the capture's units.
+    """
+    alpha = blended.alpha[0]
+    return {
+        "alpha": alpha,
+        "depth": mean_depth(blended.depth[0], alpha),
+        "median_depth": blended.median[0],
+        "distortion": blended.distortion[0] * (NDC_NEAR * extent) ** 2,
+    }
+
+
+@dataclass(frozen=True)
+class WithNormals:
+    """The frames of a renderer, with a layer `normal` [H, W, 3] where they have none.
+
+        n(u) = sum_i n_i alpha_i T_i
+
+    n_i is the shortest axis of ellipsoid i, turned to the camera (3DGS-DR, Section 3.1). Of what panes stand before it
+    is the things behind them, as the layer `depth` is. Costs a pass of its own.
+
+    Attributes:
+        renderer: whose frames these are; scenes of discs get their normals from it.
+    """
+
+    renderer: Renderer
+
+    def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
+        """Renders `scene` from `camera`, where the scene's tensors are."""
+        frame = self.renderer(scene, camera, probed=probed)
+        if "normal" in frame.layers:
+            return frame
+        normals = ellipsoid_normals(scene, camera.to(scene.primary.means.device))
+        return replace(frame, layers={**frame.layers, "normal": normals})
+
+    def check(self, scene: Scene) -> None:
+        """As the renderer does."""
+        self.renderer.check(scene)
+
+
+def ellipsoid_normals(scene: Scene, camera: Camera) -> Tensor:
+    """[H, W, 3] blended normals of the primary Gaussians, world axes, towards the camera, at most of unit length."""
+    gaussians = scene.primary
+    projected = project_gaussians(gaussians, camera, near=NEAR_PER_EXTENT * scene.extent)
+    channels = surface_channels(
+        projected.colors[0],
+        projected.radii[0],
+        gaussians.quats,
+        gaussians.log_scales,
+        gaussians.means,
+        gaussians.means.new_zeros(len(gaussians)),
+        camera.center,
+    )
+    splats = joined_splats(projected)
+    bins = bin_tiles(splats, camera.width, camera.height)
+    return composite(splats, channels[None, :, NORMAL_AT:STRENGTH_AT].contiguous(), bins).image[0]
 
 
 @dataclass(frozen=True)

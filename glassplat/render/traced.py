@@ -12,14 +12,8 @@ from glassplat.kernels.environment import cube_lookup
 from glassplat.kernels.records import FLAT, RawGaussians, Rays
 from glassplat.kernels.records import Traced as Found
 from glassplat.kernels.trace import build_bvh, shapes_of, trace
-from glassplat.render.deferred import INVISIBLE
-from glassplat.render.frame import Frame, SpacePass
-from glassplat.render.rasterize import (
-    NEAR_PER_EXTENT,
-    check_colored,
-    over_background,
-)
-from glassplat.render.surface import Surface, reflected_rays, seen_surface, view_directions
+from glassplat.render.deferred import INVISIBLE, Surface, reflected_rays, seen_surface, view_directions
+from glassplat.render.frame import NEAR_PER_EXTENT, Frame, SpacePass, check_colored, over_background
 from glassplat.scene.activations import SH_ZERO
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians

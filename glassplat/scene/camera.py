@@ -1,16 +1,106 @@
-"""A pinhole camera with OpenCV axes: +x right, +y down, +z forward, pixel centres at +0.5."""
+"""Pinhole cameras with OpenCV axes (+x right, +y down, +z forward, pixel centres at +0.5), rotations and mirror
+matrices.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.scene.pose import look_at
-from glassplat.scene.transfer import constant, moved
+
+def waits(device: torch.device) -> bool:
+    """Whether the program has to wait before it can look at what this device computes, as for a GPU."""
+    return device.type == "cuda"
+
+
+def moved(tensor: Tensor, device: torch.device | str) -> Tensor:
+    """The tensor on a device; on its way there, if it comes from memory: what is computed from it comes after it."""
+    if tensor.device.type != "cpu" or torch.device(device).type != "cuda":
+        return tensor.to(device)
+    # Only from memory that stays in its place can a GPU fetch by itself.
+    return tensor.pin_memory().to(device, non_blocking=True)
+
+
+@lru_cache(maxsize=1024)
+def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """A tensor of these numbers, or rows of them: the same one at every call, so leave it as it is."""
+    return moved(torch.tensor(values, dtype=dtype, device="cpu"), device)
+
+
+LEAST_SINE = 1e-6
+"""Of the angle between two directions that still tell which way is up."""
+
+
+def rotation_from_quat(quats: Tensor) -> Tensor:
+    """Rotation matrices [..., 3, 3] of quaternions [..., 4] in `wxyz` order, normalised here."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).reshape(*quats.shape[:-1], 3, 3)
+
+
+def quat_product(left: Tensor, right: Tensor) -> Tensor:
+    """Quaternions [..., 4], `wxyz`, of the rotations by `right` followed by `left`."""
+    left_real, left_vector = left[..., :1], left[..., 1:]
+    right_real, right_vector = right[..., :1], right[..., 1:]
+    real = left_real * right_real - (left_vector * right_vector).sum(-1, keepdim=True)
+    crossed = torch.linalg.cross(left_vector, right_vector)
+    return torch.cat([real, left_real * right_vector + right_real * left_vector + crossed], dim=-1)
+
+
+def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
+    """`cam_from_world` [4, 4], float32, of an upright camera at `eye` that looks at `target`, OpenCV axes.
+
+    Args:
+        eye: [3] camera centre, world units.
+        target: [3] what is in the middle of the picture.
+        up: [3] away from the ground, of any length.
+
+    Raises:
+        ValueError: the camera stands where it looks, or looks straight up or down.
+    """
+    eye, target, up = (vector.detach().to("cpu", torch.float64) for vector in (eye, target, up))
+    forward = torch.nn.functional.normalize(target - eye, dim=0)
+    right = torch.linalg.cross(forward, torch.nn.functional.normalize(up, dim=0))
+    if not float(right.norm()) > LEAST_SINE:
+        raise ValueError(
+            f"a camera at {eye.tolist()} cannot look at {target.tolist()} with {up.tolist()} upwards; expected another "
+            "place, and a direction that is not that of the view"
+        )
+    right = torch.nn.functional.normalize(right, dim=0)
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
+    return pose.float()
+
+
+def mirror_matrices(centers: Tensor, normals: Tensor) -> Tensor:
+    """Householder reflections [K, 4, 4] about planes through `centers` with unit `normals`.
+
+    Maps a world point x to x - 2 ((x - c) . n) n (TR-Gaussians, Eq. 8). Its own inverse.
+    Differentiable in both arguments.
+
+    Args:
+        centers: [K, 3] a point on each plane, world frame.
+        normals: [K, 3] unit normals; the sign does not matter.
+    """
+    outer = normals[:, :, None] * normals[:, None, :]
+    linear = torch.eye(3, dtype=normals.dtype, device=normals.device) - 2 * outer
+    offset = 2 * (centers * normals).sum(-1, keepdim=True) * normals
+    top = torch.cat([linear, offset[:, :, None]], dim=2)
+    bottom = constant((0.0, 0.0, 0.0, 1.0), normals.dtype, normals.device)
+    return torch.cat([top, bottom.expand(normals.shape[0], 1, 4)], dim=1)
 
 
 @dataclass(frozen=True)
@@ -102,3 +192,69 @@ class Camera:
         u = self.fx * in_camera[:, 0] / safe + self.cx
         v = self.fy * in_camera[:, 1] / safe + self.cy
         return torch.stack([u, v], dim=-1), depth
+
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Eye:
+    """A pinhole camera.
+
+    Attributes:
+        rotation: [3, 3] of `cam_from_world`.
+        center: [3] in the world.
+        intrinsics: [4] fx, fy, cx, cy in pixels.
+        size: [2] width and height in pixels.
+    """
+
+    rotation: Array
+    center: Array
+    intrinsics: Array
+    size: Array
+
+    @staticmethod
+    def of(camera: Camera) -> Eye:
+        """The same camera."""
+        pose = camera.cam_from_world.detach().cpu().double().numpy()
+        return Eye(
+            rotation=pose[:3, :3],
+            center=-pose[:3, :3].T @ pose[:3, 3],
+            intrinsics=np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float64),
+            size=np.array([camera.width, camera.height], dtype=np.float64),
+        )
+
+    @property
+    def diagonal(self) -> float:
+        """Of the image, in pixels."""
+        return float(np.hypot(*self.size))
+
+    def in_camera(self, points: Array) -> Array:
+        """[..., 3] world points in the camera's axes, +z forward."""
+        return np.asarray((points - self.center) @ self.rotation.T)
+
+    def pixels(self, in_camera: Array) -> Array:
+        """[..., 2] of points [..., 3] in the camera's axes; those behind it are mirrored, as the formula has it."""
+        fx, fy, cx, cy = self.intrinsics
+        depth = np.where(np.abs(in_camera[..., 2]) < 1e-12, 1e-12, in_camera[..., 2])
+        return np.stack([fx * in_camera[..., 0] / depth + cx, fy * in_camera[..., 1] / depth + cy], axis=-1)
+
+    def project(self, points: Array) -> Array:
+        """[..., 2] pixels of world points [..., 3]."""
+        return self.pixels(self.in_camera(points))
+
+    def rays(self, pixels: Array) -> Array:
+        """[..., 3] unit world directions through pixels [..., 2], which may lie outside of the image."""
+        fx, fy, cx, cy = self.intrinsics
+        x, y = (pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy
+        world = np.stack([x, y, np.ones_like(x)], axis=-1) @ self.rotation
+        return np.asarray(world / np.linalg.norm(world, axis=-1, keepdims=True))
+
+    def holds(self, points: Array, margin: float = 0.0) -> NDArray[np.bool_]:
+        """[...] which world points lie in the image, or up to `margin` of its sides beside it."""
+        in_camera = self.in_camera(points)
+        pixels = self.pixels(in_camera)
+        room = margin * self.size
+        return np.asarray(
+            (in_camera[..., 2] > 0) & (pixels >= -room).all(axis=-1) & (pixels < self.size + room).all(axis=-1)
+        )

@@ -1,20 +1,88 @@
-"""Everything a renderer may draw."""
+"""Everything a renderer may draw, distant surroundings among it, and edits of a scene's panes."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from glassplat.scene.environment import Environment
-from glassplat.scene.exposure import Exposures
+from glassplat.scene.camera import quat_product, rotation_from_quat
+from glassplat.scene.corrections import Direction, Exposures, PoseCorrections
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.photographer import Direction
-from glassplat.scene.plane import TRAINABLE, Planes
-from glassplat.scene.pose_correction import PoseCorrections
+from glassplat.scene.panes import PANE_TENSORS, Planes
+
+ENVIRONMENT_TENSORS = ("raw",)
+FACES = 6
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Light from infinitely far away, one colour for each direction.
+
+    The colour in a world direction d is sigmoid(bilinear(raw, d)): the sigmoid comes after the lookup. Faces and their
+    axes are those of `kernels.cube_lookup`.
+
+    Attributes:
+        raw: [6, S, S, 3] logits of sRGB colour; S = 0 for a scene without an environment.
+        region: centre and radius, world units, of the sphere that holds all that mirrors it; None for everywhere.
+    """
+
+    raw: Tensor
+    region: tuple[float, float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.raw.shape)
+        if len(shape) != 4 or shape[0] != FACES or shape[1] != shape[2] or shape[3] != 3:
+            raise ValueError(
+                f"raw has shape {shape}; expected (6, S, S, 3), six square faces with three colour channels each"
+            )
+
+    @property
+    def size(self) -> int:
+        """Texels along the side of a face, S."""
+        return self.raw.shape[1]
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is no environment at all."""
+        return self.size == 0
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+        return {name: getattr(self, name) for name in ENVIRONMENT_TENSORS}
+
+    def with_tensors(self, tensors: Mapping[str, Tensor]) -> Environment:
+        """The same environment with its tensors replaced by name."""
+        unknown = set(tensors) - set(self.tensors())
+        if unknown:
+            raise ValueError(f"unknown tensors {sorted(unknown)}; an environment has {sorted(self.tensors())}")
+        return replace(self, raw=tensors.get("raw", self.raw))
+
+    def to(self, device: torch.device | str) -> Environment:
+        """The same environment on another device."""
+        return self.with_tensors({name: tensor.to(device) for name, tensor in self.tensors().items()})
+
+    @staticmethod
+    def empty() -> Environment:
+        """No environment."""
+        return Environment(torch.zeros(FACES, 0, 0, 3))
+
+    @staticmethod
+    def random(size: int, *, generator: torch.Generator, spread: float = 5.0) -> Environment:
+        """Noise to start training from: raw values uniform in [-spread, spread], on the generator's device.
+
+        Raises:
+            ValueError: the size is below 1.
+        """
+        if size < 1:
+            raise ValueError(f"the environment's size is {size}; expected at least 1 texel along a face")
+        uniform = torch.rand(FACES, size, size, 3, generator=generator, device=generator.device)
+        return Environment((2 * uniform - 1) * spread)
+
 
 GAUSSIAN_SETS = ("primary", "glass", "surroundings", "photographer")
 OPTIONAL_SETS = GAUSSIAN_SETS[2:]
@@ -64,7 +132,7 @@ class Scene:
         The environment (`environment.raw`), the exposures and the poses are among them where there are any.
         """
         found = {f"{part}.{name}": t for part, g in self.gaussian_sets().items() for name, t in g.tensors().items()}
-        found |= {f"planes.{name}": t for name, t in self.planes.tensors().items() if name in TRAINABLE}
+        found |= {f"planes.{name}": t for name, t in self.planes.tensors().items() if name in PANE_TENSORS}
         distant = {} if self.environment.is_empty else self.environment.tensors()
         found |= {f"environment.{name}": tensor for name, tensor in distant.items()}
         exposed = self.exposures.tensors() if len(self.exposures) else {}
@@ -94,3 +162,178 @@ class Scene:
         """The same scene on another device."""
         moved: dict[str, Any] = {name: getattr(self, name).to(device) for name in PARTS}
         return replace(self, **moved)
+
+
+LARGEST_LOGIT = 50.0
+"""Its sigmoid is 1 in both precisions, and it is finite, so that the scene can still be written."""
+
+
+def without_glass(scene: Scene) -> Scene:
+    """The scene without panes: what is seen when nothing reflects."""
+    return replace(
+        scene, glass=scene.glass.select(torch.zeros(len(scene.glass), dtype=torch.bool)), planes=Planes.empty()
+    )
+
+
+def without_pane(scene: Scene, label: int) -> Scene:
+    """The scene without one of its panes: what is behind it is seen, and nothing reflects.
+
+    Raises:
+        ValueError: no pane has the label.
+    """
+    row = row_of(scene.planes, label)
+    if len(scene.planes) == 1:
+        return without_glass(scene)
+    glass = scene.glass.select(~glass_of_pane(scene, row))
+    return replace(scene, glass=glass, planes=scene.planes.select([k for k in range(len(scene.planes)) if k != row]))
+
+
+def as_mirrors(scene: Scene, labels: Sequence[int]) -> Scene:
+    """The panes with these labels reflect everything, from every angle.
+
+    Raises:
+        ValueError: no pane has one of the labels.
+    """
+    for label in labels:
+        scene = with_reflectance(scene, label, 1.0)
+    mirrors = {*scene.planes.mirrors, *labels}
+    return replace(scene, planes=replace(scene.planes, mirrors=tuple(k for k in scene.planes.labels if k in mirrors)))
+
+
+def with_reflectance(scene: Scene, label: int, base_reflectance: float) -> Scene:
+    """The pane reflects this share of light at normal incidence; Fresnel's laws add to it at an angle.
+
+    Raises:
+        ValueError: no pane has the label, or the reflectance is not in [0, 1].
+    """
+    if not 0 <= base_reflectance <= 1:
+        raise ValueError(f"a reflectance of {base_reflectance} for pane {label}; expected a number in [0, 1]")
+    row = row_of(scene.planes, label)
+    logits = scene.planes.logit_reflectances.clone()
+    logits[row] = torch.logit(logits.new_tensor(base_reflectance)).clamp(-LARGEST_LOGIT, LARGEST_LOGIT)
+    return replace(scene, planes=scene.planes.with_tensors({"logit_reflectances": logits}))
+
+
+def tilted(scene: Scene, label: int, about_tangent: float, about_bitangent: float) -> Scene:
+    """The pane and its glass, turned about the rectangle's middle; zero angles change no bit.
+
+    Args:
+        scene: what to edit; it is left as it is.
+        label: which pane.
+        about_tangent: degrees about the rectangle's first side, right-handed.
+        about_bitangent: degrees about its second side. Two angles together are one rotation vector.
+
+    Raises:
+        ValueError: no pane has the label, or an angle is not finite.
+    """
+    row = row_of(scene.planes, label)
+    _check_finite(label, about_tangent, about_bitangent)
+    angle = math.radians(math.hypot(about_tangent, about_bitangent))
+    if angle == 0:
+        return scene
+    tangent, bitangent = (axes[row] for axes in scene.planes.axes())
+    axis = torch.nn.functional.normalize(about_tangent * tangent + about_bitangent * bitangent, dim=0)
+    return _turned(scene, row, torch.cat([axis.new_tensor([math.cos(angle / 2)]), math.sin(angle / 2) * axis]))
+
+
+def shifted(scene: Scene, label: int, distance: float) -> Scene:
+    """The pane and its glass, moved along the pane's normal; zero changes no bit.
+
+    Args:
+        scene: what to edit; it is left as it is.
+        label: which pane.
+        distance: world units, positive to where the normal points.
+
+    Raises:
+        ValueError: no pane has the label, or the distance is not finite.
+    """
+    row = row_of(scene.planes, label)
+    _check_finite(label, distance)
+    if distance == 0:
+        return scene
+    return _translated(scene, row, distance * scene.planes.normals[row])
+
+
+def moved(scene: Scene, label: int, turn: Sequence[float], step: Sequence[float]) -> Scene:
+    """The pane and its glass, turned about the rectangle's middle and then taken elsewhere; not to move changes no bit.
+
+    Args:
+        scene: what to edit; it is left as it is.
+        label: which pane.
+        turn: [4] quaternion, `wxyz`, of any length, in world axes.
+        step: [3] from where the middle was to where it is, world units.
+
+    Raises:
+        ValueError: no pane has the label, a number is not finite, or the quaternion has no length.
+    """
+    row = row_of(scene.planes, label)
+    _check_finite(label, *turn, *step)
+    if not any(turn):
+        raise ValueError(f"pane {label} cannot be turned by a quaternion of no length; expected w, x, y, z")
+    if any(turn[1:]):
+        quat = torch.nn.functional.normalize(scene.planes.centers.new_tensor(turn), dim=0)
+        scene = _turned(scene, row, quat)
+    return _translated(scene, row, scene.planes.centers.new_tensor(step)) if any(step) else scene
+
+
+def glass_of_pane(scene: Scene, row: int) -> Tensor:
+    """[N] bool: the glass Gaussians that are nearer to this pane's rectangle than to any other."""
+    distances = torch.stack([_distances(scene.planes, k, scene.glass) for k in range(len(scene.planes))])
+    return distances.argmin(dim=0) == row
+
+
+def row_of(planes: Planes, label: int) -> int:
+    """The position of the pane with a label.
+
+    Raises:
+        ValueError: there is none; lists the labels there are.
+    """
+    if label not in planes.labels:
+        there_are = f"the panes are {', '.join(map(str, sorted(planes.labels)))}" if len(planes) else "it has no panes"
+        raise ValueError(f"the scene has no pane {label}; {there_are}")
+    return planes.labels.index(label)
+
+
+def _turned(scene: Scene, row: int, turn: Tensor) -> Scene:
+    """A pane and its glass, turned about its middle by a unit quaternion [4]."""
+    rotation = rotation_from_quat(turn)
+    planes = scene.planes
+    turned = {name: _with_row(getattr(planes, name), row, rotation) for name in ("raw_normals", "tangents")}
+    glass, of_pane = scene.glass, glass_of_pane(scene, row)[:, None]
+    center = planes.centers[row].to(glass.means)
+    means = (glass.means - center) @ rotation.to(glass.means).T + center
+    quats = quat_product(turn.to(glass.quats).expand_as(glass.quats), glass.quats)
+    placed = {"means": torch.where(of_pane, means, glass.means), "quats": torch.where(of_pane, quats, glass.quats)}
+    return replace(scene, glass=glass.with_tensors(placed), planes=planes.with_tensors(turned))
+
+
+def _translated(scene: Scene, row: int, step: Tensor) -> Scene:
+    """A pane and its glass, taken elsewhere by a step [3]."""
+    centers = scene.planes.centers.clone()
+    centers[row] += step
+    means = scene.glass.means
+    placed = torch.where(glass_of_pane(scene, row)[:, None], means + step.to(means), means)
+    planes = scene.planes.with_tensors({"centers": centers})
+    return replace(scene, glass=scene.glass.with_tensors({"means": placed}), planes=planes)
+
+
+def _distances(planes: Planes, row: int, glass: Gaussians) -> Tensor:
+    """[N] distance of every glass Gaussian's centre from one rectangle; world units."""
+    offsets = glass.means - planes.centers[row].to(glass.means)
+    inside = torch.zeros_like(offsets)
+    for axes, half in zip(planes.axes(), planes.half_sizes[row].tolist(), strict=True):
+        axis = axes[row].to(offsets)
+        inside = inside + (offsets @ axis).clamp(-half, half)[:, None] * axis
+    return (offsets - inside).norm(dim=1)
+
+
+def _with_row(vectors: Tensor, row: int, rotation: Tensor) -> Tensor:
+    """The vectors [K, 3] with one of them rotated."""
+    turned = vectors.clone()
+    turned[row] = rotation @ vectors[row]
+    return turned
+
+
+def _check_finite(label: int, *numbers: float) -> None:
+    if not all(math.isfinite(number) for number in numbers):
+        raise ValueError(f"pane {label} cannot be moved by {numbers}; expected finite numbers")

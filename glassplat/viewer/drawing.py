@@ -1,22 +1,95 @@
-"""What somebody wants to see, and the picture of it."""
+"""Wishes of those who look at a scene, and the pictures of them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.evaluate.colormap import error_colors
-from glassplat.evaluate.layer_image import layer_image
 from glassplat.render.frame import Frame, Renderer
-from glassplat.render.layers import PHOTOGRAPHED, renderer_with
-from glassplat.scene.camera import Camera
-from glassplat.scene.plane_edits import as_mirrors, moved, with_reflectance, without_glass
-from glassplat.scene.scene import Scene
+from glassplat.render.layers import PHOTOGRAPHED, error_colors, layer_image, renderer_with
+from glassplat.scene.camera import Camera, rotation_from_quat
+from glassplat.scene.scene import Scene, as_mirrors, moved, with_reflectance, without_glass
+
+
+def matrix_of(wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[3, 3] of a quaternion [4] of any length."""
+    matrix: NDArray[np.float64] = rotation_from_quat(torch.from_numpy(np.asarray(wxyz, dtype=np.float64))).numpy()
+    return matrix
+
+
+def wxyz_of(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[4] of a rotation [3, 3], with w >= 0."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(matrix).as_quat(canonical=True)
+    return np.array([w, x, y, z])
+
+
+Photograph = Callable[[], Tensor]
+
+
+class Keeper(Protocol):
+    """Writes what was made in the browser, each under a new name, and says where it is.
+
+    Both raise InputError or OSError, with nothing overwritten, where that cannot be.
+    """
+
+    def keep_scene(self, scene: Scene, name: str) -> str:
+        """Writes an edited scene."""
+
+    def keep_keyframes(self, cameras: Sequence[Camera], name: str) -> str:
+        """Writes the cameras of a film."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What there is to look at.
+
+    Attributes:
+        title: of the page.
+        scene: on the renderer's device.
+        renderer: of its frames.
+        layers: names of the layers, the first one first shown.
+        cameras: of the photographs, by name; at least one.
+        photographs: [H, W, 3] uint8 by name, read when asked for; may be empty.
+        keeper: writes what is made in the browser; None where nothing may be written.
+    """
+
+    title: str
+    scene: Scene
+    renderer: Renderer
+    layers: Sequence[str]
+    cameras: Sequence[tuple[str, Camera]]
+    photographs: Mapping[str, Photograph]
+    keeper: Keeper | None = None
+
+
+class Viewpoints:
+    """Places and directions of all photographs, to find the one that is nearest to a view."""
+
+    def __init__(self, cameras: Sequence[Camera], extent: float) -> None:
+        """Keeps where the cameras are.
+
+        Args:
+            cameras: at least one.
+            extent: of the scene: that far away counts as much as a radian aside.
+        """
+        self._centers = np.stack([camera.center.double().cpu().numpy() for camera in cameras])
+        self._forwards = np.stack([camera.cam_from_world[2, :3].double().cpu().numpy() for camera in cameras])
+        self._extent = extent
+
+    def nearest(self, center: NDArray[np.float64], forward: NDArray[np.float64]) -> int:
+        """The camera whose place and direction are nearest to those of a view; both [3]."""
+        away = np.linalg.norm(self._centers - center, axis=1) / self._extent
+        aside = np.arccos(np.clip(self._forwards @ forward, -1, 1))
+        return int(np.argmin(away + aside))
+
 
 Glass = Literal["as it is", "mirror", "none"]
 LEAST_GAIN, MOST_GAIN = 0.1, 10.0

@@ -24,9 +24,9 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from glassplat.data.errors import InputError
-from glassplat.files.fields import COORDINATE, ByName, Field, Items, Number, Optional, Whole, checked
-from glassplat.serving.access import Access, RefusedError
+from glassplat.access import Access, RefusedError
+from glassplat.errors import InputError
+from glassplat.files.records import COORDINATE, ByName, Field, Items, Number, Optional, Whole, checked
 
 LARGEST_MESSAGE = 64 * 1024
 """Bytes; a page sends cameras and what is typed into controls."""

@@ -13,23 +13,201 @@ from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from glassplat.data.errors import InputError
-from glassplat.publish.surveyed import best_view, surveyed
+from glassplat.access import Access, is_local
+from glassplat.errors import InputError
+from glassplat.publish.web_page import best_view, surveyed
 from glassplat.render.frame import Renderer
+from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
-from glassplat.serving.access import Access, is_local
-from glassplat.viewer.callbacks import survived
-from glassplat.viewer.client import Client
-from glassplat.viewer.drawing import Wish, drawn, error_drawn
-from glassplat.viewer.ports import check_port
-from glassplat.viewer.render_loop import RenderLoop, RenderThread
-from glassplat.viewer.shown import Shown, Viewpoints
+from glassplat.viewer.controls import KeyframeControls, PaneControls, PhotographControls, survived
+from glassplat.viewer.drawing import ERROR, Shown, Viewpoints, Wish, drawn, edited, error_drawn, matrix_of
+from glassplat.viewer.render_loop import RenderLoop, RenderThread, check_port
+
+LARGEST_HEIGHT, MOST_PIXELS = 1080, 4_000_000
+SHARP_QUALITY, COARSE_QUALITY = 90, 60
+LEAST_AHEAD = 0.1
+"""Of the extent: how far before the camera the point is, at least, that the mouse turns it about."""
+WAITING = ("Drawing", "The first picture may take a minute or two: kernels are compiled once for each machine.")
+"""Title and text of what stands there until there is a picture."""
+
+
+class Host(Protocol):
+    """What a client needs of the viewer."""
+
+    shown: Shown
+    viewpoints: Viewpoints
+    loop: RenderLoop[Wish]
+    focus: NDArray[np.float64]
+    first: int
+
+    @property
+    def buttons(self) -> Any:
+        """Further buttons by what is written on them."""
+
+
+class Client:
+    """One browser."""
+
+    def __init__(self, handle: Any, viewer: Host) -> None:
+        """Lays out the controls and goes to the first view; `ask` is for who has made it."""
+        self._handle, self._viewer = handle, viewer
+        self._status, self._nearest = "", viewer.first
+        self._layer: Any = None
+        self._panes: PaneControls | None = None
+        self.keyframes = KeyframeControls(handle, viewer.shown.scene.extent, self.camera)
+        self._failure = ""
+        self._waiting: Any = handle.add_notification(*WAITING, loading=True, with_close_button=False)
+        self.lay_out()
+        self.stand_at(viewer.first)
+        handle.camera.on_update(survived(lambda _: self.ask()))
+
+    def show(self, picture: NDArray[np.uint8], is_sharp: bool) -> None:
+        """Puts a picture on the screen, and with a sharp one the photograph that is nearest to it."""
+        quality = SHARP_QUALITY if is_sharp else COARSE_QUALITY
+        self._handle.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
+        self._stop_waiting()
+        self._failure = ""
+        if is_sharp:
+            self._photographs.show_nearest(self._nearest)
+
+    def say_failed(self, reason: str) -> None:
+        """Says why there is no picture, once until there is one again."""
+        self._stop_waiting()
+        if reason != self._failure:
+            self._failure = reason
+            self._notify("No picture", reason, "red")
+
+    def tell(self, status: str) -> None:
+        """Shows a line above the controls."""
+        self._status = status
+        if self._told is not None:
+            self._told.content = status
+
+    def leave(self) -> None:
+        """The browser has gone."""
+        self.keyframes.stop()
+
+    def ask(self) -> None:
+        """Asks for what the controls and the camera say."""
+        wish = self.wish()
+        if wish is None:
+            return
+        most = min(LARGEST_HEIGHT, int((MOST_PIXELS / wish.aspect) ** 0.5))
+        rows = max(1, min(int(self._handle.camera.image_height), most))
+        self._viewer.loop.ask(self._handle.client_id, wish, (max(1, round(wish.aspect * rows)), rows))
+
+    def wish(self) -> Wish | None:
+        """What the controls and the camera say; None before the browser has said where it stands."""
+        camera = self._handle.camera
+        try:
+            wxyz, position = np.asarray(camera.wxyz), np.asarray(camera.position)
+            fov_rad, aspect = float(camera.fov), float(camera.aspect)
+        except AssertionError:  # viser has not heard of this camera yet; it will say so.
+            return None
+        self._nearest = self._viewer.viewpoints.nearest(position, matrix_of(wxyz)[:, 2])
+        against = self._nearest if self._layer.value == ERROR else None
+        wish = Wish(cam_from_world(wxyz, position), fov_rad, aspect, self._layer.value, against=against)
+        return wish if self._panes is None else self._panes.applied(wish)
+
+    def camera(self) -> Camera | None:
+        """Where the browser stands, with as many rows as its window has."""
+        wish = self.wish()
+        return None if wish is None else wish.camera(max(1, int(self._handle.camera.image_height)))
+
+    def stand_at(self, index: int) -> None:
+        """Moves the camera to where a photograph was taken, and shows that; keyframes play no further."""
+        self.keyframes.stop()
+        self._photographs.stands_at(index)
+        self._photographs.show_nearest(index)
+        self.go(self._viewer.shown.cameras[index][1])
+
+    def go(self, camera: Camera) -> None:
+        """Moves the camera."""
+        rotation = camera.cam_from_world[:3, :3].double().cpu().numpy()
+        position = camera.center.double().cpu().numpy()
+        extent = self._viewer.shown.scene.extent
+        ahead = max(float((self._viewer.focus - position) @ rotation[2]), LEAST_AHEAD * extent)
+        with self._handle.atomic():
+            self._handle.camera.up_direction = tuple(-rotation[1])
+            self._handle.camera.position = tuple(position)
+            self._handle.camera.look_at = tuple(position + ahead * rotation[2])
+            self._handle.camera.fov = 2 * float(np.arctan(camera.height / 2 / camera.fy))
+
+    def lay_out(self) -> None:
+        """Puts the controls there, anew where there were some."""
+        gui, shown = self._handle.gui, self._viewer.shown
+        layers = tuple(shown.layers)
+        chosen = layers[0] if self._layer is None else self._layer.value
+        gui.reset()
+        self._told = gui.add_markdown(self._status) if self._viewer.buttons else None
+        for name, act in self._viewer.buttons.items():
+            gui.add_button(name).on_click(survived(lambda _, act=act: act()))
+        self._layer = gui.add_dropdown("Layer", layers, initial_value=chosen)
+        self._layer.on_update(survived(lambda _: self.ask()))
+        panes = shown.scene.planes
+        if self._panes is not None:
+            self._panes.remove()
+        self._panes = PaneControls(self._handle, panes) if len(panes) else None
+        self._photographs = PhotographControls(gui, shown, self._nearest)
+        # Now that all are there: a control may be used as soon as it listens.
+        if self._panes is not None:
+            self._panes.listen(self.ask)
+        self._photographs.listen(self.stand_at)
+        self.keyframes.lay_out(self.go, None if shown.keeper is None else self.keep_keyframes)
+        if shown.keeper is not None:
+            self._add_saving(f"{shown.title}-edited")
+
+    def keep_scene(self, name: str) -> None:
+        """Saves the scene as it is edited here, under a new name; says how that went."""
+        keeper, wish = self._viewer.shown.keeper, self.wish()
+        if keeper is not None and wish is not None:
+            self._keep(lambda: keeper.keep_scene(edited(self._viewer.shown.scene, wish), name))
+
+    def keep_keyframes(self, name: str) -> None:
+        """Saves the keyframes under a new name; says how that went."""
+        keeper, keyframes = self._viewer.shown.keeper, self.keyframes.keyframes
+        if keeper is not None:
+            self._keep(lambda: keeper.keep_keyframes(keyframes, name))
+
+    def _add_saving(self, name: str) -> None:
+        gui = self._handle.gui
+        with gui.add_folder("Edited scene", expand_by_default=False):
+            text = gui.add_text("Name", name)
+            gui.add_button("Save as a run").on_click(survived(lambda _: self.keep_scene(text.value)))
+
+    def _keep(self, write: Callable[[], str]) -> None:
+        """Writes in the thread that draws: what is written may need kernels."""
+
+        def work() -> None:
+            try:
+                self._notify("Saved", write(), "green")
+            except (InputError, ValueError, OSError, RuntimeError) as error:
+                self._notify("Not saved", str(error), "red")
+
+        self._viewer.loop.call(work)
+
+    def _stop_waiting(self) -> None:
+        if self._waiting is not None:
+            self._waiting.remove()
+            self._waiting = None
+
+    def _notify(self, title: str, body: str, color: str) -> None:
+        self._handle.add_notification(title, body, color=color)
+
+
+def cam_from_world(wxyz: NDArray[np.float64], position: NDArray[np.float64]) -> Tensor:
+    """[4, 4] float32 from viser's camera, which has the axes of OpenCV."""
+    rotation = matrix_of(wxyz).T
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
+    return torch.from_numpy(pose).float()
 
 
 class Viewer:

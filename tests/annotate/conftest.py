@@ -15,7 +15,7 @@ from PIL import Image
 from glassplat.annotate.server import AnnotationServer
 from glassplat.annotate.session import Session, opened_session
 from glassplat.scene.camera import Camera
-from tests.init.pane_scene import FRONT, camera_from, label_image
+from tests.panes.pane_scene import FRONT, camera_from, label_image
 
 PLACES = ((0.0, 0.0, -1.0), (1.2, 0.3, -0.6), (-0.6, -0.6, -0.8), (0.5, 0.5, -1.2), (-1.0, 0.2, -0.9))
 NAMES = [f"{number}.png" for number in range(len(PLACES))]

@@ -7,9 +7,9 @@ import importlib
 import numpy as np
 import pytest
 
-from glassplat.annotate.grab import grabbed
-from glassplat.annotate.outline import filled
-from glassplat.data.errors import InputError
+from glassplat.annotate.document import filled
+from glassplat.annotate.results import grabbed
+from glassplat.errors import InputError
 
 HEIGHT, WIDTH = 160, 240
 ROUGH = np.array([[60.0, 30], [170, 30], [170, 130], [60, 130]])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from glassplat.annotate.document import MOST_PANES
-from glassplat.annotate.merging import merged
+from glassplat.annotate.session import merged
 
 
 def document(**panes: str) -> dict:

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from glassplat.data.dataset import load_dataset
+from glassplat.captures.dataset import load_dataset
 from glassplat.files.images import read_image
 from tests.annotate.conftest import NAMES, marked_document, saved, true_corners
 from tests.browser_needed import needs_browser
-from tests.init.pane_scene import FRONT
+from tests.panes.pane_scene import FRONT
 from tools.browser import wait_until
 from tools.marking_page import MarkingPage, marking_page
 

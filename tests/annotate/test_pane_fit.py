@@ -7,10 +7,17 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from glassplat.annotate.pane_fit import Marks, TooFewMarksError, corner_information, fitted_pane, tilt_deviation
-from glassplat.annotate.pane_shape import polygon_pane, rectangle_pane
-from glassplat.scene.eye import Eye
-from tests.init.pane_scene import EYES, FRONT, SIDE, Pane, camera_from
+from glassplat.annotate.fit import (
+    Marks,
+    TooFewMarksError,
+    corner_information,
+    fitted_pane,
+    polygon_pane,
+    rectangle_pane,
+    tilt_deviation,
+)
+from glassplat.scene.camera import Eye
+from tests.panes.pane_scene import EYES, FRONT, SIDE, Pane, camera_from
 
 U, V = np.array([-1.0, 1, 1, -1]), np.array([-1.0, -1, 1, 1])
 

@@ -9,20 +9,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from glassplat.annotate.document import parsed_document
-from glassplat.annotate.outline import filled, seen_outline, with_strokes
-from glassplat.annotate.pane_fit import fitted_pane
+from glassplat.annotate.document import filled, parsed_document, seen_outline, with_strokes
+from glassplat.annotate.fit import fitted_pane
 from glassplat.annotate.results import in_photograph, pane_labels
 from glassplat.annotate.session import opened_session
-from glassplat.cli import main
-from glassplat.data.dataset import load_dataset
-from glassplat.data.errors import InputError
-from glassplat.data.view import PhotoFile
+from glassplat.captures.dataset import load_dataset
+from glassplat.captures.view import PhotoFile
+from glassplat.cli.main import main
+from glassplat.errors import InputError
 from glassplat.files.images import read_image
-from glassplat.init.planes import fit_planes
-from glassplat.scene.eye import Eye
+from glassplat.panes.fit import fit_planes
+from glassplat.scene.camera import Eye
 from tests.annotate.conftest import NAMES, PLACES, marked_document, saved
-from tests.init.pane_scene import FRONT, Pane, camera_from, label_image, normal_error, offset_error
+from tests.panes.pane_scene import FRONT, Pane, camera_from, label_image, normal_error, offset_error
 
 
 def finish(root: Path, document: dict) -> None:

@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
+from glassplat.access import cookie_name
 from glassplat.annotate.document import MOST_CORNERS
 from glassplat.annotate.server import LARGEST_BODY, AnnotationServer
 from glassplat.annotate.session import opened_session
-from glassplat.data.errors import InputError
-from glassplat.serving.access import cookie_name
+from glassplat.errors import InputError
 from tests.annotate.conftest import NAMES, marked_document, serving
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from bench.parts import BEFORE, BETWEEN, STEPS, TOTAL, costs_of, parts_table
 from glassplat.kernels.backend.cpu import Kernel
-from glassplat.train.messages import ActionDone, Message, StageEntered, StepDone, Working
+from glassplat.training.messages import ActionDone, Message, StageEntered, StepDone, Working
 
 
 def busy(seconds: float) -> None:

@@ -8,7 +8,7 @@ import numba
 
 from bench.methods import doublings
 from bench.steps import step_clocks
-from glassplat.train.messages import ActionDone, Message, StepDone
+from glassplat.training.messages import ActionDone, Message, StepDone
 
 
 def test_every_number_of_threads_takes_its_turn() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import compare
 from benchmarks.compare import COLUMNS, Measured, compared, main, named_options, parsed, planned_runs, tables, values_of
-from tests.train.tiny_capture import write_tiny_capture
+from tests.training.tiny_capture import write_tiny_capture
 
 
 def results(psnr: float, **more: object) -> dict:

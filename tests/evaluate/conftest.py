@@ -10,13 +10,12 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from glassplat.data.dataset import Dataset
-from glassplat.data.point_cloud import PointCloud
-from glassplat.data.view import View
+from glassplat.captures.dataset import Dataset
+from glassplat.captures.view import PointCloud, View
 from glassplat.render.frame import Frame
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.plane import Planes
+from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
 
 WIDTH, HEIGHT = 48, 32

@@ -5,19 +5,19 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.data.errors import InputError
-from glassplat.evaluate.environment_metrics import (
+from glassplat.errors import InputError
+from glassplat.evaluate.metrics import (
     environment_lpips,
     environment_metrics,
     environment_psnr,
     learned_environment,
+    psnr,
+    quantized,
     true_environment,
 )
-from glassplat.evaluate.metrics import psnr, quantized
-from glassplat.files.environment_image import write_equirect
-from glassplat.scene.environment import Environment
+from glassplat.files.sidecars import write_equirect
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.scene import Scene
+from glassplat.scene.scene import Environment, Scene
 
 TRUTH = 0.1 + 0.6 * torch.rand(64, 128, 3, generator=torch.Generator().manual_seed(0))
 

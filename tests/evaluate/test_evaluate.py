@@ -7,20 +7,19 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.data.dataset import load_dataset
-from glassplat.data.errors import InputError
+from glassplat.captures.dataset import load_dataset
+from glassplat.errors import InputError
 from glassplat.evaluate.evaluate import EvaluatedView, evaluate, peak_memory_mib
-from glassplat.evaluate.metrics import psnr
-from glassplat.evaluate.outcome import plain
-from glassplat.evaluate.plane_errors import plane_table
+from glassplat.evaluate.metric_names import json_values
+from glassplat.evaluate.metrics import plane_table, psnr
 from glassplat.evaluate.truth import load_truth
 from glassplat.render.frame import Frame
 from glassplat.scene.camera import Camera
-from glassplat.scene.exposure import Exposures
+from glassplat.scene.corrections import Exposures
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.plane import Planes
+from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
-from tests.train.object_capture import RADIUS, write_object_capture
+from tests.training.object_capture import RADIUS, write_object_capture
 
 REQUIRED_KEYS = {
     "resolution",
@@ -227,8 +226,8 @@ def test_lpips_is_taken_with_its_backbone(case, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_plain_gives_a_reason_for_every_missing_number() -> None:
-    assert plain({"a": 1.5, "b": "because"}) == {"a": 1.5, "b": None, "b_reason": "because"}
-    assert plain({"a": math.inf})["a"] is None
+    assert json_values({"a": 1.5, "b": "because"}) == {"a": 1.5, "b": None, "b_reason": "because"}
+    assert json_values({"a": math.inf})["a"] is None
 
 
 def test_peak_memory_is_a_number_where_the_system_tells_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.evaluate.lpips import Lpips, load_lpips
+from glassplat.evaluate.metrics import Lpips, load_lpips
 
 MODULE = "torchmetrics.image.lpip"
 

@@ -9,17 +9,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.commands.measuring.evaluation import evaluate_run, plane_text
-from glassplat.commands.measuring.pane_source import pane_regions
-from glassplat.commands.runs.stored_run import open_run
-from glassplat.data.errors import InputError
-from glassplat.evaluate.evaluate import evaluate
-from glassplat.evaluate.pane_regions import MarkedRegions, RenderedRegions, TrueRegions
-from glassplat.evaluate.plane_errors import plane_table
+from glassplat.cli.evaluation import evaluate_run, pane_regions, plane_text
+from glassplat.cli.runs import open_run
+from glassplat.errors import InputError
+from glassplat.evaluate.evaluate import MarkedRegions, RenderedRegions, TrueRegions, evaluate
+from glassplat.evaluate.metrics import plane_table
 from glassplat.render.frame import Frame
-from tests.commands.tiny_run import write_run
+from tests.cli.tiny_run import write_run
 from tests.render.tiny_scene import pane, shown_panes
-from tests.train.tiny_capture import tiny_capture, true_scene, write_tiny_capture
+from tests.training.tiny_capture import tiny_capture, true_scene, write_tiny_capture
 
 NOTHING_RENDERED = Frame(torch.zeros(0), {})
 

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from glassplat.evaluate.colormap import depth_colors, heat_colors, label_colors, normal_colors
 from glassplat.evaluate.evaluate import evaluate
 from glassplat.evaluate.metric_names import (
     FACTS,
@@ -18,11 +17,12 @@ from glassplat.evaluate.metric_names import (
 )
 from glassplat.evaluate.report import Report, overview_page, sheet_names
 from glassplat.evaluate.sheet import BACKGROUND, CAPTION_HEIGHT, MARGIN, TITLE_HEIGHT, comparison_sheet
-from glassplat.evaluate.surface_truth import TrueSurface
+from glassplat.evaluate.truth import TrueSurface
 from glassplat.files.images import read_image
-from glassplat.render.choices import Blend
-from glassplat.render.dereflect import dereflected_photo
-from glassplat.scene.plane import Planes
+from glassplat.options import Blend
+from glassplat.render.layers import depth_colors, heat_colors, label_colors, normal_colors
+from glassplat.render.planar import dereflected_photo
+from glassplat.scene.panes import Planes
 
 
 class References(HTMLParser):

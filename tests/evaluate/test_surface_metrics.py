@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
-from glassplat.evaluate.surface_metrics import angular_errors_deg, surface_metrics
-from glassplat.evaluate.surface_truth import TrueSurface
+from glassplat.evaluate.metrics import angular_errors_deg, surface_metrics
+from glassplat.evaluate.truth import TrueSurface
 from glassplat.render.frame import Frame
 
 HEIGHT, WIDTH = 20, 30

@@ -9,10 +9,11 @@ import pytest
 import torch
 from PIL import Image
 
-from glassplat.data.dataset import View, load_dataset
-from glassplat.data.errors import InputError
-from glassplat.evaluate.surface_truth import TrueSurface, true_surface
-from tests.train.object_capture import RADIUS, SIZE, seen_normals, world_from_opengl, write_object_capture
+from glassplat.captures.dataset import load_dataset
+from glassplat.captures.view import View
+from glassplat.errors import InputError
+from glassplat.evaluate.truth import TrueSurface, true_surface
+from tests.training.object_capture import RADIUS, SIZE, seen_normals, world_from_opengl, write_object_capture
 
 FIRST_ANGLE_RAD = 0.4
 

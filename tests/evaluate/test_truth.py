@@ -6,7 +6,7 @@ import pytest
 import torch
 from PIL import Image
 
-from glassplat.data.errors import InputError
+from glassplat.errors import InputError
 from glassplat.evaluate.truth import load_truth
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from glassplat.files.atomic import atomic_write
+from glassplat.files.writing import atomic_write
 
 
 def test_replaces_the_file_and_leaves_nothing_else(tmp_path: Path) -> None:

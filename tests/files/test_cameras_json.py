@@ -5,9 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.files.cameras_json import read_cameras, write_cameras
-from glassplat.scene.camera import Camera
-from glassplat.scene.pose import rotation_from_quat
+from glassplat.files.sidecars import read_cameras, write_cameras
+from glassplat.scene.camera import Camera, rotation_from_quat
 
 
 def test_entries_give_the_pose_of_the_camera_in_the_world(tmp_path: Path) -> None:

@@ -4,8 +4,8 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from glassplat.files.environment_file import read_environment, write_environment
-from glassplat.scene.environment import Environment
+from glassplat.files.sidecars import read_environment, write_environment
+from glassplat.scene.scene import Environment
 
 
 def noise(size: int = 3) -> Environment:

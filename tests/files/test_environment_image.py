@@ -5,7 +5,7 @@ import OpenEXR
 import pytest
 import torch
 
-from glassplat.files.environment_image import read_equirect, write_equirect
+from glassplat.files.sidecars import read_equirect, write_equirect
 from glassplat.kernels.maths.color import linear_from_srgb
 
 

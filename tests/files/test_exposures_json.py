@@ -3,8 +3,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.files.exposures_json import read_exposures, write_exposures
-from glassplat.scene.exposure import Exposures
+from glassplat.files.sidecars import read_exposures, write_exposures
+from glassplat.scene.corrections import Exposures
 
 
 def test_what_was_written_is_read(tmp_path: Path) -> None:

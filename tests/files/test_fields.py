@@ -7,19 +7,7 @@ from typing import Any
 
 import pytest
 
-from glassplat.files.fields import (
-    ByName,
-    Choice,
-    Field,
-    Flag,
-    Items,
-    Nullable,
-    Number,
-    Optional,
-    Text,
-    Whole,
-    checked,
-)
+from glassplat.files.records import ByName, Choice, Field, Flag, Items, Nullable, Number, Optional, Text, Whole, checked
 
 NOT_NUMBERS = [None, True, "1", [1], {}, math.nan, math.inf, -math.inf, 10**400]
 CASES: list[tuple[Field, list[Any], list[Any]]] = [

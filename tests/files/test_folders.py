@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from glassplat.files.folders import check_folder, make_folder
+from glassplat.files.writing import check_folder, make_folder
 
 
 @pytest.mark.parametrize("name", ["new", "new/below/it", "there", "link"])

@@ -18,12 +18,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from glassplat.files.glb import EXTENSION, read_glb, write_glb
-from glassplat.files.glb_container import CHUNK, HEADER
+from glassplat.files.glb import CHUNK, EXTENSION, HEADER, read_glb, write_glb
 from glassplat.kernels.project.reference import rotations, sh_basis
 from glassplat.scene.activations import SH_ZERO
+from glassplat.scene.camera import rotation_from_quat
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.pose import rotation_from_quat
 from tests.files.test_spz import shapes, typical
 
 FLIP = torch.tensor([-1.0, -1.0, 1.0])

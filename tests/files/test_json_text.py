@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from glassplat.files.json_text import DEEPEST, parse_json, read_json
+from glassplat.files.records import DEEPEST, parse_json, read_json
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from glassplat.files.picture_paths import flat_picture_names, picture_paths
+from glassplat.files.images import flat_picture_names, picture_paths
 
 
 def test_pictures_are_named_after_photographs() -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.files.planes_json import read_planes, write_planes
-from glassplat.scene.plane import Planes
+from glassplat.files.sidecars import read_planes, write_planes
+from glassplat.scene.panes import Planes
 
 
 def random_planes(count: int = 3) -> Planes:

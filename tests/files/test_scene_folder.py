@@ -5,12 +5,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.files.environment_image import read_equirect
 from glassplat.files.scene_folder import read_scene, write_scene
+from glassplat.files.sidecars import read_equirect
+from glassplat.model.run_directory import RunDirectory
 from glassplat.render.environment import equirect_from_environment
-from glassplat.scene.environment import Environment
-from glassplat.scene.scene import Scene
-from glassplat.train.run_directory import RunDirectory
+from glassplat.scene.scene import Environment, Scene
 from tests.render.tiny_scene import in_single_precision, showcase
 
 

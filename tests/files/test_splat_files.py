@@ -12,12 +12,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from glassplat.files.compressed_ply import BOUNDS
-from glassplat.files.ply import write_gaussians
-from glassplat.files.splat_files import SPLAT_ROW, drawable, read_splats
+from glassplat.files.ply import BOUNDS, write_gaussians
+from glassplat.files.scene_folder import SPLAT_ROW, drawable, read_splats
 from glassplat.files.spz import write_spz
-from glassplat.init.glass import with_intensity
 from glassplat.kernels.project.reference import rotations
+from glassplat.panes.material import with_intensity
 from glassplat.scene.activations import SH_ZERO
 from glassplat.scene.gaussians import Gaussians
 from tests.files.test_spz import shapes, typical

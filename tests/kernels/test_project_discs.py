@@ -101,7 +101,7 @@ def test_the_map_leads_to_where_the_ray_meets_the_disc() -> None:
 
 
 def rotation_of(quat: Tensor) -> Tensor:
-    from glassplat.scene.pose import rotation_from_quat
+    from glassplat.scene.camera import rotation_from_quat
 
     return rotation_from_quat(quat[None])[0]
 

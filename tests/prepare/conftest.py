@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from glassplat.commands.measuring.demo import SCENE
-from glassplat.prepare.messages import Note, Progress
+from glassplat.cli.demo import SCENE
+from glassplat.prepare.photographs import Note, Progress
 
 CONNECTED = ("0000", "0001", "0003", "0004", "0006", "0007", "0009", "0010", "0012", "0013")
 """Of the bundled scene, photographs that show enough of the same."""

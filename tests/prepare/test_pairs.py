@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from glassplat.prepare.pairs import MOST_EXHAUSTIVE, alike_pairs, all_pairs, chosen_pairs, neighbouring_pairs
+from glassplat.prepare.colmap import MOST_EXHAUSTIVE, alike_pairs, all_pairs, chosen_pairs, neighbouring_pairs
 
 
 def walk_round(count: int, *, places: int = 30) -> list[np.ndarray]:

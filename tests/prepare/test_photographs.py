@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from glassplat.data.errors import InputError
+from glassplat.errors import InputError
 from glassplat.prepare.photographs import Photograph, capture_names, photographs_in, read_photograph
 from tests.prepare.conftest import Heard
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from glassplat.cli import main
+from glassplat.cli.main import main
 
 
 def refused(source: Path, output: Path, capsys: pytest.CaptureFixture[str]) -> str:

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from glassplat.cli import main
-from glassplat.commands.measuring.demo import SCENE
-from glassplat.data.dataset import Dataset, load_dataset
-from glassplat.data.errors import InputError
-from glassplat.prepare import native_call
-from glassplat.prepare.messages import Note, Progress
+from glassplat.captures.dataset import Dataset, load_dataset
+from glassplat.cli.demo import SCENE
+from glassplat.cli.main import main
+from glassplat.errors import InputError
+from glassplat.prepare import colmap
+from glassplat.prepare.photographs import Note, Progress
 from glassplat.prepare.preparation import Preparation, prepare
 from glassplat.prepare.reconstruction import Settings
 from tests.prepare.conftest import CONNECTED, Heard, copy_photographs
@@ -59,7 +59,7 @@ def test_the_focal_length_is_found(prepared: Path) -> None:
 
 
 def test_the_model_fits_the_straightened_photographs(prepared: Path) -> None:
-    from glassplat.data.colmap_library import pycolmap
+    from glassplat.captures.colmap_library import pycolmap
 
     model = pycolmap.Reconstruction(prepared / "sparse" / "0")
     model.update_point_3d_errors()
@@ -128,7 +128,7 @@ def test_only_one_sqlite_has_the_database_open_and_progress_is_read_from_it(
         raise AssertionError("another SQLite opened the database")
 
     monkeypatch.setattr(sqlite3, "connect", refuse)
-    monkeypatch.setattr(native_call, "LOOK_EVERY", 0.001)
+    monkeypatch.setattr(colmap, "LOOK_EVERY", 0.001)
     assert prepare(Preparation(photographs, tmp_path / "capture"), heard).registered == len(CONNECTED)
     for phase in ("looking for features", "matching photographs"):
         told = [message.done for message in heard if isinstance(message, Progress) and message.what == phase]

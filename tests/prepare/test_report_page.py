@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from glassplat.cli import main
-from glassplat.commands.measuring.demo import SCENE
-from glassplat.data.dataset import load_dataset
-from glassplat.prepare.plan import plan
-from glassplat.prepare.report_page import PAGE, write_page
+from glassplat.captures.dataset import load_dataset
+from glassplat.cli.demo import SCENE
+from glassplat.cli.main import main
+from glassplat.prepare.report_page import PAGE, plan, write_page
 
 RECORD = {
     "command": "prepare",

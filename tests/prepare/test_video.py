@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from glassplat.data.errors import InputError
+from glassplat.errors import InputError
 from glassplat.files.images import image_size
 from glassplat.prepare import video
 from glassplat.prepare.video import Footage, chosen_frames, frames_of

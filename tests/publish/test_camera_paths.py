@@ -8,12 +8,11 @@ import pytest
 import torch
 
 from glassplat.publish.camera_paths import interpolated, keyframes_of, orbit, widened
-from glassplat.publish.look_around import cameras_around
-from glassplat.publish.surveyed import best_view, surveyed
+from glassplat.publish.web_page import best_view, cameras_around, surveyed
 from glassplat.scene.camera import Camera
 from tests.files.test_spz import typical
 from tests.render.tiny_scene import camera_at
-from tests.train.tiny_capture import true_scene
+from tests.training.tiny_capture import true_scene
 
 UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
 AROUND = [camera for _, camera in cameras_around(typical(), UP)]

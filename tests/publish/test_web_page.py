@@ -15,11 +15,10 @@ from glassplat.publish.web_page import SCRIPTS, SHADERS, asset, filled, page_tex
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
-from glassplat.scene.plane_edits import as_mirrors, without_glass
-from glassplat.scene.scene import Scene
+from glassplat.scene.scene import Scene, as_mirrors, without_glass
 from tests.browser_needed import needs_browser
 from tests.render.tiny_scene import in_single_precision, joined, pane, showcase
-from tests.train.tiny_capture import tiny_capture, true_scene
+from tests.training.tiny_capture import tiny_capture, true_scene
 from tools.browser import Browser
 from tools.page_likeness import picture, pixels_of
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import torch
 
-from glassplat.render.contribution import contributions
+from glassplat.render.layers import contributions
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
-from glassplat.scene.plane import Planes
+from glassplat.scene.panes import Planes
 from tests.render.tiny_scene import camera_at, showcase
 
 CAMERA = camera_at(0.0, 0.0, -0.2)

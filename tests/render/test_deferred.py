@@ -9,13 +9,12 @@ import pytest
 import torch
 
 from glassplat.kernels.environment.reference import cube_lookup
-from glassplat.render.choices import Shading
+from glassplat.options import Shading
 from glassplat.render.deferred import Deferred, view_directions
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
-from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.scene import Scene
+from glassplat.scene.scene import Environment, Scene
 from tests.render.tiny_scene import camera_at, in_single_precision, random_gaussians
 
 BOTH = pytest.mark.parametrize("shading", ["deferred", "forward"])

@@ -8,12 +8,11 @@ import pytest
 import torch
 
 from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
-from glassplat.render.choices import Blend
-from glassplat.render.dereflect import as_mirror_image, dereflected_photo
+from glassplat.options import Blend
 from glassplat.render.frame import Frame
-from glassplat.render.planar import Planar
-from glassplat.scene.exposure import Exposures
-from glassplat.scene.plane_edits import as_mirrors
+from glassplat.render.planar import Planar, as_mirror_image, dereflected_photo
+from glassplat.scene.corrections import Exposures
+from glassplat.scene.scene import as_mirrors
 from tests.render.tiny_scene import camera_at, in_single_precision, showcase
 
 SIZE = (24, 32)

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from glassplat.render.contribution import contributions
 from glassplat.render.deferred import Deferred
 from glassplat.render.frame import Renderer
+from glassplat.render.layers import contributions
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.gaussians import Gaussians

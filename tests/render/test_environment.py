@@ -16,7 +16,7 @@ from glassplat.render.environment import (
     rotated,
     texel_directions,
 )
-from glassplat.scene.environment import Environment
+from glassplat.scene.scene import Environment
 
 SIZE = 16
 

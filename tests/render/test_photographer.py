@@ -10,10 +10,9 @@ from torch import Tensor
 
 from glassplat.kernels.maths.color import linear_from_srgb
 from glassplat.render.planar import Planar
-from glassplat.scene.camera import Camera
+from glassplat.scene.camera import Camera, rotation_from_quat
+from glassplat.scene.corrections import Direction, world_from_photographer
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.photographer import Direction, world_from_photographer
-from glassplat.scene.pose import rotation_from_quat
 from glassplat.scene.scene import Scene
 from tests.render.tiny_scene import (
     camera_at,

@@ -11,14 +11,12 @@ from glassplat.kernels.fresnel import Fresnel
 from glassplat.kernels.maths.color import linear_from_srgb
 from glassplat.kernels.maths.pane import LAWS
 from glassplat.kernels.panes.reference import REFLECTANCE
-from glassplat.render.choices import Blend
-from glassplat.render.glazing import gated_transmission
+from glassplat.options import Blend
+from glassplat.render.panes import SeenPanes, gated_transmission
 from glassplat.render.planar import Planar, detached
-from glassplat.render.seen_panes import SeenPanes
 from glassplat.render.splat import Splat
-from glassplat.scene.camera import Camera
-from glassplat.scene.plane import Planes
-from glassplat.scene.pose import mirror_matrices, rotation_from_quat
+from glassplat.scene.camera import Camera, mirror_matrices, rotation_from_quat
+from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
 from tests.render.tiny_scene import camera_at, in_single_precision, joined, pane, quat_product, showcase, shown_panes
 

@@ -10,15 +10,14 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.maths.color import linear_from_srgb
-from glassplat.losses.reflection import gradient_conflict
-from glassplat.render.choices import Blend
-from glassplat.render.contribution import contributions
-from glassplat.render.glazing import FAINT, curves
+from glassplat.options import Blend
+from glassplat.render.layers import contributions
+from glassplat.render.panes import FAINT, curves, glass_owners, nearest_hits, panes_in_camera, seen_panes
 from glassplat.render.planar import Planar
-from glassplat.render.seen_panes import glass_owners, nearest_hits, panes_in_camera, seen_panes
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.plane import Planes
+from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
+from glassplat.training.losses import gradient_conflict
 from tests.render.tiny_scene import camera_at, concatenated, joined, pane, random_gaussians, showcase
 
 CAMERA = camera_at(0.0, 0.0, -0.2)
@@ -123,7 +122,7 @@ def test_panes_change_places_for_a_camera_on_the_other_side() -> None:
 
 
 def test_a_mirror_behind_glass_shows_the_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("glassplat.render.glazing.FAINT", 0.0)
+    monkeypatch.setattr("glassplat.render.panes.FAINT", 0.0)
     mirror = pane(4.0, label=2, base_reflectance=1 - 1e-9)
     scene = replace(vitrine(1, 2), planes=joined(FRONT, mirror))
     room = scene.primary.select(scene.primary.means[:, 2] < 1.0)
@@ -206,7 +205,7 @@ def test_what_a_pane_mirrors_only_through_another_counts_as_seen() -> None:
 
 
 def test_the_conflict_of_edges_does_not_ask_the_farther_reflection(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("glassplat.render.glazing.FAINT", 0.0)
+    monkeypatch.setattr("glassplat.render.panes.FAINT", 0.0)
     scene = vitrine(1, 2)
     frame = Planar()(scene, CAMERA)
     alone = Planar()(vitrine(1), CAMERA)

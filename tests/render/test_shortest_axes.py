@@ -11,9 +11,8 @@ import torch
 from glassplat.render.frame import Renderer
 from glassplat.render.layers import renderer_with
 from glassplat.render.planar import Planar
-from glassplat.render.shortest_axes import WithNormals
-from glassplat.render.splat import Splat
-from glassplat.scene.pose import rotation_from_quat
+from glassplat.render.splat import Splat, WithNormals
+from glassplat.scene.camera import rotation_from_quat
 from glassplat.scene.scene import Scene
 from tests.render.tiny_scene import camera_at, pane, random_gaussians
 

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.maths.color import linear_from_srgb
-from glassplat.render.choices import Blend
-from glassplat.render.glazing import tinted
+from glassplat.options import Blend
+from glassplat.render.panes import tinted
 from glassplat.render.planar import Planar
-from glassplat.scene.plane import Planes
+from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
 from tests.render.tiny_scene import camera_at, pane, showcase
 

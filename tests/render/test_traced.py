@@ -9,14 +9,12 @@ import pytest
 import torch
 
 from glassplat.kernels.trace import Rays
-from glassplat.render.deferred import INVISIBLE, Deferred
+from glassplat.render.deferred import INVISIBLE, Deferred, view_directions
 from glassplat.render.splat import Splat
-from glassplat.render.surface import view_directions
 from glassplat.render.traced import Traced, hit_distances, mirrored_contributions, space_pass
 from glassplat.scene.camera import Camera
-from glassplat.scene.environment import Environment
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.scene import Scene
+from glassplat.scene.scene import Environment, Scene
 from tests.render.tiny_scene import camera_at, random_gaussians
 
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from glassplat.render.seen_panes import nearest_hits, panes_in_camera
+from glassplat.render.panes import nearest_hits, panes_in_camera
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.plane import Planes
+from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
 
 

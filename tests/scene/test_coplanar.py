@@ -6,8 +6,7 @@ import math
 
 import torch
 
-from glassplat.scene.coplanar import coplanar_groups
-from glassplat.scene.plane import Planes
+from glassplat.scene.panes import Planes, coplanar_groups
 
 
 def at(x: float, offset: float = 0.0, turn_deg: float = 0.0, half: float = 0.5, label: int = 1) -> Planes:

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.scene.environment import Environment
-from glassplat.train.checkpoint import load_checkpoint, save_checkpoint
-from glassplat.train.state import TrainState
+from glassplat.scene.scene import Environment
+from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
+from glassplat.training.stage import TrainState
 from tests.render.tiny_scene import in_single_precision, showcase
 
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from glassplat.losses.photometric import PhotometricLoss
 from glassplat.render.frame import Frame
-from glassplat.scene.exposure import Exposures
-from tests.train.tiny_capture import tiny_capture, true_scene
+from glassplat.scene.corrections import Exposures
+from glassplat.training.losses import PhotometricLoss
+from tests.training.tiny_capture import tiny_capture, true_scene
 
 
 def drawn(*shape: int, seed: int = 0) -> torch.Tensor:

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import torch
 
-from glassplat.scene.mirrored import mirrored_gaussians
-from glassplat.scene.pose import mirror_matrices, rotation_from_quat
+from glassplat.scene.camera import mirror_matrices, rotation_from_quat
+from glassplat.scene.gaussians import mirrored_gaussians
 from tests.render.tiny_scene import random_gaussians
 
 CENTER = torch.tensor([0.3, -0.2, 1.0], dtype=torch.float64)

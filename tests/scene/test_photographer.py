@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from glassplat.scene.camera import Camera
-from glassplat.scene.photographer import upward, world_from_photographer
+from glassplat.scene.corrections import upward, world_from_photographer
 from tests.render.tiny_scene import camera_at
 
 UP = (0.36, 0.48, -0.8)

@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from glassplat.render.planar import Planar
-from glassplat.scene.plane import Planes
-from glassplat.scene.plane_edits import (
+from glassplat.scene.panes import Planes
+from glassplat.scene.scene import (
+    Scene,
     as_mirrors,
     glass_of_pane,
     moved,
@@ -20,7 +21,6 @@ from glassplat.scene.plane_edits import (
     with_reflectance,
     without_glass,
 )
-from glassplat.scene.scene import Scene
 from tests.render.tiny_scene import (
     camera_at,
     concatenated,

@@ -11,9 +11,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from glassplat.data.dataset import load_dataset
-from glassplat.evaluate.surface_truth import true_surface
-from glassplat.evaluate.truth import load_truth
+from glassplat.captures.dataset import load_dataset
+from glassplat.evaluate.truth import load_truth, true_surface
 from glassplat.files.images import read_image
 from glassplat.kernels.panes.reference import pane_hits, two_surfaces
 from glassplat.kernels.records import Panes

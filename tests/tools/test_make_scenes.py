@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from glassplat.data.dataset import load_dataset
+from glassplat.captures.dataset import load_dataset
 from tools.make_demo_scene import linear_from_srgb
 from tools.make_scenes import BALL_RADIUS, Arguments, camera_positions, main, world_from_opengl, write_points
 from tools.scene_draws import COATINGS, SHAPES, DrawnScene, draw_scene

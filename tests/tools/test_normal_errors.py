@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.data.dataset import load_dataset
-from glassplat.evaluate.surface_truth import true_surface
+from glassplat.captures.dataset import load_dataset
+from glassplat.evaluate.truth import true_surface
 from tools.normal_errors import errors_by_band, mirrored_rays
 
 BALL = Path(__file__).parent.parent / "data_files" / "ball"

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.commands.measuring.demo import SCENE
-from glassplat.data.dataset import Dataset, load_dataset
+from glassplat.captures.dataset import Dataset, load_dataset
+from glassplat.cli.demo import SCENE
 from glassplat.evaluate.truth import GroundTruth, load_truth
 from tools.plane_errors import Fit, fits_of, main, row
 

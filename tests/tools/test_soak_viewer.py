@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
-from tests.commands.tiny_run import write_run
+from tests.cli.tiny_run import write_run
 from tools.soak_viewer import Count, Soaked, soak
 
 

@@ -11,13 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from glassplat.render.deferred import Deferred
 from glassplat.render.planar import Planar
-from glassplat.scene.environment import Environment
-from glassplat.scene.plane_edits import as_mirrors, moved, with_reflectance, without_glass
-from glassplat.scene.scene import Scene
-from glassplat.viewer.client import cam_from_world
-from glassplat.viewer.drawing import PaneMove, Wish, drawn, edited, error_drawn
-from glassplat.viewer.shown import Viewpoints
-from tests.train.tiny_capture import tiny_capture, true_scene
+from glassplat.scene.scene import Environment, Scene, as_mirrors, moved, with_reflectance, without_glass
+from glassplat.viewer.drawing import PaneMove, Viewpoints, Wish, drawn, edited, error_drawn
+from glassplat.viewer.server import cam_from_world
+from tests.training.tiny_capture import tiny_capture, true_scene
 
 POSE = tiny_capture().train[1].camera.cam_from_world
 WISH = Wish(POSE, fov_rad=0.9, aspect=1.4)

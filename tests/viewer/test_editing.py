@@ -13,16 +13,14 @@ import numpy as np
 import torch
 
 import glassplat
-from glassplat.files.cameras_json import read_cameras
-from glassplat.interface.keeping import KeptBeside
-from glassplat.interface.watching import shown_of
+from glassplat.files.sidecars import read_cameras
+from glassplat.model.watching import KeptBeside, shown_of
 from glassplat.scene.camera import Camera
-from glassplat.viewer.client import Client
-from glassplat.viewer.pane_controls import HANDLE_SHARE, PaneControls
-from glassplat.viewer.server import Viewer
+from glassplat.viewer.controls import HANDLE_SHARE, PaneControls
+from glassplat.viewer.server import Client, Viewer
 from tests.browser_needed import needs_browser
-from tests.interface.test_model import model
-from tests.train.tiny_capture import tiny_capture, true_scene
+from tests.model.test_model import model
+from tests.training.tiny_capture import tiny_capture, true_scene
 from tests.viewer.free_port import free_port
 from tests.viewer.test_server import eventually
 from tools.browser import Browser

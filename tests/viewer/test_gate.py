@@ -14,11 +14,10 @@ import torch
 import viser
 from websockets.exceptions import InvalidStatus
 
-from glassplat.data.errors import InputError
+from glassplat.errors import InputError
 from glassplat.viewer import gate
-from glassplat.viewer.client import MOST_PIXELS
 from glassplat.viewer.gate import LARGEST_MESSAGE, MESSAGES, understood
-from glassplat.viewer.server import Viewer
+from glassplat.viewer.server import MOST_PIXELS, Viewer
 from tests.viewer.free_port import free_port
 from tests.viewer.test_server import SHOWN
 from tools.viewer_client import ViewerClient, page

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 from typing import Any
 
 from glassplat.scene.camera import Camera
-from glassplat.viewer.keyframe_controls import MOST_KEYFRAMES, KeyframeControls
-from tests.train.tiny_capture import tiny_capture
+from glassplat.viewer.controls import MOST_KEYFRAMES, KeyframeControls
+from tests.training.tiny_capture import tiny_capture
 
 CAMERAS = [view.camera for view in tiny_capture().train]
 

@@ -9,14 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from glassplat.cli import main
+from glassplat.cli.main import main
 from glassplat.render.planar import Planar
-from glassplat.viewer.client import WAITING
-from glassplat.viewer.server import Viewer
-from glassplat.viewer.shown import Shown
+from glassplat.viewer.drawing import Shown
+from glassplat.viewer.server import WAITING, Viewer
 from tests.browser_needed import needs_browser
-from tests.commands.tiny_run import write_run
-from tests.train.tiny_capture import tiny_capture, true_scene
+from tests.cli.tiny_run import write_run
+from tests.training.tiny_capture import tiny_capture, true_scene
 from tests.viewer.free_port import free_port
 from tools.browser import Browser
 

@@ -14,17 +14,17 @@ from pathlib import Path
 import pytest
 
 from glassplat import Training
-from glassplat.cli import main
-from glassplat.interface.watching import WatchedTraining, renderer_now
+from glassplat.cli.main import main
+from glassplat.methods.glossy_recipes import DeferredRecipe
+from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.model.watching import WatchedTraining, renderer_now
 from glassplat.render.splat import Splat
-from glassplat.train.deferred_recipe import DeferredRecipe
-from glassplat.train.messages import Message
-from glassplat.train.splat_recipe import SplatRecipe
-from glassplat.viewer.ports import vacant_port
+from glassplat.training.messages import Message
+from glassplat.viewer.render_loop import vacant_port
 from glassplat.viewer.server import Viewer
 from tests.browser_needed import needs_browser
-from tests.interface.test_model import model
-from tests.train.tiny_capture import tiny_capture, write_tiny_capture
+from tests.model.test_model import model
+from tests.training.tiny_capture import tiny_capture, write_tiny_capture
 from tests.viewer.free_port import free_port
 from tests.viewer.test_server import eventually
 from tools.browser import Browser

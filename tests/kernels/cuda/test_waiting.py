@@ -11,17 +11,17 @@ import torch
 from torch import Tensor
 
 import glassplat.kernels
-from glassplat.data.view import View
+from glassplat.captures.view import View
+from glassplat.methods.planar_recipe import PlanarRecipe
+from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
+from glassplat.scene.camera import constant
 from glassplat.scene.scene import Scene
-from glassplat.scene.transfer import constant
-from glassplat.train.planar_recipe import PlanarRecipe
-from glassplat.train.splat_recipe import SplatRecipe
-from glassplat.train.state import TrainState
-from glassplat.train.trainer import collect_statistics, differentiate, update
+from glassplat.training.loop import collect_statistics, differentiate, update
+from glassplat.training.stage import TrainState
 from tests.kernels.cuda.waiting import KERNEL_WAITS, Waits, as_on_a_gpu
-from tests.train.tiny_capture import tiny_capture, true_scene
+from tests.training.tiny_capture import tiny_capture, true_scene
 
 KERNELS = Path(glassplat.kernels.__file__).parent
 WAITING = {"tolist", "item", "cpu", "numpy", "nonzero", "unique", "masked_select", "new_tensor", "tensor"}
@@ -65,7 +65,7 @@ def test_a_planar_frame_waits_for_two_lists_and_for_which_panes_it_shows(waits: 
     assert sorted(place.partition(":")[0] for place in waits.places) == [
         "kernel bin_tiles",
         "kernel bin_tiles",
-        "render/seen_panes.py",
+        "render/panes.py",
     ]
 
 

@@ -13,15 +13,14 @@ import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from glassplat.densify import default as densify
 from glassplat.kernels.backend import devices
 from glassplat.kernels.gradient_conflict import reference as conflict_twin
 from glassplat.kernels.harmonic_energy import _EnergyInTorch
 from glassplat.kernels.panes.reference import layer_slopes
 from glassplat.kernels.screen_statistics import add_views_in_torch
-from glassplat.losses import parsimony, reflection
 from glassplat.render import planar
-from glassplat.scene import transfer
+from glassplat.scene import camera
+from glassplat.training import densify, losses
 
 ATEN = torch.ops.aten
 LOOKED_AT = {ATEN._local_scalar_dense.default, ATEN.nonzero.default, ATEN.masked_select.default, ATEN.equal.default}
@@ -116,8 +115,8 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch, waits: Waits) -> None:
 
     monkeypatch.setattr(devices, "_module", counted)
     # The operations that are PyTorch's own on a GPU.
-    monkeypatch.setattr(reflection, "shared_edges", conflict_twin.gradient_conflict)
-    monkeypatch.setattr(parsimony, "harmonic_energy", _EnergyInTorch.apply)
+    monkeypatch.setattr(losses, "shared_edges", conflict_twin.gradient_conflict)
+    monkeypatch.setattr(losses, "harmonic_energy", _EnergyInTorch.apply)
     monkeypatch.setattr(planar, "layer_slopes", layer_slopes)
     monkeypatch.setattr(densify, "add_views", add_views_in_torch)
-    monkeypatch.setattr(transfer, "waits", lambda device: True)
+    monkeypatch.setattr(camera, "waits", lambda device: True)

@@ -1,0 +1,450 @@
+"""Where a pane is, from what was marked of its outline in several photographs, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from glassplat.scene.camera import Eye
+
+Array = NDArray[np.float64]
+
+RECTANGLE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+"""Corners in half sides, one after the other round it."""
+
+
+class PaneShape(Protocol):
+    """What is fitted to marks: corners in one plane, moved by steps of a few numbers."""
+
+    @property
+    def frame(self) -> Array:
+        """[3, 3] rows: two axes in the plane, and its normal."""
+        ...
+
+    @property
+    def freedom(self) -> int:
+        """How many numbers move it; the first two tilt its plane, in radians."""
+        ...
+
+    def corners(self) -> Array:
+        """[K, 3] in the world, in order round the outline."""
+        ...
+
+    def stepped(self, step: Array) -> PaneShape:
+        """The shape after a step."""
+        ...
+
+
+@dataclass(frozen=True)
+class RectanglePane:
+    """A rectangle: tilt, turn, centre and two half sides."""
+
+    axes: Array
+    center: Array
+    half_sizes: Array
+
+    @property
+    def frame(self) -> Array:
+        """[3, 3] along the first side, along the second, normal."""
+        return self.axes
+
+    @property
+    def freedom(self) -> int:
+        """Three to turn it, three to shift it, two for its sides."""
+        return 8
+
+    def corners(self) -> Array:
+        """[4, 3]."""
+        return np.asarray(self.center + (RECTANGLE * self.half_sizes) @ self.axes[:2])
+
+    def stepped(self, step: Array) -> RectanglePane:
+        """Shifts are in units of the longer half side, sides grow by factors."""
+        return RectanglePane(
+            axes=_turned(self.axes, step[:3]),
+            center=self.center + self.half_sizes.max() * step[3:6] @ self.axes,
+            half_sizes=self.half_sizes * np.exp(np.clip(step[6:8], -1, 1)),
+        )
+
+
+@dataclass(frozen=True)
+class PolygonPane:
+    """Corners anywhere in a plane."""
+
+    axes: Array
+    center: Array
+    places: Array
+    """[K, 2] corners along the first two axes, from the centre."""
+
+    @property
+    def frame(self) -> Array:
+        """[3, 3] two axes in the plane, normal."""
+        return self.axes
+
+    @property
+    def freedom(self) -> int:
+        """Two to tilt it, one along its normal, two for each corner."""
+        return 3 + 2 * len(self.places)
+
+    def corners(self) -> Array:
+        """[K, 3]."""
+        return np.asarray(self.center + self.places @ self.axes[:2])
+
+    def stepped(self, step: Array) -> PolygonPane:
+        """Lengths are in units of the polygon's reach."""
+        reach = float(np.linalg.norm(self.places, axis=1).max())
+        return replace(
+            self,
+            axes=_turned(self.axes, np.append(step[:2], 0.0)),
+            center=self.center + reach * step[2] * self.axes[2],
+            places=self.places + reach * step[3:].reshape(-1, 2),
+        )
+
+
+def polygon_pane(corners: Array) -> PolygonPane:
+    """The polygon in the plane that lies closest to points [K, 3].
+
+    Raises:
+        ValueError: they lie on a line.
+    """
+    center = corners.mean(axis=0)
+    _, sizes, axes = np.linalg.svd(corners - center)
+    if sizes[1] < 1e-6 * sizes[0]:
+        raise ValueError("the corners lie on one line; expected an outline that spans an area")
+    axes = axes * np.array([[1.0], [1.0], [np.linalg.det(axes)]])
+    return PolygonPane(axes, center, (corners - center) @ axes[:2].T)
+
+
+def rectangle_pane(polygon: PolygonPane) -> RectanglePane:
+    """The rectangle closest to a polygon of four corners, which may be far from one."""
+    a, b, c, d = polygon.places
+    along, across = (b - a + c - d) / 2, (d - a + c - b) / 2
+    # The direction on which both pairs of sides agree best, the second pair turned back by a right angle.
+    turn = 1.0 if along[0] * across[1] - along[1] * across[0] > 0 else -1.0
+    direction = along + turn * np.array([across[1], -across[0]])
+    first = direction / np.linalg.norm(direction)
+    second = turn * np.array([-first[1], first[0]])
+    axes = np.stack([first @ polygon.axes[:2], second @ polygon.axes[:2], turn * polygon.axes[2]])
+    half_sizes = np.maximum([along @ first / 2, across @ second / 2], 1e-3 * np.abs(polygon.places).max())
+    return RectanglePane(axes, polygon.center + polygon.places.mean(axis=0) @ polygon.axes[:2], half_sizes)
+
+
+def _turned(axes: Array, angles: Array) -> Array:
+    """Axes turned about themselves by small angles, radians."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_rotvec(angles).as_matrix().T @ axes)
+
+
+Shape = Literal["rectangle", "polygon"]
+
+ACCURACY = 1.0 / 1000
+"""Of a mark, in image diagonals: how exactly somebody clicks, at best."""
+OUTLIER = 4.0
+"""Accuracies from which on a mark counts less and less."""
+LEAST_PARALLAX = np.radians(0.5)
+"""Between two sight lines on a corner; with less its distance is a guess."""
+DERIVATIVE_STEP = 1e-5
+
+
+class TooFewMarksError(ValueError):
+    """The marks leave the plane open; the message says which are missing."""
+
+
+@dataclass(frozen=True)
+class Marks:
+    """What was marked of one pane; views are numbered.
+
+    Attributes:
+        corners: for each corner, in order round the outline, its pixel (x, y) in every view that shows it.
+        edges: for each edge, the one after the corner of its number, two pixels on it in every view that shows it.
+    """
+
+    corners: Sequence[Mapping[int, Array]]
+    edges: Sequence[Mapping[int, Array]] = field(default_factory=tuple)
+
+    def views(self) -> list[int]:
+        """Views with any mark, ascending."""
+        return sorted({view for marks in (*self.corners, *self.edges) for view in marks})
+
+
+@dataclass(frozen=True)
+class PaneFit:
+    """A pane as the marks have it.
+
+    Attributes:
+        shape: the outline in the world.
+        error: root mean square distance of marks from it, in pixels.
+        errors: the largest distance of a mark in each view, in pixels.
+        information: [F, F] of the parameters of the shape, those of `stepped`: inverse of their covariance.
+    """
+
+    shape: PaneShape
+    error: float
+    errors: Mapping[int, float]
+    information: Array
+
+    @property
+    def doubt(self) -> float:
+        """Degrees by which the plane may be tilted, one standard deviation along its least certain axis."""
+        return tilt_deviation(self.information)
+
+
+def tilt_deviation(information: Array) -> float:
+    """Degrees, of the tilt that is least certain; 90 where nothing holds the plane."""
+    tilt, mixed, rest = information[:2, :2], information[:2, 2:], information[2:, 2:]
+    # What is left of the tilt's information when everything else is free; how far edges go may be open.
+    alone = tilt - mixed @ np.linalg.pinv(rest, rcond=1e-10, hermitian=True) @ mixed.T
+    least = float(np.linalg.eigvalsh(alone)[0])
+    return 90.0 if least <= np.degrees(1) ** -2 * 1e-4 else min(float(np.degrees(1 / np.sqrt(least))), 90.0)
+
+
+def fitted_pane(marks: Marks, eyes: Sequence[Eye], shape: Shape) -> PaneFit:
+    """The outline that lies closest to all marks; single marks that are far off count little.
+
+    Args:
+        marks: corners and edges, in numbered views.
+        eyes: the cameras of all views.
+        shape: a rectangle (of four corners), or any polygon.
+
+    Raises:
+        TooFewMarksError: a corner of too few is known from two places; the message says what to mark.
+    """
+    fits = [_fitted(marks, eyes, start) for start in _starts(marks, eyes, shape)]
+    _, fitted = min(fits, key=lambda fit: fit[0])
+    away = mark_residuals(marks, eyes, fitted)
+    jacobian = _jacobian(marks, eyes, fitted)
+    spread = max(1.0, float(np.sqrt((away**2).sum() / max(len(away) - fitted.freedom, 1))))
+    pixels = _pixel_distances(marks, eyes, fitted)
+    largest = {view: max(one for number, one in pixels if number == view) for view in marks.views()}
+    error = float(np.sqrt(np.mean([one**2 for _, one in pixels])))
+    return PaneFit(fitted, error, largest, jacobian.T @ jacobian / spread**2)
+
+
+def _fitted(marks: Marks, eyes: Sequence[Eye], begun: PaneShape) -> tuple[float, PaneShape]:
+    """What marks leave unexplained, and the shape that is nearest to them from where it begins."""
+    from scipy.optimize import least_squares
+
+    def residuals(step: Array) -> Array:
+        return mark_residuals(marks, eyes, begun.stepped(step))
+
+    step, cost = np.zeros(begun.freedom), np.inf
+    for loss in ("soft_l1", "cauchy"):  # The second lets go of what is far off, and would stay there if it came first.
+        found = least_squares(residuals, step, loss=loss, f_scale=OUTLIER, x_scale="jac", max_nfev=100)
+        step, cost = found.x, float(found.cost)
+    return cost, begun.stepped(step)
+
+
+def mark_residuals(marks: Marks, eyes: Sequence[Eye], shape: PaneShape) -> Array:
+    """[R] distances of all marks from the shape, in accuracies; two for a corner, one for each pixel on an edge."""
+    parts = [away / (ACCURACY * eyes[view].diagonal) for view, away in _distances(marks, eyes, shape)]
+    return np.concatenate(parts)
+
+
+def corner_information(eye: Eye, shape: PaneShape) -> Array:
+    """[F, F] what marking every corner that a view holds would add to a fit's information."""
+    held = eye.holds(shape.corners())
+    marks = Marks([{0: pixel} if seen else {} for pixel, seen in zip(eye.project(shape.corners()), held, strict=True)])
+    if not held.any():
+        return np.zeros((shape.freedom, shape.freedom))
+    jacobian = _jacobian(marks, [eye], shape)
+    return jacobian.T @ jacobian
+
+
+def _jacobian(marks: Marks, eyes: Sequence[Eye], shape: PaneShape) -> Array:
+    """[R, F] by central differences."""
+    columns = []
+    for axis in np.eye(shape.freedom):
+        ahead, behind = (
+            mark_residuals(marks, eyes, shape.stepped(sign * DERIVATIVE_STEP * axis)) for sign in (1.0, -1.0)
+        )
+        columns.append((ahead - behind) / (2 * DERIVATIVE_STEP))
+    return np.stack(columns, axis=1)
+
+
+def _distances(marks: Marks, eyes: Sequence[Eye], shape: PaneShape) -> list[tuple[int, Array]]:
+    """The view and the distances, in pixels, of each mark: [2] of a corner, [2] across an edge."""
+    corners = shape.corners()
+    found = []
+    for number, places in enumerate(marks.corners):
+        found += [(view, eyes[view].project(corners[number]) - place) for view, place in places.items()]
+    for number, places in enumerate(marks.edges):
+        ends = corners[[number, (number + 1) % len(corners)]]
+        found += [(view, _across(eyes[view].project(ends), place)) for view, place in places.items()]
+    return found
+
+
+def _across(line: Array, places: Array) -> Array:
+    """[2] distances of two pixels from the line through two others."""
+    along = line[1] - line[0]
+    length = max(float(np.hypot(*along)), 1e-9)
+    away = places - line[0]
+    return np.asarray((along[0] * away[:, 1] - along[1] * away[:, 0]) / length)
+
+
+def _pixel_distances(marks: Marks, eyes: Sequence[Eye], shape: PaneShape) -> list[tuple[int, float]]:
+    return [(view, float(np.linalg.norm(away))) for view, away in _distances(marks, eyes, shape)]
+
+
+def _starts(marks: Marks, eyes: Sequence[Eye], shape: Shape) -> list[PaneShape]:
+    """Outlines to begin with, one at least.
+
+    An edge of one view only says nothing about the plane, but how far a pane goes: the second start is the pane that
+    all other marks give, which such edges cut off.
+
+    Raises:
+        TooFewMarksError: the marks leave the plane open.
+    """
+    corners = [_first_corners(marks, eyes)]
+    loose = [number for number, places in enumerate(marks.edges) if len(places) == 1]
+    if loose:
+        firm = Marks(marks.corners, [{} if number in loose else places for number, places in enumerate(marks.edges)])
+        corners += [_cut_by_edges(marks, eyes, fitted_pane(firm, eyes, shape).shape, loose)]
+    starts = [polygon_pane(one) for one in corners]
+    return [rectangle_pane(start) if shape == "rectangle" and len(marks.corners) == 4 else start for start in starts]
+
+
+def _cut_by_edges(marks: Marks, eyes: Sequence[Eye], pane: PaneShape, loose: Sequence[int]) -> Array:
+    """[K, 3] the corners of a pane, some edges of which are moved to where one view shows them."""
+    corners = pane.corners()
+    for number in loose:
+        corners = _cut_at(corners, number, _line_on_plane(marks.edges[number], eyes, pane))
+    return corners
+
+
+def _cut_at(corners: Array, edge: int, line: tuple[Array, Array] | None) -> Array:
+    """[K, 3] an outline, one edge of which is moved to a line in its plane."""
+    around = [corners[(edge + step) % len(corners)] for step in (-1, 0, 1, 2)]
+    first, second = (_meeting(line, (around[before], around[before + 1])) for before in (0, 2))
+    found = corners.copy()
+    if first is not None and second is not None:
+        found[edge], found[(edge + 1) % len(corners)] = first, second
+    return found
+
+
+def _line_on_plane(places: Mapping[int, Array], eyes: Sequence[Eye], pane: PaneShape) -> tuple[Array, Array] | None:
+    """Where the two sight lines of an edge that one view shows meet a pane's plane; None if they run away from it."""
+    ((view, ends),) = places.items()
+    rays, normal, center = eyes[view].rays(np.asarray(ends)), pane.frame[2], eyes[view].center
+    heights, slopes = (pane.corners().mean(axis=0) - center) @ normal, rays @ normal
+    if (slopes * heights <= 1e-3 * abs(heights)).any():
+        return None
+    first, second = center + rays * (heights / slopes)[:, None]
+    return first, second
+
+
+def _first_corners(marks: Marks, eyes: Sequence[Eye]) -> Array:
+    """[K, 3] every corner: triangulated, where two edges meet, on the plane of the others, or completing them.
+
+    Raises:
+        TooFewMarksError: fewer than three are known from two places.
+    """
+    lines = [_edge_line(places, eyes) for places in marks.edges] + [None] * (len(marks.corners) - len(marks.edges))
+    known = [
+        _triangulated(places, eyes) if len(places) > 1 else _meeting(lines[number - 1], lines[number])
+        for number, places in enumerate(marks.corners)
+    ]
+    points = [point for point in known if point is not None]
+    spanning = points + [point for line in lines if line is not None for point in line]
+    if len(spanning) < 3:
+        raise TooFewMarksError(_missing(marks, len(points)))
+    plane = polygon_pane(np.stack(spanning))
+    completed = [
+        point if point is not None else _on_plane(marks, number, eyes, plane.center, plane.frame[2])
+        for number, point in enumerate(known)
+    ]
+    return np.stack(_with_line_ends(completed, lines, marks))
+
+
+def _missing(marks: Marks, known: int) -> str:
+    views = marks.views()
+    if len(views) < 2:
+        return "mark the same corners in a second photograph, taken from another place"
+    corners = "1 corner is" if known == 1 else f"{known} corners are"
+    return (
+        f"{corners} known from two places, expected at least 3: mark the same corners in two photographs taken farther "
+        "apart"
+    )
+
+
+def _triangulated(places: Mapping[int, Array], eyes: Sequence[Eye]) -> Array | None:
+    """[3] the point nearest to all sight lines; None where they are too parallel."""
+    centers = np.stack([eyes[view].center for view in places])
+    rays = np.stack([eyes[view].rays(np.asarray(place)) for view, place in places.items()])
+    if np.arccos(np.clip((rays @ rays.T).min(), -1, 1)) < LEAST_PARALLAX:
+        return None
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    return np.linalg.solve(across.sum(axis=0), np.einsum("vij,vj->i", across, centers))
+
+
+def _edge_line(places: Mapping[int, Array], eyes: Sequence[Eye]) -> tuple[Array, Array] | None:
+    """Two points of an edge in space, where the planes of sight through it meet, as far out as the marks lie."""
+    if len(places) < 2:
+        return None
+    rays = {view: eyes[view].rays(np.asarray(place)) for view, place in places.items()}
+    normals = np.stack([np.cross(*ends) for ends in rays.values()])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    _, sizes, axes = np.linalg.svd(normals)
+    if len(normals) < 2 or sizes[1] < LEAST_PARALLAX * sizes[0]:
+        return None
+    offsets = np.array([normal @ eyes[view].center for normal, view in zip(normals, places, strict=True)])
+    point, direction = np.linalg.lstsq(normals, offsets, rcond=1e-9)[0], axes[2]
+    view = next(iter(places))
+    first, second = (_nearest_on_line(point, direction, eyes[view].center, ray) for ray in rays[view])
+    return first, second
+
+
+def _nearest_on_line(point: Array, direction: Array, center: Array, ray: Array) -> Array:
+    """[3] the point of a line that is closest to a sight line."""
+    across = np.eye(3) - np.outer(ray, ray)
+    along = float(direction @ across @ direction)
+    return np.asarray(point + direction * (direction @ across @ (center - point)) / max(along, 1e-12))
+
+
+def _meeting(before: tuple[Array, Array] | None, after: tuple[Array, Array] | None) -> Array | None:
+    """[3] half-way between two lines where they are closest; None where one is missing or they are parallel."""
+    if before is None or after is None:
+        return None
+    one, other = (line[1] - line[0] for line in (before, after))
+    matrix = np.stack([one, -other], axis=1)
+    steps, _, _, sizes = np.linalg.lstsq(matrix, after[0] - before[0], rcond=None)
+    if sizes[1] < 0.05 * sizes[0]:
+        return None
+    first, second = before[0] + steps[0] * one, after[0] + steps[1] * other
+    return np.asarray((first + second) / 2)
+
+
+def _on_plane(marks: Marks, number: int, eyes: Sequence[Eye], center: Array, normal: Array) -> Array | None:
+    """[3] where the one sight line on a corner meets the plane of the others; None where nothing was marked."""
+    for view, place in marks.corners[number].items():
+        ray = eyes[view].rays(np.asarray(place))
+        slope = ray @ normal
+        if abs(slope) > 1e-3:
+            return np.asarray(eyes[view].center + ray * ((center - eyes[view].center) @ normal) / slope)
+    return None
+
+
+def _with_line_ends(corners: list[Array | None], lines: Sequence, marks: Marks) -> list[Array]:
+    """All corners: those that nothing tells are ends of a marked edge, or the fourth of a parallelogram.
+
+    Raises:
+        TooFewMarksError: some corners are told by nothing.
+    """
+    count = len(corners)
+    for number in range(count):
+        if corners[number] is None:
+            before, after = lines[number - 1], lines[number]
+            found = after[0] if after is not None else before[1] if before is not None else None
+            corners[number] = found
+    for number in range(count):
+        if corners[number] is None and count == 4:
+            a, b, c = (corners[(number + step) % 4] for step in (1, 2, 3))
+            if a is not None and b is not None and c is not None:
+                corners[number] = a + c - b
+    missing = [str(number + 1) for number, corner in enumerate(corners) if corner is None]
+    if missing:
+        raise TooFewMarksError(f"mark corner {', '.join(missing)} too, in one photograph at least")
+    return [corner for corner in corners if corner is not None]

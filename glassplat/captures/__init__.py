@@ -1,0 +1,1 @@
+"""Captures: photographs, poses, masks and points, in the formats that others write."""

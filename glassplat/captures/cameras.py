@@ -1,0 +1,270 @@
+"""Cameras of a capture: lenses, distorted or not, as pinholes, and poses checked to be rigid."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from glassplat.captures import colmap_library as library
+from glassplat.errors import InputError
+from glassplat.files.records import LARGEST_COORDINATE
+
+ORTHOGONALITY_TOLERANCE = 1e-2
+"""Largest entry of R R^T - I that passes as rounding in the file."""
+
+
+def rigid_pose(matrix: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+    """The pose [4, 4] with its rotation made exactly orthogonal, its camera centre or origin unchanged.
+
+    Args:
+        matrix: [4, 4] or [3, 4] rigid transform as read from a file.
+        name: photograph, for the message.
+
+    Raises:
+        InputError: not finite or absurdly far away, not a rotation (scaled, sheared or mirrored), or of another shape.
+    """
+    if matrix.shape not in ((3, 4), (4, 4)):
+        raise InputError(f"the pose of {name} has shape {list(matrix.shape)}; expected a 4x4 or 3x4 matrix")
+    if not np.isfinite(matrix).all():
+        raise InputError(f"the pose of {name} holds values that are not finite; remove this photograph from the model")
+    if not (np.abs(matrix) <= LARGEST_COORDINATE).all():
+        raise InputError(
+            f"the pose of {name} holds the value {np.abs(matrix).max():g}; expected world units of at most "
+            f"{LARGEST_COORDINATE:g}"
+        )
+    if matrix.shape == (4, 4) and not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
+        raise InputError(f"the last row of the pose of {name} is {matrix[3].tolist()}; expected [0, 0, 0, 1]")
+    pose = np.eye(4)
+    pose[:3, 3] = matrix[:3, 3]
+    pose[:3, :3] = _nearest_rotation(matrix[:3, :3], name)
+    return pose
+
+
+def _nearest_rotation(linear: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+    """The rotation closest to a matrix that is one up to rounding."""
+    deviation = float(np.abs(linear @ linear.T - np.eye(3)).max())
+    determinant = float(np.linalg.det(linear))
+    if deviation > ORTHOGONALITY_TOLERANCE or determinant < 0:
+        raise InputError(
+            f"the pose of {name} is not rigid: its 3x3 block deviates from a rotation by {deviation:.3g} and has "
+            f"determinant {determinant:.3g}; expected an orthogonal matrix of determinant 1, without scale or mirroring"
+        )
+    left, _, right = np.linalg.svd(linear)
+    return left @ right
+
+
+Interpolation = Literal["BILINEAR", "NEAREST_NEIGHBOR"]
+
+PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+PERSPECTIVE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""Models that are a pinhole when all their distortion coefficients are zero; a fisheye never is."""
+LARGEST_SIDE = 2**17
+"""Of an image, in pixels; no format that is read holds more."""
+SHORTEST_FOCAL, LONGEST_FOCAL = 1e-3, 1e5
+"""In sizes of the image; beyond lies no lens, and float32 cannot resolve what such a camera shows."""
+FARTHEST_CENTER = 1e3
+"""Of the principal point from the image, in sizes of the image; cropped photographs have it outside."""
+LARGEST_COEFFICIENT = 1e6
+"""Of distortion; those of a calibration are below 100."""
+LEAST_SIDE = 8
+"""Of a photograph, in pixels; smaller ones are what a failed download or export leaves."""
+MOST_SKEW = 0.05
+"""Relative deviation of a photograph's side from a scaled copy's, however few pixels that is."""
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """Intrinsics in pixels and the image size."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class PixelMap:
+    """Turns a photograph, or its mask, into the pixel grid of its pinhole camera: undistorts, then reduces.
+
+    Attributes:
+        lens: `pycolmap.Camera` of the photograph, at the photograph's size; None when it is a pinhole already.
+        width, height: size of the result.
+    """
+
+    lens: Any
+    width: int
+    height: int
+
+    def photo(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """[H, W, 3] of the file to [height, width, 3]; bilinear undistortion, area-averaging reduction."""
+        if self.lens is not None:
+            pixels = _undistort(pixels, self.lens, "BILINEAR")
+        return area_resize(pixels, self.width, self.height)
+
+    def labels(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """[H, W] of the photograph's size to [height, width]; the nearest pixel's label, no label in between."""
+        if self.lens is not None:
+            labels = _undistort(labels, self.lens, "NEAREST_NEIGHBOR")
+        return nearest_resize(labels, self.width, self.height)
+
+
+def area_resize(pixels: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """[H, W, 3] averaged over the area of each new pixel; rounded once, so that no bias builds up."""
+    if pixels.shape[:2] == (height, width):
+        return pixels
+    reduced = np.empty((height, width, 3), dtype=np.uint8)
+    for index in range(3):  # One after the other: as floats a channel takes more memory than the photograph.
+        channel = Image.fromarray(pixels[:, :, index].astype(np.float32)).resize((width, height), Image.Resampling.BOX)
+        reduced[:, :, index] = np.clip(np.round(np.asarray(channel)), 0, 255)
+    return reduced
+
+
+def nearest_resize(labels: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """[H, W] labels on another grid over the same image, each pixel taking what lies under its centre."""
+    rows = ((np.arange(height) + 0.5) * labels.shape[0] / height).astype(np.int64)
+    columns = ((np.arange(width) + 0.5) * labels.shape[1] / width).astype(np.int64)
+    return np.ascontiguousarray(labels[rows[:, None], columns[None, :]])
+
+
+def make_lens(model: str, parameters: list[float], size: tuple[int, int]) -> Any:
+    """A checked `pycolmap.Camera`.
+
+    Args:
+        model: COLMAP's name of the camera model.
+        parameters: in COLMAP's order.
+        size: width and height in pixels.
+
+    Raises:
+        InputError: unknown model, wrong number of parameters, or a size or a parameter that no lens has.
+    """
+    if model not in library.pycolmap.CameraModelId.__members__ or model == "INVALID":
+        known = ", ".join(name for name in library.pycolmap.CameraModelId.__members__ if name != "INVALID")
+        raise InputError(f"unknown camera model {model!r}; expected one of {known}")
+    if not all(1 <= side <= LARGEST_SIDE for side in size):
+        raise InputError(f"the camera is {_size_text(size)} pixels large; expected sides from 1 to {LARGEST_SIDE}")
+    lens = library.pycolmap.Camera.create_from_model_id(0, getattr(library.pycolmap.CameraModelId, model), 1.0, *size)
+    if len(parameters) != len(lens.params):
+        raise InputError(f"camera model {model} takes {len(lens.params)} parameters, got {len(parameters)}")
+    _check_parameters(lens, parameters, size)
+    lens.params = parameters
+    return lens
+
+
+def _check_parameters(lens: Any, parameters: list[float], size: tuple[int, int]) -> None:
+    """Refuse what no lens has; comparisons with NaN are false."""
+    longer = max(size)
+    bounds: list[tuple[float, float]] = [(-LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)] * len(parameters)
+    for index in lens.focal_length_idxs():
+        bounds[index] = SHORTEST_FOCAL * longer, LONGEST_FOCAL * longer
+    for index in lens.principal_point_idxs():
+        bounds[index] = -FARTHEST_CENTER * longer, FARTHEST_CENTER * longer
+    for value, (least, most) in zip(parameters, bounds, strict=True):
+        if not least <= value <= most:
+            found = ", ".join(f"{one:g}" for one in parameters)
+            raise InputError(
+                f"camera model {lens.model_name} of {_size_text(size)} pixels has the parameters {found}; expected a "
+                f"finite number from {least:g} to {most:g} instead of {value:g}"
+            )
+
+
+def _size_text(size: tuple[int, int]) -> str:
+    """Sizes of thousands of digits, which a text file may hold, cannot be printed."""
+    return "x".join(str(side) if abs(side) < 10**9 else "huge" for side in size)
+
+
+def lens_for_image(lens: Any, size: tuple[int, int], name: str) -> Any:
+    """The lens at the size of the image file; images reduced after calibration rescale it.
+
+    Raises:
+        InputError: the two sizes differ in aspect by more than rounding.
+    """
+    width, height = size
+    if min(size) < LEAST_SIDE:
+        raise InputError(
+            f"{name} is {width}x{height} pixels large; expected a photograph, {LEAST_SIDE} pixels at least"
+        )
+    if (lens.width, lens.height) == (width, height):
+        return lens
+    scale = (width * lens.width + height * lens.height) / (lens.width**2 + lens.height**2)
+    rounding = max(1.0, scale)
+    skew = max(_skew(scale * lens.width, width, rounding), _skew(scale * lens.height, height, rounding))
+    if skew > MOST_SKEW:
+        raise InputError(
+            f"{name} is {width}x{height} pixels large, but its camera {lens.width}x{lens.height}; expected the "
+            "same size or a scaled copy; photographs rotated or cropped after calibration cannot be used"
+        )
+    rescaled = library.pycolmap.Camera(lens.todict())
+    rescaled.rescale(width, height)
+    return rescaled
+
+
+def _skew(expected: float, side: int, rounding: float) -> float:
+    """Relative deviation of a side of the photograph; infinite where it is more than rounding."""
+    deviation = abs(expected - side)
+    return math.inf if deviation > rounding else deviation / side
+
+
+def pinhole_of(lens: Any) -> tuple[Pinhole, bool]:
+    """The pinhole camera that replaces a lens, and whether photographs have to be undistorted for it.
+
+    Raises:
+        InputError: the lens cannot be undistorted, such as a panorama.
+    """
+    key = (lens.model_name, tuple(float(value) for value in lens.params), lens.width, lens.height)
+    return _pinhole(*key)
+
+
+@lru_cache(maxsize=1024)
+def _pinhole(model: str, parameters: tuple[float, ...], width: int, height: int) -> tuple[Pinhole, bool]:
+    if _is_pinhole(model, parameters):
+        lens = make_lens(model, list(parameters), (width, height))
+        return _intrinsics(lens), False
+    lens = make_lens(model, list(parameters), (width, height))
+    try:
+        undistorted = library.pycolmap.undistort_camera(library.pycolmap.UndistortCameraOptions(), lens)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(
+            f"camera model {model} with parameters {parameters} cannot be undistorted ({error})"
+        ) from error
+    return _intrinsics(undistorted), True
+
+
+def _is_pinhole(model: str, parameters: tuple[float, ...]) -> bool:
+    if model in PINHOLES:
+        return True
+    first_extra = 3 if model in ("SIMPLE_RADIAL", "RADIAL") else 4
+    return model in PERSPECTIVE and not any(parameters[first_extra:])
+
+
+def undistorted(pixels: NDArray[np.uint8], lens: Any) -> NDArray[np.uint8]:
+    """[H, W, 3] as the pinhole camera of `pycolmap.undistort_camera` shows it, which may have another size."""
+    return _undistort(pixels, lens, "BILINEAR")
+
+
+def _intrinsics(lens: Any) -> Pinhole:
+    return Pinhole(
+        fx=float(lens.focal_length_x),
+        fy=float(lens.focal_length_y),
+        cx=float(lens.principal_point_x),
+        cy=float(lens.principal_point_y),
+        width=lens.width,
+        height=lens.height,
+    )
+
+
+def _undistort(pixels: NDArray[np.uint8], lens: Any, interpolation: Interpolation) -> NDArray[np.uint8]:
+    options = library.pycolmap.UndistortCameraOptions()
+    kinds = type(options.warp_options.interpolation)  # pycolmap gives this enumeration no public name.
+    options.warp_options.interpolation = getattr(kinds, interpolation)
+    image, _ = library.pycolmap.undistort_image(
+        options, library.pycolmap.Bitmap.from_array(np.ascontiguousarray(pixels)), lens
+    )
+    return np.array(image.to_array())

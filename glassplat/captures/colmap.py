@@ -1,0 +1,299 @@
+"""COLMAP captures: a sparse model, binary or text, beside a folder of images.
+
+With label images `masks/<photograph's stem>.png` for the annotated photographs only, this is also the layout for
+captures of transparent panes such as RTR's, whose own files were never published.
+
+Models are read here: on a truncated file COLMAP's own reader reads garbage or does not come back.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from os.path import isfile, lexists
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from glassplat.captures.cameras import make_lens
+from glassplat.captures.capture import Capture, RawPoints, Shot
+from glassplat.errors import InputError, first_names, input_checked
+from glassplat.files.records import reading
+from glassplat.options import shown
+
+UNIT_TOLERANCE = 1e-2
+"""How far the length of a quaternion may be from one, as rounding in a text file."""
+
+_OBSERVATION_BYTES = 24  # x, y as double and the id of a point
+_TRACK_BYTES = 8  # id of an image, index of an observation
+
+
+@dataclass(frozen=True)
+class ModelImage:
+    """One registered image: name, camera, rotation `wxyz` and translation of `cam_from_world`."""
+
+    name: str
+    camera_id: int
+    quat: tuple[float, ...]
+    translation: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A sparse reconstruction; `lenses` maps camera ids to `pycolmap.Camera`."""
+
+    lenses: dict[int, Any]
+    images: tuple[ModelImage, ...]
+    points: RawPoints
+
+
+def model_suffix(folder: Path) -> str | None:
+    """`.bin` or `.txt` when the folder holds a model of that kind; binary wins, as in COLMAP."""
+    for suffix in (".bin", ".txt"):
+        if all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
+            return suffix
+    return None
+
+
+def read_model(folder: Path) -> Model:
+    """Read cameras, images and points; a folder without points gives none.
+
+    Raises:
+        InputError: a file is cut off or holds what no model holds; names the file.
+    """
+    suffix = model_suffix(folder)
+    if suffix is None:
+        raise InputError(f"no COLMAP model in {folder}; expected cameras and images as .bin or .txt")
+    lenses = _by_id(_records_of(folder / f"cameras{suffix}"), folder / f"cameras{suffix}")
+    images = tuple(_records_of(folder / f"images{suffix}"))
+    if not images:
+        raise InputError(f"{folder / f'images{suffix}'} registers no photograph; expected a finished reconstruction")
+    points_path = folder / f"points3D{suffix}"
+    rows = _records_of(points_path) if lexists(points_path) else []
+    table = np.array(rows, dtype=np.float64).reshape(-1, 6)
+    with input_checked(points_path):
+        return Model(lenses, images, RawPoints.from_arrays(table[:, :3], table[:, 3:]))
+
+
+def pose_matrix(image: ModelImage) -> NDArray[np.float64]:
+    """[4, 4] `cam_from_world`, OpenCV axes.
+
+    Raises:
+        InputError: the rotation is no unit quaternion.
+    """
+    if not abs(math.hypot(*image.quat) - 1) < UNIT_TOLERANCE:
+        quat = list(image.quat)
+        raise InputError(f"the rotation of {image.name} is {quat}; expected a finite unit quaternion (w, x, y, z)")
+    from glassplat.captures.colmap_library import pycolmap
+
+    w, x, y, z = np.array(image.quat) / math.hypot(*image.quat)
+    pose = np.eye(4)
+    pose[:3, :3] = pycolmap.Rotation3d(np.array([x, y, z, w])).matrix()
+    pose[:3, 3] = image.translation
+    return pose
+
+
+def _by_id(records: list[tuple[int, Any]], path: Path) -> dict[int, Any]:
+    found = dict(records)
+    if len(found) < len(records):
+        raise InputError(f"{path} has two cameras of one id; expected every id once: export the model again")
+    return found
+
+
+def _records_of(path: Path) -> list[Any]:
+    """Everything in one file of a model, with errors that name the file."""
+    binary, text = PARSERS[path.stem]
+    try:
+        with reading(path):
+            if path.suffix == ".bin":
+                return list(binary(_Bytes(path.read_bytes())))
+            with path.open(encoding="utf-8-sig") as stream:
+                return list(text(stream))
+    except FileNotFoundError as error:
+        raise InputError(str(error)) from error
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except (struct.error, EOFError, ValueError, IndexError, OverflowError) as error:
+        raise InputError(f"{path} is cut off or damaged ({error}); export the COLMAP model again") from error
+
+
+class _Bytes:
+    """A cursor over a binary file."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+        self.offset = 0
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        start = self.offset
+        self.skip(struct.calcsize(f"<{layout}"))
+        return struct.unpack_from(f"<{layout}", self.data, start)
+
+    def skip(self, count: int) -> None:
+        self.offset += count
+        if self.offset > len(self.data):
+            raise EOFError("it ends too early")
+
+    def text(self) -> str:
+        end = self.data.find(b"\0", self.offset)
+        if end < 0:
+            raise EOFError("it ends within a name")
+        start, self.offset = self.offset, end + 1
+        return self.data[start:end].decode()
+
+
+def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, Any]]:
+    from glassplat.captures.colmap_library import pycolmap
+
+    (count,) = data.take("Q")
+    for _ in range(count):
+        camera_id, model_id, width, height = data.take("IiQQ")
+        model = pycolmap.CameraModelId(model_id).name
+        parameter_count = len(
+            pycolmap.Camera.create_from_model_id(0, pycolmap.CameraModelId(model_id), 1.0, 1, 1).params
+        )
+        yield camera_id, make_lens(model, list(data.take(f"{parameter_count}d")), (width, height))
+
+
+def _binary_images(data: _Bytes) -> Iterator[ModelImage]:
+    (count,) = data.take("Q")
+    for _ in range(count):
+        values = data.take("I7dI")
+        name = data.text()
+        (observations,) = data.take("Q")
+        data.skip(observations * _OBSERVATION_BYTES)
+        yield ModelImage(name, values[8], values[1:5], values[5:8])
+
+
+def _binary_points(data: _Bytes) -> Iterator[tuple[float, ...]]:
+    (count,) = data.take("Q")
+    for _ in range(count):
+        values = data.take("Q3d3BdQ")
+        data.skip(values[8] * _TRACK_BYTES)
+        yield values[1:7]
+
+
+def _records(stream: Iterator[str]) -> Iterator[str]:
+    """Lines that are neither empty nor a comment."""
+    stripped = (line.strip() for line in stream)
+    return (line for line in stripped if line and not line.startswith("#"))
+
+
+def _at_least(count: int, fields: list[str]) -> list[str]:
+    """The fields of a line, if they are so many.
+
+    Raises:
+        ValueError: there are fewer; repeats them.
+    """
+    if len(fields) < count:
+        line = " ".join(fields)
+        raise ValueError(f"the line {shown(line)}; expected at least {count} values, separated by spaces")
+    return fields
+
+
+def _text_cameras(stream: Iterator[str]) -> Iterator[tuple[int, Any]]:
+    for line in _records(stream):
+        camera_id, model, width, height, *parameters = _at_least(4, line.split())
+        yield int(camera_id), make_lens(model, [float(value) for value in parameters], (int(width), int(height)))
+
+
+def _text_images(stream: Iterator[str]) -> Iterator[ModelImage]:
+    for line in _records(stream):
+        fields = _at_least(10, line.split(maxsplit=9))
+        numbers = tuple(float(value) for value in fields[1:8])
+        name = fields[9]
+        _check_observations(next(stream, ""), name)
+        yield ModelImage(name, int(fields[8]), numbers[:4], numbers[4:])
+
+
+def _check_observations(line: str, name: str) -> None:
+    """What follows an image is its list of x, y and point; the line is empty, but there, where it has none.
+
+    Without it the next image would pass for the list, and be lost.
+    """
+    words = line.split()
+    if len(words) % 3 or not (not words or words[-1].lstrip("-").isdigit()):
+        raise InputError(
+            f"the line after {name} is no list of observations; expected one after every image, if only an empty line"
+        )
+
+
+def _text_points(stream: Iterator[str]) -> Iterator[tuple[float, ...]]:
+    for line in _records(stream):
+        _, x, y, z, red, green, blue = _at_least(7, line.split(maxsplit=7))[:7]
+        yield (float(x), float(y), float(z), float(int(red)), float(int(green)), float(int(blue)))
+
+
+PARSERS: dict[str, tuple[Callable[[_Bytes], Iterator[Any]], Callable[[Iterator[str]], Iterator[Any]]]] = {
+    "cameras": (_binary_cameras, _text_cameras),
+    "images": (_binary_images, _text_images),
+    "points3D": (_binary_points, _text_points),
+}
+
+MODEL_FOLDERS = ("sparse/0", "sparse", ".")
+LOOKED_FOR = "a COLMAP model (cameras and images as .bin or .txt in sparse/0, sparse or the folder itself)"
+
+
+def load_colmap(root: Path) -> Capture | None:
+    """Read a COLMAP capture with photographs in `images/`; None when there is no model.
+
+    Raises:
+        InputError: the model is damaged, or photographs of it are missing.
+    """
+    folder = next((root / name for name in MODEL_FOLDERS if model_suffix(root / name)), None)
+    if folder is None:
+        return None
+    model = read_model(folder)
+    shots = _shots(root, model)
+    return Capture(
+        shots=shots,
+        test_shots=None,
+        points=_points_or_none(model),
+        format_name="COLMAP",
+        warnings=_other_models(root, folder),
+    )
+
+
+def _shots(root: Path, model: Model) -> tuple[Shot, ...]:
+    """Every registered image, with an error that counts what is missing."""
+    images = root / "images"
+    if not images.is_dir():
+        raise InputError(
+            f"no folder {images} beside the COLMAP model; expected the {len(model.images)} photographs there"
+        )
+    missing = sorted(image.name for image in model.images if not isfile(images / image.name))
+    if missing:
+        raise InputError(
+            f"{len(missing)} of the {len(model.images)} photographs of the COLMAP model are missing in {images}: "
+            f"{first_names(missing)}; copy them there, or remove them from the model"
+        )
+    orphans = sorted(image.name for image in model.images if image.camera_id not in model.lenses)
+    if orphans:
+        raise InputError(
+            f"photographs whose camera is not in the COLMAP model: {first_names(orphans)}; export it again"
+        )
+    return tuple(
+        Shot(image.name, images / image.name, model.lenses[image.camera_id], pose_matrix(image))
+        for image in model.images
+    )
+
+
+def _points_or_none(model: Model) -> RawPoints | None:
+    return model.points if len(model.points) else None
+
+
+def _other_models(root: Path, used: Path) -> tuple[str, ...]:
+    """COLMAP splits what it cannot connect into several models; only one can be trained at a time."""
+    sparse = root / "sparse"
+    others = (
+        sorted(p.name for p in sparse.iterdir() if p != used and p.is_dir() and model_suffix(p))
+        if sparse.is_dir()
+        else []
+    )
+    if not others:
+        return ()
+    return (f"{used} is used; there are more models in {sparse} ({first_names(others)}), which are left out.",)

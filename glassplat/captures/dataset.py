@@ -1,0 +1,341 @@
+"""Photographs, poses, masks and points of one capture, whatever format they came in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from os.path import lexists
+from pathlib import Path
+from threading import Event
+
+import torch
+
+from glassplat.captures.axes import axes_evidence
+from glassplat.captures.capture import Capture, Shot
+from glassplat.captures.files import CaptureFiles, read_capture
+from glassplat.captures.masks import Polarity
+from glassplat.captures.transforms import points_in_view
+from glassplat.captures.view import PointCloud, PreparedView, View, ViewOptions, prepare_view
+from glassplat.errors import InputError, first_names, input_checked
+from glassplat.files.images import is_transparent
+from glassplat.files.records import LARGEST_COORDINATE
+from glassplat.files.sidecars import read_planes
+from glassplat.options import WHITE, Rgb
+from glassplat.scene.camera import Camera
+from glassplat.scene.panes import Planes
+from glassplat.scene.scene import Scene
+
+PLANES = "planes.json"
+SAMPLES = 9
+"""Points along each side of a rectangle that are looked for in the photographs."""
+
+
+def given_planes(root: Path, cameras: Sequence[Camera]) -> Planes | None:
+    """The rectangles in a capture's own frame; None where it gives none.
+
+    Args:
+        root: the capture's folder.
+        cameras: its training cameras, each pane in the sight of one at least.
+
+    Raises:
+        InputError: the file is damaged, or a pane lies where no camera looks, as in another capture's frame.
+    """
+    path = root / PLANES
+    if not lexists(path):
+        return None
+    with input_checked():
+        planes = read_planes(path)
+    for row, label in enumerate(planes.labels):
+        places = rectangle_points(planes.select([row]))
+        if not any(_shows(camera, places) for camera in cameras):
+            raise InputError(
+                f"no photograph shows pane {label} of {path}; expected a rectangle in the capture's own frame: mark it "
+                "again, or remove it from the file"
+            )
+    return planes if len(planes) else None
+
+
+def rectangle_points(plane: Planes) -> torch.Tensor:
+    """[P, 3] points spread evenly over the rectangle of one plane, its corners among them."""
+    (tangent,), (bitangent,) = plane.axes()
+    steps = torch.linspace(-1, 1, SAMPLES)
+    u, v = torch.meshgrid(steps, steps, indexing="ij")
+    half_u, half_v = plane.half_sizes[0]
+    return plane.centers[0] + u.reshape(-1, 1) * half_u * tangent + v.reshape(-1, 1) * half_v * bitangent
+
+
+def _shows(camera: Camera, places: torch.Tensor) -> bool:
+    pixels, depth = camera.project(places)
+    size = pixels.new_tensor([camera.width, camera.height])
+    return bool(((pixels >= 0).all(dim=1) & (pixels < size).all(dim=1) & (depth > 0)).any())
+
+
+__all__ = ["Dataset", "PointCloud", "View", "load_dataset"]
+
+TEST_EVERY = 8
+EXTENT_MARGIN = 1.1
+FARTHEST_ORIGIN = 1e4
+SAME_PLACE = 1e-6
+"""Cameras closer together than this share of their distance from the origin differ by rounding only."""
+LEAST_RADIUS = 1e-9
+"""World units. The square of a smaller one is lost in float32."""
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """One capture, split for training and testing.
+
+    Attributes:
+        root: the folder.
+        train: views to learn from, by name; at least two.
+        test: views held out, by name; may be empty.
+        points: sparse points in the capture's own frame.
+        extent: 1.1 x the largest distance of a training camera from their mean; world units.
+        pane_labels: every label that occurs in the masks, ascending.
+        truth: folder of known layers and planes for evaluation, where the capture has one.
+        warnings: what was assumed or left out, full sentences.
+        split: how the test views were chosen.
+        measured_points: False if `points` are random ones, which carry no geometry.
+        background: sRGB that is seen through transparent photographs; None where none is transparent.
+        planes: panes that the capture gives as rectangles; their masks, if any, only refine them.
+        downscale: by how much the photographs were reduced.
+        mask_polarity: which value of black-and-white masks was taken for the pane.
+    """
+
+    root: Path
+    train: tuple[View, ...]
+    test: tuple[View, ...]
+    points: PointCloud
+    extent: float
+    pane_labels: tuple[int, ...] = ()
+    truth: Path | None = None
+    warnings: tuple[str, ...] = ()
+    split: str = ""
+    measured_points: bool = True
+    background: Rgb | None = None
+    planes: Planes | None = None
+    downscale: float = 1.0
+    mask_polarity: Polarity = "auto"
+
+
+def load_dataset(
+    root: Path | str, *, downscale: float = 1.0, background: Rgb = WHITE, mask_polarity: Polarity = "auto"
+) -> Dataset:
+    """Read a capture: COLMAP, Mirror-NeRF, or transforms.json in any of its dialects; photographs are read later.
+
+    Args:
+        root: the capture's folder.
+        downscale: photographs are reduced by this factor, at least 1.
+        background: sRGB in [0, 1], seen through transparent pixels.
+        mask_polarity: which value of black-and-white masks is the pane.
+
+    Raises:
+        FileNotFoundError: no such folder.
+        InputError: a format that is not known, or a capture that cannot be used; the message says why.
+    """
+    check_downscale(downscale)
+    return dataset_of(read_capture(root, mask_polarity=mask_polarity), downscale=downscale, background=background)
+
+
+def check_downscale(downscale: float) -> None:
+    """Refuse a factor that reduces nothing.
+
+    Raises:
+        InputError: it is below 1, or no number.
+    """
+    if not math.isfinite(downscale) or downscale < 1:
+        raise InputError(f"downscale is {downscale}; expected a number of at least 1")
+
+
+def dataset_of(files: CaptureFiles, *, downscale: float = 1.0, background: Rgb = WHITE) -> Dataset:
+    """What `load_dataset` returns, of a capture whose folder was read.
+
+    Raises:
+        InputError: as `load_dataset`.
+    """
+    check_downscale(downscale)
+    root, capture, shots, masks = files.root, files.capture, files.shots, files.masks
+    options = ViewOptions(downscale, background)
+    prepared = [
+        prepare_view(shot, masks.masks.get(shot.name), options, ignored=files.ignored.get(shot.name)) for shot in shots
+    ]
+    transparent = _any_transparent(shots)
+    train, test, split = _split([p.view for p in prepared], capture)
+    points, point_warnings = _points(capture, train)
+    extent = _extent(train)
+    measured = capture.points is not None
+    _check_axes(train, points if measured else None, capture.format_name)
+    warnings = (
+        *capture.warnings,
+        *masks.warnings,
+        *_view_warnings(prepared, background if transparent else None),
+        *point_warnings,
+        *_far_off(train, extent),
+    )
+    truth = root / "gt"
+    return Dataset(
+        root=root,
+        train=train,
+        test=test,
+        points=points,
+        extent=extent,
+        pane_labels=masks.labels,
+        truth=truth if truth.is_dir() else None,
+        warnings=warnings,
+        split=split,
+        measured_points=measured,
+        background=background if transparent else None,
+        planes=given_planes(root, [view.camera for view in train]),
+        downscale=downscale,
+        mask_polarity=files.mask_polarity,
+    )
+
+
+def _check_axes(train: tuple[View, ...], points: PointCloud | None, format_name: str) -> None:
+    """Refuse poses with which everything lies behind the cameras, where turning them round would mend that."""
+    evidence = axes_evidence(train, None if points is None else points.positions)
+    if evidence is not None and evidence.contradicts:
+        raise InputError(
+            f"the cameras of the {format_name} capture look away from the scene: {evidence.as_read:.0%} of the "
+            f"{evidence.source} lie in front of them, {evidence.flipped:.0%} if they looked the other way. Expected +y "
+            "down and +z forward in a COLMAP model, +y up and -z forward in transforms.json; turn the y and z axes of "
+            "the poses round"
+        )
+
+
+def _any_transparent(shots: Sequence[Shot]) -> bool:
+    """Whether a photograph has transparent pixels."""
+    with input_checked():
+        return any(is_transparent(shot.image_path) for shot in shots)
+
+
+def _split(views: list[View], capture: Capture) -> tuple[tuple[View, ...], tuple[View, ...], str]:
+    """Training views, test views (both by name) and how they were chosen."""
+    if capture.test_shots is None:
+        held_out = {view.name for view in views[::TEST_EVERY]}
+        split = f"every {TEST_EVERY}th image by name"
+    else:
+        held_out = {shot.name for shot in capture.test_shots}
+        split = "shipped with the data"
+    train = tuple(view for view in views if view.name not in held_out)
+    test = tuple(view for view in views if view.name in held_out)
+    if len(train) < 2:
+        raise InputError(
+            f"{len(train)} of {len(views)} photographs are left for training (test views: {split}); "
+            "expected at least two"
+        )
+    return train, test, split
+
+
+def _extent(train: tuple[View, ...]) -> float:
+    """1.1 x the radius of the training cameras about their mean; world units."""
+    centers = torch.stack([view.camera.center.double() for view in train])
+    radius = float((centers - centers.mean(0)).norm(dim=1).max())
+    if radius <= max(SAME_PLACE * float(centers.norm(dim=1).max()), LEAST_RADIUS):
+        raise InputError("all training cameras stand at one point; expected photographs from different places")
+    return EXTENT_MARGIN * radius
+
+
+def _far_off(train: tuple[View, ...], extent: float) -> tuple[str, ...]:
+    """A warning when coordinates are so large that float32 cannot resolve the scene."""
+    distance = float(train[0].camera.center.norm())
+    if distance <= FARTHEST_ORIGIN * extent:
+        return ()
+    ratio = distance / extent
+    return (f"The cameras are {ratio:.0f} scene extents away from the origin; shift the capture to keep precision.",)
+
+
+def _points(capture: Capture, train: tuple[View, ...]) -> tuple[PointCloud, list[str]]:
+    """The capture's points, or random ones with a warning."""
+    if capture.points is None:
+        make = capture.random_points or (lambda: points_in_view([view.camera for view in train]))
+        points = PointCloud.of(make())
+        return points, [
+            f"The {capture.format_name} capture has no points; {len(points)} random points are used instead."
+        ]
+    found = PointCloud.of(capture.points)
+    # Where a coordinate is NaN, the comparison is false.
+    usable = (found.positions.abs() <= LARGEST_COORDINATE).all(dim=1)
+    if usable.all():
+        return found, []
+    kept = PointCloud(found.positions[usable], found.colors[usable])
+    if not len(kept):
+        raise InputError(f"no point of the capture is finite and within {LARGEST_COORDINATE:g}; export the model again")
+    return kept, [f"{int((~usable).sum())} points that are not finite or beyond {LARGEST_COORDINATE:g} are left out."]
+
+
+def _view_warnings(prepared: list[PreparedView], background: Rgb | None) -> list[str]:
+    """What was assumed about photographs, once for all of them."""
+    warnings = []
+    rescaled = [p.view.name for p in prepared if p.rescaled]
+    if rescaled:
+        warnings.append(
+            f"{len(rescaled)} photographs are scaled copies of what was calibrated; intrinsics were scaled with them "
+            f"({first_names(rescaled)})."
+        )
+    if background is not None:
+        warnings.append(f"The photographs have transparent pixels; they are laid over sRGB {background}.")
+    return warnings
+
+
+@torch.no_grad()
+def with_corrected_cameras(dataset: Dataset, scene: Scene) -> Dataset:
+    """The capture with the cameras of its photographs corrected as the scene says; itself where nothing is.
+
+    Nobody has looked where the cameras of test views are: they move as those of the photographs before and after them.
+
+    Args:
+        dataset: as it was read.
+        scene: whose `poses` were learned on it.
+    """
+    if not len(scene.poses):
+        return dataset
+
+    def corrected(view: View) -> View:
+        camera = scene.poses.interpolated(view.name).corrected(view.camera, view.name, scene.extent)
+        return view if camera is view.camera else view.with_camera(detached_camera(camera))
+
+    return replace(dataset, train=tuple(map(corrected, dataset.train)), test=tuple(map(corrected, dataset.test)))
+
+
+def detached_camera(camera: Camera) -> Camera:
+    """The camera in memory, cut off from the autograd graph."""
+    return replace(camera, cam_from_world=camera.cam_from_world.detach().cpu())
+
+
+@contextmanager
+def photographs_read(dataset: Dataset) -> Iterator[Callable[[], None]]:
+    """Reads all photographs in a thread as long as the context lasts, one after the other.
+
+    Those for testing come first: nothing else would read them before training has ended. They are forgotten again;
+    training photographs stay in memory, where training wants them anyway.
+
+    Yields:
+        A function that does nothing, or raises the InputError of a photograph that could not be read.
+    """
+    stop = Event()
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="photographs") as pool:
+        reading = pool.submit(_read, dataset, stop)
+
+        def check() -> None:
+            if reading.done():
+                reading.result()
+
+        try:
+            yield check
+        finally:
+            stop.set()
+
+
+def _read(dataset: Dataset, stop: Event) -> None:
+    for view in dataset.test:
+        if stop.is_set():
+            return
+        view.read_photo()
+    for view in dataset.train:
+        if stop.is_set():
+            return
+        _ = view.photo

@@ -1,0 +1,96 @@
+"""A capture's folder in any format, read without PyTorch, before any photograph is."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from glassplat.captures import colmap, mirror_nerf, transforms
+from glassplat.captures.capture import Capture, Loader, Shot
+from glassplat.captures.masks import MaskSet, PaneMask, Polarity, find_ignored, find_masks, known_masks
+from glassplat.errors import InputError, UnknownFormatError, first_names
+from glassplat.files.writing import check_capture_folder
+
+LOADERS: tuple[tuple[Loader, str], ...] = (
+    (colmap.load_colmap, colmap.LOOKED_FOR),
+    (mirror_nerf.load_mirror_nerf, mirror_nerf.LOOKED_FOR),
+    (transforms.load_transforms, transforms.LOOKED_FOR),
+)
+"""Tried in this order; each with what it looks for, for the message when none fits."""
+
+
+@dataclass(frozen=True)
+class CaptureFiles:
+    """A capture of which all is known but what its photographs show.
+
+    Attributes:
+        root: the folder.
+        capture: what its format says.
+        shots: all photographs, by name.
+        masks: where the panes are, by name of the photograph, and their labels.
+        ignored: masks of what is not to be learned, by name of the photograph.
+        mask_polarity: which value of black-and-white masks was taken for the pane.
+    """
+
+    root: Path
+    capture: Capture
+    shots: tuple[Shot, ...]
+    masks: MaskSet
+    ignored: Mapping[str, PaneMask]
+    mask_polarity: Polarity
+
+    def __str__(self) -> str:
+        """What was found, in a line."""
+        points = "no" if self.capture.points is None else len(self.capture.points)
+        masks = len(self.masks.masks)
+        return (
+            f"{self.root}: a {self.capture.format_name} capture of {len(self.shots)} photographs, {points} points, "
+            f"{masks or 'no'} {'mask' if masks == 1 else 'masks'} of panes"
+        )
+
+
+def read_capture(root: Path | str, *, mask_polarity: Polarity = "auto") -> CaptureFiles:
+    """Read the poses, points and masks of a capture: COLMAP, Mirror-NeRF, or transforms.json in any of its dialects.
+
+    Args:
+        root: the capture's folder.
+        mask_polarity: which value of black-and-white masks is the pane.
+
+    Raises:
+        FileNotFoundError: no such folder.
+        InputError: a format that is not known, or a capture that cannot be used; the message says why.
+    """
+    root = Path(root)
+    capture = _load_capture(root)
+    shots = tuple(sorted((*capture.shots, *(capture.test_shots or ())), key=lambda shot: shot.name))
+    _check_names(shots)
+    masks = _masks(root, capture, shots, mask_polarity)
+    ignored = find_ignored(root, {shot.name: shot.image_path for shot in shots})
+    return CaptureFiles(root, capture, shots, masks, ignored, mask_polarity)
+
+
+def _load_capture(root: Path) -> Capture:
+    """The answer of the first loader that knows the format."""
+    check_capture_folder(root)
+    for load, _ in LOADERS:
+        capture = load(root)
+        if capture is not None:
+            return capture
+    looked_for = "; ".join(text for _, text in LOADERS)
+    found = first_names(sorted(path.name for path in root.iterdir()), limit=8) or "nothing"
+    raise UnknownFormatError(f"{root} is no capture that can be read. Looked for: {looked_for}. Found: {found}.")
+
+
+def _masks(root: Path, capture: Capture, shots: tuple[Shot, ...], polarity: Polarity) -> MaskSet:
+    """The masks that the format names, or else those whose names fit."""
+    if capture.masks is not None:
+        return known_masks(root, capture.masks, polarity)
+    return find_masks(root, {shot.name: shot.image_path for shot in shots}, polarity)
+
+
+def _check_names(shots: tuple[Shot, ...]) -> None:
+    repeated = [name for name, count in Counter(shot.name for shot in shots).items() if count > 1]
+    if repeated:
+        raise InputError(f"photographs that occur more than once: {first_names(repeated)}; keep one pose for each")

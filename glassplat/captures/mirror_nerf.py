@@ -1,0 +1,213 @@
+"""Mirror-NeRF captures: `transforms_train.json` and its siblings, with one mirror mask per photograph.
+
+Public readers agree on the layout, not on the axes:
+
+```
+transforms_{train,val,test}.json   an explicit split; transforms.json with all frames may lie beside them
+masks/<name of the photograph>     real scenes; white is the mirror, one half is the threshold, some may be missing
+masks/MirrorMask_0001.png          synthetic scenes, for the photograph Image_0001
+```
+
+The matrices are camera-to-world. The authors' reader takes them in OpenGL axes, as `transforms.json` has them
+everywhere else; another takes them in OpenCV axes. OpenGL is assumed, the mirror's masks are asked whether that can be
+(the mirror has to lie in front of the cameras), and the other axes are taken where only they fit. Neither could be
+tried on the authors' own files.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from glassplat.captures.capture import Capture, RawPoints, Shot
+from glassplat.captures.masks import MASK_FOLDER, PaneMask, read_mask_at_threshold
+from glassplat.captures.transforms import OPENCV_FROM_OPENGL, Settings, image_path, read_points, read_settings, shots_of
+from glassplat.errors import InputError, first_names, input_checked
+from glassplat.files.images import IMAGE_SUFFIXES, image_size
+
+if TYPE_CHECKING:
+    from glassplat.captures.axes import AxesEvidence
+    from glassplat.captures.view import View
+
+TRAIN, VAL, TEST = (f"transforms_{part}.json" for part in ("train", "val", "test"))
+LOOKED_FOR = f"a Mirror-NeRF scene ({TRAIN} and {MASK_FOLDER}/)"
+SYNTHETIC_MASK = "MirrorMask_"
+SAME_SIZE = 0.1
+"""Relative deviation up to which twice the principal point is the size of the photograph."""
+
+
+def load_mirror_nerf(root: Path) -> Capture | None:
+    """Read a Mirror-NeRF scene; None when the folder is none.
+
+    What tells it from other `transforms_train.json` captures, beside the folder of masks: intrinsics spelled `fx` or as
+    a matrix, a validation file, or masks called `MirrorMask_*`. Test views are those of the test file, or else of the
+    validation file; photographs that are in it and in the training file too are only tested on.
+
+    Raises:
+        InputError: a broken file, no mask that belongs to a photograph, or poses with which the mirror lies behind
+            the cameras whatever the axes.
+    """
+    if not _is_mirror_nerf(root):
+        return None
+    settings = read_settings(root / TRAIN)
+    train = _shots(root, settings, TRAIN)
+    test_file = next((name for name in (TEST, VAL) if (root / name).is_file()), None)
+    test = _shots(root, read_settings(root / test_file), test_file) if test_file else None
+    tested = {shot.name for shot in test or ()}
+    kept = tuple(shot for shot in train if shot.name not in tested)
+    warnings = []
+    if len(kept) < len(train):
+        warnings.append(
+            f"{len(train) - len(kept)} training photographs are test photographs too; they are not trained on."
+        )
+    masks = _masks(root, (*kept, *(test or ())))
+    points = read_points(root, settings)
+    capture = Capture(kept, test, points, "Mirror-NeRF", tuple(warnings), masks=masks)
+    return _with_fitting_axes(capture, _evidence(kept, masks, points))
+
+
+def _is_mirror_nerf(root: Path) -> bool:
+    masks = root / MASK_FOLDER
+    if not (root / TRAIN).is_file() or not masks.is_dir():
+        return False
+    if (root / VAL).is_file() or next(masks.glob(f"{SYNTHETIC_MASK}*"), None) is not None:
+        return True
+    settings = read_settings(root / TRAIN)
+    return "fx" in settings or "intrinsics" in settings["frames"][0]
+
+
+def _shots(root: Path, settings: Settings, file_name: str) -> tuple[Shot, ...]:
+    """The photographs of one part, with the intrinsics in the spelling that the lens knows."""
+    frames = [_plain_frame(root, settings, frame) for frame in settings["frames"]]
+    return tuple(shots_of(root, {**settings, "frames": frames}, file_name).values())
+
+
+def _plain_frame(root: Path, settings: Settings, frame: Settings) -> dict[str, Any]:
+    """One frame with its photograph where it lies and with `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h` in its pixels."""
+    path = image_path(root, frame)
+    in_images = root / "images" / path.name
+    if not path.is_file() and in_images.is_file():
+        path = in_images
+        frame = {**frame, "file_path": os.path.relpath(path, root)}
+    intrinsics = _intrinsics({**settings, **frame}, path.name)
+    if intrinsics is None or not path.is_file():
+        return dict(frame)
+    return {**frame, **_in_pixels_of(path, intrinsics)}
+
+
+def _intrinsics(settings: Settings, name: str) -> tuple[float, float, float, float] | None:
+    """fx, fy, cx, cy as stored, of the frame's matrix or of the file; None where only opening angles are given.
+
+    Raises:
+        InputError: something else than numbers.
+    """
+    try:
+        if "intrinsics" in settings:
+            matrix = np.array(settings["intrinsics"], dtype=np.float64)
+            return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
+        if "fx" in settings:
+            fx = float(settings["fx"])
+            return fx, float(settings.get("fy", fx)), float(settings["cx"]), float(settings["cy"])
+    except (TypeError, ValueError, IndexError, KeyError) as error:
+        raise InputError(
+            f"the intrinsics of {name} cannot be read ({error!r}); expected a 3x3 matrix `intrinsics`, or fx, fy, "
+            "cx, cy"
+        ) from error
+    return None
+
+
+def _in_pixels_of(path: Path, intrinsics: tuple[float, float, float, float]) -> dict[str, float]:
+    """Intrinsics in the pixels of a photograph that may have been reduced after calibration.
+
+    Nothing says at what size it was calibrated. The principal point lies near the middle, so twice its position is
+    that size; where this is about the photograph's own, the principal point is taken as measured.
+
+    Raises:
+        InputError: the photograph cannot be read, or is of another shape than what was calibrated.
+    """
+    with input_checked():
+        width, height = image_size(path)
+    fx, fy, cx, cy = intrinsics
+    across, down = 2 * cx / width, 2 * cy / height
+    if not (across > 0 and abs(down / across - 1) < SAME_SIZE):
+        raise InputError(
+            f"{path.name} is {width}x{height} pixels large, but its principal point ({cx:g}, {cy:g}) is the middle of "
+            "an image of another shape; photographs rotated or cropped after calibration cannot be used"
+        )
+    scale = 1.0 if abs(across - 1) < SAME_SIZE else across
+    return {"fl_x": fx / scale, "fl_y": fy / scale, "cx": cx / scale, "cy": cy / scale, "w": width, "h": height}
+
+
+def _masks(root: Path, shots: tuple[Shot, ...]) -> dict[str, Path]:
+    """Mask path by name of the photograph, where there is one; those of photographs in no part are left alone."""
+    present = {path.name: path for path in sorted((root / MASK_FOLDER).iterdir()) if path.is_file()}
+    found = {}
+    for shot in shots:
+        name = next((name for name in _mask_names(shot.image_path) if name in present), None)
+        if name is not None:
+            found[shot.name] = present[name]
+    if not found:
+        raise InputError(
+            f"none of the {len(present)} files in {root / MASK_FOLDER} is called like a photograph "
+            f"({first_names(sorted(present)) or 'the folder is empty'}); expected names such as "
+            f"{shots[0].image_path.name}"
+        )
+    return found
+
+
+def _mask_names(photograph: Path) -> list[str]:
+    """What the mask of a photograph may be called, the most explicit first."""
+    number = photograph.stem.rpartition("_")[2]
+    stems = (photograph.stem, f"{SYNTHETIC_MASK}{number}")
+    return [photograph.name, *(stem + suffix for stem in stems for suffix in IMAGE_SUFFIXES)]
+
+
+def _evidence(shots: tuple[Shot, ...], masks: Mapping[str, Path], points: RawPoints | None) -> AxesEvidence | None:
+    """What some of the masks, or else the points, say about the axes of the poses."""
+    from glassplat.captures.axes import axes_evidence  # Takes PyTorch, which no other format needs to be read.
+    from glassplat.captures.view import PointCloud
+
+    views = [_view(shot, masks.get(shot.name)) for shot in shots]
+    return axes_evidence(views, None if points is None else PointCloud.of(points).positions)
+
+
+def _view(shot: Shot, mask: Path | None) -> View:
+    from glassplat.captures.view import ViewOptions, prepare_view
+
+    pane_mask = None if mask is None else PaneMask(mask, inverted=False, read=read_mask_at_threshold)
+    return prepare_view(shot, pane_mask, ViewOptions()).view
+
+
+def _with_fitting_axes(capture: Capture, evidence: AxesEvidence | None) -> Capture:
+    """The capture in the axes that the evidence leaves."""
+    if evidence is None:
+        unsure = "Nothing tells the axes of the poses; OpenGL is assumed, as the authors' reader does."
+        return replace(capture, warnings=(*capture.warnings, unsure))
+    if evidence.fits_neither:
+        raise InputError(
+            f"the {evidence.source} lie in front of the cameras neither with OpenGL nor with OpenCV axes (shares "
+            f"{evidence.as_read:.0%} and {evidence.flipped:.0%}); expected camera-to-world matrices, and masks that "
+            "belong to the photographs of the same name"
+        )
+    if not evidence.contradicts:
+        return capture
+    turned = (
+        f"The poses are read in OpenCV axes: with OpenGL axes {evidence.as_read:.0%} of the {evidence.source} lie in "
+        f"front of the cameras, so {evidence.flipped:.0%}."
+    )
+    return replace(
+        capture,
+        shots=_turned(capture.shots),
+        test_shots=None if capture.test_shots is None else _turned(capture.test_shots),
+        warnings=(*capture.warnings, turned),
+    )
+
+
+def _turned(shots: tuple[Shot, ...]) -> tuple[Shot, ...]:
+    """The photographs with the y and z axes of their cameras turned round."""
+    return tuple(replace(shot, cam_from_world=OPENCV_FROM_OPENGL @ shot.cam_from_world) for shot in shots)

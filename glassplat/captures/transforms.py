@@ -1,0 +1,316 @@
+"""`transforms.json` captures, as written by instant-ngp, nerfstudio and Blender scripts.
+
+Their poses are camera-to-world in OpenGL axes (+y up, -z forward); they are converted here and nowhere else.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from os.path import isfile, lexists, normpath
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from glassplat.captures.cameras import LARGEST_SIDE, make_lens, rigid_pose
+from glassplat.captures.capture import Capture, RawPoints, Shot
+from glassplat.errors import InputError, first_names, input_checked
+from glassplat.files.images import IMAGE_SUFFIXES, image_size
+from glassplat.files.ply_table import read_table
+from glassplat.files.records import COORDINATE, Choice, Field, Flag, Items, Number, Optional, Text, checked, read_json
+
+if TYPE_CHECKING:
+    from glassplat.scene.camera import Camera
+
+GREY = 128
+SPHERE_COUNT = 20_000
+BOX_COUNT = 100_000
+BOX_HALF_SIZE = 1.3
+SEED = 0
+LEAST_CROSSING = 1e-2
+"""Smallest eigenvalue of the mean of I - d d^T for which optical axes are taken to cross (about 6 degrees apart)."""
+MOST_CAMERAS = 0.8
+"""Share of the cameras that must see the crossing in front of them; fewer do in a room photographed from its middle."""
+AHEAD = 3.0
+"""How far ahead points are placed otherwise, in radii of the camera path."""
+
+
+def points_in_box(count: int = BOX_COUNT, half_size: float = BOX_HALF_SIZE) -> RawPoints:
+    """Uniform points in a cube about the origin; the default is what synthetic Blender scenes fit in."""
+    positions = np.random.default_rng(SEED).uniform(-half_size, half_size, (count, 3))
+    return RawPoints.from_arrays(positions, np.full((count, 3), GREY))
+
+
+def points_in_view(cameras: Sequence[Camera], count: int = SPHERE_COUNT) -> RawPoints:
+    """Uniform points in a ball about what the cameras look at, reaching as far as the cameras stand away."""
+    centers = np.stack([camera.center.double().numpy() for camera in cameras])
+    forward = np.stack([camera.cam_from_world[2, :3].double().numpy() for camera in cameras])
+    target, radius = _ball(centers, forward)
+    generator = np.random.default_rng(SEED)
+    directions = generator.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    distances = radius * generator.uniform(size=(count, 1)) ** (1 / 3)
+    return RawPoints.from_arrays(target + distances * directions, np.full((count, 3), GREY))
+
+
+def _ball(centers: NDArray[np.float64], forward: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Centre and radius: about the crossing of the optical axes, or ahead of cameras whose axes do not cross."""
+    projectors = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    mean = projectors.mean(axis=0)
+    if np.linalg.eigvalsh(mean)[0] > LEAST_CROSSING:
+        target = np.linalg.solve(mean, (projectors @ centers[:, :, None])[:, :, 0].mean(axis=0))
+        ahead = ((target - centers) * forward).sum(axis=1)
+        if np.mean(ahead > 0) > MOST_CAMERAS:
+            return target, float(np.median(np.linalg.norm(centers - target, axis=1)))
+    middle = centers.mean(axis=0)
+    reach = AHEAD * float(np.linalg.norm(centers - middle, axis=1).max())
+    return middle + reach * forward.mean(axis=0), reach
+
+
+FISHEYE = "OPENCV_FISHEYE"
+PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+LENS: dict[str, Field] = {
+    "camera_model": Optional(Choice((*PERSPECTIVE, FISHEYE))),
+    "is_fisheye": Optional(Flag(), default=False),
+    **dict.fromkeys(("w", "h"), Optional(Number(1, LARGEST_SIDE))),
+    **dict.fromkeys(("fl_x", "fl_y"), Optional(Number(above=0))),
+    **dict.fromkeys(("camera_angle_x", "camera_angle_y"), Optional(Number(above=0, most=math.pi))),
+    **dict.fromkeys(("cx", "cy"), Optional(Number())),
+    **dict.fromkeys(COEFFICIENTS, Optional(Number(), default=0.0)),
+}
+
+
+def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str) -> Any:
+    """The `pycolmap.Camera` of one frame.
+
+    Focal length: `fl_x`, `fl_y`, or the opening angles `camera_angle_x`, `camera_angle_y` in radians. Principal
+    point: `cx`, `cy`, or the middle. Size: `w`, `h`, or that of the image. Distortion: `k1` ... `k6`, `p1`, `p2`, as
+    in OpenCV.
+
+    Raises:
+        InputError: no focal length, a value that is no number, an unknown camera model; names the photograph.
+    """
+    with input_checked():
+        found = checked(settings, LENS, f"the lens of {name}")
+        width, height = _size(found, image_path)
+        fx, fy = _focal_lengths(found, width, height, name)
+    model = found["camera_model"] or (FISHEYE if found["is_fisheye"] else "OPENCV")
+    middle = [half if at is None else at for at, half in ((found["cx"], width / 2), (found["cy"], height / 2))]
+    try:
+        return _lens(str(model), [fx, fy, *middle], [found[key] for key in COEFFICIENTS], (width, height))
+    except InputError as error:
+        raise InputError(f"the lens of {name}: {error}") from error
+
+
+def _lens(model: str, pinhole: list[float], coefficients: list[float], size: tuple[int, int]) -> Any:
+    """The simplest of COLMAP's models that has all coefficients that are not zero."""
+    k1, k2, k3, k4, k5, k6, p1, p2 = coefficients
+    if model == FISHEYE:
+        return make_lens(FISHEYE, [*pinhole, k1, k2, k3, k4], size)
+    if any((k3, k4, k5, k6)):
+        return make_lens("FULL_OPENCV", [*pinhole, k1, k2, p1, p2, k3, k4, k5, k6], size)
+    if any((k1, k2, p1, p2)):
+        return make_lens("OPENCV", [*pinhole, k1, k2, p1, p2], size)
+    return make_lens("PINHOLE", pinhole, size)
+
+
+def _size(found: Mapping[str, Any], image_path: Path) -> tuple[int, int]:
+    """Width and height the intrinsics refer to."""
+    if found["w"] is None or found["h"] is None:
+        return image_size(image_path)
+    return round(found["w"]), round(found["h"])
+
+
+def _focal_lengths(found: Mapping[str, Any], width: int, height: int, name: str) -> tuple[float, float]:
+    """fx and fy in pixels; one stands for both where only one is given."""
+    along_x = _focal_length(found["fl_x"], found["camera_angle_x"], width)
+    along_y = _focal_length(found["fl_y"], found["camera_angle_y"], height)
+    fx, fy = along_x or along_y, along_y or along_x
+    if not fx or not fy:
+        raise ValueError(
+            f"the lens of {name} has no focal length; expected fl_x in pixels or camera_angle_x in radians"
+        )
+    return fx, fy
+
+
+def _focal_length(length: float | None, angle_rad: float | None, size: int) -> float | None:
+    """From the length in pixels, or else from the opening angle."""
+    if length is not None or angle_rad is None:
+        return length
+    return 0.5 * size / math.tan(0.5 * angle_rad)
+
+
+POINT_FILES = ("points3d.ply", "points3D.ply", "sparse_pc.ply")
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+Settings = Mapping[str, Any]
+FRAME: dict[str, Field] = {"file_path": Text(), "transform_matrix": Items(Items(COORDINATE, 4))}
+FILE: dict[str, Field] = {
+    "ply_file_path": Optional(Text()),
+    "train_filenames": Optional(Items(Text())),
+    "val_filenames": Optional(Items(Text())),
+    "test_filenames": Optional(Items(Text())),
+}
+"""What is read beside the lens (`transforms_lens`); more may be in the file."""
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """The contents of one file, with at least one frame; every frame names a photograph and has a matrix.
+
+    Raises:
+        InputError: no valid JSON, no frames, or one that is not as `FRAME` says; names the file.
+    """
+    with input_checked():
+        settings = read_json(path)
+        frames = settings.get("frames") if isinstance(settings, dict) else None
+        if not isinstance(frames, list) or not frames:
+            raise ValueError(f"{path} lists no frames; expected a list `frames` of at least one photograph")
+        for index, frame in enumerate(frames, start=1):
+            checked(frame, FRAME, f"frame {index} of {path}")
+        checked(settings, FILE, str(path))
+    return settings
+
+
+def shots_of(root: Path, settings: Settings, file_name: str) -> dict[str, Shot]:
+    """Every frame by its `file_path`, with an error that lists the photographs that are missing."""
+    paths = [image_path(root, frame) for frame in settings["frames"]]
+    missing = [path.name for path in paths if not isfile(path)]
+    if missing:
+        raise InputError(
+            f"{len(missing)} of {len(paths)} photographs of {root / file_name} are missing: {first_names(missing)}; "
+            "copy them to where file_path says, or delete their entries from `frames`"
+        )
+    shots = {}
+    for frame, path in zip(settings["frames"], paths, strict=True):
+        name = _name(root, path)
+        lens = lens_from_settings({**settings, **frame}, path, name)
+        if frame["file_path"] in shots:
+            raise InputError(f"{root / file_name} has two frames for {frame['file_path']}; keep one")
+        shots[frame["file_path"]] = Shot(name, path, lens, _cam_from_world(frame, name))
+    return shots
+
+
+def image_path(root: Path, frame: Settings) -> Path:
+    """The photograph of one frame; Blender leaves its suffix out."""
+    path = normpath(root / frame["file_path"].replace("\\", "/"))
+    candidates = [path, *(path + suffix for suffix in IMAGE_SUFFIXES)]
+    return Path(next((candidate for candidate in candidates if isfile(candidate)), path))
+
+
+def _name(root: Path, path: Path) -> str:
+    """The photograph's name, relative to the folder of images, or to the capture, where it lies in there."""
+    plain_root = Path(normpath(root))
+    for folder in (plain_root / "images", plain_root):
+        if path.is_relative_to(folder):
+            return path.relative_to(folder).as_posix()
+    return path.name
+
+
+def _cam_from_world(frame: Settings, name: str) -> NDArray[np.float64]:
+    """[4, 4] in OpenCV axes, from camera-to-world in OpenGL axes."""
+    world_from_opengl = rigid_pose(np.array(frame["transform_matrix"], dtype=np.float64), name)
+    rotation = (world_from_opengl[:3, :3] @ OPENCV_FROM_OPENGL[:3, :3]).T
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ world_from_opengl[:3, 3]
+    return pose
+
+
+def read_points(root: Path, settings: Settings) -> RawPoints | None:
+    """The points of the file that the settings name, or of one that usually holds them."""
+    named = settings.get("ply_file_path")
+    if named is not None and not isfile(root / named):
+        raise InputError(f"ply_file_path names {root / named}, which does not exist; copy it there or delete the entry")
+    candidates = [named] if named is not None else [name for name in POINT_FILES if lexists(root / name)]
+    if not candidates:
+        return None
+    path = root / candidates[0]
+    if not isfile(path):
+        raise InputError(f"{path} is no file that can be read; replace or remove it")
+    with input_checked():
+        columns = read_table(path).columns
+    lacking = [axis for axis in "xyz" if axis not in columns]
+    if lacking:
+        raise InputError(
+            f"{path} has no vertex property {first_names(lacking)}; expected a point cloud with x, y and z"
+        )
+    positions = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    rgb = [columns.get(colour) for colour in ("red", "green", "blue")]
+    colors = (
+        np.full(positions.shape, GREY)
+        if any(c is None for c in rgb)
+        else np.stack([c for c in rgb if c is not None], 1)
+    )
+    with input_checked(path):
+        return RawPoints.from_arrays(positions, colors) if len(positions) else None
+
+
+WHOLE, TRAIN, TEST = "transforms.json", "transforms_train.json", "transforms_test.json"
+LOOKED_FOR = f"{WHOLE}, or {TRAIN} with or without {TEST}"
+
+
+def load_transforms(root: Path) -> Capture | None:
+    """Read `transforms.json`, or the train and test files of a synthetic scene; None when there is neither.
+
+    Raises:
+        InputError: no valid JSON, missing photographs, poses or intrinsics; names the file.
+    """
+    if (root / TRAIN).is_file():
+        return _load_split(root)
+    if (root / WHOLE).is_file():
+        return _load_whole(root)
+    return None
+
+
+def _load_whole(root: Path) -> Capture:
+    """One file for all photographs, which may name its own split."""
+    settings = read_settings(root / WHOLE)
+    shots = shots_of(root, settings, WHOLE)
+    train, test, warnings = _own_split(shots, settings)
+    if any("mask_path" in frame for frame in settings["frames"]):
+        warnings.append("mask_path says which pixels are valid, not where panes are; it is not used.")
+    return Capture(
+        shots=train,
+        test_shots=test,
+        points=read_points(root, settings),
+        format_name=WHOLE,
+        warnings=tuple(warnings),
+    )
+
+
+def _load_split(root: Path) -> Capture:
+    """Separate files for training and testing, as synthetic scenes have them."""
+    settings = read_settings(root / TRAIN)
+    test = shots_of(root, read_settings(root / TEST), TEST) if (root / TEST).is_file() else None
+    return Capture(
+        shots=tuple(shots_of(root, settings, TRAIN).values()),
+        test_shots=None if test is None else tuple(test.values()),
+        points=read_points(root, settings),
+        format_name=TRAIN,
+        random_points=points_in_box if _is_blender(settings) else None,
+    )
+
+
+def _is_blender(settings: Settings) -> bool:
+    """Blender scripts write the opening angle and nothing else about the lens."""
+    return "camera_angle_x" in settings and "fl_x" not in settings and "w" not in settings
+
+
+def _own_split(
+    shots: Mapping[str, Shot], settings: Settings
+) -> tuple[tuple[Shot, ...], tuple[Shot, ...] | None, list[str]]:
+    """Training and test photographs as nerfstudio lists them in the file, or all and None; and warnings."""
+    train_names = settings.get("train_filenames")
+    test_names = settings.get("test_filenames") or settings.get("val_filenames")
+    if not train_names or not test_names:
+        return tuple(shots.values()), None, []
+    unknown = sorted({*train_names, *test_names} - set(shots))
+    if unknown:
+        raise InputError(f"the split of {WHOLE} names photographs that have no frame: {first_names(unknown)}")
+    test = tuple(shots[name] for name in test_names)
+    train = tuple(shots[name] for name in train_names if name not in set(test_names))
+    left_out = len(shots) - len(train) - len(test)
+    return train, test, [f"{left_out} photographs are in neither part of the split and left out."] if left_out else []

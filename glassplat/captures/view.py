@@ -1,0 +1,330 @@
+"""Photographs with their cameras, panes and estimated normals, read when first asked for; and coloured points.
+
+Estimated normals are those that networks for single photographs write: x to the right, y up, z towards the camera; in a
+PNG of 8 or 16 bits (n + 1) / 2, in an NPY file [H, W, 3] of floats the vectors themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from glassplat.captures.cameras import (
+    MOST_SKEW,
+    Pinhole,
+    PixelMap,
+    lens_for_image,
+    nearest_resize,
+    pinhole_of,
+    rigid_pose,
+)
+from glassplat.captures.capture import RawPoints, Shot
+from glassplat.captures.masks import PaneMask
+from glassplat.errors import InputError, input_checked
+from glassplat.files.images import image_size, read_image, read_image_float
+from glassplat.options import WHITE, Rgb
+from glassplat.scene.camera import Camera, moved
+
+LEAST_SIDE = 8
+"""Pixels along the side of a photograph that was reduced; below that are no edges to tell panes or details by."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph of the capture.
+
+    Attributes:
+        name: unique within the data set, with suffix; `/` between folders.
+        camera: float32 pinhole camera of `photo`.
+        image_path: the file.
+        read_photo: returns `photo`.
+        read_pane_labels: returns `pane_labels`; None where the view is not annotated.
+        read_ignored: returns `ignored`; None where all pixels count.
+    """
+
+    name: str
+    camera: Camera
+    image_path: Path
+    read_photo: Callable[[], Tensor]
+    read_pane_labels: Callable[[], Tensor] | None = None
+    read_ignored: Callable[[], Tensor] | None = None
+    _read: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    @property
+    def photo(self) -> Tensor:
+        """[H, W, 3] uint8 sRGB, undistorted and reduced; stays in memory once read.
+
+        Threads may ask at once: without a lock, which `cached_property` has for all views together, none waits for the
+        photograph of another.
+
+        Raises:
+            InputError: the file cannot be read; names it.
+        """
+        if "photo" not in self._read:
+            self._read["photo"] = self.read_photo()
+        return self._read["photo"]
+
+    @cached_property
+    def pane_labels(self) -> Tensor | None:
+        """[H, W] uint8 pane label per pixel, 0 for no pane; None where the view is not annotated."""
+        return None if self.read_pane_labels is None else self.read_pane_labels()
+
+    @cached_property
+    def ignored(self) -> Tensor | None:
+        """[H, W] bool, the pixels that show what is not to be learned or measured; None where there are none."""
+        return None if self.read_ignored is None else self.read_ignored() > 0
+
+    @property
+    def is_annotated(self) -> bool:
+        """Whether there is a mask; does not read it."""
+        return self.read_pane_labels is not None
+
+    def with_camera(self, camera: Camera) -> View:
+        """The same photograph from another camera; what was read of it stays read."""
+        other = copy(self)
+        object.__setattr__(other, "camera", camera)
+        return other
+
+    @staticmethod
+    def in_memory(name: str, camera: Camera, *, photo: Tensor, pane_labels: Tensor | None = None) -> View:
+        """A view of pixels at hand, such as a rendered one."""
+        return View(name, camera, Path(name), lambda: photo, None if pane_labels is None else lambda: pane_labels)
+
+
+@dataclass(frozen=True)
+class PhotoFile:
+    """How to read the pixels of one view from its file; `background` is seen through transparent pixels."""
+
+    path: Path
+    pixel_map: PixelMap
+    background: Rgb
+
+    def __call__(self) -> Tensor:
+        """[H, W, 3] uint8 in the pixel grid of the view's camera."""
+        with input_checked():
+            pixels = read_image(self.path)
+        return torch.from_numpy(self.pixel_map.photo(_opaque(pixels, self.background)))
+
+
+@dataclass(frozen=True)
+class MaskFile:
+    """How to read the pane labels of one view; `size` is the photograph's, before undistortion."""
+
+    mask: PaneMask
+    size: tuple[int, int]
+    pixel_map: PixelMap
+
+    def __call__(self) -> Tensor:
+        """[H, W] uint8 in the pixel grid of the view's camera."""
+        return torch.from_numpy(self.pixel_map.labels(nearest_resize(self.mask.labels(), *self.size)))
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """How photographs become views.
+
+    Attributes:
+        downscale: width and height are divided by it and rounded.
+        background: sRGB in [0, 1], seen through transparent pixels.
+    """
+
+    downscale: float = 1.0
+    background: Rgb = WHITE
+
+
+@dataclass(frozen=True)
+class PreparedView:
+    """A view and what was noticed while its file header was looked at."""
+
+    view: View
+    rescaled: bool
+
+
+def prepare_view(
+    shot: Shot, mask: PaneMask | None, options: ViewOptions, *, ignored: PaneMask | None = None
+) -> PreparedView:
+    """Check one photograph against its camera and set up how it is read; decodes no pixels of it.
+
+    Raises:
+        InputError: unreadable file, sizes that disagree, a pose that is not rigid, a lens that cannot be undistorted.
+    """
+    with input_checked():
+        width, height = image_size(shot.image_path)
+    lens = lens_for_image(shot.lens, (width, height), shot.name)
+    pinhole, distorted = pinhole_of(lens)
+    small = _reduced_size(pinhole, options.downscale, shot.name)
+    pixel_map = PixelMap(lens if distorted else None, *small)
+    pose = torch.from_numpy(rigid_pose(shot.cam_from_world, shot.name)).float()
+    camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.width, pinhole.height)
+    view = View(
+        name=shot.name,
+        camera=camera.resized(*small),
+        image_path=shot.image_path,
+        read_photo=PhotoFile(shot.image_path, pixel_map, options.background),
+        read_pane_labels=None if mask is None else _mask_file(mask, (width, height), pixel_map),
+        read_ignored=None if ignored is None else _mask_file(ignored, (width, height), pixel_map),
+    )
+    return PreparedView(view, lens is not shot.lens)
+
+
+def _reduced_size(pinhole: Pinhole, downscale: float, name: str) -> tuple[int, int]:
+    """Width and height of a photograph that is reduced by a factor.
+
+    Raises:
+        InputError: that makes it too small to learn from.
+    """
+    width, height = (max(1, round(side / downscale)) for side in (pinhole.width, pinhole.height))
+    if downscale > 1 and min(width, height) < LEAST_SIDE:
+        most = max(min(pinhole.width, pinhole.height) / LEAST_SIDE, 1)
+        raise InputError(
+            f"{name} is {pinhole.width}x{pinhole.height} pixels large, and reduced by {downscale:g} {width}x{height}; "
+            f"expected at least {LEAST_SIDE} pixels along each side: use --downscale {int(10 * most) / 10:g} or less"
+        )
+    return width, height
+
+
+def _mask_file(mask: PaneMask, size: tuple[int, int], pixel_map: PixelMap) -> MaskFile:
+    """The mask at the photograph's size, which it must have up to an integer factor."""
+    with input_checked():
+        mask_size = image_size(mask.path)
+    if not (_is_multiple(mask_size, size) or _is_multiple(size, mask_size)):
+        raise InputError(
+            f"mask {mask.path} is {mask_size[0]}x{mask_size[1]} pixels large, its photograph {size[0]}x{size[1]}; "
+            "expected the same size, or one an integer multiple of the other"
+        )
+    return MaskFile(mask, size, pixel_map)
+
+
+def _is_multiple(large: tuple[int, int], small: tuple[int, int]) -> bool:
+    """Whether one size is an integer multiple of the other, up to the rounding of the smaller one."""
+    factor = round(large[0] / small[0])
+    return factor >= 1 and all(
+        abs(a / factor - b) < min(1, MOST_SKEW * b) and (factor > 1 or a == b)
+        for a, b in zip(large, small, strict=True)
+    )
+
+
+def _opaque(pixels: NDArray[np.uint8], background: Rgb) -> NDArray[np.uint8]:
+    """[H, W, 3] from grey, colour or colour with transparency, over the background."""
+    if pixels.shape[2] == 1:
+        return np.repeat(pixels, 3, axis=2)
+    if pixels.shape[2] == 3:
+        return np.ascontiguousarray(pixels)
+    behind = np.asarray(background, dtype=np.float32) * 255
+    opaque = np.empty((*pixels.shape[:2], 3), dtype=np.uint8)
+    for row, seen in enumerate(pixels):  # Row by row: as floats a photograph takes four times its memory.
+        alpha = seen[:, 3:].astype(np.float32) / 255
+        opaque[row] = np.round(seen[:, :3] * alpha + behind * (1 - alpha))
+    return opaque
+
+
+FOLDER = "normals"
+SUFFIXES = (".png", ".npy")
+CAMERA_FROM_PICTURE = (1.0, -1.0, -1.0)
+"""Turns y up and z towards the camera into y down and z forward."""
+LEAST_LENGTH = 0.5
+"""Shorter vectors, such as those of grey or black pixels, are no normals."""
+
+
+def estimated_normals(view: View) -> Tensor | None:
+    """[H, W, 3] unit normals of a view in world axes, zero where none is known; None where there is no file.
+
+    The photograph's lens must be a pinhole: normals are reduced with it, but not undistorted.
+
+    Raises:
+        InputError: a file cannot be read, or has not the proportions of the photograph.
+    """
+    path = normals_path(view.image_path)
+    if path is None:
+        return None
+    with input_checked():
+        vectors = _vectors(path)
+    camera = view.camera
+    height, width = vectors.shape[:2]
+    if abs(width * camera.height - height * camera.width) > max(width, height, camera.width, camera.height):
+        raise InputError(
+            f"{path} is {width}x{height} pixels large, its photograph {camera.width}x{camera.height} here; expected "
+            "the same proportions"
+        )
+    in_picture = torch.from_numpy(vectors).permute(2, 0, 1)[None]
+    small = torch.nn.functional.interpolate(in_picture, (camera.height, camera.width), mode="area")[0].permute(1, 2, 0)
+    known = small.norm(dim=-1, keepdim=True) > LEAST_LENGTH
+    unit = torch.nn.functional.normalize(small, dim=-1) * torch.tensor(CAMERA_FROM_PICTURE)
+    return torch.where(known, unit @ camera.cam_from_world[:3, :3].to(unit), 0)
+
+
+def normals_path(image_path: Path) -> Path | None:
+    """The file of normals in a folder `normals` beside a photograph or beside its folder; None where there is none."""
+    for folder in (image_path.parent / FOLDER, image_path.parent.parent / FOLDER):
+        for name in (image_path.stem, image_path.name):
+            for suffix in SUFFIXES:
+                path = folder / f"{name}{suffix}"
+                if path.is_file():
+                    return path
+    return None
+
+
+def _vectors(path: Path) -> NDArray[np.float32]:
+    """[H, W, 3] as stored, zero where not finite."""
+    if path.suffix == ".png":
+        pixels = read_image_float(path)
+        if pixels.shape[2] < 3:
+            raise ValueError(f"{path} is grey; expected normals as colours")
+        vectors = 2 * pixels[..., :3] - 1
+        return vectors * (pixels[..., 3:] > LEAST_LENGTH) if pixels.shape[2] == 4 else vectors
+    try:
+        vectors = np.load(path, allow_pickle=False)
+    except Exception as error:  # It evaluates the head of the file, and damaged ones raise what tokens do.
+        raise ValueError(f"{path} is no array that NumPy can read: {error}") from error
+    if vectors.ndim != 3 or vectors.shape[2] != 3 or vectors.dtype.kind != "f" or 0 in vectors.shape:
+        raise ValueError(f"{path} holds {vectors.dtype} of shape {list(vectors.shape)}; expected floats [H, W, 3]")
+    return np.nan_to_num(vectors.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Coloured points in world space.
+
+    Attributes:
+        positions: [P, 3] float32, world units.
+        colors: [P, 3] uint8 sRGB.
+    """
+
+    positions: Tensor
+    colors: Tensor
+
+    def __post_init__(self) -> None:
+        expected = (self.positions.shape[0], 3)
+        if tuple(self.positions.shape) != expected or tuple(self.colors.shape) != expected:
+            raise ValueError(
+                f"expected positions and colors of shape [P, 3], got {list(self.positions.shape)} and "
+                f"{list(self.colors.shape)}"
+            )
+        if self.positions.dtype != torch.float32 or self.colors.dtype != torch.uint8:
+            raise TypeError(
+                f"expected float32 positions and uint8 colors, got {self.positions.dtype}, {self.colors.dtype}"
+            )
+
+    def __len__(self) -> int:
+        return self.positions.shape[0]
+
+    @staticmethod
+    def of(points: RawPoints) -> PointCloud:
+        """The points that were read; they share their memory."""
+        return PointCloud(torch.from_numpy(points.positions), torch.from_numpy(points.colors))
+
+
+def with_ignored_right(image: Tensor, view: View) -> Tensor:
+    """An image [H, W, 3] that shows the photograph itself where the view ignores pixels: no error, no gradient."""
+    if view.ignored is None:
+        return image
+    photo = moved(view.photo, image.device).to(image.dtype) / 255
+    return torch.where(moved(view.ignored, image.device)[..., None], photo, image)

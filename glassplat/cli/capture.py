@@ -1,0 +1,104 @@
+"""`glassplat prepare` and `glassplat annotate`: photographs to a capture, and its panes marked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from glassplat.cli.console import import_now, say, warn
+from glassplat.cli.progress import WorkProgress
+from glassplat.files.writing import check_capture_folder
+from glassplat.options import Range, Share
+from glassplat.prepare.colmap import Lens, Mapper
+from glassplat.prepare.preparation import Preparation, check_places, prepare
+from glassplat.prepare.reconstruction import Settings
+from glassplat.prepare.workplace import Workplace
+
+
+@dataclass(frozen=True)
+class Prepare:
+    """Find out where photographs were taken, and make a capture of them.
+
+    Attributes:
+        input: folder of photographs, or a video.
+        output: the capture; a new folder.
+        max_size: reduce photographs to this many pixels along the longer side.
+        frames: photographs to take from a video, at most.
+        lens: COLMAP's model of the lens; opencv and opencv_fisheye for wide ones.
+        mapper: place one photograph after the other, or all at once.
+        least_registered: share of the photographs that have to be placed.
+        resume: go on where the command was interrupted.
+        force: replace a capture that was prepared before, or begin an interrupted one again.
+    """
+
+    input: tyro.conf.Positional[Path]
+    output: Path
+    max_size: Annotated[int, Range(320, 16384)] = 1600
+    frames: Annotated[int, Range(8, 2000)] = 150
+    lens: Lens = "simple_radial"
+    mapper: Mapper = "incremental"
+    least_registered: Share = 0.8
+    resume: bool = False
+    force: bool = False
+
+    def ready(self) -> None:
+        """Refuses an input that is no photographs, and an output among them."""
+        check_places(self._task())
+
+    def _task(self) -> Preparation:
+        settings = Settings(lens=self.lens, mapper=self.mapper)
+        return Preparation(
+            self.input, self.output, self.max_size, self.frames, self.least_registered, settings=settings
+        )
+
+    def run(self, console: Console) -> None:
+        """Prepares, with progress, and says what became of the photographs."""
+        with WorkProgress(console) as progress:
+            report = prepare(self._task(), progress.show, resume=self.resume, force=self.force)
+        for line in report.lines():
+            (warn if line.startswith("advice") else say)(console, line)
+        from glassplat.prepare.report_page import PAGE, write_page  # PyTorch, which nothing before needs.
+
+        write_page(self.output, self.output / PAGE)
+        say(console, f"capture: {self.output}, report: {self.output / PAGE}")
+        say(console, f"next: glassplat annotate {self.output}")
+
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        if Workplace(self.output).folder.exists():
+            return f"repeat the command with --resume to go on; what is done so far lies in {self.output}.partial"
+        return "nothing was written: repeat the command to begin again"
+
+
+@dataclass(frozen=True)
+class Annotate:
+    """Mark the panes of a capture in the browser: corners in a few photographs, and what stands before them.
+
+    Attributes:
+        capture: directory of the capture.
+        port: to listen on, on this computer only; 0 takes any that is free.
+        open_browser: open the page at once; not over SSH.
+    """
+
+    capture: tyro.conf.Positional[Path]
+    port: Annotated[int, Range(0, 65535)] = 8765
+    open_browser: bool = True
+
+    def ready(self) -> None:
+        """Refuses what is no folder, and imports what reads it."""
+        check_capture_folder(self.capture)
+        import_now("glassplat.cli.serving")
+
+    def run(self, console: Console) -> None:
+        """Serves the page until it is closed, or Ctrl-C."""
+        from glassplat.cli.serving import serve_marking
+
+        serve_marking(self, console)
+
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        return f"what was marked is saved in {self.capture}: repeat the command to go on"

@@ -1,0 +1,389 @@
+"""The console of commands: printed lines, arguments, signals, imports, and how commands end.
+
+Everything printed may hold a path or a name that somebody else chose. Rich would read `[...]` in it as markup and `:x:`
+as a picture, and break it at 80 columns where the output goes to a file; a control character would reach the terminal.
+"""
+
+from __future__ import annotations
+
+import errno
+import gc
+import importlib
+import importlib.metadata
+import io
+import itertools
+import logging
+import os
+import platform
+import re
+import signal
+import sys
+import tempfile
+import threading
+import time
+import traceback
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any, Literal, NamedTuple
+
+from rich.console import Console
+from rich.control import Control, ControlType
+from rich.text import Text
+
+from glassplat import __version__
+from glassplat.errors import InputError
+
+UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+"""Control characters but for tabs and line breaks, and the bytes of a file name that are not text."""
+
+
+def message_console(*, stderr: bool = False) -> Console:
+    """The console of a command: strings are shown as they are, and break only in a terminal."""
+    console = Console(stderr=stderr, markup=False, emoji=False, highlight=False)
+    console.soft_wrap = not console.is_terminal
+    return console
+
+
+def say(console: Console, text: object, *, label: str = "", style: str = "") -> None:
+    """Prints a line as it is.
+
+    Args:
+        console: where to; any console, also one that reads markup.
+        text: what to say.
+        label: a word in front, followed by a colon, such as `warning`.
+        style: the label's colour.
+    """
+    line = Text(f"{label}:" if label else "", style=style)
+    line.append(f"{' ' if label else ''}{printable(str(text))}", style="default")
+    console.print(line, soft_wrap=not console.is_terminal)
+
+
+def warn(console: Console, text: object) -> None:
+    """Prints a warning: the command goes on."""
+    say(console, text, label="warning", style="yellow")
+
+
+def complain(label: Literal["error", "stopped", "failed"], text: object) -> None:
+    """Prints on standard error why a command ends, or one of its parts.
+
+    Args:
+        label: `error` for wrong input, `stopped` for a failure while running, `failed` for a part that is left out.
+        text: what was expected, what came, and what to do.
+    """
+    say(message_console(stderr=True), text, label=label, style="red")
+
+
+def printable(text: str) -> str:
+    r"""The text with what no terminal should get written out, such as `\x1b`."""
+    return UNPRINTABLE.sub(lambda found: repr(found.group())[1:-1], text)
+
+
+def plain_streams() -> None:
+    """Lets every program be started from: with output that is closed, or in an encoding that lacks a character."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - Until the process ends.
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def drop_output() -> None:
+    """Sends what is still to be printed nowhere, since nobody reads it any more."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+
+
+class LogLines(logging.Handler):
+    """Shows what is logged among the other lines of a command, above its progress bar."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self._console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Prints one record."""
+        if record.levelno >= logging.WARNING:
+            warn(self._console, record.getMessage())
+        else:
+            say(self._console, record.getMessage())
+
+
+@contextmanager
+def heard_by(console: Console) -> Iterator[None]:
+    """Shows on a console what the package logs and what libraries warn of, each as a line."""
+
+    def show(message: Warning | str, *place: Any, **more: Any) -> None:
+        warn(console, message)
+
+    logging.basicConfig(level=logging.WARNING, handlers=[LogLines(console)])
+    logging.getLogger("glassplat").setLevel(logging.INFO)
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
+
+
+WORDS = {
+    name: word
+    for name, word in (("SIGINT", "interrupted"), ("SIGTERM", "terminated"), ("SIGHUP", "the terminal was closed"))
+    if hasattr(signal, name)  # Windows has no SIGHUP.
+}
+CODE_OF_SIGNALS = 128
+"""Shells report a process that a signal ended by this plus the signal's number."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """The command was asked to end.
+
+    Attributes:
+        number: the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(WORDS[signal.Signals(number).name])
+        self.number = number
+
+
+def code_of(stop: KeyboardInterrupt) -> int:
+    """The exit code: 130 after Ctrl-C, 143 and 129 after the two other signals."""
+    return CODE_OF_SIGNALS + (stop.number if isinstance(stop, Interrupted) else signal.SIGINT)
+
+
+@contextmanager
+def raised_signals() -> Iterator[list[Interrupted]]:
+    """Turns the signals into `Interrupted`, raised where the command is, so that half-written files are removed.
+
+    Gives the list of those raised: a library that is interrupted may end with an error of its own.
+    """
+    raised: list[Interrupted] = []
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raised.append(Interrupted(number))
+        raise raised[-1]
+
+    with _answered(stop):
+        yield raised
+
+
+@contextmanager
+def immediate_end() -> Iterator[None]:
+    """Ends the process at the first signal, with one line: for the seconds in which libraries are imported.
+
+    Nothing has been written yet that would be left behind. An exception would not do: a library may take it for its
+    own failure, or go on without the module that it was importing.
+    """
+
+    def end(number: int, frame: FrameType | None) -> None:
+        stop = Interrupted(number)
+        os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, f"{stop}\n".encode())
+        os._exit(code_of(stop))
+
+    with _answered(end):
+        yield
+
+
+@contextmanager
+def held_signals() -> Iterator[None]:
+    """Answers signals when the context ends: for imports while something runs that has to be told to end."""
+    held: list[int] = []
+    with _answered(lambda number, frame: held.append(number)):
+        yield
+    for number in held[:1]:
+        signal.raise_signal(number)
+
+
+@contextmanager
+def _answered(answer: signal._HANDLER) -> Iterator[None]:
+    """Has the signals answered, but for those that the process was told to ignore, as by `nohup`."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # Only the main thread may say how signals are answered.
+        return
+    numbers = [getattr(signal, name) for name in WORDS]
+    before = {number: signal.getsignal(number) for number in numbers}
+    heard = [number for number, handler in before.items() if handler not in (signal.SIG_IGN, None)]
+    for number in heard:
+        signal.signal(number, answer)
+    try:
+        yield
+    finally:
+        for number in heard:
+            signal.signal(number, before[number])
+
+
+BAD_INPUT_CODE, FAILURE_CODE = 2, 1
+BAD_INPUT = ("glassplat.panes.options.PlaneFitError", "glassplat.kernels.backend.devices.CudaUnavailableError")
+FAILURES = ("glassplat.training.loop.TrainingDivergedError",)
+GPU_IS_FULL = ("torch.OutOfMemoryError",)
+"""By name: this module is loaded before PyTorch, and also where PyTorch is what cannot be loaded."""
+BAD_PATH = (
+    FileNotFoundError,
+    FileExistsError,
+    NotADirectoryError,
+    IsADirectoryError,
+    PermissionError,
+)
+BAD_PATH_NUMBERS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EROFS, errno.EINVAL)
+FULL = (errno.ENOSPC, errno.EDQUOT)
+OUT_OF_MEMORY = (
+    "can't allocate memory",
+    "Cannot allocate memory",
+    "not enough memory",
+    "bad_alloc",
+    "bad allocation",
+    "failed to map segment",
+)
+LONGEST_QUOTE = 300
+REMEDY = "photographs made smaller (train with a larger --downscale) or fewer Gaussians need less"
+
+
+class Ending(NamedTuple):
+    """What is said and returned at the end of a command: `error` for wrong input, `stopped` for a failure."""
+
+    label: Literal["error", "stopped"]
+    text: str
+    code: int
+
+
+def ending(error: BaseException) -> Ending:
+    """The message and the exit code that an error ends a command with; one that nobody foresaw is saved to a file."""
+    if isinstance(error, InputError) or is_one_of(error, BAD_INPUT):
+        return Ending("error", str(error), BAD_INPUT_CODE)
+    if isinstance(error, OSError):
+        bad_path = isinstance(error, BAD_PATH) or error.errno in BAD_PATH_NUMBERS
+        label: Literal["error", "stopped"] = "error" if bad_path else "stopped"
+        return Ending(label, described_os_error(error), BAD_INPUT_CODE if bad_path else FAILURE_CODE)
+    return Ending("stopped", _failure(error), FAILURE_CODE)
+
+
+def is_one_of(error: BaseException, names: tuple[str, ...]) -> bool:
+    """Whether an error is of a class given by name; one whose module is not loaded cannot have been raised."""
+    for module, _, name in (full.rpartition(".") for full in names):
+        kind = getattr(sys.modules.get(module), name, None)
+        if kind is not None and isinstance(error, kind):
+            return True
+    return False
+
+
+def described_os_error(error: OSError) -> str:
+    """An error of the operating system in words: what it is about, what is wrong, and what helps."""
+    if error.errno is None or error.strerror is None:
+        return str(error)  # Our own, whose message says everything.
+    subjects = [os.fsdecode(name) for name in (error.filename, error.filename2) if isinstance(name, str | bytes)]
+    about = f"{' -> '.join(subjects)}: " if subjects else ""
+    remedy = "; free some space, then repeat the command" if error.errno in FULL else ""
+    return f"{about}{error.strerror[:1].lower()}{error.strerror[1:]}{remedy}"
+
+
+def _failure(error: BaseException) -> str:
+    if is_one_of(error, FAILURES):
+        return str(error)
+    if is_one_of(error, GPU_IS_FULL):
+        return f"{quoted(error)}; {REMEDY}, or use --device cpu; the last checkpoint stays"
+    if is_out_of_memory(error):
+        return f"out of memory ({quoted(error) or 'an allocation failed'}); {REMEDY}; the last checkpoint stays"
+    return f"an error that glassplat did not foresee, {type(error).__name__}: {quoted(error)}; {saved_traceback(error)}"
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether the CPU's memory ran out, or that is what made a library fail; many say so in words only."""
+    if isinstance(error, MemoryError):
+        return True
+    if isinstance(error, RuntimeError | ImportError | OSError) and any(text in str(error) for text in OUT_OF_MEMORY):
+        return True
+    return error.__cause__ is not None and is_out_of_memory(error.__cause__)
+
+
+def quoted(error: BaseException) -> str:
+    """The first sentence of somebody else's message, which may have many lines."""
+    first = (str(error).strip().splitlines() or [""])[0].split(". ")[0].rstrip(".")
+    return first if len(first) <= LONGEST_QUOTE else f"{first[:LONGEST_QUOTE]} ..."
+
+
+def saved_traceback(error: BaseException) -> str:
+    """Writes the traceback to a file among the temporary ones; says where, or where the error was if it cannot."""
+    trace = "".join(traceback.format_exception(error))
+    head = (
+        f"glassplat {__version__}, Python {platform.python_version()}, PyTorch {_version('torch')}, "
+        f"Numba {_version('numba')}, {platform.system()} {platform.release()} {platform.machine()}\n"
+        f"{time.strftime('%Y-%m-%d %H:%M:%S %z')}\n{sys.argv}\n\n"
+    )
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="glassplat-", suffix=".log", delete=False, encoding="utf-8", errors="backslashreplace"
+        ) as file:
+            file.write(head + trace)
+    except OSError:
+        frames = traceback.extract_tb(error.__traceback__)
+        return f"raised in {frames[-1].filename}, line {frames[-1].lineno}" if frames else "its place is not known"
+    return f"the traceback is in {file.name}. Please report it, with what you did"
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "missing"
+
+
+def check_arguments(arguments: Sequence[str]) -> None:
+    """Refuses empty arguments after a command: as a path, an empty text is the folder that it was started in.
+
+    Raises:
+        InputError: an argument is empty; says which.
+    """
+    for before, argument in itertools.pairwise(arguments):
+        option, is_joined, value = argument.partition("=")
+        if argument == "" or (option.startswith("--") and is_joined and not value):
+            name = option or before
+            raise InputError(f"what follows {name} is empty, as of a shell variable that is not set; expected a value")
+
+
+LINE = "loading PyTorch ..."
+"""Shown in a terminal only, and gone when the work begins. The cursor stays: Ctrl-C may end the process at once."""
+
+
+def import_now(module: str, console: Console | None = None) -> Any:
+    """A module of `glassplat` that imports PyTorch, imported now if it is not there yet.
+
+    Args:
+        module: its dotted name.
+        console: where the line appears; that of standard error if not given.
+    """
+    console = console or message_console(stderr=True)
+    with _uncollected(), _announced(console, module):
+        return importlib.import_module(module)
+
+
+def import_held(module: str) -> Any:
+    """The same while a command works: signals are answered after the import, which must not break off."""
+    with held_signals():
+        return import_now(module)
+
+
+@contextmanager
+def _announced(console: Console, module: str) -> Iterator[None]:
+    """Shows the line meanwhile, where somebody may be watching and the module is not there yet."""
+    if module in sys.modules or not console.is_terminal:
+        yield
+        return
+    console.print(LINE, end="", highlight=False)
+    try:
+        yield
+    finally:
+        console.control(Control(ControlType.CARRIAGE_RETURN, (ControlType.ERASE_IN_LINE, 2)))
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Keeps Python from looking for garbage among what is imported, now and later: all of it stays to the end."""
+    if not gc.isenabled():
+        yield
+        return
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()

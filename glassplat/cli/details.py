@@ -1,0 +1,204 @@
+"""Details of captures and scenes for `glassplat info`, which take PyTorch to read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+
+from glassplat.captures.dataset import Dataset, dataset_of, load_dataset
+from glassplat.captures.files import CaptureFiles
+from glassplat.captures.view import normals_path
+from glassplat.cli.info import FEW_VIEWS, Finding
+from glassplat.errors import InputError
+from glassplat.files.records import read_json
+from glassplat.files.scene_folder import read_scene, read_splats
+from glassplat.methods.planar import fitted_planes
+from glassplat.model.run_directory import RunDirectory
+from glassplat.panes.material import virtual_points
+from glassplat.panes.options import PlaneFit, PlaneFitError
+from glassplat.prepare.report_page import PAGE, write_page
+from glassplat.prepare.workplace import RECORD
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Scene
+
+FEW_POINTS, FEW_MASKS = 500, 3
+
+
+def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
+    """What there is to say of a capture beside what its files say.
+
+    Raises:
+        InputError: it cannot be used.
+    """
+    dataset = dataset_of(files)
+    finding = Finding()
+    sizes = sorted({f"{v.camera.width}x{v.camera.height}" for v in (*dataset.train, *dataset.test)})
+    finding.facts["photographs"] = (
+        f"{len(dataset.train)} to train, {len(dataset.test)} to test ({dataset.split}), {', '.join(sizes[:3])}"
+    )
+    finding.problems += dataset.warnings
+    if len(dataset.train) + len(dataset.test) < FEW_VIEWS:
+        finding.problems.append(f"{len(dataset.train) + len(dataset.test)} photographs are few; 30 and more do better")
+    if dataset.measured_points and len(dataset.points) < FEW_POINTS:
+        finding.problems.append(f"{len(dataset.points)} points are few; more photographs with more overlap give more")
+    yield finding
+    yield _marked(files.root, dataset)
+    yield _behind(files.root, dataset)
+
+
+def write_capture_page(path: Path, target: Path) -> None:
+    """Writes the report of a prepared capture, with the panes that are marked in it.
+
+    Raises:
+        InputError: it is no such capture, or the file is somebody's.
+    """
+    if not (path / RECORD).is_file():
+        raise InputError(f"{path} was not made by `glassplat prepare`: there is no {RECORD} to report on")
+    if target.exists() and target.resolve() != (path / PAGE).resolve():
+        raise InputError(f"{target} exists; choose another name for --page")
+    dataset = load_dataset(path)
+    marked = bool(dataset.pane_labels) or dataset.planes is not None
+    write_page(path, target, fitted_planes(dataset, None, PlaneFit()) if marked else None)
+
+
+def _marked(path: Path, dataset: Dataset) -> Finding:
+    """Which panes are marked, and how well."""
+    finding = Finding()
+    if ignoring := sum(view.read_ignored is not None for view in (*dataset.train, *dataset.test)):
+        finding.facts["ignored"] = f"parts of {ignoring} photographs, marked in ignore/"
+    if estimated := sum(normals_path(view.image_path) is not None for view in dataset.train):
+        finding.facts["normals"] = f"estimated for {estimated} training photographs; deferred and traced heed them"
+    annotated = sum(view.is_annotated for view in dataset.train)
+    if not dataset.pane_labels and dataset.planes is None:
+        finding.facts["panes"] = "none marked"
+        finding.next.append(f"glassplat annotate {path}    marks panes")
+        finding.next.append(f"glassplat train splat --data {path} --output RUN    needs none")
+        return finding
+    given = () if dataset.planes is None else dataset.planes.labels
+    labels = sorted({*dataset.pane_labels, *given})
+    finding.facts["panes"] = f"{', '.join(map(str, labels))}; masks of {annotated} training photographs" + (
+        f", planes.json gives {', '.join(map(str, given))}" if given else ""
+    )
+    if annotated < FEW_MASKS and not given:
+        finding.problems.append(f"{annotated} masks are few; three to ten, from places well apart, do better")
+    return finding
+
+
+def _behind(path: Path, dataset: Dataset) -> Finding:
+    """Whether planes can be fitted to the panes that are marked, and what lies behind them; takes seconds."""
+    finding = Finding()
+    if not dataset.pane_labels and dataset.planes is None:
+        return finding
+    try:
+        planes = fitted_planes(dataset, None, PlaneFit())
+    except PlaneFitError as error:
+        finding.problems.append(str(error))
+        finding.next.append(f"glassplat annotate {path}    marks panes by corners instead")
+        return finding
+    if dataset.measured_points:
+        cameras = [view.camera for view in dataset.train]
+        behind = int(virtual_points(dataset.points.positions, planes, cameras).sum())
+        finding.facts["points behind panes"] = f"{behind} ({behind / max(len(dataset.points), 1):.0%})"
+    finding.next.append(f"glassplat train planar --data {path} --output RUN")
+    return finding
+
+
+MEASURES = {"psnr": "PSNR", "pane_psnr": "PSNR over panes", "ssim": "SSIM", "lpips": "LPIPS"}
+MANY_FAINT = 0.5
+FAINT = 0.01
+
+
+def splats_part(path: Path) -> Finding:
+    """What a file of Gaussians holds.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        gaussians = read_splats(path)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    finding = Finding()
+    _look_at(gaussians, finding)
+    return finding
+
+
+def trained_part(directory: RunDirectory) -> Finding:
+    """What a training has led to so far."""
+    finding = Finding()
+    try:
+        scene, step = directory.latest_scene()
+    except InputError as error:
+        begun = directory.checkpoint.is_file()
+        finding.problems.append("it was interrupted, and goes on with --resume" if begun else str(error))
+        finding.next.append(f"the train command that began it, {'with --resume' if begun else 'again'}")
+        return finding
+    finding.facts["trained to"] = step
+    _describe_scene(scene, finding)
+    _describe_results(directory, finding)
+    return finding
+
+
+def scene_part(path: Path) -> Finding:
+    """What the scene in a folder consists of.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        scene = read_scene(path)
+    except (ValueError, FileNotFoundError) as error:
+        raise InputError(str(error)) from error
+    finding = Finding()
+    _describe_scene(scene, finding)
+    return finding
+
+
+def _describe_scene(scene: Scene, finding: Finding) -> None:
+    _look_at(scene.primary, finding)
+    planes = scene.planes
+    if len(planes):
+        told = (
+            f"{label}{' (mirror)' if label in planes.mirrors else f' (R0 {float(reflectance):.3f})'}"
+            for label, reflectance in zip(planes.labels, planes.base_reflectances, strict=True)
+        )
+        finding.facts["panes"] = ", ".join(told)
+    if len(scene.photographer):
+        finding.facts["photographer"] = f"{len(scene.photographer)} Gaussians, which panes show in photographs only"
+    if not scene.environment.is_empty:
+        finding.facts["environment"] = f"a cube map of {scene.environment.size} texels a side"
+
+
+def _look_at(gaussians: Gaussians, finding: Finding) -> None:
+    """Number, colours, reach and oddities of Gaussians."""
+    finding.facts["Gaussians"] = len(gaussians)
+    if not len(gaussians):
+        finding.problems.append("it holds no Gaussian")
+        return
+    finding.facts["degree of harmonics"] = gaussians.max_sh_degree
+    finite = torch.isfinite(gaussians.means).all(dim=1)
+    if not bool(finite.all()):
+        finding.problems.append(f"{int((~finite).sum())} Gaussians have no place that is finite; they are not drawn")
+    means = gaussians.means[finite]
+    low, high = (torch.quantile(means[:: max(1, len(means) // 100_000)], share, dim=0) for share in (0.02, 0.98))
+    spans = " x ".join(f"{float(side):.3g}" for side in high - low)
+    finding.facts["size of the middle 96 %"] = f"{spans} world units"
+    faint = float((torch.sigmoid(gaussians.logit_opacities) < FAINT).float().mean())
+    if faint > MANY_FAINT:
+        finding.problems.append(f"{faint:.0%} of the Gaussians are nearly invisible; `glassplat export` can prune them")
+
+
+def _describe_results(directory: RunDirectory, finding: Finding) -> None:
+    path = directory.path
+    if not directory.results.is_file():
+        finding.next.append(f"glassplat eval {path}    measures it on its test views")
+    else:
+        try:
+            results = read_json(directory.results)
+            measures = [f"{label} {results[name]:.3f}" for name, label in MEASURES.items() if results.get(name)]
+            finding.facts["measured"] = ", ".join(measures)
+        except (ValueError, TypeError, AttributeError):
+            finding.problems.append(f"{directory.results} is damaged; evaluate it again")
+    finding.next.append(f"glassplat render {path} --layers rgb --output PICTURES")

@@ -1,0 +1,164 @@
+"""The work of `glassplat eval`: metrics and pictures of a run, over the panes of its capture."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.table import Table
+
+from glassplat.captures.dataset import Dataset
+from glassplat.cli.console import say
+from glassplat.cli.runs import StoredRun
+from glassplat.errors import InputError
+from glassplat.evaluate.evaluate import (
+    Evaluation,
+    MarkedRegions,
+    PaneRegions,
+    RenderedRegions,
+    TrueRegions,
+    evaluate,
+    with_aligned_test_views,
+)
+from glassplat.evaluate.metric_names import PLANE_COLUMNS, missing_reasons, shown_metrics, written
+from glassplat.evaluate.report import Report
+from glassplat.methods.planar import fitted_planes
+from glassplat.model.run_directory import write_text
+from glassplat.panes.options import PlaneFit, PlaneFitError
+from glassplat.render.planar import Planar, with_photographer
+from glassplat.training.checkpoint import recorded_seconds
+
+if TYPE_CHECKING:
+    from glassplat.cli.evaluate import Align, PaneSource
+
+
+def pane_regions(dataset: Dataset, source: PaneSource) -> PaneRegions:
+    """The pixels that show panes, from the source of this name.
+
+    Raises:
+        InputError: the capture has no such source.
+    """
+    if source == "auto":
+        return _best_regions(dataset)
+    if source == "masks":
+        return _marked_regions(dataset)
+    if source == "truth" and dataset.truth is None:
+        raise InputError(f"{dataset.root} has no folder gt/ that says where its panes are; use --panes masks")
+    return TrueRegions() if source == "truth" else RenderedRegions()
+
+
+def _best_regions(dataset: Dataset) -> PaneRegions:
+    """Those that say most surely where the panes are."""
+    if dataset.truth is not None:
+        return TrueRegions()
+    try:
+        return _marked_regions(dataset)
+    except InputError:
+        return RenderedRegions()
+
+
+def _marked_regions(dataset: Dataset) -> MarkedRegions:
+    """Those of the masks, with planes fitted as any method would begin, so that all are measured alike."""
+    if not dataset.pane_labels and dataset.planes is None:
+        raise InputError(f"{dataset.root} has no masks that name a pane; use --panes rendered, or add masks")
+    try:
+        # The rectangle's margin is for training, which must not cut into a pane.
+        return MarkedRegions(fitted_planes(dataset, None, PlaneFit(margin=1.0)))
+    except PlaneFitError as error:
+        raise InputError(f"the masks of {dataset.root} lead to no plane: {error}. Use --panes rendered") from error
+
+
+UNMOVED = "as the capture has them"
+
+
+def evaluate_run(stored: StoredRun, panes: PaneSource = "auto", *, align: Align = "auto") -> dict:
+    """Evaluates a run, writes `results.json`, `per_view.json`, sheets and overview; returns the results.
+
+    Raises:
+        InputError: the capture does not say where its panes are in this way.
+    """
+    seconds, regions = train_seconds(stored), pane_regions(stored.dataset, panes)
+    aligned = align == "always" or (align == "auto" and len(stored.scene.poses) > 0)
+    if aligned:
+        photographed = with_photographer(stored.renderer, "present")
+        stored = stored._replace(dataset=with_aligned_test_views(stored.scene, photographed, stored.dataset))
+    settings, path = stored.directory.settings(), stored.directory.path
+    blend = stored.renderer.blend if isinstance(stored.renderer, Planar) else None
+    report = Report(path, stored.dataset, blend)
+    evaluation: Evaluation = evaluate(
+        stored.scene,
+        with_photographer(stored.renderer, "beside"),
+        stored.dataset,
+        regions=regions,
+        listen=report.add,
+    )
+    results = {
+        "method": stored.recipe.method,
+        "iterations": stored.iterations,
+        "seed": settings.seed,
+        "downscale": settings.downscale,
+        "train_seconds": seconds,
+        "test_cameras": cameras_of_test_views(stored, aligned),
+        **evaluation.results,
+    }
+    write_text(path / "results.json", json.dumps(results, indent=2))
+    write_text(path / "per_view.json", json.dumps(evaluation.per_view, indent=2))
+    report.finish(results, evaluation.per_view)
+    return results
+
+
+def cameras_of_test_views(stored: StoredRun, aligned: bool) -> str:
+    """Where the cameras of test views are taken to be, in words."""
+    if aligned:
+        return "aligned with their photographs"
+    return "moved as the neighbouring photographs', in the order of names" if len(stored.scene.poses) else UNMOVED
+
+
+def train_seconds(stored: StoredRun) -> float | None:
+    """Training time as the checkpoint recorded it."""
+    file = stored.directory.checkpoint
+    return recorded_seconds(file) if file.is_file() else None
+
+
+def print_results(console: Console, *results: dict) -> None:
+    """Shows the main metrics of one or several runs, side by side, and says why some have no value."""
+    console.print(results_table(*results))
+    for line in notes(*results):
+        say(console, line)
+
+
+def results_table(*results: dict) -> Table:
+    """The main metrics of one or several runs, side by side, by their names in `results.json`."""
+    table = Table("metric", *(r["method"] for r in results))
+    metrics = {name: metric for r in results for name, metric in shown_metrics(r).items()}
+    for name in dict.fromkeys(name for r in results for name in shown_metrics(r)):
+        table.add_row(name, *(written(r.get(name), metrics[name].pattern) for r in results))
+    for result in results:
+        for plane in result.get("planes") or []:
+            cells = (plane_text(plane) if r is result else "" for r in results)
+            table.add_row(f"pane {plane['label']}", *cells)
+    return table
+
+
+def plane_text(plane: dict) -> str:
+    """A pane in one line: its reflectance, and its errors where the truth is known."""
+    text = f"R0 {written(plane['base_reflectance'], PLANE_COLUMNS['base_reflectance'].pattern)}"
+    if plane.get("normal_drift_deg") is not None:
+        text += f", {plane['normal_drift_deg']:.2f}° from the plane of the masks"
+    if plane.get("normal_error_deg") is None:
+        return text
+    return (
+        f"{text} (error {plane['base_reflectance_error']:.3f}), normal off by {plane['normal_error_deg']:.2f}°, "
+        f"centre by {100 * plane['offset_error']:.2f} % of the extent"
+    )
+
+
+def notes(*results: dict) -> list[str]:
+    """Why metrics have no value, a line for each reason."""
+    heads = [f"{result['method']}: " if len(results) > 1 else "" for result in results]
+    return [
+        f"{head}no {', '.join(names)}: {reason}"
+        for head, result in zip(heads, results, strict=True)
+        for reason, names in missing_reasons(result).items()
+    ]

@@ -1,0 +1,288 @@
+"""`glassplat info`: what a path holds, whether it is healthy, and what to do next."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+
+from glassplat.captures.files import CaptureFiles, read_capture
+from glassplat.cli.console import import_held, say, warn
+from glassplat.errors import InputError, UnknownFormatError, first_names
+from glassplat.files.images import IMAGE_SUFFIXES
+from glassplat.files.records import read_json
+from glassplat.files.writing import SCENE, SPLAT_SUFFIXES
+from glassplat.model.run_directory import RunDirectory
+from glassplat.prepare.photographs import broken_photographs
+from glassplat.prepare.video import VIDEO_SUFFIXES, NoOpenCVError, video_facts
+from glassplat.prepare.workplace import RECORD
+
+KINDS = f"a capture, photographs, a video, a run, an exported scene, or a splat file ({', '.join(SPLAT_SUFFIXES)})"
+"""What there is to be found."""
+FEW_VIEWS = 20
+"""Photographs, below which more are advised."""
+
+
+@dataclass
+class Finding:
+    """What something is, how it is, and what can be done with it.
+
+    What takes long to find out comes in parts: finders yield them, and each adds to those before.
+
+    Attributes:
+        kind: what it is, in a few words; the first part says it.
+        facts: by name, in the order in which they are told.
+        problems: what keeps it from being used, or makes it worse, full sentences.
+        next: commands that go on from here, each with what it does.
+    """
+
+    kind: str = ""
+    facts: dict[str, Any] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+    next: list[str] = field(default_factory=list)
+
+    def add(self, part: Finding) -> None:
+        """Takes what was found next."""
+        self.kind = self.kind or part.kind
+        self.facts |= part.facts
+        self.problems += part.problems
+        self.next += part.next
+
+    def as_json(self) -> dict[str, Any]:
+        """For programs."""
+        return {
+            "kind": self.kind,
+            "healthy": not self.problems,
+            "facts": self.facts,
+            "problems": self.problems,
+            "next": self.next,
+        }
+
+
+Finder = Callable[[Path], Iterator[Finding]]
+"""Finds out what a path holds, part by part."""
+
+
+def capture_finding(path: Path) -> Iterator[Finding]:
+    """A capture that can be trained.
+
+    Raises:
+        UnknownFormatError: it is none.
+        InputError: it cannot be read.
+    """
+    files = read_capture(path)
+    yield _first_part(files)
+    details = import_held("glassplat.cli.details")
+    yield from details.remaining_parts(files)
+
+
+def _first_part(files: CaptureFiles) -> Finding:
+    capture = files.capture
+    finding = Finding("a capture", {"format": capture.format_name})
+    finding.facts["points"] = "none (random ones are used)" if capture.points is None else len(capture.points)
+    _prepared(files.root, finding)
+    return finding
+
+
+def _prepared(path: Path, finding: Finding) -> None:
+    """What `glassplat prepare` reported, where it made the capture."""
+    try:
+        report = read_json(path / RECORD)["report"]
+        finding.facts["prepared"] = (
+            f"{report['registered']} of {report['photographs']} photographs placed, points "
+            f"{report['reprojection_error']:.2f} pixels off"
+        )
+        finding.problems += report["advice"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return  # Others make captures too.
+
+
+def photographs_finding(path: Path) -> Iterator[Finding]:
+    """A folder of photographs without poses.
+
+    Raises:
+        InputError: there are none.
+    """
+    found = sorted(one for one in path.rglob("*") if one.suffix.lower() in IMAGE_SUFFIXES and one.is_file())
+    if not found:
+        names = first_names(sorted(one.name for one in path.iterdir()), 8) or "nothing"
+        raise InputError(f"{path} is nothing that is known; expected {KINDS}; it holds {names}")
+    yield Finding("photographs without poses", {"photographs": len(found)})
+    finding = Finding()
+    if broken := broken_photographs(found):
+        finding.problems.append(
+            f"{len(broken)} are broken, tiny or of a kind that cannot be read ({first_names(broken)}); replace or "
+            "remove them"
+        )
+    if len(found) - len(broken) < FEW_VIEWS:
+        finding.problems.append(f"{len(found) - len(broken)} photographs are few; 30 and more do better")
+    finding.next.append(f"glassplat prepare {path} --output CAPTURE    finds out where they were taken")
+    yield finding
+
+
+def video_finding(path: Path) -> Iterator[Finding]:
+    """A video, or what only has the name of one."""
+    size = path.stat().st_size
+    try:
+        footage = video_facts(path)
+    except NoOpenCVError as error:
+        yield Finding("a video, by its name", {"bytes": size}, [str(error)])
+        return
+    if footage is None:
+        problem = "OpenCV can read no picture of it; convert it to an MP4, or give a folder of photographs"
+        yield Finding("a file that has the name of a video", {"bytes": size}, [problem])
+        return
+    finding = Finding(
+        "a video", {"bytes": size, "frames": footage.frames, "pictures": f"{footage.width}x{footage.height}"}
+    )
+    finding.next.append(f"glassplat prepare {path} --output CAPTURE    takes photographs from it, and places them")
+    yield finding
+
+
+def preparation_finding(path: Path) -> Iterator[Finding]:
+    """The folder of a preparation that was interrupted."""
+    settings = read_json(path / "settings.json")
+    finding = Finding("an interrupted preparation", {"of": settings.get("input")})
+    finding.problems.append("it is not finished")
+    output = str(path).removesuffix(".partial")
+    finding.next.append(f"glassplat prepare {settings.get('input')} --output {output} --resume")
+    yield finding
+
+
+DETAILS = "glassplat.cli.details"
+
+
+def splat_finding(path: Path) -> Iterator[Finding]:
+    """A file of Gaussians.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    first = Finding("a splat file", {"bytes": path.stat().st_size})
+    if (path.parent / SCENE).is_file():
+        first.facts["beside it"] = ", ".join(sorted(one.name for one in path.parent.iterdir() if one != path))
+    yield first
+    yield import_held(DETAILS).splats_part(path)
+
+
+def run_finding(path: Path) -> Iterator[Finding]:
+    """The directory of a training.
+
+    Raises:
+        InputError: its records are damaged.
+    """
+    directory = RunDirectory(path)
+    recipe, settings = directory.recipe(), directory.settings()
+    finding = Finding(f"a {recipe.method} run")
+    finding.facts |= {"capture": settings.data, "iterations": settings.iterations, "downscale": settings.downscale}
+    if not os.path.isdir(settings.data):
+        finding.problems.append(f"its capture is no longer at {settings.data}; say with --data where it is now")
+    yield finding
+    yield import_held(DETAILS).trained_part(directory)
+
+
+def scene_finding(path: Path) -> Iterator[Finding]:
+    """A folder that a scene was exported to.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    yield Finding("an exported scene", {"files": ", ".join(sorted(one.name for one in path.iterdir()))})
+    yield import_held(DETAILS).scene_part(path)
+
+
+CAPTURE_DETAILS = "glassplat.cli.details"
+
+
+@dataclass(frozen=True)
+class Info:
+    """Say what a folder or file is, whether it is healthy, and what to do next.
+
+    Attributes:
+        path: anything that glassplat reads or writes.
+        json: print it for programs.
+        page: of a capture from `prepare`, its report anew, with the panes and the points behind them, as an HTML file.
+    """
+
+    path: tyro.conf.Positional[Path]
+    json: bool = False
+    page: Path | None = None
+
+    def ready(self) -> None:
+        """Refuses what is not known."""
+        finder_of(self.path)
+
+    def run(self, console: Console) -> None:
+        """Looks, and tells what is found as soon as it is."""
+        whole = Finding()
+        for part in finder_of(self.path)(self.path):
+            if not self.json:
+                self._tell_facts(part, console)
+            whole.add(part)
+        if self.page is not None:
+            import_held(CAPTURE_DETAILS).write_capture_page(self.path, self.page)
+        if self.json:
+            say(console, json.dumps({"path": str(self.path), **whole.as_json()}, indent=1))
+            return
+        for problem in whole.problems:
+            warn(console, problem)
+        for command in whole.next:
+            say(console, f"next: {command}")
+
+    def _tell_facts(self, part: Finding, console: Console) -> None:
+        if part.kind:
+            say(console, f"{self.path}: {part.kind}")
+        for name, fact in part.facts.items():
+            say(console, f"  {name}: {fact}")
+
+    def left_behind(self) -> str:
+        """What an interrupt leaves: everything."""
+        return "nothing was changed"
+
+
+def finder_of(path: Path) -> Finder:
+    """What finds out about a path.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        InputError: nothing that is known.
+    """
+    if not os.path.lexists(path):
+        raise FileNotFoundError(f"there is nothing at {path}; expected {KINDS}")
+    return _finder_of_folder(path) if path.is_dir() else _finder_of_file(path)
+
+
+def _finder_of_file(path: Path) -> Finder:
+    suffix = path.suffix.lower()
+    if suffix in SPLAT_SUFFIXES:
+        return splat_finding
+    if suffix in VIDEO_SUFFIXES:
+        return video_finding
+    raise InputError(f"{path} is no file that is known; expected {KINDS}")
+
+
+def _finder_of_folder(path: Path) -> Finder:
+    if (path / "recipe.json").is_file():
+        return run_finding
+    if RunDirectory(path).is_saved:
+        raise InputError(f"{path} holds a scene, but no recipe.json; expected what `glassplat train --output` wrote")
+    if path.name.endswith(".partial") and (path / "settings.json").is_file():
+        return preparation_finding
+    if (path / SCENE).is_file():
+        return scene_finding
+    if all(one.suffix.lower() in IMAGE_SUFFIXES for one in path.iterdir()):
+        return photographs_finding
+    return _capture_or_photographs
+
+
+def _capture_or_photographs(path: Path) -> Iterator[Finding]:
+    try:
+        yield from capture_finding(path)
+    except UnknownFormatError:
+        yield from photographs_finding(path)

@@ -1,0 +1,223 @@
+"""The command line: `glassplat prepare | annotate | train | eval | render | dereflect | export | info | demo`.
+
+A command's module is imported when the command is chosen, and nothing before that which takes long: the list of
+commands appears at once, and Ctrl-C works from the beginning. What does a command's work, and PyTorch with it, is
+imported when the command has understood its options and refused what can be refused without: its method `ready`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import field, make_dataclass
+from typing import Annotated, Any, NamedTuple, Union
+
+from glassplat import __version__
+
+FAILURE_CODE, USAGE_CODE, INTERRUPTED_CODE, UNREAD_CODE = 1, 2, 130, 141
+"""The last two as shells report a process that Ctrl-C or a closed pipe ended."""
+DESCRIPTION = "Gaussian splatting for scenes with window panes, showcases and mirrors."
+
+
+class Listed(NamedTuple):
+    """A command in the list: its class, the module beside this one that holds it, and the class's first sentence."""
+
+    module: str
+    kind: str
+    summary: str
+
+
+COMMANDS = {
+    "prepare": Listed("capture", "Prepare", "Find out where photographs were taken, and make a capture of them."),
+    "annotate": Listed(
+        "capture",
+        "Annotate",
+        "Mark the panes of a capture in the browser: corners in a few photographs, and what stands before them.",
+    ),
+    "train": Listed("train", "Train", "Train a scene from photographs."),
+    "eval": Listed("evaluate", "Evaluate", "Measure a run on its test views and write comparison sheets."),
+    "render": Listed(
+        "look", "Render", "Render the layers of a run from its cameras, with its panes as they are or edited."
+    ),
+    "dereflect": Listed(
+        "publish",
+        "Dereflect",
+        "Take the reflections out of a planar run's photographs; one PNG per photograph, under its name.",
+    ),
+    "view": Listed(
+        "look", "View", "Look at a scene in the browser, layer by layer, with its panes as they are or edited."
+    ),
+    "video": Listed(
+        "look",
+        "Video",
+        "Film a scene along a path: one layer, several side by side, or one wiped over another.",
+    ),
+    "import": Listed(
+        "publish",
+        "Import",
+        "Read a splat file (PLY, SPZ, GLB, .splat) of any program as a scene to look at, film and export.",
+    ),
+    "export": Listed(
+        "publish",
+        "Export",
+        "Write a scene as others read it: PLY, SPZ, GLB, a web page with live panes, and the panes beside them.",
+    ),
+    "info": Listed("info", "Info", "Say what a folder or file is, whether it is healthy, and what to do next."),
+    "demo": Listed(
+        "demo",
+        "Demo",
+        "Train planar and splat on the bundled showcase and compare them; goes on where it was interrupted.",
+    ),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command; returns the exit code.
+
+    That is 0 done, 1 failed, 2 bad input, 130 interrupted (143 and 129 where another signal than Ctrl-C asked for it),
+    141 when nobody reads the output any more.
+
+    Raises:
+        SystemExit: after help (0) and after options that cannot be understood (2).
+    """
+    try:
+        return guarded(sys.argv[1:] if arguments is None else list(arguments), is_program=arguments is None)
+    except KeyboardInterrupt:  # In the moments before anybody listens, or while the end is being reported.
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED_CODE
+    except Exception as error:  # noqa: BLE001 - Even the report failed, as it may when memory has run out.
+        reason = "out of memory" if isinstance(error, MemoryError) else type(error).__name__
+        print(f"stopped: {reason}", file=sys.stderr)
+        return FAILURE_CODE
+
+
+def guarded(arguments: list[str], *, is_program: bool) -> int:
+    """Runs a command; whatever happens ends in one readable message and an exit code."""
+    from glassplat.cli.console import complain, drop_output, ending, immediate_end, plain_streams, raised_signals
+
+    plain_streams()
+    command = None
+    with raised_signals() as raised:
+        try:
+            with immediate_end() if is_program else nullcontext():
+                command = readied(arguments)
+            run(command)
+        except KeyboardInterrupt as stop:
+            return interrupted(stop, command)
+        except SystemExit:
+            raise
+        except BrokenPipeError:
+            drop_output()
+            return UNREAD_CODE
+        except BaseException as error:  # noqa: BLE001 - The last guard: nobody is to read a traceback.
+            if raised:
+                return interrupted(raised[-1], command)
+            end = ending(error)
+            with suppress(OSError):  # Nobody hears it where the output is full or closed.
+                complain(end.label, end.text)
+            return end.code
+    return 0
+
+
+def readied(arguments: list[str]) -> Any:
+    """The command that the arguments describe, once it has refused what it can and imported what it works with.
+
+    Raises:
+        InputError, OSError: an option is out of range, there is nothing at a path, or something that must stay.
+        SystemExit: as in `parsed`.
+    """
+    command = parsed(arguments)
+    command.ready()
+    return command
+
+
+def parsed(arguments: list[str]) -> Any:
+    """The command that the arguments describe.
+
+    Raises:
+        InputError: an option is out of range.
+        SystemExit: they ask for help or the version, or cannot be understood.
+    """
+    import tyro
+
+    from glassplat.cli.console import check_arguments
+    from glassplat.options import check_options
+
+    if arguments[:1] == ["--version"]:
+        print(f"glassplat {__version__}")
+        raise SystemExit(0)
+    config = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes)
+    name = arguments[0] if arguments else ""
+    if name in COMMANDS:
+        check_arguments(arguments)
+        kind, options = command_line(name, arguments[1:])
+        command = tyro.cli(kind, prog=f"glassplat {name}", args=options, config=config)
+        check_options(command)
+        return command
+    # Nothing is left to run after the list of commands; only a shell's completions need to know every option.
+    complete = name.startswith("--tyro-")
+    kinds = {known: command_line(known, [])[0] if complete else stub(known) for known in COMMANDS}
+    tyro.cli(overview(kinds), prog="glassplat", description=DESCRIPTION, args=arguments, config=config)
+    raise SystemExit(USAGE_CODE)
+
+
+def command_line(name: str, options: list[str]) -> tuple[Any, list[str]]:
+    """What tyro should make of a command's options, and how it should see them; that of `train` depends on them."""
+    if name == "train":
+        from glassplat.cli.train import train_command
+
+        return train_command(options)
+    return command_class(name), options
+
+
+def command_class(name: str) -> type:
+    """The class of a command, from its module, which is imported now."""
+    listed = COMMANDS[name]
+    return getattr(importlib.import_module(f"glassplat.cli.{listed.module}"), listed.kind)
+
+
+def stub(name: str) -> type:
+    """What the list of commands shows of a command whose module is not imported."""
+    return make_dataclass(COMMANDS[name].kind, [], namespace={"__doc__": COMMANDS[name].summary})
+
+
+def overview(kinds: Mapping[str, type]) -> type:
+    """What can be asked of `glassplat` itself: one of the commands, or the version."""
+    import tyro
+
+    commands: Any = Union[tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in kinds.items())]  # noqa: UP007
+    version = tyro.conf.arg(help="show the version and exit", help_behavior_hint="")
+    return make_dataclass(
+        "Glassplat",
+        [
+            ("command", Annotated[commands, tyro.conf.arg(name="")]),
+            ("version", Annotated[bool, tyro.conf.FlagCreatePairsOff, version], field(default=False)),
+        ],
+    )
+
+
+def run(command: Any) -> None:
+    """Runs a command; its console shows the package's log too, and what libraries warn of."""
+    from glassplat.cli.console import heard_by, message_console
+
+    console = message_console()
+    with heard_by(console):
+        command.run(console)
+
+
+def interrupted(stop: KeyboardInterrupt, command: Any) -> int:
+    """Says what an interrupted command leaves behind, and how to go on."""
+    from glassplat.cli.console import code_of, drop_output, message_console, say
+
+    left = "" if command is None else f"; {command.left_behind()}"
+    try:
+        say(message_console(stderr=True), f"{str(stop) or 'interrupted'}{left}")
+    except OSError:  # A terminal that was closed shows nothing any more.
+        drop_output()
+    return code_of(stop)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

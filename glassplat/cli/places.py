@@ -1,0 +1,220 @@
+"""Places named on the command line: scenes to read, edits of them, folders to write into, and splits."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from glassplat.cli.console import message_console, say
+from glassplat.errors import InputError, first_names, input_checked
+from glassplat.files.records import read_json, reading
+from glassplat.files.writing import check_folder, make_folder, real_path
+from glassplat.model.run_directory import RunDirectory, write_text
+from glassplat.options import Finite, PaneLabel, Share
+
+if TYPE_CHECKING:
+    from glassplat.captures.dataset import Dataset
+    from glassplat.captures.view import View
+    from glassplat.scene.scene import Scene
+
+RECORD = "glassplat.json"
+"""Marks a folder as written by one of the commands."""
+
+
+def claim_folder(folder: Path, command: str, run: Path) -> bool:
+    """Makes a folder for a command's pictures and records whose it is; returns whether pictures in it are replaced.
+
+    Raises:
+        InputError: the folder holds something else, which must not be overwritten.
+        NotADirectoryError: it is a file, or goes through one.
+    """
+    found = check_claim(folder, command)
+    make_folder(folder)
+    write_text(folder / RECORD, json.dumps({"command": command, "run": str(run)}))
+    return found
+
+
+def check_claim(folder: Path, command: str) -> bool:
+    """Look whether a command may write into a folder; returns whether it has done so before.
+
+    Raises:
+        InputError, NotADirectoryError: as `claim_folder` does; nothing is written.
+        PermissionError: nothing may be written there.
+    """
+    check_folder(folder)
+    found = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
+    if found and _recorded_command(folder / RECORD) != command:
+        raise InputError(
+            f"{folder} is not empty, and not from `glassplat {command}` (it holds {first_names(found)}); nothing was "
+            "written. Choose a new folder for --output"
+        )
+    return bool(found)
+
+
+def check_targets(folder: Path, targets: Sequence[Path], photographs: Sequence[Path]) -> None:
+    """Refuse to write where a link leads, in a folder that is written again, out of it or to a photograph.
+
+    Args:
+        folder: what the pictures are written into.
+        targets: the files to write, in it, and folders that they go into.
+        photographs: what must stay whatever happens.
+
+    Raises:
+        InputError: names the file and where it leads, or what is in its place; nothing has been written.
+    """
+    inside, kept = real_path(folder), {real_path(path) for path in photographs}
+    for target in (folder / RECORD, *targets):
+        real = real_path(target)
+        if real in kept or not real.is_relative_to(inside):
+            what = "is a photograph of the capture" if real in kept else f"leads out of {folder}, to {real}"
+            raise InputError(f"{target} {what}; nothing was written. Choose a new folder for --output")
+        if os.path.lexists(real) and not (os.path.isfile(real) or os.path.isdir(real)):
+            raise InputError(
+                f"{target} is a pipe, a device or a link to nothing; nothing was written. Choose a new folder for "
+                "--output"
+            )
+
+
+def _recorded_command(record: Path) -> str | None:
+    """Who wrote the folder; None where nobody says."""
+    try:
+        content = read_json(record)
+    except (OSError, ValueError):
+        return None
+    return content.get("command") if isinstance(content, dict) else None
+
+
+def check_scene(path: Path) -> None:
+    """Refuses a folder that no run was begun in, and a file that cannot be read.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: the folder is no run, or the file cannot be read.
+    """
+    if path.is_dir() or not (path.is_file() or path.suffix):
+        RunDirectory(path).check_begun()
+    else:
+        check_file(path)
+
+
+def say_scene(path: Path) -> None:
+    """Says what the records of a run tell, or how large a file is: the first that is known of a scene.
+
+    Raises:
+        InputError: the records are damaged.
+    """
+    say(message_console(), f"{path}: {_in_words(path)}")
+
+
+def _in_words(path: Path) -> str:
+    if path.is_file():
+        return f"a splat file of {path.stat().st_size / 1e6:.1f} MB"
+    directory = RunDirectory(path)
+    if directory.imported.is_file():
+        return "an imported scene"
+    recipe, settings = directory.recipe(), directory.settings()
+    return f"a {recipe.method} run of {settings.iterations} iterations on {settings.data}"
+
+
+def check_file(path: Path) -> None:
+    """Refuses a file that cannot be read.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: it cannot be read.
+    """
+    with input_checked(), reading(path), path.open("rb"):
+        pass
+
+
+@dataclass(frozen=True)
+class SceneEdits:
+    """Changes to panes and surroundings; the run itself stays as it is. Pane labels are those of the masks.
+
+    Attributes:
+        remove_glass: no reflections at all, only what is behind the panes.
+        as_mirror: labels of panes that become perfect mirrors.
+        reflectance: pane label and its reflectance at normal incidence, 0 to 1; `--reflectance 1 0.5 2 0`.
+        tilt: pane label and two angles in degrees, about the pane's first and second side; `--tilt 1 10 0`.
+        shift: pane label and a distance along the pane's normal in world units, those of the capture's poses;
+            the normal is in results.json, and a negative distance goes the other way; `--shift 1 0.05`.
+        surroundings: panorama (.exr or .png, equirectangular, z up) that glossy things mirror instead of their own.
+    """
+
+    remove_glass: bool = False
+    as_mirror: tuple[PaneLabel, ...] = ()
+    reflectance: dict[PaneLabel, Share] = field(default_factory=dict)
+    tilt: dict[PaneLabel, tuple[Finite, Finite]] = field(default_factory=dict)
+    shift: dict[PaneLabel, Finite] = field(default_factory=dict)
+    surroundings: Path | None = None
+
+    def applied(self, scene: Scene) -> Scene:
+        """The edited scene.
+
+        Raises:
+            InputError: there are no panes, no pane has a label, a value is out of range, edits contradict, or the
+                panorama cannot be read or nothing mirrors it.
+        """
+        from glassplat.scene.scene import as_mirrors, shifted, tilted, with_reflectance, without_glass
+
+        if self.surroundings is not None:
+            scene = in_surroundings(scene, self.surroundings)
+        if replace(self, surroundings=None) == SceneEdits():
+            return scene
+        self._check(scene)
+        with input_checked():
+            for label, reflectance in self.reflectance.items():
+                scene = with_reflectance(scene, label, reflectance)
+            for label, angles in self.tilt.items():
+                scene = tilted(scene, label, *angles)
+            for label, distance in self.shift.items():
+                scene = shifted(scene, label, distance)
+            scene = as_mirrors(scene, self.as_mirror)
+        return without_glass(scene) if self.remove_glass else scene
+
+    def _check(self, scene: Scene) -> None:
+        if not len(scene.planes):
+            raise InputError("the run has no panes to edit; train it with `glassplat train planar` and pane masks")
+        if self.remove_glass and replace(self, surroundings=None) != SceneEdits(remove_glass=True):
+            raise InputError("--remove-glass leaves no pane to edit; give it without the other edits")
+        twice = sorted(set(self.as_mirror) & set(self.reflectance))
+        if twice:
+            raise InputError(f"panes {twice} have a --reflectance and are --as-mirror; give one of the two")
+
+
+def in_surroundings(scene: Scene, panorama: Path) -> Scene:
+    """The scene with another environment, as finely divided as its own.
+
+    Raises:
+        InputError: the scene mirrors no environment, or the panorama cannot be read.
+    """
+    from glassplat.files.sidecars import read_equirect
+    from glassplat.render.environment import environment_from_equirect
+
+    if scene.environment.is_empty:
+        raise InputError("nothing in the run mirrors its surroundings; train it with `glassplat train deferred`")
+    try:
+        environment = environment_from_equirect(read_equirect(panorama), scene.environment.size)
+    except (FileNotFoundError, ValueError) as error:
+        raise InputError(str(error)) from error
+    raw = environment.raw.to(scene.environment.raw)
+    return replace(scene, environment=replace(scene.environment, raw=raw))
+
+
+Split = Literal["train", "test", "all"]
+
+
+def chosen_views(dataset: Dataset, split: Split) -> tuple[View, ...]:
+    """The views of a split, by name.
+
+    Raises:
+        InputError: there are none.
+    """
+    parts = {"train": dataset.train, "test": dataset.test, "all": (*dataset.train, *dataset.test)}
+    if not parts[split]:
+        raise InputError(f"{dataset.root} has no {split} views; choose another --split")
+    return tuple(sorted(parts[split], key=lambda view: view.name))

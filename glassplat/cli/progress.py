@@ -1,0 +1,295 @@
+"""Progress of training and other long work: a bar in a terminal, lines now and then elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Protocol
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from glassplat.cli.console import say, warn
+from glassplat.prepare.photographs import Note
+from glassplat.prepare.photographs import Progress as Step
+from glassplat.training.messages import (
+    ActionDone,
+    CheckpointWritten,
+    Message,
+    RunBegun,
+    StageEntered,
+    StepDone,
+    Working,
+)
+
+FIRST_PAUSE, LONGEST_PAUSE = 1.0, 10.0
+"""Seconds between two lines: at first, so that a newcomer sees that something happens, and in the end."""
+SPEED_SECONDS = 60.0
+"""How far back the speed is measured from which the time left follows."""
+SMOOTHING = 0.98
+WIDE = 110
+"""Columns of a terminal from which on the last checkpoint has room in the bar."""
+FREQUENT = ("densify", "grow")
+"""Actions of which nobody wants to read each time, by how their names begin."""
+
+
+@dataclass
+class Standing:
+    """Where a training stands; `loss` is smoothed, `saved` the step of the last checkpoint."""
+
+    iterations: int
+    step: int = 0
+    stage: str = ""
+    loss: float = 0.0
+    count: int = 0
+    saved: int | None = None
+
+
+class Display(Protocol):
+    """What shows the standing between the lines that both kinds print."""
+
+    def step(self, standing: Standing) -> None:
+        """Shows a step."""
+        ...
+
+    def work(self, standing: Standing, work: Working) -> None:
+        """Shows how far something is that happens between two steps."""
+        ...
+
+    def stop(self) -> None:
+        """Ends the display."""
+        ...
+
+
+class TrainingProgress:
+    """Shows a run's messages; a context, so that a bar ends with the run."""
+
+    def __init__(self, console: Console, iterations: int) -> None:
+        self._console, self._standing = console, Standing(iterations)
+        self._display: Display = StepBar(console) if console.is_terminal else StepLines(console)
+
+    def __enter__(self) -> TrainingProgress:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        with suppress(OSError):  # A terminal that was closed must not hide why the run ends.
+            self._display.stop()
+
+    def show(self, message: Message) -> None:
+        """Follows a run's messages."""
+        standing = self._standing
+        if isinstance(message, RunBegun):
+            self._begin(message)
+        elif isinstance(message, StageEntered):
+            standing.stage = message.stage
+            self._say(f"step {message.step}: stage {message.stage}, {_counted(message.counts)}")
+        elif isinstance(message, ActionDone) and not message.action.startswith(FREQUENT):
+            self._say(f"step {message.step}: {message.action}")
+        elif isinstance(message, Working):
+            self._display.work(standing, message)
+        elif isinstance(message, CheckpointWritten):
+            standing.saved = message.step
+        elif isinstance(message, StepDone):
+            standing.step = message.step
+            standing.loss = _smoothed(standing.loss, message.loss)
+            standing.count = message.counts["primary"] + message.counts["glass"]
+            self._display.step(standing)
+
+    def _begin(self, message: RunBegun) -> None:
+        if message.anew:
+            warn(self._console, "an earlier run in this folder was begun and never saved; it is replaced")
+        if message.step:
+            self._say(f"going on from step {message.step} of {message.iterations}")
+
+    def _say(self, text: str) -> None:
+        say(self._console, text)
+
+
+class StepBar:
+    """A bar with loss, number of Gaussians, remaining time and, if there is room, the last checkpoint.
+
+    It appears with the first step.
+    """
+
+    def __init__(self, console: Console) -> None:
+        columns: list[ProgressColumn] = [
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("loss {task.fields[loss]:.4f}"),
+            TextColumn("{task.fields[count]} Gaussians"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(compact=True),
+        ]
+        if console.width >= WIDE:
+            columns.append(TextColumn("{task.fields[saved]}"))
+        self._bar = Progress(*columns, console=console, refresh_per_second=4)
+        self._begun = False
+
+    def step(self, standing: Standing) -> None:
+        """Shows a step."""
+        if not self._begun:
+            # The speed is that of this sitting, not of the steps before it.
+            fields = {"loss": standing.loss, "count": standing.count, "saved": ""}
+            self._bar.add_task(standing.stage, total=standing.iterations, completed=standing.step - 1, **fields)  # type: ignore[arg-type]
+            self._bar.start()
+            self._begun = True
+        saved = "" if standing.saved is None else f"saved at {standing.saved}"
+        fields = {"loss": standing.loss, "count": standing.count, "saved": saved}
+        task = self._bar.task_ids[0]
+        self._bar.update(task, description=standing.stage, completed=standing.step, **fields)  # type: ignore[arg-type]
+
+    def work(self, standing: Standing, work: Working) -> None:
+        """Shows the work in the stage's place; before the first step a line, as errors stood below an empty bar."""
+        if self._begun:
+            self._bar.update(self._bar.task_ids[0], description=f"{work.what} {work.done}/{work.total}")
+        elif work.done == 0:
+            say(self._bar.console, work.what)
+
+    def stop(self) -> None:
+        """Ends the display."""
+        if self._begun:
+            self._bar.stop()
+
+
+class StepLines:
+    """A line every few seconds, which a file or a job scheduler's log can hold."""
+
+    def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
+        self._console, self._clock = console, clock
+        self._pause, self._shown_at = FIRST_PAUSE, clock()
+        self._passed: deque[tuple[float, int]] = deque()
+
+    def step(self, standing: Standing) -> None:
+        """Shows a step, if it is time for a line."""
+        if not self._passed:
+            self._passed.append((self._clock(), standing.step))
+        if not self._is_time():
+            return
+        saved = "" if standing.saved is None else f", saved at step {standing.saved}"
+        left = self._left(standing)
+        say(
+            self._console,
+            f"step {standing.step} of {standing.iterations}: loss {standing.loss:.4f}, {standing.count} Gaussians, "
+            f"{left}{saved}",
+        )
+
+    def work(self, standing: Standing, work: Working) -> None:
+        """Shows the work when it is time for a line, or where there will be no other moment for it."""
+        if work.total == 1:
+            say(self._console, f"step {standing.step}: {work.what}")
+        elif self._is_time():
+            say(self._console, f"step {standing.step}: {work.what}, {work.done} of {work.total} done")
+
+    def stop(self) -> None:
+        """Ends the display; lines need no end."""
+
+    def _is_time(self) -> bool:
+        now = self._clock()
+        if now - self._shown_at < self._pause:
+            return False
+        self._shown_at, self._pause = now, min(2 * self._pause, LONGEST_PAUSE)
+        return True
+
+    def _left(self, standing: Standing) -> str:
+        """The time left at the speed of the last minute."""
+        now = self._clock()
+        self._passed.append((now, standing.step))
+        while len(self._passed) > 2 and now - self._passed[1][0] > SPEED_SECONDS:
+            self._passed.popleft()
+        since, first = self._passed[0]
+        if standing.step == first:
+            return "time left is not known yet"
+        return f"{in_words((now - since) / (standing.step - first) * (standing.iterations - standing.step))} left"
+
+
+def in_words(seconds: float) -> str:
+    """A duration as someone who waits would say it."""
+    minutes = round(seconds / 60)
+    if minutes < 1:
+        return f"{seconds:.0f} s"
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min"
+
+
+def _smoothed(known: float, loss: float) -> float:
+    return SMOOTHING * known + (1 - SMOOTHING) * loss if known else loss
+
+
+def _counted(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{number} {name}" for name, number in counts.items())
+
+
+PAUSE = 10.0
+"""Seconds between two lines about the same work."""
+
+
+class WorkProgress:
+    """Shows messages of work; a context, so that a bar ends with it."""
+
+    def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
+        self._console, self._clock = console, clock
+        self._what = ""
+        self._begun = self._shown = 0.0
+        self._first = 0
+        self._bar: Progress | None = None
+        self._task: TaskID | None = None
+
+    def __enter__(self) -> WorkProgress:
+        if self._console.is_terminal:
+            columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn())
+            times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(compact=True))
+            self._bar = Progress(*columns, *times, console=self._console, refresh_per_second=4)
+            self._bar.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self._bar is not None:
+            with suppress(OSError):  # A terminal that was closed must not hide why the work ends.
+                self._bar.stop()
+
+    def show(self, message: Step | Note) -> None:
+        """Follows the work."""
+        if isinstance(message, Note):
+            warn(self._console, message.text)
+            self._what = ""
+        elif self._bar is not None:
+            self._show_bar(self._bar, message)
+        else:
+            self._show_line(message)
+
+    def _show_bar(self, bar: Progress, step: Step) -> None:
+        if step.what != self._what or self._task is None:
+            if self._task is not None:
+                bar.remove_task(self._task)
+            self._task = bar.add_task(step.what, total=step.total, completed=step.done)
+            self._what = step.what
+        bar.update(self._task, completed=step.done)
+
+    def _show_line(self, step: Step) -> None:
+        now = self._clock()
+        if step.what != self._what:
+            self._what, self._begun, self._shown, self._first = step.what, now, now, step.done
+            say(self._console, f"{step.what} ({step.total})")
+        elif now - self._shown >= PAUSE:
+            self._shown = now
+            say(self._console, f"{step.what}: {step.done} of {step.total}, {self._left(step, now)}")
+
+    def _left(self, step: Step, now: float) -> str:
+        done = step.done - self._first
+        if done <= 0:
+            return "time left is not known yet"
+        return f"{in_words((now - self._begun) / done * (step.total - step.done))} left"

@@ -1,0 +1,204 @@
+"""Runs, trained by `glassplat train` and opened by other commands: scene, renderer and data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from glassplat.access import is_local
+from glassplat.captures.dataset import TEST_EVERY, Dataset, dataset_of, load_dataset, with_corrected_cameras
+from glassplat.captures.view import PointCloud, View
+from glassplat.cli.console import say, warn
+from glassplat.cli.places import chosen_views
+from glassplat.cli.progress import TrainingProgress
+from glassplat.errors import InputError, first_names, input_checked
+from glassplat.files.images import picture_paths
+from glassplat.files.sidecars import read_cameras
+from glassplat.kernels.backend.devices import DeviceName, chosen_device
+from glassplat.methods.recipe import photo_background, settled
+from glassplat.model.run_directory import RunDirectory, check_output
+from glassplat.model.training import Listener, Training
+from glassplat.render.frame import Renderer
+from glassplat.scene.scene import Scene
+from glassplat.training.messages import Message
+from glassplat.viewer.server import Viewer
+
+if TYPE_CHECKING:
+    from glassplat.cli.train import Train
+
+
+def announce(viewer: Viewer, console: Console) -> None:
+    """Says where to look."""
+    say(console, f"look at {viewer.address}")
+    if is_local(viewer.host):
+        say(console, f"from elsewhere: ssh -L {viewer.port}:localhost:{viewer.port} <this machine>, then the same")
+
+
+class StoredRun(NamedTuple):
+    """A finished run, ready to render."""
+
+    directory: RunDirectory
+    recipe: Any
+    scene: Scene
+    renderer: Renderer
+    dataset: Dataset
+    iterations: int
+
+
+def open_run(path: Path, device: DeviceName = "auto", data: Path | None = None) -> StoredRun:
+    """Opens the run in a directory, with the capture it was trained on, over the same background.
+
+    Args:
+        path: the run's directory.
+        device: where to render.
+        data: where the capture is now; where it was during training if None.
+
+    Raises:
+        CudaUnavailableError: the GPU was asked for and cannot be used.
+        InputError: the directory holds no finished run, or the capture is another one.
+        FileNotFoundError: the capture is no longer where it was.
+    """
+    directory = RunDirectory(path)
+    recorded = directory.recipe()
+    scene, iterations = directory.latest_scene()
+    with input_checked():
+        recorded.renderer().check(scene)
+    scene = scene.to(chosen_device(device))
+    dataset = with_corrected_cameras(capture_of(directory, recorded, data), scene)
+    recipe = settled(recorded, dataset)
+    return StoredRun(directory, recipe, scene, recipe.renderer(), dataset, iterations)
+
+
+def capture_of(directory: RunDirectory, recipe: Any, moved: Path | None = None) -> Dataset:
+    """The capture of a run, where it was or where it is said to be now; of an imported scene its cameras alone.
+
+    Raises:
+        InputError: it cannot be read, or is another one.
+        FileNotFoundError: it is no longer where it was.
+    """
+    if directory.imported.is_file() and moved is None:
+        return _without_photographs(directory)
+    settings = directory.settings()
+    data = Path(settings.data) if moved is None else moved
+    if moved is None and not data.is_dir():
+        raise FileNotFoundError(
+            f"the capture of {directory.path} is no longer at {data}; say with --data where it is now"
+        )
+    dataset = load_dataset(
+        data,
+        downscale=settings.downscale,
+        background=photo_background(recipe),
+        mask_polarity=settings.mask_polarity,
+    )
+    if moved is not None:
+        _check_same(directory, dataset)
+    return dataset
+
+
+def _without_photographs(directory: RunDirectory) -> Dataset:
+    """The cameras of a scene that was imported, as views that have no photographs."""
+    with input_checked():
+        cameras = sorted(read_cameras(directory.path / "cameras.json"), key=lambda named: named[0])
+
+    def no_photograph() -> Tensor:
+        raise InputError(f"{directory.path} was imported and has no photographs; this command needs those it shows")
+
+    views = tuple(View(name, camera, directory.path / name, no_photograph) for name, camera in cameras)
+    points = PointCloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
+    test = views[::TEST_EVERY]
+    train = tuple(view for view in views if view not in test)
+    return Dataset(directory.path, train, test, points, extent=1.0)
+
+
+def _check_same(directory: RunDirectory, dataset: Dataset) -> None:
+    """Refuse a capture of other photographs than the run was trained on."""
+    trained, found = directory.photographs(), {view.name for view in (*dataset.train, *dataset.test)}
+    if trained is None or trained == found:
+        return
+    only = [
+        f"{first_names(sorted(names))} only in {where}"
+        for names, where in ((trained - found, "the run"), (found - trained, "the capture"))
+        if names
+    ]
+    raise InputError(
+        f"{dataset.root} is not the capture that {directory.path} was trained on: {', '.join(only)}. Give the same "
+        "photographs to --data"
+    )
+
+
+def pictures_of(dataset: Dataset) -> dict[str, Path]:
+    """The file of each view's picture in a folder, the same whichever views are asked for."""
+    return picture_paths([view.name for view in chosen_views(dataset, "all")])
+
+
+def photographs_of(dataset: Dataset) -> list[Path]:
+    """The files of all photographs."""
+    return [view.image_path for view in (*dataset.train, *dataset.test)]
+
+
+def train(asked: Train[Any], console: Console) -> None:
+    """Trains, with a progress bar or lines."""
+    check_output(RunDirectory(asked.output), resume=asked.resume)
+    dataset = dataset_of(asked.files, downscale=asked.downscale, background=photo_background(asked.recipe))
+    describe(dataset, console)
+    training = Training(
+        dataset,
+        asked.recipe,
+        iterations=asked.iterations,
+        output=asked.output,
+        seed=asked.seed,
+        device=asked.device,
+        resume=asked.resume,
+        checkpoint_every=asked.checkpoint_every,
+    )
+    with TrainingProgress(console, asked.iterations) as progress, _watched(asked, training, dataset, console) as watch:
+
+        def listen(message: Message) -> None:
+            progress.show(message)
+            watch(message)
+
+        scene = training.run(listen).scene
+    say(
+        console,
+        f"trained {asked.recipe.method} for {training.step} iterations in {training.seconds:.0f} s: "
+        f"{len(scene.primary)} Gaussians, {len(scene.planes)} panes -> {asked.output}",
+    )
+    say(console, f"next: glassplat eval {asked.output}")
+
+
+@contextmanager
+def _watched(asked: Train[Any], training: Training, dataset: Dataset, console: Console) -> Iterator[Listener]:
+    """What else listens: the viewer, where it is asked for."""
+    if not asked.view:
+        yield lambda message: None
+        return
+    from glassplat.model.watching import WatchedTraining
+    from glassplat.viewer.render_loop import LOCAL, vacant_port
+
+    watched = WatchedTraining(
+        training, dataset, host=LOCAL, port=vacant_port(LOCAL), announce=lambda viewer: announce(viewer, console)
+    )
+    try:
+        yield watched.hear
+    finally:
+        watched.stop()
+
+
+def describe(dataset: Dataset, console: Console) -> None:
+    """Says what was loaded, with the loader's warnings."""
+    annotated = sum(view.is_annotated for view in dataset.train)
+    given = f", {len(dataset.planes)} in planes.json" if dataset.planes is not None else ""
+    say(
+        console,
+        f"{dataset.root}: {len(dataset.train)} training and {len(dataset.test)} test views, "
+        f"{len(dataset.points.positions)} points, {annotated} annotated views with {len(dataset.pane_labels)} panes"
+        f"{given}",
+    )
+    for warning in dataset.warnings:
+        warn(console, warning)

@@ -1,0 +1,85 @@
+"""Pages served to a browser: the viewer, and the marking of panes."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from torch import Tensor
+
+from glassplat.access import is_local
+from glassplat.annotate.server import AnnotationServer
+from glassplat.annotate.session import opened_session
+from glassplat.cli.console import say
+from glassplat.cli.runs import announce, capture_of
+from glassplat.errors import InputError
+from glassplat.model.loading import load
+from glassplat.model.model import Model
+from glassplat.model.run_directory import RunDirectory
+from glassplat.model.watching import KeptBeside, shown_of
+from glassplat.viewer.server import Viewer
+
+if TYPE_CHECKING:
+    from glassplat.cli.capture import Annotate
+    from glassplat.cli.look import View
+
+
+def serve_viewer(command: View, console: Console) -> None:
+    """Serves until it is interrupted."""
+    model = load(command.scene, device=command.device)
+    model = model.with_scene(command.edits.applied(model.scene))
+    viewer = Viewer(shown_of(model, photographs_of(command.scene), keeper(command, model)), command.host, command.port)
+    viewer.start()
+    try:
+        announce(viewer, console)
+        say(console, "Ctrl-C ends it")
+        while True:
+            time.sleep(3600)
+    finally:
+        viewer.stop()
+
+
+def keeper(command: View, model: Model) -> KeptBeside | None:
+    """Who may look from elsewhere must not write here unless that was asked for."""
+    if command.output is None and not is_local(command.host):
+        return None
+    return KeptBeside(model, command.output or Path(os.path.abspath(command.scene)).parent)
+
+
+def photographs_of(run: Path) -> dict[str, Callable[[], Tensor]]:
+    """The photographs of a run by name, where they still are."""
+    directory = RunDirectory(run)
+    if not run.is_dir() or directory.imported.is_file():
+        return {}
+    try:
+        dataset = capture_of(directory, directory.recipe())
+    except (InputError, FileNotFoundError):
+        return {}
+    views = [view for view in (*dataset.train, *dataset.test) if view.image_path.is_file()]
+    return {view.name: view.read_photo for view in views}
+
+
+def serve_marking(command: Annotate, console: Console) -> None:
+    """Serves the page until it is closed, or Ctrl-C."""
+    session = opened_session(command.capture)
+    with AnnotationServer(session, command.port) as server:
+        port = server.server_address[1]
+        say(console, f"{len(session.views)} photographs; the page is at {server.address}")
+        say(console, f"over SSH, first: ssh -L {port}:127.0.0.1:{port} HOST; Ctrl-C ends, and nothing is lost")
+        if command.open_browser and has_screen():
+            webbrowser.open(server.address)
+        server.serve_forever(poll_interval=0.2)
+    say(console, f"next: glassplat train planar --data {command.capture} --output RUN")
+
+
+def has_screen() -> bool:
+    """Whether a browser that is opened here is seen by whoever typed the command."""
+    if "SSH_CONNECTION" in os.environ:
+        return False
+    return sys.platform in ("darwin", "win32") or bool({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ))

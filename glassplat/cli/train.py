@@ -1,0 +1,156 @@
+"""`glassplat train`: its methods, the presets they begin from, and how much of them help shows."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+import operator
+import typing
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Generic, TypeVar
+
+import tyro
+from rich.console import Console
+
+from glassplat.captures.files import CaptureFiles, read_capture
+from glassplat.captures.masks import Polarity
+from glassplat.cli.console import import_now, message_console, say
+from glassplat.kernels.backend.devices import DeviceName, chosen_device
+from glassplat.methods.recipe import RECIPES, Preset, Recipe, recipe_of
+from glassplat.model.run_directory import CHECKPOINT_SECONDS, RunDirectory, RunSettings, check_output
+from glassplat.options import Downscale, Essential, Positive, Seed, Several
+
+RecipeKind = TypeVar("RecipeKind", bound=Recipe)
+
+
+@dataclass(frozen=True)
+class Train(Generic[RecipeKind]):
+    """Train a scene from photographs.
+
+    Attributes:
+        recipe: method and its options; `train_options` tells the command line which there are.
+        preset: what the options are unless they are given: the best that this project found, or those of the paper.
+        data: directory of the capture (COLMAP or transforms.json; pane masks in masks/).
+        output: directory of the run.
+        iterations: length of the run; every schedule stretches with it.
+        downscale: shrink the photographs by this factor.
+        seed: fixes every random choice.
+        device: where to train; auto takes an NVIDIA GPU where one can be used.
+        resume: go on with the run in `output`.
+        mask_polarity: which value of black-and-white masks is the pane.
+        checkpoint_every: seconds from one checkpoint to the next; an end or an interrupt writes one in any case.
+        view: look at it in the browser meanwhile.
+    """
+
+    recipe: Annotated[RecipeKind, tyro.conf.arg(name="")]
+    data: Path
+    output: Path
+    iterations: Several = 30_000
+    downscale: Downscale = 1.0
+    seed: Seed = 0
+    device: DeviceName = "auto"
+    resume: bool = False
+    mask_polarity: Polarity = "auto"
+    checkpoint_every: Positive = CHECKPOINT_SECONDS
+    preset: Preset = "glassplat"
+    view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+
+    def ready(self) -> None:
+        """Refuses what stands in the way, says what the capture's folder holds, and imports what trains."""
+        check_output(RunDirectory(self.output), resume=self.resume)
+        say(message_console(), self.files)
+        import_now("glassplat.cli.runs")
+        self.recipe.renderer()  # Imports what this method trains with, too, before anything is written.
+
+    @cached_property
+    def files(self) -> CaptureFiles:
+        """What the capture's folder holds; read when it is first asked for, without PyTorch."""
+        return read_capture(self.data, mask_polarity=self.mask_polarity)
+
+    def run(self, console: Console) -> None:
+        """Trains, with a progress bar or lines."""
+        from glassplat.cli.runs import train
+
+        train(self, console)
+
+    def left_behind(self) -> str:
+        """What an interrupt leaves, and how to go on."""
+        if RunDirectory(self.output).checkpoint.is_file():
+            return f"{self.output} holds a checkpoint: repeat the command with --resume to go on from it"
+        return "no checkpoint was written yet: repeat the command to begin again"
+
+    def settings(self) -> RunSettings:
+        """What the run's directory records beside the recipe."""
+        device = str(chosen_device(self.device))
+        data = str(self.data.resolve())  # The run may be looked at from another folder than it was started in.
+        return RunSettings(data, self.iterations, self.downscale, self.seed, device, self.mask_polarity)
+
+    def resuming(self, begun: bool) -> Train:
+        """The same run, going on from its checkpoint if it has begun."""
+        return replace(self, resume=begun)
+
+
+HELP, FULL_HELP = ("-h", "--help"), "--help-advanced"
+POINTER = f"These are the options that most runs need; {FULL_HELP} in place of --help shows all of them."
+
+
+def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
+    """What tyro should make of a command line that may be one of `train`.
+
+    Returns:
+        `Train`, with the recipes of the preset that the arguments name as defaults and, where they ask for help, with
+        the options that help should show; and the arguments for it.
+    """
+    full = FULL_HELP in arguments
+    recipes = [recipe_of(method, asked_preset(arguments)) for method in RECIPES]
+    if not full and any(help_option in arguments for help_option in HELP):
+        recipes = [in_brief(recipe) for recipe in recipes]
+    choices = [Annotated[type(r), tyro.conf.subcommand(r.method, default=r)] for r in recipes]
+    any_recipe: Any = functools.reduce(operator.or_, choices)
+    return Train[any_recipe], ["--help" if argument == FULL_HELP else argument for argument in arguments]
+
+
+def asked_preset(arguments: Sequence[str]) -> Preset:
+    """The preset that the arguments name last; the default one where that is none, which parsing will refuse."""
+    return "paper" if last_value(arguments, "--preset") == "paper" else "glassplat"
+
+
+def last_value(arguments: Sequence[str], option: str) -> str | None:
+    """The value that arguments give to an option last; None where they give none."""
+    found = None
+    for before, argument in itertools.pairwise(["", *arguments]):
+        if argument.startswith(f"{option}="):
+            found = argument.removeprefix(f"{option}=")
+        elif before == option and not argument.startswith("-"):
+            found = argument
+    return found
+
+
+def in_brief(options: Any) -> Any:
+    """The same options as another type, of which help shows the essential ones only; it parses no others."""
+    kind, hints = type(options), typing.get_type_hints(type(options), include_extras=True)
+    values = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
+    fields: list[Any] = []
+    for name, value in values.items():
+        values[name] = in_brief(value) if dataclasses.is_dataclass(value) and has_essentials(type(value)) else value
+        if values[name] is not value:
+            fields.append((name, type(values[name]), dataclasses.field(default=values[name])))
+        elif not is_essential(hints[name]):
+            fields.append((name, Annotated[hints[name], tyro.conf.Suppress], dataclasses.field(default=value)))
+    summary, _, rest = (kind.__doc__ or "").partition("\n\n")
+    namespace = {"__doc__": f"{summary}\n\n    {POINTER}\n\n{rest}", "__module__": kind.__module__}
+    return dataclasses.make_dataclass(kind.__name__, fields, bases=(kind,), namespace=namespace, frozen=True)(**values)
+
+
+def has_essentials(kind: type) -> bool:
+    """Whether one of a dataclass's options is essential."""
+    return any(is_essential(hint) for hint in typing.get_type_hints(kind, include_extras=True).values())
+
+
+def is_essential(hint: Any) -> bool:
+    """Whether an annotation marks an option as one that many runs need."""
+    return any(isinstance(data, Essential) for data in typing.get_args(hint)[1:])

@@ -1,0 +1,245 @@
+"""Files written by commands: layers as pictures, photographs without reflections, films, other formats."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+from torch import Tensor
+
+from glassplat.captures.view import View
+from glassplat.cli.console import say, warn
+from glassplat.cli.places import check_targets, chosen_views, claim_folder
+from glassplat.cli.progress import WorkProgress
+from glassplat.cli.runs import StoredRun, open_run, photographs_of, pictures_of
+from glassplat.errors import InputError, input_checked
+from glassplat.evaluate.evaluate import timed_render
+from glassplat.evaluate.metrics import quantized
+from glassplat.files.glb import write_glb
+from glassplat.files.images import write_image
+from glassplat.files.ply import write_gaussians
+from glassplat.files.sidecars import read_cameras, write_cameras
+from glassplat.files.spz import write_spz
+from glassplat.files.writing import atomic_write
+from glassplat.model.layers import check_layers
+from glassplat.model.loading import load
+from glassplat.model.model import ENVIRONMENT, GLASS, PLANES, Model, save_page, write_beside
+from glassplat.prepare.photographs import Progress as Step
+from glassplat.publish.camera_paths import interpolated, keyframes_of, widened
+from glassplat.publish.film import side_by_side, wiped, write_film
+from glassplat.publish.web_page import can_show
+from glassplat.render.layers import layer_image, renderer_with
+from glassplat.render.planar import Planar, dereflected_photo
+from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Scene, without_glass
+
+if TYPE_CHECKING:
+    from glassplat.cli.look import Render, Video
+    from glassplat.cli.publish import Dereflect, Export
+
+
+def write_layers(command: Render, console: Console) -> None:
+    """Renders every layer of every view into its file."""
+    stored = open_run(command.run_directory, command.device, command.data)
+    check_layers(command.layers, stored.recipe)
+    scene = command.edits.applied(stored.scene)
+    renderer = renderer_with(stored.renderer, command.layers)
+    views = chosen_views(stored.dataset, command.split)
+    paths = pictures_of(stored.dataset)
+    targets = [command.output / layer / paths[view.name] for layer in command.layers for view in views]
+    check_targets(command.output, targets, photographs_of(stored.dataset))
+    if claim_folder(command.output, "render", command.run_directory):
+        say(
+            console,
+            f"adding to {command.output}, which `glassplat render` wrote earlier; images of one name are replaced",
+        )
+    for view in track(views, "rendering", console=console):
+        frame, _ = timed_render(renderer, scene, view)
+        for layer in command.layers:
+            image = layer_image(frame, layer)
+            write_image(command.output / layer / paths[view.name], image)
+    say(console, f"{len(views)} views x {len(command.layers)} layers -> {command.output}")
+
+
+def write_dereflected(command: Dereflect, console: Console) -> None:
+    """Writes an image for each photograph."""
+    stored = open_run(command.run_directory, command.device, command.data)
+    renderer = planar_renderer(stored)
+    views = chosen_views(stored.dataset, command.split)
+    paths = pictures_of(stored.dataset)
+    check_targets(command.output, [command.output / paths[view.name] for view in views], photographs_of(stored.dataset))
+    if claim_folder(command.output, "dereflect", command.run_directory):
+        say(console, f"replacing the images of an earlier run of this command in {command.output}")
+    for warning in mirror_warnings(stored):
+        warn(console, warning)
+    for view in track(views, "taking reflections off", console=console):
+        write_image(command.output / paths[view.name], dereflected(command, stored, renderer, view))
+    say(console, f"{len(views)} images without reflections -> {command.output}")
+
+
+def dereflected(command: Dereflect, stored: StoredRun, renderer: Planar, view: View) -> Tensor:
+    """The photograph of a view without its reflections, or the render in its place."""
+    frame, _ = timed_render(renderer, stored.scene, view)
+    if command.source == "render":
+        return quantized(frame.layers["without_panes"])
+    # Not `view.photo`, which stays in memory: a capture may be larger than that.
+    exposures = stored.scene.exposures.to("cpu")
+    return dereflected_photo(frame, view.read_photo(), renderer.blend, exposures=exposures, name=view.name)
+
+
+def planar_renderer(stored: StoredRun) -> Planar:
+    """The renderer of a run that has reflections to take off, that of the photographer among them.
+
+    Raises:
+        InputError: it has none.
+    """
+    renderer = stored.renderer
+    if isinstance(renderer, Planar) and len(stored.scene.planes):
+        return replace(renderer, photographer="present")
+    raise InputError(
+        f"{stored.directory.path} is a {stored.recipe.method} run without panes, so it knows no reflection; train one "
+        f"that does, with pane masks: glassplat train planar --data {stored.directory.settings().data} --output RUN"
+    )
+
+
+def mirror_warnings(stored: StoredRun) -> list[str]:
+    """What to expect of panes that transmit nothing."""
+    return [
+        f"pane {label} is a mirror, and nothing is seen through it; without its reflection it shows what the scene "
+        "happens to hold behind it"
+        for label in stored.scene.planes.mirrors
+    ]
+
+
+WIPE_SPAN = 0.9
+"""Part of the picture that a wipe goes over, there and back."""
+
+
+def film(command: Video, console: Console) -> None:
+    """Renders the pictures and encodes them one by one."""
+    model = load(command.scene, device=command.device)
+    check_layers(command.layers, model.recipe)
+    model = model.with_scene(command.edits.applied(model.scene))
+    cameras = _cameras(command, model)
+    with WorkProgress(console) as progress, atomic_write(command.output) as temporary:
+        pictures = followed("filming", _pictures(command, model, cameras), len(cameras), progress)
+        count = write_film(temporary, pictures, command.fps)
+    say(console, f"{count} pictures, {command.output.stat().st_size / 1e6:.2f} MB -> {command.output}")
+
+
+def _cameras(command: Video, model: Model) -> list[Camera]:
+    frames = max(2, round(command.seconds * command.fps))
+    with input_checked():
+        if command.keyframes is not None:
+            cameras = interpolated([camera for _, camera in read_cameras(command.keyframes)], frames)
+        elif command.path == "interpolate":
+            cameras = interpolated(keyframes_of([model.cameras[name] for name in sorted(model.cameras)]), frames)
+        else:
+            cameras = model.orbit(frames)
+    return [widened(camera, command.width + command.width % 2) for camera in cameras]
+
+
+def _pictures(command: Video, model: Model, cameras: Sequence[Camera]) -> Iterator[NDArray[np.uint8]]:
+    """One picture per camera; rendered when it is asked for."""
+    renderer = renderer_with(model.renderer, command.layers)
+    for index, camera in enumerate(cameras):
+        with torch.no_grad():
+            frame = renderer(model.scene, camera)
+            shown = [_picture(layer_image(frame, layer)) for layer in command.layers]
+        if command.layout == "wipe":
+            share = 0.5 + WIPE_SPAN / 2 * math.sin(2 * math.pi * index / len(cameras))
+            yield wiped(shown[0], shown[1], share)
+        else:
+            yield side_by_side(shown)
+
+
+def _picture(image: torch.Tensor) -> NDArray[np.uint8]:
+    """A layer [H, W] or [H, W, 3] as a picture."""
+    if image.dim() == 2:
+        image = image[..., None].expand(-1, -1, 3)
+    picture: NDArray[np.uint8] = quantized(image).cpu().contiguous().numpy()
+    return picture
+
+
+def followed(
+    what: str, pictures: Iterable[NDArray[np.uint8]], total: int, progress: WorkProgress
+) -> Iterator[NDArray[np.uint8]]:
+    """The pictures, with a progress shown as they are taken."""
+    progress.show(Step(what, 0, total))
+    for number, picture in enumerate(pictures, start=1):
+        yield picture
+        progress.show(Step(what, number, total))
+
+
+def write_files(command: Export, console: Console) -> None:
+    """Writes the files."""
+    model = load(command.run_directory, device=command.device)
+    model = model.with_scene(_chosen(command, command.edits.applied(model.scene)))
+    targets = [
+        command.output / name
+        for name in (
+            "index.html",
+            "scene.ply",
+            "scene.spz",
+            "scene.glb",
+            "glass.ply",
+            "planes.json",
+            "cameras.json",
+        )
+    ]
+    check_targets(command.output, targets, [])
+    if claim_folder(command.output, "export", command.run_directory):
+        say(console, f"replacing the files of an earlier run of this command in {command.output}")
+    _write_beside(command, model.scene, console)
+    write_cameras(command.output / "cameras.json", model.cameras.items())
+    _write_gaussians(command, model.scene.primary, console)
+    if "html" in command.formats:
+        _write_page(command, model, console)
+
+
+def _chosen(command: Export, scene: Scene) -> Scene:
+    if command.layer == "all":
+        return scene
+    bare = without_glass(scene)
+    return replace(bare, primary=replace(bare.primary, channels={}))
+
+
+def _write_gaussians(command: Export, gaussians: Gaussians, console: Console) -> None:
+    if "ply" in command.formats:
+        write_gaussians(command.output / "scene.ply", gaussians)
+        say(console, f"{len(gaussians)} Gaussians -> {command.output / 'scene.ply'}")
+    if "spz" in command.formats:
+        path = command.output / "scene.spz"
+        write_spz(path, gaussians, command.spz_version)
+        say(console, f"{path.stat().st_size / 1e6:.2f} MB, version {command.spz_version} -> {path}")
+    if "glb" in command.formats:
+        path = command.output / "scene.glb"
+        with input_checked():
+            write_glb(path, gaussians)
+        say(console, f"{path.stat().st_size / 1e6:.2f} MB -> {path}")
+
+
+def _write_page(command: Export, model: Model, console: Console) -> None:
+    path = command.output / "index.html"
+    if not can_show(model.renderer):
+        warn(console, f"no page was written: it does not show {model.recipe.method} runs of this kind")
+        return
+    save_page(model, path, command.title or model.name)
+    say(console, f"{path.stat().st_size / 1e6:.2f} MB, open it in a browser -> {path}")
+
+
+def _write_beside(command: Export, scene: Scene, console: Console) -> None:
+    """Planes, glass and environment, where there are any."""
+    write_beside(command.output, scene)
+    if len(scene.planes):
+        say(console, f"{len(scene.planes)} panes -> {command.output / PLANES}, their shape -> {GLASS}")
+    if not scene.environment.is_empty:
+        warn(console, f"other viewers show this scene without what it mirrors; that is in {ENVIRONMENT}")

@@ -1,1 +1,0 @@
-"""From photographs to a capture with marked panes."""

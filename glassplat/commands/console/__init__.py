@@ -1,1 +1,0 @@
-"""What commands print, how they follow work, and how they end."""

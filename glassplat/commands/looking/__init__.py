@@ -1,1 +1,0 @@
-"""Pictures of a scene: in the browser, as a film, layer by layer."""

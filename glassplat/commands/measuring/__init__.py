@@ -1,1 +1,0 @@
-"""How good a run is, and how methods compare."""

@@ -1,1 +1,0 @@
-"""Scenes and photographs for others, and scenes from others."""

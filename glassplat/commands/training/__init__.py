@@ -1,1 +1,0 @@
-"""From a capture to a scene."""

@@ -1,1 +1,0 @@
-"""Captures: photographs, poses, pane masks and points, from any of the formats people have."""

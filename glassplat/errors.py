@@ -1,0 +1,33 @@
+"""Errors that a wrong input ends with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+class InputError(ValueError):
+    """The data set cannot be used as it is; the message says what was expected, what came and what to do."""
+
+
+class UnknownFormatError(InputError):
+    """A folder holds no capture of any format that is read."""
+
+
+@contextmanager
+def input_checked(where: object = None) -> Iterator[None]:
+    """Turns the ValueError of a reader or an edit, whose message says what is wrong, into an InputError.
+
+    Args:
+        where: what to name before the message, such as a file, where that does not name it.
+    """
+    try:
+        yield
+    except ValueError as error:
+        raise InputError(str(error) if where is None else f"{where}: {error}") from error
+
+
+def first_names(names: list[str], limit: int = 5) -> str:
+    """A list of names for a message, cut short after `limit`."""
+    shown = ", ".join(names[:limit])
+    return shown if len(names) <= limit else f"{shown} and {len(names) - limit} more"

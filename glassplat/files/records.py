@@ -1,0 +1,369 @@
+"""JSON records from files that anybody may have written: parsing, limits, and tables of fields.
+
+Nothing that is read is deeper than `DEEPEST`, no text in it is unprintable in UTF-8, no whole number has more than
+`MOST_DIGITS` digits (a longer one becomes a float, which may be infinite), and no key of an object comes twice.
+
+A table of fields checks a JSON object:
+
+    SCENE = {"extent": Number(above=0), "active_sh_degree": Whole(0, 3), "files": Optional(Items(Text()), ())}
+    header = checked(read_json(path), SCENE, str(path))
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import stat
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+LARGEST_TEXT = 2**28
+"""Bytes of a text file; a list of a hundred thousand photographs with their poses has a quarter of it."""
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turns what opening or reading a file raises into errors that say what is wrong with which file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: a folder, a pipe or a device, which may never end, a file without permission, a name that is too
+            long, a loop of links, a failing disk.
+    """
+    try:
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            raise ValueError(f"{path} cannot be read (it is a folder, a pipe or a device); expected a file")
+        yield
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"no file {path}; expected it there") from error
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ValueError(f"{path} cannot be read ({reason}); expected a file that may be read") from error
+
+
+def read_text(path: Path) -> str:
+    """The text of a UTF-8 file, with or without a byte-order mark.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it cannot be read, is no text in UTF-8, or is larger than `LARGEST_TEXT`.
+    """
+    with reading(path):
+        size = os.stat(path).st_size
+        if size > LARGEST_TEXT:
+            raise ValueError(f"{path} has {size} bytes; expected a text file of at most {LARGEST_TEXT}")
+        data = path.read_bytes()
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(
+            f"{path} is no text in UTF-8 ({error.reason} at byte {error.start}); save it as such"
+        ) from error
+
+
+DEEPEST = 32
+MOST_DIGITS = 20
+"""Enough for every number of 64 bits."""
+
+
+def read_json(path: Path) -> Any:
+    """The contents of a JSON file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it cannot be read or is no valid JSON; the message names the file.
+    """
+    return parse_json(read_text(path), str(path))
+
+
+def parse_json(text: str, where: str) -> Any:
+    """The value that a text in JSON stands for; `where` names the text in messages.
+
+    Raises:
+        ValueError: no valid JSON, nested too deeply, or with a key twice in one object.
+    """
+    try:
+        value = json.loads(text, parse_int=_whole, object_pairs_hook=_without_repeats)
+    except RecursionError as error:
+        raise ValueError(_too_deep(where)) from error
+    except ValueError as error:
+        raise ValueError(f"{where} is not valid JSON ({error}); it is damaged or cut off: write it again") from error
+    _check_nesting_and_text(value, where)
+    return value
+
+
+def _whole(digits: str) -> int | float:
+    return int(digits) if len(digits) <= MOST_DIGITS else float(digits)
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        repeated = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"the key {repeated!r} occurs twice in one object")
+    return found
+
+
+def _check_nesting_and_text(value: Any, where: str) -> None:
+    """Level by level, without recursion of its own."""
+    level = [value]
+    for _ in range(DEEPEST):
+        unprintable = next((text for text in level if isinstance(text, str) and not _is_encodable(text)), None)
+        if unprintable is not None:
+            raise ValueError(f"{where} holds the text {unprintable!r}, which is no valid Unicode; write it again")
+        level = [inner for outer in level for inner in _inside(outer)]
+        if not level:
+            return
+    raise ValueError(_too_deep(where))
+
+
+def _inside(value: Any) -> list[Any]:
+    if isinstance(value, dict):
+        return [*value.keys(), *value.values()]
+    return value if isinstance(value, list) else []
+
+
+def _is_encodable(text: str) -> bool:
+    """Half of a surrogate pair can be written in JSON, but in no file name and on no screen."""
+    return text.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in text)
+
+
+def _too_deep(where: str) -> str:
+    return f"{where} is nested more than {DEEPEST} levels deep; expected a file that such a program wrote"
+
+
+LARGEST_SHOWN = 80
+LEAST_WHOLE, MOST_WHOLE = -(2**63), 2**63 - 1
+LARGEST_COORDINATE = 1e12
+"""World units. The square of a greater one, and what is summed up of them, does not fit float32."""
+
+
+class Field(Protocol):
+    """What one value has to be."""
+
+    @property
+    def expected(self) -> str:
+        """For messages, as in "expected a number"."""
+        ...
+
+    def read(self, value: Any, where: str) -> Any:
+        """The value, in the type that the program uses.
+
+        Raises:
+            ValueError: it is something else; names `where` it was found.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Number:
+    """A finite number, from `least` to `most`, or above `above`; read as float."""
+
+    least: float = -math.inf
+    most: float = math.inf
+    above: float = -math.inf
+
+    @property
+    def expected(self) -> str:
+        """For messages."""
+        return "a finite number" + _range_text(self.least, self.most, self.above)
+
+    def read(self, value: Any, where: str) -> float:
+        """Refuses text and truth values too."""
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not is_number or not (_is_finite(value) and self.least <= value <= self.most and value > self.above):
+            raise mismatch(value, where, self)
+        return float(value)
+
+
+@dataclass(frozen=True)
+class Whole:
+    """A whole number from `least` to `most`; read as int."""
+
+    least: int = LEAST_WHOLE
+    most: int = MOST_WHOLE
+
+    @property
+    def expected(self) -> str:
+        """For messages."""
+        return "a whole number" + _range_text(self.least, self.most)
+
+    def read(self, value: Any, where: str) -> int:
+        """Refuses 2.0 and true too."""
+        if not isinstance(value, int) or isinstance(value, bool) or not self.least <= value <= self.most:
+            raise mismatch(value, where, self)
+        return value
+
+
+@dataclass(frozen=True)
+class Flag:
+    """True or false."""
+
+    expected: str = "true or false"
+
+    def read(self, value: Any, where: str) -> bool:
+        """Refuses 0 and 1 too."""
+        if not isinstance(value, bool):
+            raise mismatch(value, where, self)
+        return value
+
+
+@dataclass(frozen=True)
+class Text:
+    """A text that is not empty."""
+
+    expected: str = "a text that is not empty"
+
+    def read(self, value: Any, where: str) -> str:
+        """The text as it is."""
+        if not isinstance(value, str) or not value:
+            raise mismatch(value, where, self)
+        return value
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One of a few values."""
+
+    choices: tuple[Any, ...]
+
+    @property
+    def expected(self) -> str:
+        """For messages."""
+        return f"one of {', '.join(map(repr, self.choices))}"
+
+    def read(self, value: Any, where: str) -> Any:
+        """1 is not true here."""
+        if not any(value == choice and type(value) is type(choice) for choice in self.choices):
+            raise mismatch(value, where, self)
+        return value
+
+
+@dataclass(frozen=True)
+class Items:
+    """A list of values of one kind, of `count` of them if that is given; read as a tuple."""
+
+    item: Field
+    count: int | None = None
+
+    @property
+    def expected(self) -> str:
+        """For messages."""
+        count = "" if self.count is None else f"{self.count} "
+        return f"a list of {count}values, each {self.item.expected}"
+
+    def read(self, value: Any, where: str) -> tuple[Any, ...]:
+        """Names the entry that is wrong, counted from 1."""
+        if not isinstance(value, (list, tuple)) or self.count not in (None, len(value)):
+            raise mismatch(value, where, self)
+        return tuple(self.item.read(one, f"entry {index} of {where}") for index, one in enumerate(value, start=1))
+
+
+@dataclass(frozen=True)
+class ByName:
+    """An object that maps any names to values of one kind; read as a dictionary."""
+
+    item: Field
+
+    @property
+    def expected(self) -> str:
+        """For messages."""
+        return f"an object whose values are each {self.item.expected}"
+
+    def read(self, value: Any, where: str) -> dict[str, Any]:
+        """Names the value that is wrong."""
+        if not isinstance(value, dict):
+            raise mismatch(value, where, self)
+        return {name: self.item.read(one, f"{name!r} of {where}") for name, one in value.items()}
+
+
+@dataclass(frozen=True)
+class Nullable:
+    """A value of some kind, or null."""
+
+    field: Field
+
+    @property
+    def expected(self) -> str:
+        """For messages."""
+        return f"{self.field.expected}, or null"
+
+    def read(self, value: Any, where: str) -> Any:
+        """None for null."""
+        return None if value is None else self.field.read(value, where)
+
+
+@dataclass(frozen=True)
+class Optional:
+    """A value of some kind under a key that may be missing, which means `default`."""
+
+    field: Field
+    default: Any = None
+
+    @property
+    def expected(self) -> str:
+        """For messages."""
+        return self.field.expected
+
+    def read(self, value: Any, where: str) -> Any:
+        """The value where there is one."""
+        return self.field.read(value, where)
+
+
+def checked(value: Any, fields: Mapping[str, Field], where: str) -> dict[str, Any]:
+    """The fields of an object, each as its entry of the table says; keys that the table does not know are left out.
+
+    Args:
+        value: what was read.
+        fields: what has to be under each key; one that is `Optional` may be missing.
+        where: names the object in messages.
+
+    Raises:
+        ValueError: no object, a key that is missing, or a value of another type or out of range.
+    """
+    if not isinstance(value, dict):
+        raise ValueError(f"{where} is {shown(value)}; expected an object with {', '.join(fields)}")
+    found = {}
+    for key, field in fields.items():
+        if key in value:
+            found[key] = field.read(value[key], f"{key} of {where}")
+        elif isinstance(field, Optional):
+            found[key] = field.default
+        else:
+            raise ValueError(f"{where} has no {key}; expected {field.expected}")
+    return found
+
+
+def mismatch(value: Any, where: str, field: Field) -> ValueError:
+    """The error of a value that is not what was expected."""
+    return ValueError(f"{where} is {shown(value)}; expected {field.expected}")
+
+
+def shown(value: Any) -> str:
+    """A value for a message, cut short."""
+    text = repr(value)
+    return text if len(text) <= LARGEST_SHOWN else f"{text[:LARGEST_SHOWN]}..."
+
+
+def _is_finite(value: float) -> bool:
+    """Also for whole numbers beyond the range of floats, which `math.isfinite` cannot take."""
+    return -1.7e308 < value < 1.7e308
+
+
+def _range_text(least: float, most: float, above: float = -math.inf) -> str:
+    """The range of a number, for messages; the ends of 64 bits go without saying."""
+    is_above, has_least, has_most = above > -math.inf, least > LEAST_WHOLE, most < MOST_WHOLE
+    if has_least and has_most:
+        return f" from {least:g} to {most:g}"
+    lower = f" above {above:g}" if is_above else f" of at least {least:g}" if has_least else ""
+    upper = f" of at most {most:g}" if has_most else ""
+    return lower + (" and" if lower and upper else "") + upper
+
+
+COORDINATE = Number(-LARGEST_COORDINATE, LARGEST_COORDINATE)
+"""One component of a position in the world."""

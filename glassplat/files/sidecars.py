@@ -1,0 +1,504 @@
+"""Sidecar files of a PLY: panes, cameras, corrections of photographs, environments."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from os.path import isfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from glassplat.files.images import read_image_float, write_image
+from glassplat.files.records import (
+    COORDINATE,
+    LARGEST_COORDINATE,
+    ByName,
+    Field,
+    Flag,
+    Items,
+    Nullable,
+    Number,
+    Optional,
+    Text,
+    Whole,
+    checked,
+    read_json,
+    shown,
+)
+from glassplat.files.tensors_file import opened_tensors, write_tensors
+from glassplat.files.writing import atomic_write, make_folder
+from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
+from glassplat.scene.camera import Camera
+from glassplat.scene.corrections import Exposures, PoseCorrections
+from glassplat.scene.panes import Planes
+from glassplat.scene.scene import Environment
+
+EDIT_TOLERANCE = 1e-5
+"""Above this difference the readable value has been edited by hand, and wins over the raw one."""
+REFLECTANCE_MARGIN = 1e-6
+LEAST_LENGTH = 1e-6
+LEAST_ANGLE = 1e-3
+"""Between tangent and normal, in radians: below it the rectangle's sides have no direction."""
+LEAST_HALF_SIZE = 1e-9
+GLASS_REFLECTANCE = 0.2
+"""That learning starts at, where nobody says."""
+LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE = 1e-6, 1.0
+HIGHEST_LABEL = 255
+VECTOR = Items(COORDINATE, 3)
+LOGIT = Number(-1e3, 1e3)
+PLANE: dict[str, Field] = {
+    "label": Whole(1, HIGHEST_LABEL),
+    "mirror": Optional(Flag(), default=False),
+    "center": VECTOR,
+    "normal": VECTOR,
+    "tangent": VECTOR,
+    "half_sizes": Items(Number(LEAST_HALF_SIZE, LARGEST_COORDINATE), 2),
+    "base_reflectance": Optional(Number(0, 1), default=GLASS_REFLECTANCE),
+    "raw_normal": Optional(VECTOR),
+    "logit_reflectance": Optional(LOGIT),
+    "transmittance": Optional(Items(Number(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE), 3)),
+    "log_transmittance": Optional(Items(LOGIT, 3)),
+}
+
+
+def write_planes(path: Path | str, planes: Planes) -> None:
+    """Writes planes as a JSON list, atomically; `read_planes` gives back the same float32 bits.
+
+    Each entry has label, mirror, center, normal (unit), tangent, half_sizes and base_reflectance for people
+    and other programs (world units, the capture's frame), and the raw values raw_normal and
+    logit_reflectance that training continues from; where glass may be tinted also transmittance, of red, green and
+    blue, and its raw log_transmittance (see `Planes`).
+
+    Raises:
+        ValueError: a plane holds a value that is not finite.
+    """
+    entries = [_pane_entry(planes, index) for index in range(len(planes))]
+    for entry in entries:
+        broken = [key for key, value in entry.items() if not _finite(value)]
+        if broken:
+            raise ValueError(
+                f"plane {entry['label']} cannot be written: {', '.join(broken)} must be finite, but is not"
+            )
+    with atomic_write(path) as temporary_path:
+        temporary_path.write_text(json.dumps(entries, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_planes(path: Path | str) -> Planes:
+    """Reads planes as float32 tensors.
+
+    A file edited by hand works as expected: where `normal`, `base_reflectance` or `transmittance` no longer agrees
+    with its raw value, or the raw value is missing, the readable one is taken.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: not a list of planes, a missing or malformed value, or a label that appears twice.
+    """
+    path = Path(path)
+    entries = [_checked_entry(entry, index, path) for index, entry in enumerate(_load_entries(path), start=1)]
+    if not entries:
+        return Planes.empty()
+    labels = tuple(entry["label"] for entry in entries)
+    if len(set(labels)) != len(labels):
+        raise ValueError(f"{path} has plane labels {list(labels)}; expected every label once")
+    return Planes(
+        centers=_column(entries, "center"),
+        raw_normals=torch.stack([_raw_normal(entry) for entry in entries]),
+        logit_reflectances=torch.stack([_logit_reflectance(entry) for entry in entries]),
+        tangents=_column(entries, "tangent"),
+        half_sizes=_column(entries, "half_sizes"),
+        labels=labels,
+        mirrors=tuple(entry["label"] for entry in entries if entry["mirror"]),
+        log_transmittances=_log_transmittances(entries),
+    )
+
+
+def _pane_entry(planes: Planes, index: int) -> dict[str, Any]:
+    """One plane as plain numbers; a float32 survives the way through a decimal double unchanged."""
+    return {
+        "label": int(planes.labels[index]),
+        "mirror": planes.labels[index] in planes.mirrors,
+        "center": planes.centers[index].tolist(),
+        "normal": planes.normals[index].tolist(),
+        "tangent": planes.tangents[index].tolist(),
+        "half_sizes": planes.half_sizes[index].tolist(),
+        "base_reflectance": planes.base_reflectances[index].item(),
+        "raw_normal": planes.raw_normals[index].tolist(),
+        "logit_reflectance": planes.logit_reflectances[index].item(),
+    } | {name: values[index].tolist() for name, values in _glass(planes).items()}
+
+
+def _glass(planes: Planes) -> dict[str, Tensor]:
+    """What panes have if their glass may be tinted, a row for each."""
+    glass = {}
+    if planes.transmittances is not None and planes.log_transmittances is not None:
+        glass["transmittance"] = planes.transmittances.clamp(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE)
+        glass["log_transmittance"] = planes.log_transmittances
+    return glass
+
+
+def _finite(value: Any) -> bool:
+    return all(_finite(one) for one in value) if isinstance(value, list) else math.isfinite(value)
+
+
+def _load_entries(path: Path) -> list[Any]:
+    if not os.path.isfile(path):
+        raise FileNotFoundError(f"no planes file at {path}; expected the planes.json of a run")
+    entries = read_json(path)
+    if not isinstance(entries, list):
+        raise ValueError(f"{path} holds {shown(entries)}; expected a list with one object per plane")
+    return entries
+
+
+def _checked_entry(entry: Any, index: int, path: Path) -> dict[str, Any]:
+    """One plane whose rectangle has a direction and an area."""
+    where = f"plane {index} in {path}"
+    plane = checked(entry, PLANE, where)
+    normal, tangent = (torch.tensor(plane[key], dtype=torch.float64) for key in ("normal", "tangent"))
+    for key, vector in (("normal", normal), ("tangent", tangent)):
+        if float(vector.norm()) < LEAST_LENGTH:
+            raise ValueError(f"{key} of {where} has length 0; expected a direction")
+    if float(torch.linalg.cross(normal, tangent).norm() / (normal.norm() * tangent.norm())) < LEAST_ANGLE:
+        raise ValueError(f"tangent of {where} lies along its normal; expected the direction of a side of the rectangle")
+    return plane
+
+
+def _column(entries: list[dict[str, Any]], key: str) -> Tensor:
+    return torch.tensor([entry[key] for entry in entries], dtype=torch.float32)
+
+
+def _raw_normal(entry: Mapping[str, Any]) -> Tensor:
+    normal = torch.tensor(entry["normal"], dtype=torch.float32)
+    if entry["raw_normal"] is None:
+        return normal
+    raw = torch.tensor(entry["raw_normal"], dtype=torch.float32)
+    unit, raw_unit = (torch.nn.functional.normalize(vector, dim=0) for vector in (normal, raw))
+    return raw if (unit - raw_unit).abs().max() <= EDIT_TOLERANCE else normal
+
+
+def _logit_reflectance(entry: Mapping[str, Any]) -> Tensor:
+    readable = torch.tensor(entry["base_reflectance"], dtype=torch.float32)
+    if entry["logit_reflectance"] is not None:
+        logit = torch.tensor(entry["logit_reflectance"], dtype=torch.float32)
+        if (torch.sigmoid(logit) - readable).abs() <= EDIT_TOLERANCE:
+            return logit
+    return torch.logit(readable, eps=REFLECTANCE_MARGIN)
+
+
+def _log_transmittances(entries: list[dict[str, Any]]) -> Tensor | None:
+    """[K, 3], zeros for panes that say nothing of it; None if none does."""
+    if all(entry["transmittance"] is None for entry in entries):
+        return None
+    return torch.stack([_log_transmittance(entry) for entry in entries])
+
+
+def _log_transmittance(entry: Mapping[str, Any]) -> Tensor:
+    readable = torch.tensor(entry["transmittance"] or (1.0, 1.0, 1.0), dtype=torch.float32)
+    if entry["log_transmittance"] is not None:
+        raw = torch.tensor(entry["log_transmittance"], dtype=torch.float32)
+        if (raw.exp() - readable).abs().max() <= EDIT_TOLERANCE:
+            return raw
+    return readable.log()
+
+
+LARGEST_SIDE = 2**17
+FOCAL = Number(above=0, most=1e9)
+CAMERA: dict[str, Field] = {
+    "img_name": Text(),
+    "width": Whole(1, LARGEST_SIDE),
+    "height": Whole(1, LARGEST_SIDE),
+    "position": Items(COORDINATE, 3),
+    "rotation": Items(Items(Number(-1.01, 1.01), 3), 3),
+    "fx": FOCAL,
+    "fy": FOCAL,
+    "cx": Optional(COORDINATE),
+    "cy": Optional(COORDINATE),
+}
+LARGEST_SHEAR = 1e-3
+"""Of a rotation: how far its rows may be from unit vectors at right angles."""
+
+
+def write_cameras(path: Path | str, cameras: Iterable[tuple[str, Camera]]) -> None:
+    """Writes named cameras in the layout of 3DGS's `cameras.json`, atomically.
+
+    Each entry has id, img_name, width, height, position (camera centre), rotation (the rows of
+    world_from_cam, OpenCV axes), fy and fx as other programs expect, and cx and cy in addition.
+
+    Args:
+        path: the file.
+        cameras: image name and camera, in the order in which ids are given.
+    """
+    entries = [_camera_entry(index, name, camera) for index, (name, camera) in enumerate(cameras)]
+    with atomic_write(path) as temporary_path:
+        temporary_path.write_text(json.dumps(entries, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_cameras(path: Path | str) -> list[tuple[str, Camera]]:
+    """Reads what `write_cameras`, or another program in that layout, wrote: names and float32 cameras, in file order.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: not a list of cameras, a missing or malformed value, or a matrix that is no rotation.
+    """
+    path = Path(path)
+    entries = read_json(path)
+    if not isinstance(entries, list):
+        raise ValueError(f"{path} holds {shown(entries)}; expected a list with one object per camera")
+    return [_camera(entry, f"camera {index} in {path}") for index, entry in enumerate(entries, start=1)]
+
+
+def _camera(entry: Any, where: str) -> tuple[str, Camera]:
+    values = checked(entry, CAMERA, where)
+    rotation = torch.tensor(values["rotation"], dtype=torch.float64).T
+    shear = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
+    if float(shear) > LARGEST_SHEAR or float(torch.linalg.det(rotation)) < 0:
+        raise ValueError(f"rotation of {where} is none; expected three unit vectors at right angles, right-handed")
+    cam_from_world = torch.eye(4, dtype=torch.float64)
+    cam_from_world[:3, :3] = rotation
+    cam_from_world[:3, 3] = -rotation @ torch.tensor(values["position"], dtype=torch.float64)
+    width, height = values["width"], values["height"]
+    cx, cy = (side / 2 if values[key] is None else values[key] for key, side in (("cx", width), ("cy", height)))
+    return values["img_name"], Camera(cam_from_world.float(), values["fx"], values["fy"], cx, cy, width, height)
+
+
+def _camera_entry(index: int, name: str, camera: Camera) -> dict[str, Any]:
+    return {
+        "id": index,
+        "img_name": name,
+        "width": camera.width,
+        "height": camera.height,
+        "position": camera.center.tolist(),
+        "rotation": camera.cam_from_world[:3, :3].T.tolist(),
+        "fy": camera.fy,
+        "fx": camera.fx,
+        "cx": camera.cx,
+        "cy": camera.cy,
+    }
+
+
+def write_by_photograph(path: Path, names: Sequence[str], values: Tensor) -> None:
+    """Writes values [N, ...] of N photographs; `read_by_photograph` returns them exactly."""
+    entries = dict(zip(names, values.detach().cpu().tolist(), strict=True))
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
+
+
+def read_by_photograph(path: Path, entry: Field, shape: tuple[int, ...]) -> tuple[tuple[str, ...], Tensor]:
+    """Names of N photographs and the float32 values [N, *shape] that `write_by_photograph` wrote.
+
+    Args:
+        path: the file.
+        entry: what the value of each photograph has to be; as nested lists, of `shape`.
+        shape: of one value.
+
+    Raises:
+        FileNotFoundError, ValueError: the file is missing or foreign; says what is wrong.
+    """
+    entries = ByName(entry).read(read_json(path), str(path))
+    return tuple(entries), torch.tensor(list(entries.values()), dtype=torch.float32).reshape(len(entries), *shape)
+
+
+LARGEST_ENTRY = 1e3
+TRANSFORM = Items(Items(Number(-LARGEST_ENTRY, LARGEST_ENTRY), 4), 3)
+
+
+def write_exposures(path: Path, exposures: Exposures) -> None:
+    """Writes the transforms by photograph; `read_exposures` returns them exactly."""
+    write_by_photograph(path, exposures.names, exposures.affine)
+
+
+def read_exposures(path: Path) -> Exposures:
+    """Reads what `write_exposures` wrote.
+
+    Raises:
+        FileNotFoundError, ValueError: the file is missing or foreign; says what is wrong.
+    """
+    names, affine = read_by_photograph(path, TRANSFORM, (3, 4))
+    return Exposures(affine, names)
+
+
+LARGEST_TWIST = 1e2
+TWIST = Items(Number(-LARGEST_TWIST, LARGEST_TWIST), 6)
+
+
+def write_poses(path: Path, poses: PoseCorrections) -> None:
+    """Writes the twists by photograph; `read_poses` returns them exactly."""
+    write_by_photograph(path, poses.names, poses.twists)
+
+
+def read_poses(path: Path) -> PoseCorrections:
+    """Reads what `write_poses` wrote.
+
+    Raises:
+        FileNotFoundError, ValueError: the file is missing or foreign; says what is wrong.
+    """
+    names, twists = read_by_photograph(path, TWIST, (6,))
+    return PoseCorrections(twists, names)
+
+
+def write_colmap(
+    folder: Path,
+    cameras: Iterable[tuple[str, Camera]],
+    positions: NDArray[np.floating],
+    colors: NDArray[np.uint8],
+) -> None:
+    """Writes `cameras.txt`, `images.txt` and `points3D.txt`; points have no tracks.
+
+    Args:
+        folder: of the model, such as `sparse/0`; made where it is missing.
+        cameras: image name and pinhole camera.
+        positions: [P, 3] of the points, world units.
+        colors: [P, 3] of the points, sRGB.
+    """
+    lenses: dict[str, int] = {}
+    images = []
+    for number, (name, camera) in enumerate(cameras, start=1):
+        lens = f"PINHOLE {camera.width} {camera.height} {camera.fx!r} {camera.fy!r} {camera.cx!r} {camera.cy!r}"
+        pose = " ".join(f"{value:.9f}" for value in (*quat_wxyz(camera), *camera.cam_from_world[:3, 3].tolist()))
+        images.append(f"{number} {pose} {lenses.setdefault(lens, len(lenses) + 1)} {name}\n\n")
+    points = [
+        f"{number} {x:.9g} {y:.9g} {z:.9g} {r} {g} {b} 0\n"
+        for number, ((x, y, z), (r, g, b)) in enumerate(zip(positions.tolist(), colors.tolist(), strict=True), start=1)
+    ]
+    make_folder(folder)
+    _write(folder / "cameras.txt", [f"{number} {lens}\n" for lens, number in lenses.items()])
+    _write(folder / "images.txt", images)
+    _write(folder / "points3D.txt", points)
+
+
+def quat_wxyz(camera: Camera) -> list[float]:
+    """The camera's orientation, cam from world."""
+    from scipy.spatial.transform import Rotation  # Slow to import, and few runs need it.
+
+    x, y, z, w = Rotation.from_matrix(camera.cam_from_world[:3, :3].double().cpu().numpy()).as_quat().tolist()
+    return [w, x, y, z]
+
+
+def _write(path: Path, lines: list[str]) -> None:
+    with atomic_write(path) as temporary:
+        temporary.write_text("".join(lines), encoding="utf-8")
+
+
+FORMAT = "glassplat-environment-1"
+REGION = Nullable(Items(COORDINATE, 4))
+"""Centre and radius of the sphere that holds all that mirrors the environment."""
+
+
+def write_environment(path: Path | str, environment: Environment) -> None:
+    """Writes an environment, atomically; `read_environment` gives back the same bits.
+
+    Raises:
+        OSError: the file cannot be written; an older one is unchanged.
+    """
+    write_tensors(path, environment.tensors(), {"format": FORMAT, "region": environment.region})
+
+
+def read_environment(path: Path | str) -> Environment:
+    """Reads what `write_environment` wrote.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is truncated or foreign, or holds values that are not finite.
+    """
+    path = Path(path)
+    if not os.path.isfile(path):
+        raise FileNotFoundError(f"no environment at {path}; expected the environment.safetensors of a run")
+    with opened_tensors(path, FORMAT, "an environment") as file:
+        region = checked(file.header, {"region": Optional(REGION)}, f"the header of {path}")["region"]
+        raw = file.tensors().get("raw")
+    if raw is None or not (raw.is_floating_point() and bool(torch.isfinite(raw).all())):
+        raise ValueError(f"{path} holds no tensor `raw` of finite numbers; expected the texels of an environment")
+    try:
+        return Environment(raw, region)
+    except ValueError as error:
+        raise ValueError(f"{path} holds no environment: {error}") from error
+
+
+EXR, PNG = ".exr", ".png"
+
+
+def read_equirect(path: Path | str) -> Tensor:
+    """Reads a panorama, equirectangular with z up, as [H, 2H, 3] float32 sRGB in [0, 1].
+
+    An EXR file holds linear radiance with Rec. 709 primaries, of which what is brighter than white is clipped; a PNG
+    file holds sRGB. Where directions lie is said in docs/conventions.md.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: another format, cut off, without colour, not twice as wide as high, or a value that is not finite.
+    """
+    path = Path(path)
+    _check_suffix(path)
+    if not isfile(path):
+        raise FileNotFoundError(f"no panorama at {path}; expected an equirectangular image, {EXR} or {PNG}")
+    if path.suffix.lower() == EXR:
+        image = srgb_from_linear(torch.from_numpy(_read_exr(path)))
+    else:
+        image = torch.from_numpy(_color(read_image_float(path), path))
+    height, width = image.shape[:2]
+    if width != 2 * height:
+        raise ValueError(
+            f"{path} is {width} x {height} pixels; expected an equirectangular image, twice as wide as high"
+        )
+    if not bool(torch.isfinite(image).all()):
+        raise ValueError(f"{path} holds values that are not finite; expected radiance of at least 0")
+    return image.clamp(0, 1)
+
+
+def write_equirect(path: Path | str, image: Tensor) -> None:
+    """Writes a panorama [H, 2H, 3], sRGB in [0, 1], atomically: linear float32 radiance as EXR, sRGB in 8 bits as PNG.
+
+    Raises:
+        ValueError: another format, a wrong shape, or a value that is not finite.
+        OSError: the file cannot be written; an older one is unchanged.
+    """
+    path = Path(path)
+    _check_suffix(path)
+    if image.ndim != 3 or tuple(image.shape[1:]) != (2 * image.shape[0], 3) or image.shape[0] == 0:
+        raise ValueError(f"the panorama has shape {tuple(image.shape)}; expected (H, 2 H, 3)")
+    if not bool(torch.isfinite(image).all()):
+        raise ValueError("the panorama holds values that are not finite; expected sRGB in [0, 1]")
+    if path.suffix.lower() == PNG:
+        write_image(path, image)
+        return
+    import OpenEXR  # Only where there are such files.
+
+    radiance = linear_from_srgb(image.detach().cpu().double()).float().contiguous().numpy()
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with atomic_write(path) as temporary:
+        try:
+            OpenEXR.File(header, {"RGB": radiance}).write(str(temporary))
+        except RuntimeError as error:
+            raise OSError(str(error)) from error
+
+
+def _check_suffix(path: Path) -> None:
+    if path.suffix.lower() not in (EXR, PNG):
+        raise ValueError(f"cannot tell the format of the panorama {path}; use the suffix {EXR} or {PNG}")
+
+
+def _read_exr(path: Path) -> NDArray[np.float32]:
+    """Linear radiance [H, W, 3]."""
+    import OpenEXR  # As above.
+
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: channel.pixels for name, channel in file.channels().items()}
+    except (RuntimeError, ValueError) as error:
+        raise ValueError(f"cannot read {path} as OpenEXR ({error}); replace the file or remove it") from error
+    if not {"R", "G", "B"} <= channels.keys():
+        raise ValueError(f"{path} has the channels {sorted(channels)}; expected R, G and B")
+    return np.stack([channels[name] for name in "RGB"], axis=-1).astype(np.float32)
+
+
+def _color(pixels: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
+    """Pixels without transparency."""
+    if pixels.shape[2] < 3:
+        raise ValueError(f"{path} is grey; expected a panorama in colour")
+    return np.ascontiguousarray(pixels[:, :, :3])

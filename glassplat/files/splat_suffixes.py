@@ -1,3 +1,0 @@
-"""How the names of splat files end that are read."""
-
-SPLAT_SUFFIXES = (".ply", ".spz", ".glb", ".splat")

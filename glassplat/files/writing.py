@@ -1,0 +1,160 @@
+"""Files written completely or not at all, the folders for them, and tables as markdown."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from uuid import uuid4
+
+SPLAT_SUFFIXES = (".ply", ".spz", ".glb", ".splat")
+
+
+@contextmanager
+def atomic_write(path: Path | str) -> Iterator[Path]:
+    """Yield a temporary path next to `path`; on success it replaces `path` in one step.
+
+    The temporary file has the suffix of `path`, which may be a link to a file without it, so writers that pick a format
+    by suffix work unchanged. When the body raises (a
+    full disk, Ctrl-C), the temporary file is removed and an older file at `path` keeps its contents. Missing parent
+    folders are created.
+
+    Example:
+        with atomic_write(run / "results.json") as temporary:
+            temporary.write_text(json.dumps(results))
+
+    Raises:
+        OSError: the target cannot be written; the message names it. Keeps the subclass, such as PermissionError.
+    """
+    target = Path(os.path.realpath(path))
+    # Shortened, because a name that is as long as names may be leaves no room for more.
+    temporary = target.with_name(f".{target.stem[:32]}.{uuid4().hex[:12]}.tmp{Path(path).suffix[:32]}")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        _flush_to_disk(temporary)
+        os.replace(temporary, target)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        message = f"could not write {path} ({reason}); whatever was there before is unchanged"
+        raise (OSError(message) if error.errno is None else OSError(error.errno, message)) from error
+    finally:
+        with suppress(OSError):  # never hide the error above behind one from the clean-up
+            temporary.unlink()
+
+
+def _flush_to_disk(path: Path) -> None:
+    """Force the contents out, so that a crash cannot leave the new name on an empty file."""
+    descriptor = os.open(path, os.O_RDWR)  # Windows flushes only what may be written.
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+SCENE = "scene.json"
+"""The file by which a folder is known to hold a scene that was exported."""
+IN_THE_WAY = (errno.EEXIST, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
+
+
+def check_folder(path: Path) -> None:
+    """Look whether a folder is there or can be made, without making it.
+
+    Raises:
+        NotADirectoryError: it is a file, or its path goes through one.
+        PermissionError: nothing may be written there.
+    """
+    whole = Path(os.path.abspath(path))
+    found = next(folder for folder in (whole, *whole.parents) if os.path.lexists(folder))
+    if not found.is_dir():
+        kind = "a link that leads nowhere" if found.is_symlink() and not found.exists() else "a file"
+        where = "" if found == whole else f", so there can be no folder {path}"
+        raise NotADirectoryError(
+            f"{found} is {kind}{where}; expected a folder, or a name for a new one, for the output"
+        )
+    if not os.access(found, os.W_OK | os.X_OK):
+        raise PermissionError(f"nothing may be written in {found}; choose another folder for the output, or allow it")
+
+
+def check_capture_folder(path: Path) -> None:
+    """Look whether a folder is there that may be a capture.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    if not os.path.isdir(path):
+        raise FileNotFoundError(f"no folder {path}; expected the folder of a capture")
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder, with those above it, where there is none; where that fails, none of them is left.
+
+    Raises:
+        NotADirectoryError: something that is no folder is in the way, or it cannot have that name.
+        PermissionError: nothing may be written there.
+        OSError: the disk is full, or fails.
+    """
+    check_folder(path)
+    missing = missing_folders(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        remove_empty(missing)
+        if error.errno not in IN_THE_WAY:
+            raise
+        raise NotADirectoryError(
+            f"there can be no folder {path} ({error.strerror}); choose another folder for the output"
+        ) from error
+
+
+def missing_folders(path: Path) -> list[Path]:
+    """A folder and those above it, as far as they are not there, the innermost first."""
+    return [folder for folder in (path, *path.parents) if not os.path.lexists(folder)]
+
+
+def remove_empty(folders: Sequence[Path]) -> None:
+    """Removes those folders that hold nothing, the first one first."""
+    for folder in folders:
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def real_path(path: Path) -> Path:
+    """Where a path leads through links; one that goes round in circles stays what it is, unlike in `Path.resolve`."""
+    return Path(os.path.realpath(path))
+
+
+@dataclass
+class Table:
+    """A titled table that is filled row by row."""
+
+    title: str
+    columns: tuple[str, ...]
+    note: str = ""
+    rows: list[tuple[str, ...]] = field(default_factory=list)
+
+    def add(self, *cells: object) -> None:
+        """Adds a row; numbers are shown with three significant digits."""
+        if len(cells) != len(self.columns):
+            raise ValueError(f"a row of {len(cells)} cells for the columns {self.columns}")
+        self.rows.append(tuple(shown(cell) for cell in cells))
+
+    def markdown(self) -> str:
+        """The table as markdown."""
+        lines = [f"### {self.title}", ""]
+        if self.note:
+            lines += [self.note, ""]
+        lines += [_line(self.columns), _line(["---"] * len(self.columns)), *(_line(row) for row in self.rows)]
+        return "\n".join(lines) + "\n"
+
+
+def shown(cell: object) -> str:
+    """A cell's text."""
+    return f"{cell:.3g}" if isinstance(cell, float) else str(cell)
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"

@@ -1,1 +1,0 @@
-"""The first scene from data: points to Gaussians, masks to planes and glass."""

@@ -1,1 +1,0 @@
-"""Terms of the training objective, each `(frame, view, scene) -> scalar`."""

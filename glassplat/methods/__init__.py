@@ -1,0 +1,1 @@
+"""Methods: how each trains, and with which options."""

@@ -1,0 +1,214 @@
+"""Training of `deferred`: 3D Gaussian Splatting with Deferred Reflection."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+
+from glassplat.captures.dataset import Dataset
+from glassplat.methods.mirrors import (
+    DensifyWhilePropagating,
+    GrowShAfterPropagation,
+    Propagate,
+    RefineEnvironment,
+    ResetRaised,
+)
+from glassplat.methods.splat import image_terms
+from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.methods.surroundings import AddEnvironment, BeginReflections, StayMatte
+from glassplat.options import BLACK
+from glassplat.render.deferred import INVISIBLE, Deferred
+from glassplat.render.splat import Splat
+from glassplat.scene.activations import logit
+from glassplat.scene.scene import Scene
+from glassplat.training.actions import Densify, GrowSh, Population, ResetOpacity, population_of
+from glassplat.training.corrections import exposures_begun, exposures_learnt, poses_begun, poses_learnt
+from glassplat.training.losses import (
+    LossTerm,
+    MonocularNormals,
+    mean_strength,
+    normal_consistency,
+    strength_outside,
+    weighted,
+)
+from glassplat.training.options import PUBLISHED_ITERATIONS, GaussianRates, Rate, Rhythm
+from glassplat.training.stage import Action, Every, Stage
+
+if TYPE_CHECKING:
+    from glassplat.methods.glossy_recipes import DeferredRecipe
+
+
+def first_scene(recipe: DeferredRecipe, dataset: Dataset) -> Scene:
+    """The first scene: one Gaussian per point that hardly reflects, and no environment yet."""
+    primary = _population(recipe).initial(dataset.points, recipe.sh_degree)
+    strengths = torch.full((len(primary),), logit(recipe.first_strength))
+    primary = replace(primary, channels={"logit_strength": strengths})
+    scene = Scene(primary, dataset.extent)
+    return poses_begun(recipe.poses, exposures_begun(recipe.exposure, scene, dataset), dataset)
+
+
+def finished_renderer(recipe: DeferredRecipe) -> Deferred:
+    """The renderer of the finished scene, with all its layers."""
+    return Deferred(recipe.background or BLACK, recipe.shading, least_strength=INVISIBLE)
+
+
+def stages_of(recipe: DeferredRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
+    """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has one stage."""
+    short = iterations < recipe.least_iterations
+    stages = _matte_stages(recipe, seed, iterations) if short else _reflecting_stages(recipe)
+    return poses_learnt(recipe.poses, exposures_learnt(recipe.exposure, stages))
+
+
+def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
+    """Those of a run that is long enough for normals to spread."""
+    population = _population(recipe)
+    image = image_terms(recipe.ssim_weight, recipe.view_dependence_weight)
+    bootstrap = Stage(
+        name="1 bootstrap",
+        share=recipe.bootstrap,
+        renderer=Splat(recipe.background or BLACK, depth=False),
+        losses=(*image, *population.terms),
+        rates=(_rates_of_splat(recipe) if recipe.search.begin_found else recipe.rates).of("primary"),
+        actions=(*population.edits, *_regular(recipe, population)),
+        motions=population.motions,
+        densify_until=population.densify_until,
+    )
+    beat = Every(recipe.rhythm.beat, 0.0, recipe.schedule.stop, recipe.rhythm.least, skip_multiples_of=3)
+    renderer = Deferred(recipe.background or BLACK, recipe.shading, depth=recipe.consistency_weight != 0)
+    guidance = weighted(
+        LossTerm("outside", recipe.outside_weight, strength_outside),
+        LossTerm("strength", recipe.strength_weight, mean_strength),
+        LossTerm("consistency", recipe.consistency_weight, normal_consistency),
+        LossTerm("monocular normals", recipe.monocular_weight, MonocularNormals()),
+    )
+    reflection = Stage(
+        name="2 reflection",
+        share=recipe.schedule.stop - recipe.bootstrap,
+        renderer=renderer,
+        losses=(*image, *guidance, *population.terms),
+        rates=recipe.rates.of("primary") | recipe.reflection_rates.of(),
+        actions=(
+            *_edits(recipe, population),
+            # Before the resets: it looks at what is seen, also at the beats that it leaves to them.
+            _propagate(recipe, beat, renderer),
+            GrowShAfterPropagation(Every(recipe.rhythm.sh)),
+            *_resets(recipe, population),
+            RefineEnvironment(_doublings(recipe), recipe.texels),
+        ),
+        motions=population.motions,
+        entry=first_reflections(recipe),
+        densify_until=population.densify_until,
+    )
+    refinement = replace(
+        reflection,
+        entry=None,
+        name="3 refinement",
+        share=1 - recipe.schedule.stop,
+        renderer=Deferred(recipe.background or BLACK, recipe.shading, depth=False),
+        losses=tuple(term for term in reflection.losses if term.name != "consistency"),
+    )
+    return bootstrap, reflection, refinement
+
+
+def _matte_stages(recipe: DeferredRecipe, seed: int, iterations: int) -> tuple[Stage, ...]:
+    """The one stage of a run that is too short for normals to spread: that of `splat`."""
+    usual = Rhythm()
+    plain = SplatRecipe(
+        sh_degree=recipe.sh_degree,
+        ssim_weight=recipe.ssim_weight,
+        view_dependence_weight=recipe.view_dependence_weight,
+        background=recipe.background,
+        rates=_rates_of_splat(recipe),
+        rhythm=replace(recipe.rhythm, beat=usual.beat, least=usual.least),
+        strategy=recipe.strategy,
+        densify=recipe.densify,
+        mcmc=recipe.mcmc,
+    )
+    (stage,) = plain.stages(seed)
+    entry = StayMatte(iterations, recipe.least_iterations, _environment(recipe))
+    return (replace(stage, name="as splat", entry=entry),)
+
+
+def _rates_of_splat(recipe: DeferredRecipe) -> GaussianRates:
+    """The learning rates where nothing reflects that higher ones would spoil."""
+    return (
+        replace(recipe.rates, short_run_power=GaussianRates().short_run_power) if recipe.hurry_matte else recipe.rates
+    )
+
+
+def _regular(recipe: DeferredRecipe, population: Population) -> tuple[Action, ...]:
+    """What happens in the bootstrap as in `splat`: a scene has to look right for mirrors to be told from it."""
+    return (GrowSh(Every(recipe.rhythm.sh)), *population.resets) if recipe.search.begin_found else ()
+
+
+def first_reflections(recipe: DeferredRecipe) -> BeginReflections:
+    """How things begin to reflect."""
+    seen_by = Splat(recipe.background or BLACK, depth=False)
+    return BeginReflections(_environment(recipe), None, recipe.search, seen_by, harmonics_wait=True)
+
+
+def _environment(recipe: DeferredRecipe) -> AddEnvironment:
+    """What is mirrored."""
+    return AddEnvironment(min(recipe.first_texels, recipe.texels), recipe.region, recipe.find_region)
+
+
+def _doublings(recipe: DeferredRecipe) -> tuple[float, ...]:
+    """The shares of the run at which the environment's edge length doubles."""
+    return doublings(recipe.first_texels, recipe.texels, recipe.refinements)
+
+
+def _edits(recipe: DeferredRecipe, population: Population) -> tuple[Action, ...]:
+    """What changes the number of Gaussians once they reflect."""
+    if recipe.propagation_interval is None or recipe.strategy == "mcmc":
+        return population.edits
+    slow = replace(recipe.densify, interval=recipe.propagation_interval)
+    return tuple(
+        DensifyWhilePropagating(slow, regular=edit) if isinstance(edit, Densify) else edit for edit in population.edits
+    )
+
+
+def _resets(recipe: DeferredRecipe, population: Population) -> tuple[ResetOpacity, ...]:
+    """The resets during and after propagation."""
+    if not recipe.schedule.last_reset:
+        return population.resets
+    return tuple(ResetRaised.instead_of(reset) for reset in population.resets)
+
+
+def _propagate(recipe: DeferredRecipe, beat: Every, renderer: Deferred) -> Propagate:
+    return Propagate(
+        beat,
+        recipe.propagation,
+        recipe.schedule,
+        renderer,
+        matte_rates=_matte_rates(recipe),
+        hurries_found=recipe.hurry_found,
+    )
+
+
+def _matte_rates(recipe: DeferredRecipe) -> dict[str, Rate]:
+    """What brings the learning rates to those of `splat`, where nothing reflects that higher ones would spoil."""
+    if not recipe.hurry_matte:
+        return {}
+    missing = GaussianRates().short_run_power - recipe.rates.short_run_power
+    return {
+        name: Rate(1.0, short_run_power=missing)
+        for name, rate in GaussianRates().of("primary").items()
+        if rate.short_run_power
+    }
+
+
+def _population(recipe: DeferredRecipe) -> Population:
+    means_rate = recipe.rates.of("primary")["primary.means"]
+    return population_of(
+        recipe.strategy, default=recipe.densify, mcmc=recipe.mcmc, rhythm=recipe.rhythm, means_rate=means_rate
+    )
+
+
+def doublings(first_texels: int, texels: int, refinements: tuple[float, float]) -> tuple[float, ...]:
+    """The shares of the run, evenly from a first to a last one, at which an edge length doubles until it is reached."""
+    count = max(math.ceil(math.log2(texels / first_texels)), 0)
+    first, last = refinements
+    return tuple(first + (last - first) * number / max(count - 1, 1) for number in range(count))

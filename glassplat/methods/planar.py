@@ -1,0 +1,399 @@
+"""Training of `planar`: TR-Gaussians in three stages."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from glassplat.captures.dataset import Dataset
+from glassplat.methods.splat import image_terms
+from glassplat.options import BLACK
+from glassplat.panes.fit import fit_planes, with_mirrors
+from glassplat.panes.material import glass_gaussians, mirrored_coverage, mirrors_among, pane_pixels, virtual_points
+from glassplat.panes.options import PlaneFit, PlaneFitError
+from glassplat.render.planar import Planar
+from glassplat.render.splat import Splat
+from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import mirrored_gaussians
+from glassplat.scene.panes import Planes, coplanar_groups
+from glassplat.scene.scene import Scene
+from glassplat.training.actions import Densify, GrowSh, PerturbOpacity, Population, ResetOpacity, population_of
+from glassplat.training.corrections import (
+    exposures_begun,
+    exposures_learnt,
+    photographer_learnt,
+    poses_begun,
+    poses_learnt,
+)
+from glassplat.training.densify import append, apply_edit, keep
+from glassplat.training.losses import (
+    LossTerm,
+    depth_deviation_loss,
+    gradient_conflict,
+    intensity_departure,
+    mask_loss,
+    tint_departure,
+    weighted,
+)
+from glassplat.training.messages import Working
+from glassplat.training.options import PUBLISHED_ITERATIONS, Rate
+from glassplat.training.points import gaussians_from_points
+from glassplat.training.stage import Clock, Every, Motion, Stage, TrainState, Work
+
+if TYPE_CHECKING:
+    from glassplat.methods.planar_recipe import PlanarRecipe, ReflectionWeights
+
+log = logging.getLogger("glassplat.training")
+
+LEAST_COVERAGE = 0.5
+"""Where the panes mirror less than this share of what they could, the photographs do not show the room directly."""
+
+
+@dataclass(frozen=True)
+class PlaneEntry:
+    """Fits the planes and places the glass when reflections begin (Appendix A).
+
+    Attributes:
+        fit: how planes are found.
+        glass_count: glass Gaussians on each pane.
+        seed: of the glass Gaussians' places.
+        detect_mirrors: tell mirrors from glass, unless `fit` names the mirrors.
+        fixed_mirrors: mirrors keep their reflectance, and what is behind them moves to their front; if not, they only
+            start at that reflectance.
+        seed_reflections: start what no photograph shows directly from the virtual points behind the panes.
+        tint: whether panes may be tinted.
+    """
+
+    fit: PlaneFit
+    glass_count: int
+    seed: int
+    detect_mirrors: bool = True
+    fixed_mirrors: bool = True
+    seed_reflections: bool = True
+    tint: bool = False
+
+    def __call__(self, state: TrainState, dataset: Dataset) -> Work:
+        """Edits `state`, and tells how far it is."""
+        yield Working("fitting planes to the masks", 0, 1)
+        planes = fitted_planes(dataset, state.scene.primary.means, self.fit)
+        glass = glass_gaussians(planes, count=self.glass_count, seed=self.seed)
+        scene = replace(state.scene, planes=planes, glass=glass)
+        if self.detect_mirrors and not self.fit.mirror_labels:
+            planes = yield from self._with_mirrors_found(scene, dataset)
+        if not self.fixed_mirrors:
+            planes = replace(planes, mirrors=())
+        state.scene = replace(scene, planes=planes.that_may_tint() if self.tint else planes)
+        state.statistics.clear()
+        for mirrors in surfaces(planes, mirrors=True):
+            yield Working(f"moving what was built behind {named(mirrors, 'mirror')}", 0, 1)
+            turn_virtual_scene_round(state, dataset, mirrors)
+        for panes in surfaces(planes, mirrors=False) if self.seed_reflections else ():
+            yield from seed_reflection(state, dataset, panes)
+        return True
+
+    def _with_mirrors_found(self, scene: Scene, dataset: Dataset) -> Generator[Working, None, Planes]:
+        """The scene's planes, with those as mirrors that look like it; of given ones the capture says what they are."""
+        given = Planes.empty() if dataset.planes is None else dataset.planes
+        told = [label for label in scene.planes.labels if label in given.labels]
+        if len(told) == len(scene.planes):
+            return scene.planes
+        found = yield from mirrors_found(scene, dataset)
+        mirrors = tuple(label for label in found if label not in told)
+        log.info("mirrors among the panes: %s", ", ".join(map(str, mirrors)) or "none")
+        return with_mirrors(scene.planes, (*given.mirrors, *mirrors), self.fit.mirror_reflectance)
+
+
+def glass_only_darkens(state: TrainState, clock: Clock, visible: Tensor | None) -> None:
+    """Takes logarithms of transmittances that a step has led above 0 back to it: glass adds no light."""
+    logarithms = state.scene.planes.log_transmittances
+    if logarithms is not None:
+        logarithms.detach().clamp_(max=0)
+
+
+def fitted_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Planes:
+    """The planes of all panes: those that the capture gives, and those that only its masks name, fitted to them.
+
+    Args:
+        dataset: the capture.
+        centers: [N, 3] those of Gaussians; None fits to the capture's own points.
+        fit: how planes are found.
+
+    Raises:
+        PlaneFitError: the masks do not do.
+    """
+    given = Planes.empty() if dataset.planes is None else _as_given(dataset.planes, fit)
+    labels = [label for label in dataset.pane_labels if label not in given.labels]
+    if not labels and len(given):
+        return given if centers is None else given.to(centers.device)
+    shown = [(view.name, view.camera, view.pane_labels) for view in dataset.train if view.pane_labels is not None]
+    points = dataset.points.positions
+    fitted = fit_planes(
+        points if centers is None else centers,
+        [(camera, labels) for _, camera, labels in shown],
+        extent=dataset.extent,
+        measured=points if dataset.measured_points and centers is not None else None,
+        names=[name for name, _, _ in shown],
+        labels=labels or None,
+        options=fit,
+    )
+    return fitted if not len(given) else given.to(fitted.centers.device).joined(fitted)
+
+
+def _as_given(planes: Planes, fit: PlaneFit) -> Planes:
+    """Given rectangles with the margin that fitted ones get, and mirrors as mirrors."""
+    mirrors = tuple(dict.fromkeys((*planes.mirrors, *fit.mirror_labels)))
+    log.info("panes %s lie where the capture's planes.json says", ", ".join(map(str, planes.labels)))
+    return with_mirrors(replace(planes, half_sizes=fit.margin * planes.half_sizes), mirrors, fit.mirror_reflectance)
+
+
+def mirrors_found(scene: Scene, dataset: Dataset) -> Generator[Working, None, tuple[int, ...]]:
+    """Labels of the panes that look like mirrors in the annotated views."""
+    annotated = [view for view in dataset.train if view.is_annotated]
+    pairs = []
+    for done, view in enumerate(annotated):
+        yield Working("telling mirrors from glass", done, len(annotated))
+        pairs.append(pane_pixels(scene, view))
+    return mirrors_among(scene.planes.labels, pairs)
+
+
+def surfaces(planes: Planes, *, mirrors: bool) -> list[Planes]:
+    """The mirrors, or the panes that are none, those in one plane together.
+
+    Behind one pane of a glass front lies what is mirrored in it and its neighbours: most views show it through these.
+    """
+    rows = [row for row, label in enumerate(planes.labels) if (label in planes.mirrors) == mirrors]
+    return [planes.select(group) for group in coplanar_groups(planes, rows)]
+
+
+def named(panes: Planes, kind: str) -> str:
+    """What messages call panes: "pane 2", "panes 2, 3"."""
+    labels = ", ".join(map(str, sorted(panes.labels)))
+    return f"{kind}s {labels}" if len(panes) > 1 else f"{kind} {labels}"
+
+
+def reflects_little(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Work:
+    """Whether Gaussians cover hardly anything of what panes could mirror; False where no view shows any."""
+    covered, whole = 0.0, 0
+    for done, camera in enumerate(cameras):
+        yield Working(f"looking for what {named(panes, 'pane')} can mirror", done, len(cameras))
+        of_view, pixels = mirrored_coverage(scene, panes, camera)
+        covered, whole = covered + of_view, whole + pixels
+    return covered < LEAST_COVERAGE * whole
+
+
+def turn_virtual_scene_round(state: TrainState, dataset: Dataset, mirrors: Planes) -> None:
+    """Moves what the first stage built behind a mirror, or several in one plane, to where it really is, in front."""
+    primary, moments = state.scene.primary, state.optimizer.moments
+    virtual = virtual_points(primary.means, mirrors, [view.camera for view in dataset.train])
+    if not bool(virtual.any()):
+        return
+    turned = mirrored_gaussians(primary.select(virtual), mirrors.centers[0], mirrors.normals[0])
+    primary, moments = apply_edit(primary, moments, keep(~virtual))
+    primary, state.optimizer.moments = append(primary, moments, turned)
+    state.scene = replace(state.scene, primary=primary)
+    log.info("%d Gaussians behind %s moved to the front", int(virtual.sum()), named(mirrors, "mirror"))
+
+
+def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
+    """Adds the mirror images of the measured points behind panes in one plane, if these hardly have a thing to mirror.
+
+    Structure from motion places points on reflected things where they seem to be, behind the pane. In a capture from
+    the front these are the only trace of what is reflected; the true points behind the pane, mirrored along, are
+    wrong and fade.
+    """
+    cameras = [view.camera for view in dataset.train]
+    # The coverage is rendered over all views, so it comes last.
+    if not dataset.measured_points or not (yield from reflects_little(state.scene, panes, cameras)):
+        return False
+    points = dataset.points
+    device = panes.centers.device
+    virtual = virtual_points(points.positions.to(device), panes, cameras).cpu()
+    if not bool(virtual.any()):
+        return False
+    behind = replace(points, positions=points.positions[virtual], colors=points.colors[virtual])
+    primary = state.scene.primary
+    seeds = gaussians_from_points(behind, sh_degree=primary.max_sh_degree).to(device)
+    seeds = replace(seeds, active_sh_degree=primary.active_sh_degree)
+    seeds = mirrored_gaussians(seeds, panes.centers[0], panes.normals[0])
+    primary, state.optimizer.moments = append(primary, state.optimizer.moments, seeds)
+    state.scene = replace(state.scene, primary=primary)
+    log.info("no photograph shows what is mirrored by %s: %d points behind mirrored", named(panes, "pane"), len(seeds))
+    return True
+
+
+def first_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
+    """The first scene: one Gaussian per point, no planes yet.
+
+    Raises:
+        PlaneFitError: the masks do not do. The planes are fitted to the measured points once and forgotten,
+            because a bad mask should end a run before the first iteration and not at the second stage.
+    """
+    if not dataset.pane_labels and dataset.planes is None:
+        raise PlaneFitError(
+            f"{_lack_of_masks(dataset)}, and planar needs to know where the panes are: expected masks of 3 to "
+            f"10 photographs in {dataset.root / 'masks'}, named <photograph's name>.png, each pixel the label 1, "
+            "2, ... of a pane, or 0 (`glassplat annotate` writes them). `glassplat train splat` needs none"
+        )
+    if dataset.measured_points:
+        fitted_planes(dataset, None, recipe.plane_fit)
+    scene = Scene(planar_population(recipe).initial(dataset.points, recipe.sh_degree), dataset.extent)
+    return poses_begun(recipe.poses, exposures_begun(recipe.exposure, scene, dataset), dataset)
+
+
+def _lack_of_masks(dataset: Dataset) -> str:
+    count = sum(view.is_annotated for view in (*dataset.train, *dataset.test))
+    return f"none of the {count} masks of {dataset.root} names a pane" if count else f"{dataset.root} has no masks"
+
+
+def finished_renderer(recipe: PlanarRecipe) -> Planar:
+    """The renderer of the finished scene, with all its layers."""
+    return Planar(
+        recipe.background or BLACK,
+        fresnel=recipe.fresnel,
+        intensity=recipe.intensity,
+        blend=recipe.blend,
+        nearest_only=recipe.panes == "nearest",
+    )
+
+
+def stages_of(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
+    """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
+    first, second, third = recipe.stage_shares
+    population = planar_population(recipe)
+    entry = PlaneEntry(
+        recipe.plane_fit,
+        recipe.glass_count,
+        seed,
+        detect_mirrors=recipe.detect_mirrors,
+        fixed_mirrors=recipe.fixed_mirrors,
+        seed_reflections=recipe.seed_reflections,
+        tint=recipe.tint,
+    )
+    initialisation = Stage(
+        name="1 initialisation",
+        share=first,
+        renderer=Splat(recipe.background or BLACK, depth=False),
+        losses=(*image_terms(recipe.ssim_weight, recipe.view_dependence_weight), *population.terms),
+        rates=recipe.rates.of("primary"),
+        actions=(*population.edits, GrowSh(Every(recipe.rhythm.sh)), *_early_resets(recipe, population)),
+        motions=population.motions,
+        densify_until=population.densify_until,
+    )
+    if not recipe.multi_stage:
+        stages: tuple[Stage, ...] = (initialisation, replace(_joint(recipe, second + third), entry=entry))
+    else:
+        stages = (initialisation, _adjustment(recipe, second, entry), _joint(recipe, third))
+    stages = photographer_learnt(recipe.photographer, stages, recipe.densify, seed)
+    return poses_learnt(recipe.poses, exposures_learnt(recipe.exposure, stages))
+
+
+def _adjustment(recipe: PlanarRecipe, share: float, entry: PlaneEntry) -> Stage:
+    """Stage 2: the reflection's gradient reaches the planes, not the Gaussians."""
+    population = planar_population(recipe)
+    return Stage(
+        name="2 plane adjustment",
+        share=share,
+        renderer=_training_renderer(recipe, "planes"),
+        losses=_joint_terms(recipe, population),
+        rates=recipe.rates.of("primary") | recipe.rates.of("glass") | recipe.plane_rates.of(1.0),
+        actions=(
+            *population.edits,
+            GrowSh(Every(recipe.rhythm.sh)),
+            Densify(recipe.densify, part="glass"),
+            *_early_resets(recipe, population),
+            *_clearing(recipe),
+        ),
+        motions=(*_glass_motions(recipe), *population.motions),
+        entry=entry,
+        densify_until=recipe.densify.stop,
+    )
+
+
+def _joint(recipe: PlanarRecipe, share: float) -> Stage:
+    """Stage 3: everything learns, opacities are perturbed, planes move slowly."""
+    population = planar_population(recipe)
+    beat = Every(recipe.rhythm.beat, 0.0, recipe.perturbation.stop, recipe.rhythm.least, skip_multiples_of=3)
+    return Stage(
+        name="3 joint optimisation",
+        share=share,
+        renderer=_training_renderer(recipe, "all"),
+        losses=_joint_terms(recipe, population),
+        rates=recipe.rates.of("primary")
+        | recipe.rates.of("glass")
+        | recipe.plane_rates.of(recipe.plane_rates.joint_factor)
+        | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {}),
+        actions=(
+            *population.edits,
+            GrowSh(Every(recipe.rhythm.sh)),
+            Densify(recipe.densify, part="glass"),
+            *population.resets,
+            *_clearing(recipe),
+            PerturbOpacity(beat, recipe.perturbation.amplitude, recipe.perturbation.bounds),
+        ),
+        motions=(*_glass_motions(recipe), *population.motions),
+        densify_until=recipe.densify.stop,
+    )
+
+
+def _glass_motions(recipe: PlanarRecipe) -> tuple[Motion, ...]:
+    """What keeps transmittances possible; before the means of the last passes are taken."""
+    return (glass_only_darkens,) if recipe.tint else ()
+
+
+def _joint_terms(recipe: PlanarRecipe, population: Population) -> tuple[LossTerm, ...]:
+    image = image_terms(recipe.ssim_weight, recipe.view_dependence_weight)
+    glass = weighted(LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, tint_departure))
+    return (*image, *reflection_terms(recipe.weights), *glass, *population.terms)
+
+
+def planar_population(recipe: PlanarRecipe) -> Population:
+    """What the strategy adds to every stage; under `mcmc` the set grows late unless the recipe says otherwise."""
+    means_rate = recipe.rates.of("primary")["primary.means"]
+    start = recipe.mcmc.start if recipe.early_growth else max(recipe.mcmc.start, _joint_start(recipe))
+    mcmc = replace(recipe.mcmc, start=start)
+    return population_of(
+        recipe.strategy, default=recipe.densify, mcmc=mcmc, rhythm=recipe.rhythm, means_rate=means_rate
+    )
+
+
+def _early_resets(recipe: PlanarRecipe, population: Population) -> tuple[ResetOpacity, ...]:
+    """The resets of the first two stages, if there are to be any."""
+    return population.resets if recipe.early_resets else ()
+
+
+def _clearing(recipe: PlanarRecipe) -> tuple[ResetOpacity, ...]:
+    """The one reset under `mcmc`, where joint optimisation begins; `default` has its own."""
+    # A second one would come after the stop.
+    once = Every(_joint_start(recipe), stop=1.5 * _joint_start(recipe))
+    return (ResetOpacity(once),) if recipe.strategy == "mcmc" and not recipe.early_growth else ()
+
+
+def _joint_start(recipe: PlanarRecipe) -> float:
+    """Share of the run after which all three parts learn together."""
+    first, second, third = recipe.stage_shares
+    return (first + second) / (first + second + third)
+
+
+def _training_renderer(recipe: PlanarRecipe, gradient: str) -> Planar:
+    return replace(
+        finished_renderer(recipe),
+        reflection_gradient="all" if gradient == "all" else "planes",
+        deviation=recipe.weights.depth != 0,
+        deviation_depth_gradient=recipe.moving_mean,
+        tells_mirrored=recipe.densify_by == "direct",
+        gate=recipe.weights.gate if gradient == "all" else 0.0,
+    )
+
+
+def reflection_terms(weights: ReflectionWeights) -> tuple[LossTerm, ...]:
+    """The terms whose weight is not zero."""
+    return weighted(
+        LossTerm("depth", weights.depth, depth_deviation_loss),
+        LossTerm("conflict", weights.conflict, gradient_conflict),
+        LossTerm("mask", weights.mask, mask_loss),
+        LossTerm("intensity", weights.intensity, intensity_departure),
+    )

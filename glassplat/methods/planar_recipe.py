@@ -1,0 +1,204 @@
+"""The recipe of `planar`: TR-Gaussians in three stages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+from glassplat.kernels.fresnel import Fresnel
+from glassplat.options import (
+    ESSENTIAL,
+    Ascending,
+    Blend,
+    Color,
+    InnerShare,
+    Internal,
+    NotNegative,
+    Positive,
+    Range,
+    Share,
+    ShDegree,
+)
+from glassplat.panes.options import PlaneFit
+from glassplat.training.options import (
+    PUBLISHED_ITERATIONS,
+    DefaultDensify,
+    GaussianRates,
+    McmcDensify,
+    PhotoExposure,
+    Photographer,
+    PlaneRates,
+    PoseRefinement,
+    Rhythm,
+    Strategy,
+)
+
+if TYPE_CHECKING:
+    from glassplat.captures.dataset import Dataset
+    from glassplat.render.planar import Planar
+    from glassplat.scene.scene import Scene
+    from glassplat.training.stage import Stage
+
+
+@dataclass(frozen=True)
+class ReflectionWeights:
+    """Weights of the terms that tell reflection from transmission (TR-Gaussians, Eq. 17).
+
+    Attributes:
+        depth: of the depth deviation behind panes (Eq. 14).
+        conflict: of edges that transmission and reflection share (Eq. 15).
+        mask: of the difference between glass and annotation (Eq. 16).
+        intensity: of the departure of a(u) from one, which the paper leaves free.
+        gate: not of a term: how much the gradient of the transmission is held back where panes mirror edges.
+    """
+
+    depth: NotNegative = 0.005
+    conflict: NotNegative = 0.2
+    mask: NotNegative = 0.5
+    intensity: NotNegative = 0.05
+    gate: NotNegative = 70.0
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """When and how much the opacity of what lies behind a pane is perturbed (Section III-C3).
+
+    It happens at the beats of `Rhythm` that do not reset the opacities.
+
+    Attributes:
+        amplitude: half width of the uniform noise on the opacity; 0 switches it off.
+        stop: share of the run after which nothing is perturbed any more.
+        bounds: of the new opacities. The paper does not give them; the lower one lies above the pruning threshold, so
+            that what was wrongly lowered can return.
+    """
+
+    amplitude: Share = 0.4
+    stop: Internal[Share] = 0.8
+    bounds: Internal[Annotated[tuple[InnerShare, InnerShare], Ascending()]] = (0.01, 0.99)
+
+
+@dataclass(frozen=True)
+class PlanarRecipe:
+    """TR-Gaussians: transmission, reflection and planes, trained in three stages.
+
+    Attributes:
+        sh_degree: highest degree of the view-dependent colour.
+        ssim_weight: lambda, share of D-SSIM in the photometric loss.
+        view_dependence_weight: of the squares of the spherical harmonics beyond the constant one. Mirrored views see
+            Gaussians from where no photograph does, so that harmonics extrapolate; the paper has no such term.
+        background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
+        stage_shares: lengths of the three stages in relation to each other (paper: 3000, 3000 and 24,000 iterations).
+        multi_stage: False skips stage 2 (ablation).
+        fresnel: how the strength rises with the angle: as that of a pane with two surfaces, by Schlick's curve of one
+            surface as in the paper, or not at all (ablation).
+        intensity: False drops the reflection intensity a(u) (ablation).
+        blend: space in which transmission and reflection are blended: linear radiance, or sRGB as in the paper.
+        panes: which panes on a ray reflect: all of them, one behind the other, or the nearest one as in the paper.
+        detect_mirrors: treat panes that look like mirrors as mirrors, unless `plane_fit` names the mirrors.
+        fixed_mirrors: mirrors keep their reflectance, and what the first stage built behind them moves to their front;
+            if not, they only start at that reflectance, as in the paper.
+        seed_reflections: start what no photograph shows directly from the virtual points behind the panes.
+        tint: panes may be tinted: each learns what share of red, green and blue light gets through (not in the paper).
+        tint_weight: of the mean square of the logarithm of that share in the objective.
+        glass_count: glass Gaussians placed on each pane.
+        weights: of the loss terms; zero switches a term off (ablation).
+        perturbation: of opacities; amplitude zero switches it off (ablation).
+        moving_mean: let the gradient of the depth deviation pass through the mean depth too, as Eq. 14 is written; if
+            not, Gaussians are drawn to the mean, and the mean not to them.
+        rates: learning rates of the Gaussians.
+        plane_rates: learning rates of planes and glass.
+        plane_fit: how planes are found from masks.
+        rhythm: when opacities are reset and the SH degree grows.
+        strategy: what decides how many primary Gaussians there are and where: densification, or MCMC (Eq. 20), under
+            which the set grows in the joint stage only, and opacities are reset once before it.
+        early_growth: under `mcmc`, let the set grow from the first stage on, and reset no opacities, as in the paper.
+            Many Gaussians then build the reflected room behind the panes, and no pruning removes it later.
+        early_resets: reset opacities in the first two stages too, at the beats of the third, as in the paper.
+        densify_by: the views by which primary Gaussians are densified: those that show them directly, or their mirror
+            images where none does, each counting by what panes leave of it; or all views and mirror images alike.
+        densify: when and how Gaussians are added and pruned under `default`.
+        mcmc: when and how Gaussians are relocated and added under `mcmc`.
+        exposure: whether the exposure of each photograph is learned.
+        poses: whether the camera of each photograph is corrected.
+        photographer: whether panes show who took the photographs.
+    """
+
+    method: ClassVar[str] = "planar"
+
+    sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
+    ssim_weight: Share = 0.2
+    view_dependence_weight: NotNegative = 0.1
+    background: Annotated[Color | None, ESSENTIAL] = None
+    stage_shares: Internal[tuple[Positive, Positive, Positive]] = (0.1, 0.1, 0.8)
+    multi_stage: Internal[bool] = True
+    fresnel: Internal[Fresnel] = "pane"
+    intensity: Internal[bool] = True
+    blend: Internal[Blend] = "linear"
+    panes: Internal[Literal["all", "nearest"]] = "all"
+    detect_mirrors: Annotated[bool, ESSENTIAL] = True
+    fixed_mirrors: Internal[bool] = True
+    seed_reflections: Internal[bool] = True
+    tint: bool = False
+    tint_weight: NotNegative = 0.01
+    glass_count: Annotated[int, Range(1, 1_000_000)] = 1000
+    weights: ReflectionWeights = field(default_factory=ReflectionWeights)
+    moving_mean: Internal[bool] = False
+    perturbation: Perturbation = field(default_factory=Perturbation)
+    rates: GaussianRates = field(default_factory=GaussianRates)
+    plane_rates: Internal[PlaneRates] = field(default_factory=PlaneRates)
+    plane_fit: PlaneFit = field(default_factory=PlaneFit)
+    rhythm: Rhythm = field(default_factory=Rhythm)
+    strategy: Annotated[Strategy, ESSENTIAL] = "default"
+    early_growth: Internal[bool] = False
+    early_resets: Internal[bool] = False
+    densify_by: Internal[Literal["direct", "all"]] = "direct"
+    densify: DefaultDensify = field(default_factory=DefaultDensify)
+    mcmc: McmcDensify = field(default_factory=McmcDensify)
+    exposure: PhotoExposure = field(default_factory=PhotoExposure)
+    poses: PoseRefinement = field(default_factory=PoseRefinement)
+    photographer: Photographer = field(default_factory=Photographer)
+
+    @classmethod
+    def paper(cls) -> PlanarRecipe:
+        """As published, as far as the paper says; docs/planar.md lists what it leaves open."""
+        return cls(
+            view_dependence_weight=0.0,
+            fresnel="schlick",
+            blend="srgb",
+            panes="nearest",
+            detect_mirrors=False,
+            fixed_mirrors=False,
+            seed_reflections=False,
+            weights=ReflectionWeights(intensity=0.0, gate=0.0),
+            moving_mean=True,
+            perturbation=Perturbation(stop=29 / 30, bounds=(1e-6, 1 - 1e-6)),
+            rates=GaussianRates(short_run_power=0.0),
+            rhythm=Rhythm(averaged_passes=0.0),
+            early_growth=True,
+            early_resets=True,
+            densify_by="all",
+            densify=DefaultDensify.published(),
+            mcmc=McmcDensify.published(),
+        )
+
+    def initialise(self, dataset: Dataset) -> Scene:
+        """The first scene: one Gaussian per point, no planes yet.
+
+        Raises:
+            PlaneFitError: the masks do not do.
+        """
+        from glassplat.methods.planar import first_scene
+
+        return first_scene(self, dataset)
+
+    def renderer(self) -> Planar:
+        """The renderer of the finished scene, with all its layers."""
+        from glassplat.methods.planar import finished_renderer
+
+        return finished_renderer(self)
+
+    def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
+        """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
+        from glassplat.methods.planar import stages_of
+
+        return stages_of(self, seed, iterations)

@@ -1,0 +1,88 @@
+"""Training of `splat`: 3D Gaussian Splatting, or 2D Gaussian Splatting with discs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from glassplat.captures.dataset import Dataset
+from glassplat.options import BLACK
+from glassplat.render.splat import Splat
+from glassplat.scene.scene import Scene
+from glassplat.training.actions import GrowSh, Population, population_of
+from glassplat.training.corrections import exposures_begun, exposures_learnt, poses_begun, poses_learnt
+from glassplat.training.losses import LossTerm, PhotometricLoss, disc_normals, distortion, view_dependence, weighted
+from glassplat.training.options import PUBLISHED_ITERATIONS
+from glassplat.training.points import as_discs
+from glassplat.training.stage import Every, Stage
+
+if TYPE_CHECKING:
+    from glassplat.methods.splat_recipe import DiscTerms, SplatRecipe
+
+
+def first_scene(recipe: SplatRecipe, dataset: Dataset) -> Scene:
+    """The first scene: one Gaussian per point."""
+    first = _population(recipe).initial(dataset.points, recipe.sh_degree)
+    scene = Scene(as_discs(first) if recipe.primitive == "disc" else first, dataset.extent)
+    return poses_begun(recipe.poses, exposures_begun(recipe.exposure, scene, dataset), dataset)
+
+
+def finished_renderer(recipe: SplatRecipe) -> Splat:
+    """The renderer of the finished scene, with all its layers."""
+    return Splat(recipe.background or BLACK)
+
+
+def stages_of(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
+    """One stage; of discs a new one whenever one of their terms begins to count."""
+    population = _population(recipe)
+    first = Stage(
+        name="splat",
+        share=1.0,
+        renderer=_bare(recipe),
+        losses=(*image_terms(recipe.ssim_weight, recipe.view_dependence_weight), *population.terms),
+        rates=recipe.rates.of("primary"),
+        actions=(*population.edits, GrowSh(Every(recipe.rhythm.sh)), *population.resets),
+        motions=population.motions,
+        densify_until=population.densify_until,
+    )
+    stages, began = [first], 0.0
+    for start, term in terms_by_start(recipe.discs) if recipe.primitive == "disc" else ():
+        last = stages.pop()
+        stages += [replace(last, share=start - began)] if start > began else []
+        losses = (*last.losses, term)
+        with_normals = any(known.function is disc_normals for known in losses)
+        name = f"{last.name}, {term.name}"
+        stages.append(replace(last, name=name, renderer=_bare(recipe, normal=with_normals), losses=losses))
+        began = start
+    stages[-1] = replace(stages[-1], share=1 - began)
+    return poses_learnt(recipe.poses, exposures_learnt(recipe.exposure, tuple(stages)))
+
+
+def _bare(recipe: SplatRecipe, *, normal: bool = False) -> Splat:
+    """The renderer with what the losses need and no more."""
+    return Splat(recipe.background or BLACK, depth=False, normal=normal)
+
+
+def _population(recipe: SplatRecipe) -> Population:
+    means_rate = recipe.rates.of("primary")["primary.means"]
+    return population_of(
+        recipe.strategy, default=recipe.densify, mcmc=recipe.mcmc, rhythm=recipe.rhythm, means_rate=means_rate
+    )
+
+
+def terms_by_start(options: DiscTerms) -> tuple[tuple[float, LossTerm], ...]:
+    """The terms that count at all, with the shares of the run after which they do, in order."""
+    terms = (
+        (options.distortion_start, LossTerm("distortion", options.distortion_weight, distortion)),
+        (options.normal_start, LossTerm("normals", options.normal_weight, disc_normals)),
+    )
+    wanted = [(start, term) for start, term in terms if term.weight > 0 and start < 1]
+    return tuple(sorted(wanted, key=lambda pair: pair[0]))
+
+
+def image_terms(ssim_weight: float, view_dependence_weight: float) -> tuple[LossTerm, ...]:
+    """(1 - lambda) L1 + lambda D-SSIM (TR-Gaussians, Eq. 18), and what keeps colours from turning with the view."""
+    return weighted(
+        LossTerm("photometric", 1.0, PhotometricLoss(ssim_weight)),
+        LossTerm("view dependence", view_dependence_weight, view_dependence),
+    )

@@ -1,0 +1,295 @@
+"""First surroundings, an environment or Gaussians that rays can meet, and the setup of stages that reflect them."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from glassplat.captures.dataset import Dataset
+from glassplat.captures.view import PointCloud
+from glassplat.methods.mirrors import made_mirrors, mirror_lookalikes
+from glassplat.render.frame import Renderer
+from glassplat.scene.activations import logit
+from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Environment
+from glassplat.training.densify import apply_edit, forget
+from glassplat.training.messages import Working
+from glassplat.training.options import MirrorSearch, SurroundingsStart
+from glassplat.training.points import as_discs, in_morton_order
+from glassplat.training.stage import TrainState
+
+LARGEST_MISS = 0.35
+"""Share of their distance by which optical axes may pass the common point and still count as looking at it."""
+SHARE = 0.6
+"""Radius of the region, as a share of the nearest camera's distance."""
+LARGER_PART, ROUNDS = 0.6, 10
+"""Share of the cameras that have to look at it, and how often those are chosen anew that do."""
+
+
+def reflective_region(cameras: Sequence[Camera]) -> tuple[float, float, float, float] | None:
+    """Centre and radius, world units, of the sphere that the cameras look at from around; None where there is none.
+
+    The centre is the point nearest to all optical axes in the least-squares sense. It counts if the axes pass it
+    within a share of their distance, on average, and if the cameras are in front of it on more than one side. Where it
+    does not, those may be left out that look elsewhere, such as into the room that is mirrored: the point then is that
+    of the larger part of the cameras, which have to pass it twice as closely.
+    """
+    centers = torch.stack([camera.center.double().cpu() for camera in cameras])
+    forward = torch.stack([camera.cam_from_world[2, :3].double().cpu() for camera in cameras])
+    found = _common_point(centers, forward)
+    if found is None:
+        return None
+    ahead, misses = _seen_from(found, centers, forward)
+    if not bool(ahead.float().mean() > 0.9) or float(misses.mean()) > LARGEST_MISS:
+        for _ in range(ROUNDS):
+            away = torch.where(ahead, misses, torch.inf)
+            kept = away.argsort()[: math.ceil(LARGER_PART * len(cameras))]
+            found = _common_point(centers[kept], forward[kept])
+            if found is None:
+                return None
+            ahead, misses = _seen_from(found, centers, forward)
+        centers, ahead, misses = centers[kept], ahead[kept], misses[kept]
+        if not bool(ahead.all()) or float(misses.mean()) > LARGEST_MISS / 2:
+            return None
+    x, y, z = found.tolist()
+    return x, y, z, SHARE * float((found - centers).norm(dim=1).min())
+
+
+def _seen_from(point: torch.Tensor, centers: torch.Tensor, forward: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """[C] whether a point lies ahead of each camera, and by which share of its distance the axis passes it."""
+    towards = point - centers
+    along = (towards * forward).sum(1)
+    return along > 0, (towards - along[:, None] * forward).norm(dim=1) / towards.norm(dim=1)
+
+
+def _common_point(centers: torch.Tensor, forward: torch.Tensor) -> torch.Tensor | None:
+    """[3] the point nearest to the axes from centers [C, 3] along unit vectors [C, 3]; None if they are parallel."""
+    across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
+    normal_matrix = across.sum(0)
+    if float(torch.linalg.eigvalsh(normal_matrix)[0]) < 1e-3 * len(centers):
+        return None
+    return torch.linalg.solve(normal_matrix, (across @ centers[:, :, None]).sum(0)).squeeze(1)
+
+
+MOST_CELLS = 32
+"""Along an edge of the box (EnvGS, Section 4.3)."""
+GAUSSIANS_PER_PIXEL = 0.5
+"""Where the number of cells is left open: about so many Gaussians for each pixel of a photograph."""
+NARROWEST = 1e-3
+"""Smallest side of the box, as a share of the largest: points may all lie in one plane."""
+
+
+def suitable_cells(pixels: int, per_cell: int) -> int:
+    """Cells along an edge of the box that suit photographs of so many pixels; the paper's 32 from a megapixel on."""
+    wanted = (GAUSSIANS_PER_PIXEL * pixels / per_cell) ** (1 / 3)
+    return min(max(round(wanted), 2), MOST_CELLS)
+
+
+def percentile_box(points: PointCloud, outside: float) -> tuple[Tensor, Tensor]:
+    """Lowest and highest corner [3] of the box that leaves out a share of the points at either end of every axis."""
+    positions = points.positions.double()
+    low, high = (positions.quantile(share, dim=0) for share in (outside, 1 - outside))
+    middle, half = (low + high) / 2, (high - low) / 2
+    half = half.clamp(min=NARROWEST * max(float(half.max()), 1e-9))
+    return (middle - half).float(), (middle + half).float()
+
+
+def surroundings_in_box(
+    box: tuple[Tensor, Tensor], *, cells: int, per_cell: int, sh_degree: int, opacity: float, generator: torch.Generator
+) -> Gaussians:
+    """Grey round Gaussians, as many in every cell of a box and anywhere in it (EnvGS, Section 4.3).
+
+    The standard deviation is the mean distance of neighbours that so many points in a cell have.
+
+    Args:
+        box: lowest and highest corner [3].
+        cells: along each edge.
+        per_cell: in each cell.
+        sh_degree: highest degree to make room for; degree 0 is active.
+        opacity: of every Gaussian.
+        generator: source of the places; the Gaussians are on its device.
+    """
+    low, high = (corner.to(generator.device) for corner in box)
+    size = (high - low) / cells
+    along = torch.arange(cells, dtype=low.dtype, device=low.device)
+    corners = torch.cartesian_prod(along, along, along).repeat_interleave(per_cell, dim=0)
+    means = low + (corners + torch.rand(corners.shape, generator=generator, device=low.device)) * size
+    count = means.shape[0]
+    # Of points at random with density rho the nearest one is 0.554 rho^(-1/3) away on average.
+    spread = 0.554 * (float(size.prod()) / per_cell) ** (1 / 3)
+    return Gaussians(
+        means=means,
+        quats=means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        log_scales=means.new_full((count, 3), math.log(spread)),
+        logit_opacities=means.new_full((count,), logit(opacity)),
+        sh=means.new_zeros(count, (sh_degree + 1) ** 2, 3),
+    )
+
+
+def copied_surroundings(primary: Gaussians, chosen: Tensor, *, sh_degree: int) -> Gaussians:
+    """Copies of what stands in the scene and does not reflect: that is what mirrors show of it.
+
+    Args:
+        primary: the scene's Gaussians.
+        chosen: [N] bool, which ones to copy.
+        sh_degree: highest degree to make room for; degree 0 is active.
+    """
+    kept = primary.select(chosen)
+    coefficients = (sh_degree + 1) ** 2
+    sh = kept.sh.new_zeros(len(kept), coefficients, 3)
+    shared = min(coefficients, kept.sh.shape[1])
+    sh[:, :shared] = kept.sh[:, :shared]
+    return Gaussians(
+        means=kept.means.clone(),
+        quats=kept.quats.clone(),
+        log_scales=kept.log_scales.clone(),
+        logit_opacities=kept.logit_opacities.clone(),
+        sh=sh,
+        active_sh_degree=min(kept.active_sh_degree, sh_degree),
+    )
+
+
+def joined(*parts: Gaussians) -> Gaussians:
+    """One set of several that hold the same tensors."""
+    names = parts[0].tensors()
+    tensors = {name: torch.cat([part.tensors()[name] for part in parts]) for name in names}
+    most = max(parts, key=lambda part: part.active_sh_degree)
+    return most.with_tensors(tensors)
+
+
+log = logging.getLogger("glassplat.training")
+
+TOO_SHORT = (
+    "%d iterations are too few for normals to spread: nothing will reflect, and the run trains like splat, which has "
+    "the better picture then. Reflections need %d --iterations; --least-iterations 1 looks for them all the same"
+)
+
+
+@dataclass(frozen=True)
+class AddEnvironment:
+    """Surrounds the scene with an environment of noise, drawn by the run's seed.
+
+    Attributes:
+        texels: along the edge of a face.
+        region: centre and radius of the sphere that holds all that may reflect, world units; None for everywhere.
+        find_region: without a region, take the place that the cameras stand around, if there is one.
+    """
+
+    texels: int
+    region: tuple[float, float, float, float] | None = None
+    find_region: bool = True
+
+    def __call__(self, state: TrainState, dataset: Dataset) -> None:
+        """Edits `state`."""
+        environment = Environment.random(self.texels, generator=state.generator("environment"))
+        region = self.region
+        if region is None and self.find_region:
+            region = reflective_region([view.camera for view in dataset.train])
+        state.scene = replace(state.scene, environment=replace(environment, region=region))
+
+
+@dataclass(frozen=True)
+class StayMatte:
+    """Says that a run is too short for reflections; its scene has an environment all the same, which nothing mirrors.
+
+    Attributes:
+        iterations: length of the run.
+        least: length of the shortest run in which things learn to reflect.
+        environment: adds the environment.
+    """
+
+    iterations: int
+    least: int
+    environment: AddEnvironment
+
+    def __call__(self, state: TrainState, dataset: Dataset) -> None:
+        """Edits `state`."""
+        log.warning(TOO_SHORT, self.iterations, self.least)
+        self.environment(state, dataset)
+
+
+@dataclass(frozen=True)
+class AddSurroundings:
+    """Surrounds the scene with Gaussians for reflections to show, drawn by the run's seed.
+
+    Attributes:
+        start: what they are.
+        sh_degree: highest degree of their colours.
+    """
+
+    start: SurroundingsStart
+    sh_degree: int
+
+    def __call__(self, state: TrainState, dataset: Dataset, matte: Tensor) -> None:
+        """Edits `state`; `matte` [N] bool tells which primary Gaussians may be copied."""
+        parts = [part for part in self._parts(state, dataset, matte) if len(part)]
+        # A scene in which everything reflects has nothing to copy.
+        found = joined(*(parts or [self._in_box(state, dataset)]))
+        ordered, _ = apply_edit(found, {}, in_morton_order(found.means), part="surroundings")
+        state.scene = replace(state.scene, surroundings=ordered)
+
+    def _parts(self, state: TrainState, dataset: Dataset, matte: Tensor) -> list[Gaussians]:
+        parts = []
+        if self.start.source != "box":
+            parts.append(copied_surroundings(state.scene.primary, matte, sh_degree=self.sh_degree))
+        if self.start.source != "scene":
+            parts.append(self._in_box(state, dataset))
+        return parts
+
+    def _in_box(self, state: TrainState, dataset: Dataset) -> Gaussians:
+        camera = dataset.train[0].camera
+        cells = self.start.cells or suitable_cells(camera.width * camera.height, self.start.per_cell)
+        found = surroundings_in_box(
+            percentile_box(dataset.points, self.start.outside),
+            cells=cells,
+            per_cell=self.start.per_cell,
+            sh_degree=self.sh_degree,
+            opacity=self.start.opacity,
+            generator=state.generator("surroundings"),
+        )
+        return as_discs(found, seed=state.seed) if state.scene.primary.are_discs else found
+
+
+@dataclass(frozen=True)
+class BeginReflections:
+    """Adds what is there to be mirrored, and takes for mirrors what looks like them.
+
+    Attributes:
+        environment: adds an environment; None where only near things are mirrored.
+        surroundings: adds what is near; None where only the environment is mirrored.
+        mirrors: what looks like a mirror.
+        renderer: that of the stage before.
+        harmonics_wait: where mirrors were found, colours are again the same from all sides, until harmonics rise anew:
+            what they had learnt by then is what those mirrors show.
+    """
+
+    environment: AddEnvironment | None
+    surroundings: AddSurroundings | None
+    mirrors: MirrorSearch
+    renderer: Renderer
+    harmonics_wait: bool = False
+
+    def __call__(self, state: TrainState, dataset: Dataset) -> Generator[Working, None, bool]:
+        """Edits `state`."""
+        if self.environment is not None:
+            self.environment(state, dataset)
+        if self.surroundings is None and not self.mirrors.begin_found:
+            return True
+        yield Working("looking for mirrors", 0, 1)
+        seen, mirrors = mirror_lookalikes(self.mirrors, state.scene, dataset.train, self.renderer)
+        if self.surroundings is not None:
+            self.surroundings(state, dataset, seen & ~mirrors)
+        if self.mirrors.begin_found:
+            primary = made_mirrors(self.mirrors, state.scene, dataset.train, mirrors)
+            if self.harmonics_wait and bool(mirrors.any()):
+                primary = replace(primary, active_sh_degree=0)
+            state.scene = replace(state.scene, primary=primary)
+            names = [f"primary.{name}" for name in primary.tensors()]
+            state.optimizer.moments = forget(state.optimizer.moments, names, mirrors)
+        return True

@@ -1,0 +1,393 @@
+"""A scene that can be looked at, edited and saved."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from glassplat.captures.dataset import Dataset, with_corrected_cameras
+from glassplat.errors import InputError, first_names, input_checked
+from glassplat.files.glb import write_glb
+from glassplat.files.ply import write_gaussians
+from glassplat.files.records import read_text
+from glassplat.files.sidecars import write_cameras, write_equirect, write_planes
+from glassplat.files.spz import write_spz
+from glassplat.files.writing import atomic_write, make_folder
+from glassplat.methods.planar_recipe import PlanarRecipe
+from glassplat.methods.recipe import recipe_to_json
+from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.model.layers import Layer, check_layers, layers_of
+from glassplat.model.run_directory import RunDirectory, write_text
+from glassplat.panes.material import with_pane
+from glassplat.publish.camera_paths import orbit
+from glassplat.publish.web_page import can_show, write_page
+from glassplat.render.environment import equirect_from_environment
+from glassplat.render.frame import Frame, Renderer
+from glassplat.render.layers import layer_image, renderer_with
+from glassplat.scene import scene
+from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.panes import Planes
+from glassplat.scene.scene import Scene
+
+
+@dataclass(frozen=True, repr=False)
+class Model:
+    """A scene, the method that renders it, and the cameras it was photographed from.
+
+    Models are values: what edits one returns another, and the tensors that were not edited are shared.
+
+    Attributes:
+        scene: Gaussians and panes; `scene.parameters()` are all its trainable tensors by name.
+        recipe: how it was trained, and with that how it is rendered.
+        cameras: by the names of their photographs; of a foreign file, some that look at it.
+        name: what to call it.
+        path: where it was loaded from; None if it was not.
+    """
+
+    scene: Scene
+    recipe: Any
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
+    name: str = ""
+    path: Path | None = None
+
+    def __repr__(self) -> str:
+        panes = len(self.scene.planes)
+        return (
+            f"Model({self.name!r}: {self.recipe.method}, {len(self.scene.primary)} Gaussians, "
+            f"{panes} {'pane' if panes == 1 else 'panes'}, {len(self.cameras)} cameras)"
+        )
+
+    @property
+    def renderer(self) -> Renderer:
+        """What turns the scene and a camera into a frame: a function `(scene, camera) -> Frame`."""
+        renderer: Renderer = self.recipe.renderer()
+        return renderer
+
+    @property
+    def layers(self) -> tuple[Layer, ...]:
+        """Names of the layers that are worth looking at, `rgb` the first."""
+        return layers_of(self.recipe)
+
+    @property
+    def panes(self) -> tuple[int, ...]:
+        """Labels of the panes, as in the masks."""
+        return self.scene.planes.labels
+
+    def render(self, camera: Camera | str, *, layers: Sequence[str] = ("rgb",)) -> Frame:
+        """Renders the image and its layers; differentiable in every tensor of the scene and in the camera's pose.
+
+        `frame.rgb` is [H, W, 3] in sRGB, not clamped; `frame.layers` are further images by name, [H, W] or [H, W, 3].
+        Under `torch.no_grad()` it is faster.
+
+        Args:
+            camera: any pinhole camera, or the name of one of `cameras`.
+            layers: which ones the frame has to have; most are there in any case.
+
+        Raises:
+            InputError: the method renders no such layer; says which it does.
+            KeyError: no camera has that name.
+        """
+        check_layers(layers, self.recipe)
+        chosen = self.cameras[camera] if isinstance(camera, str) else camera
+        return renderer_with(self.renderer, layers)(self.scene, chosen)
+
+    @torch.no_grad()
+    def image(self, camera: Camera | str, layer: str = "rgb") -> Tensor:
+        """One layer to look at: [H, W, 3] in [0, 1], on the CPU. Depth is colour-mapped, normals are (n + 1) / 2.
+
+        Args:
+            camera: any pinhole camera, or the name of one of `cameras`.
+            layer: one of `layers`.
+
+        Raises:
+            InputError, KeyError: as `render` does.
+        """
+        image = layer_image(self.render(camera, layers=(layer,)), layer).cpu()
+        return image if image.dim() == 3 else image[..., None].expand(-1, -1, 3)
+
+    def orbit(self, frames: int) -> list[Camera]:
+        """Cameras once around what the photographs show, or in a loop before what was photographed from one side."""
+        return orbit(list(self.cameras.values()), self.scene.extent, frames)
+
+    def evaluate(self, dataset: Dataset) -> dict[str, Any]:
+        """Metrics over the test views of a data set, by name: `psnr`, `ssim`, `pane_psnr` ...
+
+        Where cameras were corrected, those of the test views move as their neighbours'.
+        Where one is None, `<name>_reason` says why.
+        """
+        from glassplat.evaluate.evaluate import evaluate  # Training imports this file, and may never need it.
+
+        return evaluate(self.scene, self.renderer, with_corrected_cameras(dataset, self.scene)).results
+
+    def to(self, device: torch.device | str) -> Model:
+        """The same on another device."""
+        return replace(self, scene=self.scene.to(device))
+
+    def with_scene(self, scene: Scene) -> Model:
+        """Another scene, rendered in the same way from the same cameras."""
+        return replace(self, scene=scene)
+
+    def with_parameters(self, parameters: Mapping[str, Tensor]) -> Model:
+        """The same with some tensors replaced, by their names in `scene.parameters()`; gradients flow to them."""
+        return self.with_scene(self.scene.with_parameters(parameters))
+
+    def without_glass(self) -> Model:
+        """Without any panes: what is seen when nothing reflects."""
+        return self.with_scene(scene.without_glass(self.scene))
+
+    def without_pane(self, label: int) -> Model:
+        """Without one of its panes.
+
+        Raises:
+            ValueError: no pane has the label.
+        """
+        return self.with_scene(scene.without_pane(self.scene, label))
+
+    def with_mirrors(self, *labels: int) -> Model:
+        """The panes with these labels reflect everything, from every angle.
+
+        Raises:
+            ValueError: no pane has one of the labels.
+        """
+        return self.with_scene(scene.as_mirrors(self.scene, labels))
+
+    def with_reflectance(self, label: int, base_reflectance: float) -> Model:
+        """A pane reflects this share of light at normal incidence; Fresnel's laws add to it at an angle.
+
+        Raises:
+            ValueError: no pane has the label, or the reflectance is not in [0, 1].
+        """
+        return self.with_scene(scene.with_reflectance(self.scene, label, base_reflectance))
+
+    def shifted(self, label: int, distance: float) -> Model:
+        """A pane moved along its normal by a distance in world units.
+
+        Raises:
+            ValueError: no pane has the label, or the distance is not finite.
+        """
+        return self.with_scene(scene.shifted(self.scene, label, distance))
+
+    def tilted(self, label: int, about_tangent: float, about_bitangent: float = 0.0) -> Model:
+        """A pane turned about its middle, by degrees about its first and its second side.
+
+        Raises:
+            ValueError: no pane has the label, or an angle is not finite.
+        """
+        return self.with_scene(scene.tilted(self.scene, label, about_tangent, about_bitangent))
+
+    def with_pane(
+        self,
+        center: Sequence[float],
+        normal: Sequence[float],
+        half_sizes: tuple[float, float],
+        *,
+        tangent: Sequence[float] | None = None,
+        base_reflectance: float = 0.077,
+        label: int | None = None,
+    ) -> Model:
+        """One more pane, also in a scene that was trained without any.
+
+        Args:
+            center: [3] the rectangle's middle, world units.
+            normal: [3] of any length.
+            half_sizes: half its sides along tangent and bitangent, world units.
+            tangent: [3] direction of its first side; the most horizontal one if None.
+            base_reflectance: R0; that of window glass if not given, 1 makes a mirror.
+            label: what to call it; the first number that is free if None.
+
+        Raises:
+            ValueError: the label is taken, a direction has no length, or a value is out of range; or the scene is of
+                another method than `planar` and `splat`, or of discs.
+        """
+        free = next(number for number in range(1, len(self.panes) + 2) if number not in self.panes)
+        pane = Planes.rectangle(center, normal, half_sizes, tangent=tangent, label=free if label is None else label)
+        added = with_pane(self.scene, pane)
+        recipe = planar_of(self.recipe)
+        recipe.renderer().check(added)
+        model = replace(self, scene=added, recipe=recipe).with_reflectance(pane.labels[0], base_reflectance)
+        return model.with_mirrors(*pane.labels) if base_reflectance == 1 else model
+
+    def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+        """Writes the model; `glassplat.load` reads what it wrote, but for .html, which is for browsers.
+
+        Args:
+            path: .ply, .spz or .glb for other programs, with the panes beside it as `planes.json` and `glass.ply`, and
+                the cameras as `cameras.json`; .html for a page that shows it with live panes; without a suffix a folder
+                that is loaded bit for bit, like a run.
+            overwrite: replace files that are there.
+
+        Returns:
+            The path.
+
+        Raises:
+            FileExistsError: something is there, also beside it; nothing was written.
+            InputError: the format is not known, or cannot hold this model.
+        """
+        return save_model(self, Path(path), overwrite=overwrite)
+
+
+def planar_of(recipe: Any) -> PlanarRecipe:
+    """The recipe by which a scene of another method is rendered when it gets a pane.
+
+    Raises:
+        ValueError: panes cannot mirror what it renders.
+    """
+    if isinstance(recipe, PlanarRecipe):
+        return recipe
+    if isinstance(recipe, SplatRecipe) and recipe.primitive == "ellipsoid":
+        return PlanarRecipe(background=recipe.background)
+    raise ValueError(
+        f"panes cannot be put into a scene of {recipe.method}; expected one of planar, or splat's ellipsoids"
+    )
+
+
+def by_name(cameras: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:
+    """Cameras by name; of several with one name the later ones get a number."""
+    named: dict[str, Camera] = {}
+    for name, camera in cameras:
+        number = sum(known.partition(" #")[0] == name for known in named) if name in named else 0
+        named[f"{name} #{number + 1}" if number else name] = camera
+    return named
+
+
+WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {".ply": write_gaussians, ".spz": write_spz, ".glb": write_glb}
+PLANES, GLASS, CAMERAS = "planes.json", "glass.ply", "cameras.json"
+SETTINGS = "settings.json"
+PANORAMA, ENVIRONMENT = "environment.png", "environment.json"
+
+
+class Savable(Protocol):
+    """What of a model is written."""
+
+    @property
+    def scene(self) -> Scene:
+        """Gaussians and panes."""
+
+    @property
+    def recipe(self) -> Any:
+        """How it is rendered."""
+
+    @property
+    def renderer(self) -> Renderer:
+        """The renderer of the recipe."""
+
+    @property
+    def cameras(self) -> Mapping[str, Camera]:
+        """By name."""
+
+    @property
+    def name(self) -> str:
+        """What to call it."""
+
+
+def save_model(model: Savable, path: Path, *, overwrite: bool) -> Path:
+    """Writes a model in the format that the path's suffix names, see `Model.save`; returns the path.
+
+    Raises:
+        FileExistsError: something is there; nothing was written.
+        InputError: the format is not known, or cannot hold this model.
+    """
+    kind = path.suffix.lower()
+    if not kind:
+        return save_folder(model, path)
+    if kind not in (*WRITERS, ".html"):
+        raise InputError(f"{path}: expected a name that ends in {', '.join((*WRITERS, '.html'))}, or a folder's")
+    beside = [] if kind == ".html" else [path.with_name(name) for name in (PLANES, GLASS, CAMERAS)]
+    found = [str(target) for target in (path, *beside) if target.exists()]
+    if found and not overwrite:
+        raise FileExistsError(
+            f"{first_names(found)} is already there; nothing was written. Choose another folder, or overwrite=True"
+        )
+    make_folder(path.parent)
+    if kind == ".html":
+        save_page(model, path, model.name or path.stem)
+        return path
+    with input_checked():
+        WRITERS[kind](path, model.scene.primary)
+    write_beside(path.parent, model.scene)
+    if not len(model.scene.planes) and (path.parent / PLANES).exists():
+        write_planes(path.parent / PLANES, model.scene.planes)  # Panes of what was there must not be taken for its own.
+    write_cameras(path.parent / CAMERAS, model.cameras.items())
+    return path
+
+
+def save_page(model: Savable, path: Path, title: str) -> None:
+    """Writes the page that shows a model with live panes in any browser.
+
+    Raises:
+        InputError: it shows only what `planar` and `splat` render of ellipsoids.
+    """
+    if not can_show(model.renderer):
+        raise InputError(f"the page shows planar and splat scenes, not {model.recipe.method} ones of this kind")
+    with input_checked():
+        write_page(path, model.scene, model.renderer, tuple(model.cameras.items()), title)
+
+
+def write_beside(folder: Path, scene: Scene) -> list[Path]:
+    """Writes planes, glass and environment, where there are any, and returns what was written."""
+    written = []
+    if len(scene.planes):
+        write_planes(folder / PLANES, scene.planes)
+        write_gaussians(folder / GLASS, scene.glass)
+        written += [folder / PLANES, folder / GLASS]
+    if not scene.environment.is_empty:
+        write_environment_files(folder, scene)
+        written += [folder / ENVIRONMENT, folder / PANORAMA]
+    return written
+
+
+def write_environment_files(folder: Path, scene: Scene) -> None:
+    """The surroundings as a panorama, and a description that says how to read it."""
+    environment = scene.environment
+    write_equirect(folder / PANORAMA, equirect_from_environment(environment, 2 * environment.size))
+    description = {
+        "image": PANORAMA,
+        "projection": "equirectangular",
+        "color": "sRGB",
+        "up": "+z in the top row",
+        "forward": "+x in the middle column, +y left of it",
+        "region": environment.region,
+    }
+    with atomic_write(folder / ENVIRONMENT) as temporary:
+        temporary.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
+
+
+def write_as_run(folder: Path, model: Savable, source: Path | None) -> None:
+    """Writes a scene as a run that was not trained; the record comes last, so that a part of one is none.
+
+    What comes of a run knows its capture, as far as the run does.
+
+    Args:
+        folder: new or empty.
+        model: what to write.
+        source: where the scene was read from, for the record.
+    """
+    make_folder(folder)
+    directory = RunDirectory(folder)
+    directory.export(model.scene, step=0)
+    write_cameras(folder / CAMERAS, model.cameras.items())
+    if source is not None and (source / SETTINGS).is_file():
+        write_text(folder / SETTINGS, read_text(source / SETTINGS).rstrip("\n"))
+    else:
+        write_text(directory.imported, json.dumps({"file": None if source is None else str(source.resolve())}))
+    write_text(folder / "recipe.json", recipe_to_json(model.recipe))
+
+
+def save_folder(model: Savable, folder: Path) -> Path:
+    """Writes a model as a run of its own, which `load` reads bit for bit; returns the folder.
+
+    Raises:
+        FileExistsError: something is there; nothing was written.
+    """
+    if os.path.lexists(folder) and (not folder.is_dir() or any(folder.iterdir())):
+        raise FileExistsError(f"{folder} is already there and not empty; nothing was written. Choose a new folder")
+    write_as_run(folder, model, getattr(model, "path", None))
+    return folder

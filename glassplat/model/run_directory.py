@@ -1,0 +1,389 @@
+"""The directory of a run: its settings, log, lock, and whether it may be written.
+
+Where it must not be written, or holds no run, is found out without PyTorch.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from operator import itemgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+from glassplat.captures.masks import Polarity
+from glassplat.errors import InputError, first_names, input_checked
+from glassplat.files.records import parse_json, read_json, read_text
+from glassplat.files.writing import atomic_write, check_folder, make_folder
+from glassplat.options import Downscale, Seed, Several, options_from_json
+from glassplat.training.messages import Message, StepDone, Working
+
+if TYPE_CHECKING:
+    from glassplat.captures.dataset import Dataset
+    from glassplat.scene.scene import Scene
+
+log = logging.getLogger("glassplat.training")
+
+NAME = "train.lock"
+"""The file stays behind, empty; the lock on it ends with the process, however that ends."""
+
+
+@contextmanager
+def run_lock(folder: Path) -> Iterator[None]:
+    """Holds the folder against other trainings; a file system that knows no locks is used without one.
+
+    Raises:
+        InputError: another training writes into it.
+    """
+    descriptor = os.open(folder / NAME, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        _lock(descriptor, folder)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def check_unlocked(folder: Path) -> None:
+    """Look whether another training writes into a folder.
+
+    Raises:
+        InputError: one does.
+    """
+    if (folder / NAME).is_file():
+        with run_lock(folder):
+            pass
+
+
+def _lock(descriptor: int, folder: Path) -> None:
+    try:
+        import fcntl
+    except ImportError:  # Windows, where nothing holds a second training off.
+        return
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise InputError(
+            f"another training is writing into {folder}; expected a folder for each. Wait until it has ended, or "
+            "choose another --output"
+        ) from error
+    except OSError as error:
+        log.warning("%s cannot be locked (%s); see that no second training writes into it", folder, error.strerror)
+
+
+CHECKPOINT_SECONDS = 120.0
+"""What a power cut may cost at the most, unless the user says otherwise."""
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """What was asked for, beside the recipe.
+
+    Attributes:
+        data: directory of the capture, from the root of the file system.
+        iterations: length of the run.
+        downscale: factor by which photographs are shrunk.
+        seed: fixes every random choice.
+        device: where training runs.
+        mask_polarity: which value of black-and-white masks is the pane.
+    """
+
+    data: str
+    iterations: Several
+    downscale: Downscale = 1.0
+    seed: Seed = 0
+    device: str = "cpu"
+    mask_polarity: Polarity = "auto"
+
+
+FILES = (
+    "recipe.json",
+    "settings.json",
+    "log.jsonl",
+    "cameras.json",
+    "per_view.json",
+    "sheets",
+    "uses.png",
+    "index.html",
+)
+"""What a run writes beside its checkpoint, scene and metrics."""
+NUMBERED = re.compile(r"iteration_([0-9]{1,18})")
+"""The folder of a scene; people keep copies under other names beside it."""
+
+
+@dataclass(frozen=True)
+class RunDirectory:
+    """Names of the files of a run.
+
+    ```
+    recipe.json  settings.json         what was run
+    log.jsonl                          one line per logged step
+    train.lock                         held while a training writes here
+    checkpoint.safetensors             to resume from
+    cameras.json                       all cameras, where training refined them if it did
+    sparse/0/                          the same as a COLMAP model, only of refined ones
+    point_cloud/iteration_N/           point_cloud.ply, scene.json, and what else the scene has
+    results.json  per_view.json        metrics
+    sheets/  uses.png  index.html      pictures
+    ```
+    """
+
+    path: Path
+
+    @property
+    def checkpoint(self) -> Path:
+        """Where the newest checkpoint is."""
+        return self.path / "checkpoint.safetensors"
+
+    @property
+    def log(self) -> Path:
+        """Where the training log is."""
+        return self.path / "log.jsonl"
+
+    @property
+    def results(self) -> Path:
+        """Where the metrics are."""
+        return self.path / "results.json"
+
+    @property
+    def imported(self) -> Path:
+        """Where the source of a scene is recorded that has no capture: it was imported, or made in a program."""
+        return self.path / "imported.json"
+
+    @property
+    def is_saved(self) -> bool:
+        """Whether there is something in it that took training to make."""
+        return any((self.path / name).exists() for name in (self.checkpoint.name, self.results.name, "point_cloud"))
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether a run was begun here, whatever has become of it."""
+        try:
+            self.recipe()
+        except InputError:
+            return False
+        return True
+
+    def check_begun(self) -> None:
+        """Refuse what no run was begun in.
+
+        Raises:
+            InputError: there is no recipe.
+        """
+        self._read("recipe.json")
+
+    def check_vacant(self) -> None:
+        """Refuse to begin a run where something would be lost by it.
+
+        Raises:
+            InputError: the directory holds a run, or files of somebody else that have the names of a run's.
+        """
+        if self.checkpoint.exists():
+            raise InputError(
+                f"{self.path} already holds a run; pass --resume to go on with it, or choose another --output"
+            )
+        if self.is_saved:
+            raise InputError(f"{self.path} already holds a trained scene; choose another --output, or move it away")
+        found = [name for name in FILES if os.path.lexists(self.path / name)]
+        if found and not self.is_begun:
+            raise InputError(
+                f"{self.path} holds {first_names(found)}, which is not from a run of this version and would be "
+                "overwritten; choose another --output"
+            )
+
+    def check_saved(self) -> None:
+        """Refuse to go on with a run of which there is no checkpoint.
+
+        Raises:
+            InputError: there is none.
+        """
+        if self.checkpoint.is_file():
+            return
+        if self.is_saved:
+            raise InputError(
+                f"{self.path} holds a trained scene, but no {self.checkpoint.name} to go on from; train it again with "
+                "another --output"
+            )
+        raise InputError(f"nothing was saved yet in {self.path}; begin again without --resume")
+
+    def begin(self, recipe: Any, settings: RunSettings, dataset: Dataset) -> None:
+        """Creates the directory and records what is about to run."""
+        from glassplat.files.sidecars import write_cameras
+        from glassplat.methods.recipe import recipe_to_json
+
+        make_folder(self.path)
+        write_text(self.path / "recipe.json", recipe_to_json(recipe))
+        write_text(self.path / "settings.json", json.dumps(dataclasses.asdict(settings), indent=2))
+        write_cameras(self.path / "cameras.json", [(v.name, v.camera) for v in (*dataset.train, *dataset.test)])
+
+    def write_refined(self, dataset: Dataset, scene: Scene) -> None:
+        """Replaces the recorded cameras by those that training found, if it looked for them.
+
+        `sparse/0` is the same as a COLMAP model, of the photographs as training saw them: undistorted and reduced.
+        """
+        from glassplat.captures.dataset import with_corrected_cameras
+        from glassplat.files.sidecars import write_cameras, write_colmap
+
+        if not len(scene.poses):
+            return
+        refined = with_corrected_cameras(dataset, scene)
+        cameras = [(view.name, view.camera) for view in (*refined.train, *refined.test)]
+        write_cameras(self.path / "cameras.json", cameras)
+        positions, colors = dataset.points.positions.numpy(), dataset.points.colors.numpy()
+        write_colmap(self.path / "sparse" / "0", sorted(cameras, key=itemgetter(0)), positions, colors)
+
+    def recipe(self) -> Any:
+        """The recorded recipe."""
+        from glassplat.methods.recipe import recipe_from_json
+
+        return recipe_from_json(self._read("recipe.json"), str(self.path / "recipe.json"))
+
+    def was_begun_with(self, recipe: Any) -> bool:
+        """Whether `begin` recorded just this recipe.
+
+        Compared as written: `recipe()` gives options that an earlier version did not have their present defaults,
+        with which the run was not made.
+        """
+        from glassplat.methods.recipe import recipe_to_json
+
+        written = self._read("recipe.json")
+        return self.recipe() == recipe and parse_json(written, "recipe.json") == json.loads(recipe_to_json(recipe))
+
+    def settings(self) -> RunSettings:
+        """The recorded settings."""
+        path = self.path / "settings.json"
+        with input_checked():
+            written = parse_json(self._read(path.name), str(path))
+        try:
+            return options_from_json(RunSettings, written)
+        except InputError as error:
+            raise InputError(f"{path} cannot be read: {error}; train again") from error
+
+    def photographs(self) -> set[str] | None:
+        """Names of the photographs that the run was begun with; None where that is not recorded legibly."""
+        try:
+            return {entry["img_name"] for entry in read_json(self.path / "cameras.json")}
+        except (OSError, ValueError, TypeError, KeyError):
+            return None
+
+    def export(self, scene: Scene, step: int) -> Path:
+        """Writes the scene in the formats that others read; returns its folder."""
+        from glassplat.files.scene_folder import write_scene
+        from glassplat.files.sidecars import write_equirect
+        from glassplat.render.environment import equirect_from_environment
+
+        folder = self.path / "point_cloud" / f"iteration_{step}"
+        write_scene(folder, scene)
+        if not scene.environment.is_empty:
+            panorama = equirect_from_environment(scene.environment, 2 * scene.environment.size)
+            write_equirect(folder / "environment.png", panorama)
+        return folder
+
+    def latest_scene(self) -> tuple[Scene, int]:
+        """The exported scene of the highest iteration, and that iteration."""
+        from glassplat.files.scene_folder import read_scene
+
+        named = {NUMBERED.fullmatch(folder.name): folder for folder in self.path.glob("point_cloud/*")}
+        folders = {int(match[1]): folder for match, folder in named.items() if match and folder.is_dir()}
+        if not folders:
+            raise InputError(
+                f"{self.path} holds no point_cloud/iteration_N; expected a finished run. Train first, or --resume it"
+            )
+        step = max(folders)
+        try:
+            return read_scene(folders[step]), step
+        except (ValueError, FileNotFoundError) as error:
+            raise InputError(f"the scene in {folders[step]} cannot be read: {error}") from error
+
+    def _read(self, name: str) -> str:
+        file = self.path / name
+        if not file.is_file():
+            raise InputError(
+                f"{self.path} is not a run directory: no {name} in it; expected what `glassplat train --output` wrote"
+            )
+        with input_checked():
+            return read_text(file)
+
+
+def check_output(directory: RunDirectory, *, resume: bool) -> None:
+    """What can be told about a run's directory before the photographs are read; writes nothing.
+
+    Raises:
+        InputError: a fresh run would overwrite something, there is nothing to go on from, or another training writes
+            there.
+        NotADirectoryError: it is a file, or goes through one.
+        PermissionError: nothing may be written there.
+    """
+    check_folder(directory.path)
+    check_unlocked(directory.path)
+    if resume:
+        directory.check_saved()
+    else:
+        directory.check_vacant()
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a text file atomically."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+LOG_EVERY = 10
+
+
+class RunLog:
+    """Appends messages to an open log."""
+
+    def __init__(self, file: TextIO, path: Path) -> None:
+        self._file, self._path = file, path
+
+    def write(self, message: Message) -> None:
+        """Appends a message; of the steps, every tenth, and nothing of what happens between two of them.
+
+        Raises:
+            OSError: the disk is full or fails; names the log.
+        """
+        if isinstance(message, Working) or (isinstance(message, StepDone) and message.step % LOG_EVERY):
+            return
+        try:
+            self._file.write(json.dumps({"message": type(message).__name__, **vars(message)}) + "\n")
+            self._file.flush()
+        except OSError as error:
+            raise OSError(error.errno, f"could not write {self._path} ({error.strerror})") from error
+
+
+@contextmanager
+def open_log(path: Path, step: int) -> Iterator[RunLog]:
+    """The log, cut back to the step from which the run goes on.
+
+    A run that was killed may leave half a line, or the zeros of a power cut; such lines are left out.
+    """
+    kept = lines_until(path, step) if step and path.is_file() else []
+    with atomic_write(path) as temporary:
+        temporary.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+    file = path.open("a", encoding="utf-8")
+    try:
+        yield RunLog(file, path)
+    finally:
+        with suppress(OSError):  # Every line was flushed when it was written.
+            file.close()
+
+
+def lines_until(path: Path, step: int) -> list[str]:
+    """The legible lines of a log up to a step."""
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    return [line for line in lines if 0 <= _step_of(line) <= step]
+
+
+def _step_of(line: str) -> int:
+    """The step of a line; -1 where it is none of a log."""
+    try:
+        step = json.loads(line)["step"]
+    except (ValueError, KeyError, TypeError, IndexError, RecursionError):
+        return -1
+    return step if isinstance(step, int) else -1

@@ -1,0 +1,459 @@
+"""Training runs: data in, run directory out, with checkpoints, a log and a clean stop."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn
+
+from glassplat.captures.dataset import Dataset, photographs_read
+from glassplat.errors import InputError
+from glassplat.files.writing import make_folder
+from glassplat.kernels.backend.devices import DeviceName, chosen_device
+from glassplat.methods.recipe import RECIPES, Recipe, settled
+from glassplat.model.model import Model
+from glassplat.model.run_directory import (
+    CHECKPOINT_SECONDS,
+    RunDirectory,
+    RunLog,
+    RunSettings,
+    check_output,
+    open_log,
+    run_lock,
+)
+from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
+from glassplat.training.loop import train
+from glassplat.training.messages import ActionDone, CheckpointWritten, Message, RunBegun, StepDone, Working
+from glassplat.training.stage import Stage, TrainState, check_length
+
+Listener = Callable[[Message], None]
+STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""Ctrl-C, what a shut-down or a job scheduler sends before it kills, and what a closed terminal leaves behind."""
+
+
+@dataclass
+class StopRequest:
+    """Set when the user asks a run to stop; the run ends after the current step.
+
+    Attributes:
+        number: the signal by which it was asked; None as long as it was not.
+        answer: what the signal did before the run began.
+    """
+
+    number: int | None = None
+    answer: Callable[[int, FrameType | None], Any] | int | None = None
+
+    @property
+    def requested(self) -> bool:
+        """Whether the run is to stop."""
+        return self.number is not None
+
+    def end(self) -> NoReturn:
+        """Ends the run as the signal would have ended it, so that the caller can tell one from the other."""
+        if callable(self.answer) and self.number is not None:
+            self.answer(self.number, None)
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def stop_on_interrupt() -> Iterator[StopRequest]:
+    """Turns the first Ctrl-C, termination or hang-up into a request to stop after the step; a second one interrupts.
+
+    What is ignored stays ignored, as a hang-up is under `nohup`. Only the main thread can be asked.
+    """
+    request = StopRequest()
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        if request.requested:
+            request.end()
+        request.number, request.answer = number, previous[number]
+
+    main = threading.current_thread() is threading.main_thread()
+    heard = [number for number in STOP_SIGNALS if main and signal.getsignal(number) != signal.SIG_IGN]
+    previous = {number: signal.signal(number, ask) for number in heard}
+    try:
+        yield request
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def run_training(
+    recipe: Any,
+    settings: RunSettings,
+    directory: RunDirectory,
+    dataset: Dataset,
+    *,
+    resume: bool,
+    listen: Listener,
+    checkpoint_every: float = CHECKPOINT_SECONDS,
+) -> TrainState:
+    """Trains to the end or to the user's interrupt, and leaves a run directory from which both can go on.
+
+    Args:
+        recipe: as for `Run`, like the others.
+        settings: what was asked for beside it.
+        directory: where everything goes.
+        dataset: photographs to fit.
+        resume: go on from the checkpoint in `directory`.
+        listen: gets every message.
+        checkpoint_every: seconds from one checkpoint to the next.
+
+    Raises:
+        InputError, KeyboardInterrupt, TrainingDivergedError, OSError: as `Run` does.
+    """
+    run = Run(recipe, settings, directory, dataset, resume=resume, checkpoint_every=checkpoint_every)
+    return run.to_the_end(listen)
+
+
+class Run:
+    """A training run in its directory, followed message by message.
+
+    A recipe that names no background gets the one that transparent photographs are laid over; it is recorded. Nothing
+    is written before the first scene has been made. Who stops following leaves a checkpoint behind, from which the run
+    can be resumed.
+    """
+
+    def __init__(
+        self,
+        recipe: Any,
+        settings: RunSettings,
+        directory: RunDirectory,
+        dataset: Dataset,
+        *,
+        resume: bool = False,
+        checkpoint_every: float = CHECKPOINT_SECONDS,
+    ) -> None:
+        """Checks what can be known beforehand.
+
+        Args:
+            recipe: how to train.
+            settings: what was asked for beside it.
+            directory: where everything goes.
+            dataset: photographs to fit.
+            resume: go on from the checkpoint in `directory`.
+            checkpoint_every: seconds from one checkpoint to the next; there is one at the end in any case.
+
+        Raises:
+            InputError: the directory is not fit for it (`check_output`), the run is too short for its stages, or as
+                `settled` does.
+        """
+        self.recipe = settled(recipe, dataset)
+        self._stages = self.recipe.stages(settings.seed, settings.iterations)
+        check_length(self._stages, settings.iterations)
+        check_output(directory, resume=resume)
+        self._settings, self._directory, self._dataset = settings, directory, dataset
+        self._resume, self._every = resume, checkpoint_every
+        self._sitting: Sitting | None = None
+        self.state: TrainState | None = None
+
+    def to_the_end(self, listen: Listener) -> TrainState:
+        """Trains to the end or to the user's interrupt; raises what `listen` raises, once all is saved."""
+        messages = self.messages()
+        for message in messages:
+            try:
+                listen(message)
+            except BaseException as error:  # noqa: BLE001 - The run saves itself, and raises it again.
+                messages.throw(error)
+        assert self.state is not None
+        return self.state
+
+    def messages(self) -> Generator[Message, None, None]:
+        """Trains from one message to the next.
+
+        Raises:
+            InputError: the run was recorded with other settings, or a photograph cannot be read, of the test views too.
+            KeyboardInterrupt: the user stopped the run; the checkpoint is written.
+            TrainingDivergedError: training cannot go on; the last checkpoint stays.
+            OSError: the disk is full or fails; the last checkpoint stays.
+        """
+        directory, settings = self._directory, self._settings
+        if not self._resume:
+            yield Working("preparing the first scene", 0, 1)
+            self.state = first_state(self.recipe, settings, self._dataset)
+        make_folder(directory.path)
+        with run_lock(directory.path):
+            # Another training may have ended here meanwhile.
+            anew = directory.is_begun and not self._resume
+            if self.state is None:
+                self.state = resumed_state(self.recipe, settings, directory)
+            else:
+                directory.check_vacant()
+                directory.begin(self.recipe, settings, self._dataset)
+            with open_log(directory.log, self.state.step) as log:
+                self._sitting = Sitting(directory, self.state, log=log, checkpoint_every=self._every)
+                yield from self._sitting.told(RunBegun(self.state.step, settings.iterations, anew))
+                yield from self._sitting.trained(self._stages, self._dataset, settings.iterations)
+            self._export()
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether the user has asked the run to end; it does after the step."""
+        return self._sitting is not None and self._sitting.is_stopping
+
+    def save(self) -> None:
+        """Writes a checkpoint and the scene, between two messages of which the last one is `StepDone` or later.
+
+        Raises:
+            RuntimeError: the run has not begun.
+            OSError: the disk is full or fails.
+        """
+        if self._sitting is None or self.state is None:
+            raise RuntimeError("nothing to save: the run has not begun")
+        self._sitting.save()
+        self._export()
+
+    def _export(self) -> None:
+        assert self.state is not None
+        self._directory.export(self.state.scene, self.state.step)
+        self._directory.write_refined(self._dataset, self.state.scene)
+
+
+def first_state(recipe: Any, settings: RunSettings, dataset: Dataset) -> TrainState:
+    """The state from which a fresh run starts."""
+    return TrainState(recipe.initialise(dataset), settings.seed, method=recipe.method).to(settings.device)
+
+
+def resumed_state(recipe: Any, settings: RunSettings, directory: RunDirectory) -> TrainState:
+    """The checkpoint's state.
+
+    Raises:
+        InputError: the run was recorded with other settings, or nothing is saved.
+    """
+    directory.check_saved()
+    # A run may go on on another device.
+    recorded = replace(directory.settings(), device=settings.device)
+    if recorded != settings or not directory.was_begun_with(recipe):
+        raise InputError(
+            f"{directory.path} was started with {directory.settings()} and its own recipe; expected the same to "
+            f"resume it, got {settings}. Repeat the original options, with the version of glassplat that began "
+            "it, or choose another --output"
+        )
+    state = load_checkpoint(
+        directory.checkpoint, method=recipe.method, seed=settings.seed, iterations=settings.iterations
+    )
+    return state.to(settings.device)
+
+
+class Sitting:
+    """One stretch of a run: from its beginning or a checkpoint to its end or an interrupt."""
+
+    def __init__(self, directory: RunDirectory, state: TrainState, *, log: RunLog, checkpoint_every: float) -> None:
+        self._directory, self._state = directory, state
+        self._log, self._every = log, checkpoint_every
+        self._seconds_before, self._started = state.seconds, time.perf_counter()
+        self._saved = self._started
+        self._stop = StopRequest()
+
+    def trained(self, stages: tuple[Stage, ...], dataset: Dataset, iterations: int) -> Generator[Message, None, None]:
+        """Trains to the end, or raises KeyboardInterrupt after the step in which the user asks for it."""
+        with stop_on_interrupt() as self._stop, photographs_read(dataset) as check_photographs:
+            for message in train(stages, dataset, self._state, iterations):
+                check_photographs()
+                yield from self.told(message)
+                if not isinstance(message, StepDone):
+                    continue
+                is_last = message.step == iterations
+                if self._stop.requested or is_last or time.perf_counter() - self._saved >= self._every:
+                    self.save()
+                    yield from self.told(CheckpointWritten(message.step))
+                if self._stop.requested and not is_last:
+                    self._stop.end()
+
+    def told(self, message: Message) -> Generator[Message, None, None]:
+        """Passes a message on; should nobody be there any more to hear it, what was trained is saved first."""
+        try:
+            self._log.write(message)
+            yield message
+        except BaseException as error:
+            if isinstance(message, StepDone | ActionDone):
+                self.save()
+            if self._stop.requested and isinstance(error, OSError):
+                self._stop.end()  # A terminal that was closed can show nothing, and that is no failure.
+            raise
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether a signal asked for the end."""
+        return self._stop.requested
+
+    def save(self) -> None:
+        """Writes a checkpoint; the state must not be in the middle of a change."""
+        self._state.seconds = self._seconds_before + time.perf_counter() - self._started
+        save_checkpoint(self._directory.checkpoint, self._state)
+        self._saved = time.perf_counter()
+
+
+class Training:
+    """A training run: iterate over it, and it trains from one message to the next.
+
+        for message in glassplat.Training(dataset, "planar", iterations=7000, output="runs/shop"):
+            match message:
+                case glassplat.StepDone(step=step, loss=loss):
+                    print(step, loss)
+
+    Between two messages, from the first `StepDone` on, `model` is the scene as trained so far. With an `output` the run
+    is written as `glassplat train` writes it, `for` may be left with `break`, Ctrl-C ends it after a step, and either
+    way `resume=True` goes on. Without one, everything stays in memory.
+
+    Attributes:
+        recipe: how to train, with the background that the photographs have.
+        iterations: length of the run.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        recipe: str | Recipe = "planar",
+        *,
+        iterations: int = 30_000,
+        output: str | os.PathLike[str] | None = None,
+        seed: int = 0,
+        device: DeviceName = "auto",
+        resume: bool = False,
+        checkpoint_every: float = CHECKPOINT_SECONDS,
+    ) -> None:
+        """Checks what can be known beforehand; nothing is trained or written yet.
+
+        Args:
+            dataset: photographs to fit.
+            recipe: the name of a method, with its options as they are by default; or a recipe, such as
+                `PlanarRecipe(fresnel="schlick")`, or one of your own.
+            iterations: length of the run; every schedule stretches with it.
+            output: directory of the run.
+            seed: fixes every random choice.
+            device: where to train; `auto` takes an NVIDIA GPU where one can be used.
+            resume: go on with the run in `output`.
+            checkpoint_every: seconds from one checkpoint to the next; there is one at the end in any case.
+
+        Raises:
+            CudaUnavailableError: the GPU was asked for and cannot be used.
+            InputError: no method has that name; `output` holds something else, or nothing to go on from; the run is too
+                short for its stages; or the photographs lie over another background than the recipe's.
+        """
+        chosen = chosen_recipe(recipe)
+        root = str(dataset.root.resolve())  # The run may be looked at from another folder than it was started in.
+        self.iterations, self._dataset = iterations, dataset
+        self._settings = RunSettings(
+            root, iterations, dataset.downscale, seed, str(chosen_device(device)), dataset.mask_polarity
+        )
+        self._run: Run | None = None
+        self._state: TrainState | None = None
+        if output is None:
+            if resume:
+                raise InputError("resume=True needs the output that it is to go on with")
+            self.recipe: Any = settled(chosen, dataset)
+            self._stages = self.recipe.stages(seed, iterations)
+            check_length(self._stages, iterations)
+            return
+        self._run = Run(
+            chosen,
+            self._settings,
+            RunDirectory(Path(output)),
+            dataset,
+            resume=resume,
+            checkpoint_every=checkpoint_every,
+        )
+        self.recipe = self._run.recipe
+
+    def __iter__(self) -> Generator[Message, None, None]:
+        """Trains from one message to the next, to the end.
+
+        Raises:
+            InputError: a photograph cannot be read; or the run in `output` was recorded with other options.
+            KeyboardInterrupt: the user stopped the run.
+            TrainingDivergedError: training cannot go on.
+            OSError: the disk is full or fails.
+        """
+        return self._in_memory() if self._run is None else self._run.messages()
+
+    def run(self, listen: Listener | None = None) -> Model:
+        """Trains to the end; returns the trained model.
+
+        Args:
+            listen: gets every message; what it raises ends the run, once what was trained is saved.
+        """
+        if self._run is not None:
+            self._run.to_the_end(listen or _nobody)
+        else:
+            for message in self._in_memory():
+                (listen or _nobody)(message)
+        return self.model
+
+    @property
+    def state(self) -> TrainState:
+        """Everything that changes while training: scene, optimiser, statistics.
+
+        Raises:
+            RuntimeError: the first scene has not been made yet.
+        """
+        state = self._state if self._run is None else self._run.state
+        if state is None:
+            raise RuntimeError("the run has not begun; ask after its first message from a step")
+        return state
+
+    @property
+    def step(self) -> int:
+        """Iterations done; 0 before the run begins."""
+        state = self._state if self._run is None else self._run.state
+        return 0 if state is None else state.step
+
+    @property
+    def seconds(self) -> float:
+        """Time spent training, over all sittings, up to the last checkpoint."""
+        return self.state.seconds
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether the user has asked the run to end, as with Ctrl-C; it does after the step."""
+        return self._run is not None and self._run.is_stopping
+
+    @property
+    def model(self) -> Model:
+        """The scene as trained so far; its tensors go on changing, so `save` it, or clone what has to stay.
+
+        Raises:
+            RuntimeError: the first scene has not been made yet.
+        """
+        cameras = {view.name: view.camera for view in (*self._dataset.train, *self._dataset.test)}
+        return Model(self.state.scene, self.recipe, cameras, self._dataset.root.name)
+
+    def save(self) -> None:
+        """Writes a checkpoint and the scene into `output` now; between two messages, after a `StepDone`.
+
+        Raises:
+            RuntimeError: there is no `output`, or the run has not begun.
+        """
+        if self._run is None:
+            raise RuntimeError("this training has no output to save to; use `training.model.save(path)`")
+        self._run.save()
+
+    def _in_memory(self) -> Generator[Message, None, None]:
+        if self._state is None:
+            yield Working("preparing the first scene", 0, 1)
+            self._state = first_state(self.recipe, self._settings, self._dataset)
+        yield from train(self._stages, self._dataset, self._state, self.iterations)
+
+
+def chosen_recipe(recipe: str | Recipe) -> Any:
+    """The recipe, or that of a method's name.
+
+    Raises:
+        InputError: no method has that name.
+    """
+    if not isinstance(recipe, str):
+        return recipe
+    if recipe not in RECIPES:
+        raise InputError(f"no method is called {recipe!r}; expected {', '.join(RECIPES)}, or a recipe")
+    return RECIPES[recipe]()
+
+
+def _nobody(message: Message) -> None:
+    """Listens to nothing."""

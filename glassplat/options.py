@@ -1,0 +1,361 @@
+"""Options as dataclasses: ranges in annotations, checked from the command line and from JSON.
+
+An annotation is the only place that says what a value may be: its type, `Literal` choices, and requirements such as
+`Range`. A dataclass whose fields have to fit together has a method `contradiction`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
+
+import tyro
+
+from glassplat.errors import InputError
+
+MOST = 1_000_000_000
+"""Of anything that is counted: more than a machine holds, and few enough for every integer type."""
+
+
+@runtime_checkable
+class Requirement(Protocol):
+    """What the annotation of a field may say of its values; `allows` is asked about values of the annotated type."""
+
+    def allows(self, value: Any) -> bool:
+        """Whether the value will do."""
+        ...
+
+    @property
+    def expected(self) -> str:
+        """What is expected, as the end of a message."""
+        ...
+
+
+@dataclass(frozen=True)
+class Range:
+    """Bounds of a number.
+
+    Attributes:
+        low: the smallest one.
+        high: the largest one.
+        above: the number has to be larger than this.
+        below: the number has to be smaller than this.
+    """
+
+    low: float | None = None
+    high: float | None = None
+    above: float | None = None
+    below: float | None = None
+
+    def allows(self, value: float) -> bool:
+        """Whether the number is within the bounds; NaN never is."""
+        return (
+            value == value
+            and (self.low is None or value >= self.low)
+            and (self.high is None or value <= self.high)
+            and (self.above is None or value > self.above)
+            and (self.below is None or value < self.below)
+        )
+
+    @property
+    def expected(self) -> str:
+        """The bounds in words."""
+        if self.low is not None and self.high is not None:
+            return f"from {self.low} to {self.high}"
+        bounds = ((">=", self.low), (">", self.above), ("<=", self.high), ("<", self.below))
+        return " and ".join(f"{sign} {bound}" for sign, bound in bounds if bound is not None) or "that is finite"
+
+
+@dataclass(frozen=True)
+class Ascending:
+    """Numbers that get no smaller."""
+
+    def allows(self, value: Sequence[float]) -> bool:
+        """Whether they are in order."""
+        return list(value) == sorted(value)
+
+    @property
+    def expected(self) -> str:
+        """The order in words."""
+        return "in ascending order"
+
+
+Finite = Annotated[float, Range()]
+"""Any number but NaN and infinity, which no option may be."""
+Positive = Annotated[float, Range(above=0)]
+NotNegative = Annotated[float, Range(0)]
+Share = Annotated[float, Range(0, 1)]
+"""A part of a whole, nothing and everything included."""
+PositiveShare = Annotated[float, Range(above=0, high=1)]
+InnerShare = Annotated[float, Range(above=0, below=1)]
+"""Of what is stored as a logit, which 0 and 1 do not have."""
+LearningRate = Annotated[float, Range(0, 1)]
+"""Of Adam, which moves a raw parameter by about so much at every step; 0 keeps it as it is."""
+Count = Annotated[int, Range(0, MOST)]
+Several = Annotated[int, Range(1, MOST)]
+Downscale = Annotated[float, Range(1, 1000)]
+"""Of photographs: width and height are divided by it."""
+Seed = Annotated[int, Range(0, 2**32 - 1)]
+ShDegree = Annotated[int, Range(0, 3)]
+PaneLabel = Annotated[int, Range(1, 255)]
+"""What a pixel of a mask can hold; 0 is no pane."""
+Up = Literal["x", "y", "z", "-x", "-y", "-z"]
+"""The axis of the world that points up."""
+Color = tuple[Share, Share, Share]
+"""sRGB."""
+
+
+class Essential(NamedTuple):
+    """Marks an option that many runs need; `--help` shows these, `--help-advanced` all."""
+
+
+ESSENTIAL = Essential()
+
+T = TypeVar("T")
+Internal = Annotated[T, tyro.conf.Fixed, tyro.conf.Suppress]
+"""A value that recipes hold and the command line does not set: a constant of a method, or what its preset decides."""
+
+LONGEST_SHOWN = 60
+"""Characters of a wrong value that a message repeats."""
+UNIONS = (typing.Union, types.UnionType)
+PLAIN = {bool: "True or False", int: "a whole number", float: "a number", str: "a text", Path: "a path"}
+"""Types of single values, and what messages call them."""
+
+
+class OptionError(InputError):
+    """A value that its field does not take; the name is that of the field, with those of the fields it lies in."""
+
+    def __init__(self, name: str, value: Any, expected: str) -> None:
+        super().__init__(f"{name or 'the value'} is {shown(value)}; expected {expected}")
+        self.name, self.value, self.expected = name, value, expected
+
+
+def check_options(options: Any) -> None:
+    """Checks a command or a recipe, and all that it consists of.
+
+    Raises:
+        InputError: a value is out of range, or values contradict; names the option as it is typed.
+    """
+    try:
+        checked(type(options), options, "")
+    except OptionError as error:
+        raise InputError(f"{as_typed(error.name)} is {shown(error.value)}; expected {error.expected}") from error
+
+
+def options_from_json(kind: type, value: Any) -> Any:
+    """An instance of a dataclass from what JSON made of it; fields that are missing have their defaults.
+
+    Raises:
+        InputError: not an object, an unknown field, or a value of a wrong type or out of range; names the field.
+    """
+    return checked(kind, value, "")
+
+
+def as_typed(name: str) -> str:
+    """The option of the command line that sets a field: `rates.means_end` is `--rates.means-end`."""
+    return "--" + name.replace("_", "-")
+
+
+def checked(hint: Any, value: Any, name: str) -> Any:
+    """The value in the type of its annotation, if it is as that demands.
+
+    Args:
+        hint: annotation of a field, or a dataclass.
+        value: of this type, or what JSON makes of such a one.
+        name: of the field, for messages.
+
+    Raises:
+        OptionError: it is not.
+    """
+    hint, requirements = unwrapped(hint)
+    result = _in_type(hint, value, name, requirements)
+    for requirement in requirements:
+        if result is not None and not requirement.allows(result):
+            raise OptionError(name, value, expectation(hint, requirements))
+    return result
+
+
+def unwrapped(hint: Any) -> tuple[Any, tuple[Requirement, ...]]:
+    """An annotation without its metadata, and what of them is a requirement."""
+    if typing.get_origin(hint) is not typing.Annotated:
+        return hint, ()
+    inner, *metadata = typing.get_args(hint)
+    return inner, tuple(data for data in metadata if isinstance(data, Requirement))
+
+
+def expectation(hint: Any, requirements: tuple[Requirement, ...] = ()) -> str:
+    """What a value of this annotation has to be, in words."""
+    bounds = " and ".join(requirement.expected for requirement in requirements)
+    return f"{PLAIN[hint]} {bounds}".rstrip() if hint in PLAIN else ", ".join(filter(None, (_structure(hint), bounds)))
+
+
+def _structure(hint: Any) -> str:
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Literal:
+        return f"one of {', '.join(map(str, inner))}"
+    if origin in UNIONS:
+        return " or ".join("None" if option is type(None) else expectation(*unwrapped(option)) for option in inner)
+    if origin is tuple:
+        if inner[-1] is ...:
+            return f"any number of values, each {expectation(*unwrapped(inner[0]))}"
+        kinds = dict.fromkeys(expectation(*unwrapped(part)) for part in inner)
+        return f"{len(inner)} values, " + (
+            f"each {next(iter(kinds))}" if len(kinds) == 1 else f"out of: {'; '.join(kinds)}"
+        )
+    return "an object with named values"
+
+
+def _in_type(hint: Any, value: Any, name: str, requirements: tuple[Requirement, ...]) -> Any:
+    """The value in a type without metadata; requirements are for the message."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return _fields(type(value), {field.name: getattr(value, field.name) for field in fields(value)}, name)
+    if dataclasses.is_dataclass(hint):
+        return _fields(typing.cast(type, hint), value, name)
+    origin = typing.get_origin(hint)
+    if origin in UNIONS:
+        return _alternative(hint, value, name)
+    if origin in CONTAINERS:
+        return CONTAINERS[origin](hint, value, name)
+    if not _is_of(hint, value):
+        raise OptionError(name, value, expectation(hint, requirements))
+    return hint(value) if hint in (float, Path) else value
+
+
+def _is_of(hint: Any, value: Any) -> bool:
+    """Whether a single value is of a type; a whole number is a number too, but True is not, nor is infinity."""
+    if hint is float:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and _is_finite(value)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    if hint is Path:
+        return isinstance(value, (str, Path))
+    return isinstance(value, hint)
+
+
+def _is_finite(value: float) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # A whole number of hundreds of digits.
+        return False
+
+
+def _fields(kind: type, value: Any, name: str) -> Any:
+    """An instance of a dataclass from its fields by name."""
+    if not isinstance(value, Mapping):
+        raise OptionError(name, value, "an object with named values")
+    hints = typing.get_type_hints(kind, include_extras=True)
+    known = [field.name for field in fields(kind)]
+    unknown = sorted(map(str, set(value) - set(known)))
+    if unknown:
+        raise InputError(f"unknown fields {unknown} of {name or 'the options'}; there are {known}")
+    missing = [field.name for field in fields(kind) if _is_needed(field) and field.name not in value]
+    if missing:
+        raise InputError(f"fields {missing} of {name or 'the options'} are missing")
+    values = {key: checked(hints[key], value[key], _inner_name(name, key, hints[key])) for key in known if key in value}
+    made = kind(**values)
+    contradiction = made.contradiction() if hasattr(made, "contradiction") else None
+    if contradiction:
+        raise InputError(contradiction)
+    return made
+
+
+def _is_needed(field: dataclasses.Field) -> bool:
+    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+
+
+def _inner_name(outer: str, field: str, hint: Any) -> str:
+    """The name of a field of a field; one that the command line does not name has no name of its own."""
+    nameless = any(getattr(data, "name", None) == "" for data in typing.get_args(hint)[1:])
+    return outer if nameless else f"{outer}.{field}".removeprefix(".")
+
+
+def _alternative(hint: Any, value: Any, name: str) -> Any:
+    """The value in the first type of a union that takes it."""
+    if value is None and type(None) in typing.get_args(hint):
+        return None
+    options = [option for option in typing.get_args(hint) if option is not type(None)]
+    if len(options) == 1:
+        try:
+            return checked(options[0], value, name)
+        except OptionError as error:
+            # Of a field inside of the value there is more to say than of the value.
+            raise OptionError(error.name, error.value, f"{error.expected}, or None") from error
+    for option in options:
+        try:
+            return checked(option, value, name)
+        except InputError:
+            continue
+    raise OptionError(name, value, expectation(hint))
+
+
+def _literal(hint: Any, value: Any, name: str) -> Any:
+    choices = typing.get_args(hint)
+    if not any(value == choice and type(value) is type(choice) for choice in choices):
+        raise OptionError(name, value, f"one of {', '.join(map(str, choices))}")
+    return value
+
+
+def _tuple(hint: Any, value: Any, name: str) -> tuple[Any, ...]:
+    inner = typing.get_args(hint)
+    if not isinstance(value, (list, tuple)) or (inner[-1] is not ... and len(value) != len(inner)):
+        raise OptionError(name, value, _structure(hint))
+    kinds = inner[:1] * len(value) if inner[-1] is ... else inner
+    try:
+        return tuple(checked(kind, element, name) for kind, element in zip(kinds, value, strict=True))
+    except OptionError as error:
+        raise OptionError(name, value, _structure(hint)) from error
+
+
+def _dict(hint: Any, value: Any, name: str) -> dict[Any, Any]:
+    keys, values = typing.get_args(hint)
+    if not isinstance(value, Mapping):
+        raise OptionError(name, value, _structure(hint))
+    return {checked(keys, key, name): checked(values, element, name) for key, element in value.items()}
+
+
+CONTAINERS: dict[Any, Callable[[Any, Any, str], Any]] = {typing.Literal: _literal, tuple: _tuple, dict: _dict}
+
+
+def shown(value: Any) -> str:
+    """A value for a message, cut short."""
+    try:
+        text = repr(value) if isinstance(value, str) else str(value)
+    except ValueError:  # A whole number of too many digits to print.
+        text = "a number of thousands of digits"
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
+
+
+def number_fields(kind: type, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Every option of a dataclass and of those in it that holds numbers: its name and the annotation of each number."""
+    for field, hint in typing.get_type_hints(kind, include_extras=True).items():
+        if typing.get_origin(hint) is not typing.ClassVar:
+            yield from _numbers(hint, _inner_name(name, field, hint))
+
+
+def _numbers(hint: Any, name: str) -> Iterator[tuple[str, Any]]:
+    inner, _ = unwrapped(hint)
+    if inner in (int, float):
+        yield name, hint
+    elif isinstance(inner, type) and dataclasses.is_dataclass(inner):
+        yield from number_fields(inner, name)
+    elif typing.get_origin(inner) is not typing.Literal:
+        for part in typing.get_args(inner):
+            yield from _numbers(part, name)
+
+
+Rgb = tuple[float, float, float]
+"""sRGB in [0, 1]."""
+WHITE: Rgb = (1.0, 1.0, 1.0)
+BLACK: Rgb = (0.0, 0.0, 0.0)
+"""Behind captures of places, which fill their photographs."""
+
+Blend = Literal["srgb", "linear"]
+"""The space in which transmission and reflection are blended: as photographed, or in radiance."""
+Shading = Literal["deferred", "forward"]
+"""Whether each pixel is shaded, or each Gaussian."""

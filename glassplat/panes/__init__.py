@@ -1,0 +1,1 @@
+"""Panes fitted to masks: planes, rectangles, glass and mirrors."""

@@ -1,0 +1,451 @@
+"""Annotated masks of a pane, their edges and rays; planes and rectangles through points; and where masks agree.
+
+Masks of several views agree on a plane in this sense: a plane maps every pixel of one view to a pixel of another. On
+the pane's own plane the mask of the first view lands on the mask of the second; on any other plane parallax pulls them
+apart. Outside of an image nothing is known, so that a mask which leaves its image is no contradiction; nor is anything
+known where a mask shows another pane, which may stand in front.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from glassplat.scene.camera import Camera
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A rectangle in the plane, longer side first.
+
+    Attributes:
+        center: [2] its middle.
+        axis: [2] unit direction of its longer side; the other side is at +90 degrees.
+        half_sizes: [2] half the length of the longer and of the shorter side.
+    """
+
+    center: Array
+    axis: Array
+    half_sizes: Array
+
+
+def min_area_rectangle(points: Array) -> Rectangle:
+    """The rectangle of least area that holds all points [P, 2].
+
+    One of its sides lies along an edge of the convex hull (Freeman and Shapira, 1975), so it is
+    enough to measure the hull along each of its edges.
+
+    Raises:
+        ValueError: the points do not span an area.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = points[ConvexHull(points).vertices]
+    except (QhullError, ValueError) as error:
+        raise ValueError(f"{len(points)} points do not span an area; expected at least three off one line") from error
+    edges = np.roll(hull, -1, axis=0) - hull
+    along = edges / np.linalg.norm(edges, axis=1, keepdims=True)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    extents = np.stack([hull @ along.T, hull @ across.T])  # [2, P, E]
+    low, high = extents.min(axis=1), extents.max(axis=1)
+    best = int(np.argmin(np.prod(high - low, axis=0)))
+
+    middle, half = (high + low)[:, best] / 2, (high - low)[:, best] / 2
+    center = middle[0] * along[best] + middle[1] * across[best]
+    if half[0] >= half[1]:
+        return Rectangle(center, along[best], half)
+    return Rectangle(center, across[best], half[::-1])
+
+
+@dataclass(frozen=True)
+class PlaneEquations:
+    """H planes, the points x with normal . x = offset.
+
+    Attributes:
+        normals: [H, 3] unit normals.
+        offsets: [H] signed distances of the planes from the origin.
+    """
+
+    normals: Array
+    offsets: Array
+
+    def __len__(self) -> int:
+        return len(self.offsets)
+
+    def distances(self, points: Array) -> Array:
+        """[H, N] signed distances of points [N, 3]."""
+        return self.normals @ points.T - self.offsets[:, None]
+
+    def select(self, index: NDArray[np.int64]) -> PlaneEquations:
+        """The planes at `index`."""
+        return PlaneEquations(self.normals[index], self.offsets[index])
+
+
+@dataclass(frozen=True)
+class FramedPlanes:
+    """Planes with the heights of the frames around them.
+
+    Attributes:
+        planes: H planes.
+        frames: [H] how far the frame stands out from the glass, world units.
+    """
+
+    planes: PlaneEquations
+    frames: Array
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def select(self, index: NDArray[np.int64]) -> FramedPlanes:
+        """Those at `index`."""
+        return FramedPlanes(self.planes.select(index), self.frames[index])
+
+
+def joined(parts: Sequence[FramedPlanes]) -> FramedPlanes:
+    """All planes of several sets."""
+    normals = np.concatenate([part.planes.normals for part in parts])
+    offsets = np.concatenate([part.planes.offsets for part in parts])
+    return FramedPlanes(PlaneEquations(normals, offsets), np.concatenate([part.frames for part in parts]))
+
+
+def in_plane_axes(planes: PlaneEquations) -> tuple[Array, Array]:
+    """Two directions [H, 3] each that are perpendicular to the normals and to one another; unit vectors."""
+    first = np.cross(planes.normals, np.eye(3)[np.argmin(np.abs(planes.normals), axis=1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return first, np.cross(planes.normals, first)
+
+
+def random_planes(points: Array, count: int, rng: np.random.Generator) -> PlaneEquations:
+    """Planes through random triplets of points [N, 3]; up to `count`, since flat triplets are dropped.
+
+    Args:
+        points: [N, 3] at least three positions.
+        count: number of triplets.
+        rng: source of randomness.
+    """
+    a, b, c = points[(len(points) * rng.random((3, count))).astype(np.int64)]
+    normals = np.cross(b - a, c - a)
+    area = np.linalg.norm(normals, axis=1)
+    # A triplet close to a line says nothing about the tilt of a plane around that line.
+    spread = np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - a, axis=1)
+    usable = area > 0.1 * np.maximum(spread, np.finfo(np.float64).tiny)
+    normals = normals[usable] / area[usable, None]
+    return PlaneEquations(normals, np.einsum("hd,hd->h", normals, a[usable]))
+
+
+def support(planes: PlaneEquations, points: Array, *, distance: float) -> Array:
+    """[H] share of the points within `distance` of each plane."""
+    near: Array = (np.abs(planes.distances(points)) <= distance).mean(axis=1)
+    return near
+
+
+Mask = NDArray[np.bool_]
+
+THINNEST_PART = 0.005  # Half width below which a part of a mask is taken for an artefact, in image diagonals.
+
+EDGE_SMOOTHING = 0.005
+"""Standard deviation with which a mask is smoothed before its edge has a direction, in image diagonals."""
+
+
+@dataclass(frozen=True)
+class PaneView:
+    """Where one pane is, and is not, in one annotated view.
+
+    Attributes:
+        cam_from_world: [4, 4] rigid transform, world to camera.
+        intrinsics: [4] fx, fy, cx, cy in pixels.
+        mask: [H, W] true on the pane.
+        hidden: [H, W] true on other panes, behind which this one may go on.
+        distance: [H, W] pixels from a pixel's centre to the edge of the mask, positive inside. Where
+            the mask leaves the image there is no edge, because the pane goes on.
+        edge: [E, 2] points (x, y) half-way between a pixel on the pane and a neighbour off it.
+        outward: [E, 2] unit vectors across the edge, off the pane.
+        name: of the photograph, for messages.
+    """
+
+    cam_from_world: Array
+    intrinsics: Array
+    mask: Mask
+    hidden: Mask
+    distance: Array
+    edge: Array
+    outward: Array
+    name: str = ""
+
+    @property
+    def center(self) -> Array:
+        """[3] camera centre in the world."""
+        return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the image diagonal in pixels."""
+        return float(np.hypot(*self.mask.shape))
+
+    def directions(self, pixels: Array) -> Array:
+        """[P, 3] world directions of the rays through pixel positions [P, 2]; camera z grows by 1 along each."""
+        fx, fy, cx, cy = self.intrinsics
+        in_camera = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], axis=1)
+        return in_camera @ self.cam_from_world[:3, :3]
+
+    def sight_limits(self, pixels: Array, outward: Array) -> Array:
+        """[P, 3] unit normals of the planes through the camera and lines in the image.
+
+        Args:
+            pixels: [P, 2] a point of each line.
+            outward: [P, 2] unit vectors across the lines, to the side that the normals point to.
+        """
+        fx, fy, cx, cy = self.intrinsics
+        a, b = outward[:, 0] * fx, outward[:, 1] * fy
+        c = -(a * (pixels[:, 0] - cx) / fx + b * (pixels[:, 1] - cy) / fy)
+        in_camera = np.stack([a, b, c], axis=1)
+        return in_camera / np.linalg.norm(in_camera, axis=1, keepdims=True) @ self.cam_from_world[:3, :3]
+
+    def project(self, points: Array) -> tuple[Array, Mask]:
+        """Pixel positions [..., 2] of world points [..., 3], and whether the image holds them."""
+        fx, fy, cx, cy = self.intrinsics
+        in_camera = points @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]
+        depth = in_camera[..., 2]
+        safe = np.where(depth > 0, depth, np.inf)
+        x, y = fx * in_camera[..., 0] / safe + cx, fy * in_camera[..., 1] / safe + cy
+        height, width = self.mask.shape
+        held = (depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        return np.stack([x, y], axis=-1), held
+
+    def covers(self, pixels: Array, held: Mask) -> Mask:
+        """[...] whether pixel positions [..., 2] lie on the pane; false where `held` is."""
+        found = np.zeros(held.shape, dtype=bool)
+        column, row = np.floor(pixels[held]).astype(np.int64).T
+        found[held] = self.mask[row, column]
+        return found
+
+    def tells(self, pixels: Array, held: Mask) -> Mask:
+        """[...] whether it is known if the pane is at pixel positions [..., 2]; false where `held` is."""
+        known = held.copy()
+        column, row = np.floor(pixels[held]).astype(np.int64).T
+        known[held] = ~self.hidden[row, column]
+        return known
+
+    def edge_distance(self, pixels: Array) -> Array:
+        """[P] signed distance to the mask's edge at pixel positions [P, 2], interpolated."""
+        centred = pixels[:, ::-1].T - 0.5
+        from scipy import ndimage
+
+        sampled: Array = ndimage.map_coordinates(self.distance, centred, order=1, mode="nearest")
+        return sampled
+
+    def grid(self, count: int) -> Array:
+        """[P, 2] about `count` pixel positions spread evenly over the image."""
+        height, width = self.mask.shape
+        step = max(np.sqrt(height * width / count), 1.0)
+        x, y = np.meshgrid(np.arange(step / 2, width, step), np.arange(step / 2, height, step))
+        return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def pane_view(camera: Camera, labels: Tensor, label: int, *, name: str = "") -> PaneView:
+    """One pane of one annotated view.
+
+    Args:
+        camera: the view's camera.
+        labels: [H, W] integer label image, of the camera's size.
+        label: which pane.
+        name: of the photograph, for messages.
+
+    Raises:
+        ValueError: the label image and the camera differ in size.
+    """
+    if tuple(labels.shape) != (camera.height, camera.width):
+        raise ValueError(
+            f"a mask of shape {tuple(labels.shape)} belongs to a camera of {camera.height} x {camera.width} pixels; "
+            "resize both the same way"
+        )
+    image = labels.cpu().numpy()
+    mask = _without_slivers(image == label)
+    edge = _edge_points(mask)
+    return PaneView(
+        cam_from_world=_array(camera.cam_from_world),
+        intrinsics=np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+        mask=mask,
+        hidden=~mask & (image != label) & (image != 0),
+        distance=_signed_distance(mask),
+        edge=edge,
+        outward=_outward(mask, edge),
+        name=name,
+    )
+
+
+def _array(tensor: Tensor) -> Array:
+    return tensor.detach().cpu().numpy().astype(np.float64)
+
+
+def _without_slivers(mask: Mask) -> Mask:
+    """The mask without parts that are only a few pixels wide.
+
+    Label images that were resized or saved with blending carry a line of label 1 around label 2.
+    """
+    from scipy import ndimage
+
+    parts, count = ndimage.label(mask)
+    if count == 0:
+        return mask
+    half_widths = ndimage.maximum(_signed_distance(mask), parts, index=np.arange(count + 1))
+    wide = half_widths > THINNEST_PART * np.hypot(*mask.shape)
+    wide[0] = False
+    return np.asarray(wide[parts])
+
+
+def _signed_distance(mask: Mask) -> Array:
+    """[H, W] distance to the mask's edge in pixels, positive inside."""
+    if mask.all() or not mask.any():
+        return np.full(mask.shape, np.hypot(*mask.shape) if mask.all() else -np.hypot(*mask.shape))
+    # The edge runs half a pixel before the nearest centre on the other side.
+    from scipy import ndimage
+
+    inside: Array = ndimage.distance_transform_edt(mask)
+    outside: Array = ndimage.distance_transform_edt(~mask)
+    return np.where(mask, inside - 0.5, 0.5 - outside)
+
+
+def _edge_points(mask: Mask) -> Array:
+    row, column = np.nonzero(mask[:, 1:] != mask[:, :-1])
+    upright = np.stack([column + 1.0, row + 0.5], axis=1)
+    row, column = np.nonzero(mask[1:] != mask[:-1])
+    level = np.stack([column + 0.5, row + 1.0], axis=1)
+    return np.concatenate([upright, level])
+
+
+def _outward(mask: Mask, edge: Array) -> Array:
+    """[E, 2] unit vectors down the slope of the smoothed mask at its edge points."""
+    from scipy import ndimage
+
+    smooth = ndimage.gaussian_filter(mask.astype(np.float64), EDGE_SMOOTHING * np.hypot(*mask.shape), mode="nearest")
+    slopes = [
+        ndimage.map_coordinates(-np.gradient(smooth, axis=axis), edge[:, ::-1].T - 0.5, order=1) for axis in (1, 0)
+    ]
+    outward = np.stack(slopes, axis=1)
+    return outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+
+
+def pane_views(
+    annotations: Sequence[tuple[Camera, Tensor]], label: int, *, most: int = 12, names: Sequence[str] | None = None
+) -> list[PaneView]:
+    """Annotated views that show a pane, ignoring parts of it that are only a few pixels wide.
+
+    Args:
+        annotations: cameras and their label images [H, W].
+        label: which pane.
+        most: largest number of views; where a capture has a mask for every photograph, those that
+            show much of the pane and were taken far from one another tell enough.
+        names: of the photographs; they are numbered from 1 if None.
+    """
+    centers = np.array([_array(camera.center) for camera, _ in annotations])
+    shares = np.array([float((labels == label).double().mean()) for _, labels in annotations])
+    chosen = _far_apart(centers, shares, most)
+    names = names or [f"annotation {number}" for number in range(1, len(annotations) + 1)]
+    views = (pane_view(*annotations[index], label, name=names[index]) for index in sorted(chosen))
+    return [view for view in views if view.mask.any()]
+
+
+def _far_apart(positions: Array, values: Array, count: int) -> list[int]:
+    """Up to `count` indices of positive values, greedily by value times distance from those already chosen."""
+    chosen: list[int] = []
+    distance = np.ones(len(values))
+    while len(chosen) < min(count, int((values > 0).sum())):
+        # Views from one place have no distance; the small constant still takes the largest of them.
+        worth = values * (distance + 1e-9)
+        worth[chosen] = 0
+        chosen.append(int(np.argmax(worth)))
+        nearest = np.linalg.norm(positions - positions[chosen[-1]], axis=1)
+        distance = nearest if len(chosen) == 1 else np.minimum(distance, nearest)
+    return chosen
+
+
+def plane_candidates(
+    points: Array, views: Sequence[PaneView], *, band: float, agreement: float = 0.5
+) -> NDArray[np.bool_]:
+    """[N] bool: which points lie along the pane's edge (TR-Gaussians, Appendix A, steps 1 and 2).
+
+    A point on the frame projects close to the mask's edge in every view; a point before or behind
+    it may do so in one view but moves away in others. So the views vote.
+
+    Args:
+        points: [N, 3] world positions.
+        views: annotated views of the pane.
+        band: half width of the band along the mask's edge, as a share of the image diagonal.
+        agreement: share of the views whose image holds the point in which it must lie in the band.
+            Not all of them, since something may stand before the edge.
+    """
+    votes, held_count = np.zeros(len(points)), np.zeros(len(points))
+    for view in views:
+        pixels, held = view.project(points)
+        votes[held] += np.abs(view.edge_distance(pixels[held])) <= band * view.diagonal
+        held_count += held
+    return (votes >= min(2, len(views))) & (votes >= agreement * held_count)
+
+
+UNKNOWN_WEIGHT = 0.05
+"""Weight of what leaves the other image, against planes on which hardly anything can be compared."""
+
+
+def meet(planes: PlaneEquations, origin: Array, directions: Array) -> tuple[Array, Mask]:
+    """Points [H, P, 3] where rays meet planes, and whether that is in front of their origin.
+
+    Args:
+        planes: H planes.
+        origin: [3] where all rays start.
+        directions: [P, 3] their directions.
+    """
+    slope = planes.normals @ directions.T
+    height = planes.offsets - planes.normals @ origin
+    along = height[:, None] / np.where(np.abs(slope) < 1e-9, 1e-9, slope)
+    hit = along > 0
+    return origin + np.where(hit, along, 0)[..., None] * directions, hit
+
+
+def mask_agreement(planes: PlaneEquations, views: Sequence[PaneView], *, pixels_per_view: int = 400) -> Array:
+    """[H] how well the masks agree on each plane: intersection over union, pooled over pairs of views.
+
+    Args:
+        planes: hypotheses.
+        views: annotated views of one pane, at least two.
+        pixels_per_view: number of rays that are followed from each view.
+    """
+    both, either = _overlaps(planes, views, pixels_per_view)
+    agreement: Array = both.sum(axis=(0, 1)) / np.maximum(either.sum(axis=(0, 1)), 1)
+    return agreement
+
+
+def agreement_of_each(plane: PlaneEquations, views: Sequence[PaneView], *, pixels_per_view: int = 400) -> Array:
+    """[V] how well the mask of each view agrees with those of all others on one plane; as `mask_agreement`."""
+    both, either = (pairs[..., 0] + pairs[..., 0].T for pairs in _overlaps(plane, views, pixels_per_view))
+    agreement: Array = both.sum(axis=1) / np.maximum(either.sum(axis=1), 1)
+    return agreement
+
+
+def _overlaps(planes: PlaneEquations, views: Sequence[PaneView], pixels_per_view: int) -> tuple[Array, Array]:
+    """Pixels of each view on the pane in another one as well, and on it in either; [V, V, H], from and to."""
+    count = len(views)
+    both, either = np.zeros((2, count, count, len(planes)))
+    for number, source in enumerate(views):
+        pixels = source.grid(pixels_per_view)
+        pixels = pixels[source.tells(pixels, np.ones(len(pixels), dtype=bool))]
+        on_pane = source.covers(pixels, np.ones(len(pixels), dtype=bool))
+        points, hit = meet(planes, source.center, source.directions(pixels))
+        for other, target in enumerate(views):
+            if target is not source:
+                landed, held = target.project(points)
+                held = target.tells(landed, held & hit)
+                covered = target.covers(landed, held)
+                both[number, other] = (covered & on_pane).sum(axis=1)
+                unknown = (hit & on_pane & ~held).sum(axis=1)
+                # A plane behind the camera cannot hold a pane that the camera sees.
+                missed = (on_pane & ~hit).sum(axis=1)
+                either[number, other] = (held & (covered | on_pane)).sum(axis=1) + missed + UNKNOWN_WEIGHT * unknown
+    return both, either

@@ -1,0 +1,290 @@
+"""The search for a pane's plane: hypotheses from points and masks, judged and refined by the masks."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from glassplat.panes.masks import FramedPlanes, joined, mask_agreement, random_planes
+from glassplat.panes.objective import (
+    COARSE,
+    EDGES,
+    FINE,
+    MIDDLE,
+    USUAL_FRAME,
+    Objective,
+    Terms,
+    moved,
+    planes_nearby,
+    planes_through_masks,
+)
+
+Array = NDArray[np.float64]
+
+ITERATIONS = 15
+STEP = 3e-4
+"""Step of the numerical derivative: radians, distances of the cameras, scene extents. A fraction of a pixel."""
+SMALLEST_CURVATURE = 1e-12
+FIRST_DAMPING, EASE, STIFFEN = 1e-2, 0.3, 5.0
+NOTICEABLE = 0.01
+"""Share of the largest possible cost."""
+SETTLED = 1e-4
+"""Change of a parameter below which a plane has arrived."""
+
+
+def refined(planes: FramedPlanes, objective: Objective, tolerances: Sequence[float]) -> FramedPlanes:
+    """Each plane after tilt, offset and height of the frame have minimised the objective.
+
+    The Geman-McClure loss ignores what is far off, and it must: where something stands before the pane, the mask's edge
+    is not the pane's and matches no other view.
+
+    Args:
+        planes: H planes to start from.
+        objective: what is known about the pane.
+        tolerances: distances of mask edges at which the loss is one half, in image diagonals, one after the other.
+    """
+    for tolerance in tolerances:
+        planes = _minimised(planes, objective, tolerance)
+    return planes
+
+
+def _minimised(planes: FramedPlanes, objective: Objective, tolerance: float) -> FramedPlanes:
+    """All planes after damped steps; those that have arrived are left where they are."""
+    count = len(planes)
+    damping, active = np.full(count, FIRST_DAMPING), np.arange(count)
+    anchors, scales = objective.anchors(planes.planes), _scales(planes, objective)
+    for _ in range(ITERATIONS):
+        moving = planes.select(active)
+        cost, hessian, gradient = _quadratic(moving, objective, tolerance, anchors[active], scales[active])
+        diagonal = np.einsum("hii->hi", hessian) + np.finfo(np.float64).eps
+        damped = hessian + (damping[active, None] * diagonal)[:, None] * np.eye(4)
+        steps = -np.linalg.solve(damped + SMALLEST_CURVATURE * np.eye(4), gradient[..., None])[..., 0]
+        tried = _stepped(moving, anchors[active], steps * scales[active])
+        better = objective.terms(tried, tolerance).cost < cost
+        planes = _replaced(planes, active[better], tried.select(np.flatnonzero(better)))
+        damping[active] *= np.where(better, EASE, STIFFEN)
+        active = active[np.abs(steps).max(axis=1) > SETTLED]
+        if not len(active):
+            break
+    return planes
+
+
+def _scales(planes: FramedPlanes, objective: Objective) -> Array:
+    """[H, 4] what a step of one means for each plane: a radian twice, a distance of the cameras, a scene extent."""
+    ones = np.ones(len(planes))
+    return np.stack([ones, ones, objective.reach(planes.planes), objective.extent * ones], axis=1)
+
+
+def _quadratic(
+    planes: FramedPlanes, objective: Objective, tolerance: float, anchors: Array, scales: Array
+) -> tuple[Array, Array, Array]:
+    """The cost [H] of planes, and its Gauss-Newton matrix [H, 4, 4] and gradient [H, 4] (halved)."""
+    here, moved_residuals = _nearby(planes, objective, tolerance, anchors, scales)
+    jacobian = (moved_residuals - here.residuals) / STEP
+    weighted = jacobian * _pull(here)
+    return here.cost, _products(weighted, jacobian), np.einsum("ahm,hm->ha", weighted, here.residuals)
+
+
+def _nearby(
+    planes: FramedPlanes, objective: Objective, tolerance: float, anchors: Array, scales: Array
+) -> tuple[Terms, Array]:
+    """The terms of planes, and the residuals [4, H, M] after a small step along each axis."""
+    count = len(planes)
+    nearby = [planes]
+    for axis in range(4):
+        nearby.append(_stepped(planes, anchors, STEP * np.eye(4)[axis] * scales))
+    terms = objective.terms(joined(nearby), tolerance)
+    residuals = terms.residuals.reshape(5, count, -1)
+    return Terms(residuals[0], terms.weights[:count], terms.rest[:count]), residuals[1:]
+
+
+def _pull(terms: Terms) -> Array:
+    """[H, M] weights with which least squares have the slope of the Geman-McClure loss."""
+    weights: Array = terms.weights / (1 + terms.residuals**2) ** 2
+    return weights
+
+
+def _products(first: Array, second: Array) -> Array:
+    """[H, 4, 4] sums of products of slopes [4, H, M]."""
+    found: Array = np.einsum("ahm,bhm->hab", first, second)
+    return found
+
+
+def _stepped(planes: FramedPlanes, anchors: Array, steps: Array) -> FramedPlanes:
+    """The planes after steps [H, 4]: two tilts, a shift, a change of the frame, which has no negative height."""
+    return FramedPlanes(moved(planes.planes, anchors, steps[:, :3]), np.maximum(planes.frames + steps[:, 3], 0))
+
+
+def _replaced(planes: FramedPlanes, index: NDArray[np.int64], others: FramedPlanes) -> FramedPlanes:
+    """The planes, with those at `index` replaced by others."""
+    order = np.arange(len(planes))
+    order[index] = len(planes) + np.arange(len(index))
+    return joined([planes, others]).select(order)
+
+
+def doubt(planes: FramedPlanes, objective: Objective, tolerance: float) -> Array:
+    """[H] angle, radians, by which each plane could turn before its cost shows a change of `NOTICEABLE`.
+
+    The plane is free to shift and the frame to grow meanwhile. The Gauss-Newton matrix at the plane tells.
+    """
+    anchors, scales = objective.anchors(planes.planes), _scales(planes, objective)
+    here, residuals = _nearby(planes, objective, tolerance, anchors, scales)
+    # Where an edge comes into an image, or leaves it, a residual jumps from zero or to it, which is no slope.
+    jacobian = np.where((residuals == 0) == (here.residuals == 0), residuals - here.residuals, 0) / STEP
+    hessian = _products(jacobian * _pull(here), jacobian)
+    turns = np.linalg.inv(hessian + SMALLEST_CURVATURE * np.eye(4))[:, :2, :2]
+    widest: Array = np.sqrt(NOTICEABLE * np.linalg.eigvalsh(turns)[:, -1])
+    return widest
+
+
+AGREEMENT_WEIGHT = 0.1
+"""Weight of the agreement of the masks against that of their edges, which know of frames."""
+POOL, LEAST_OF_BEST = 200, 0.5
+"""Number of the hypotheses on which the masks agree best whose edges are compared, and the share of the best agreement
+below which no edges are looked at."""
+BY_AREAS, BY_EDGES, CHILDREN = 12, 6, 30
+"""Number of hypotheses that are followed because masks agree on them, and because edges meet, and of the planes tried
+around each of them in each round."""
+ROUNDS = ((0.3, 0.1, 2 * COARSE), (0.1, 0.03, COARSE))
+"""Spread of these (radians, distances of the cameras from the pane) and tolerance of the edges, for each round."""
+SHAKE = (0.03, 0.01, MIDDLE)
+"""The same for the last round, between two refinements."""
+FRAME_SPREAD = 0.5
+"""Standard deviation of the logarithm of the height of frames in each round."""
+COARSE_EDGES = 200
+"""Edge points, in all views together, while hypotheses are many."""
+PIXELS = 600
+"""Pixels whose rays are followed to compare masks, in all views together."""
+
+
+def best_plane(objective: Objective, *, hypotheses: int, refine: int, rng: np.random.Generator) -> FramedPlanes:
+    """The one plane on which the masks of all views coincide best.
+
+    Hypotheses pass through triplets of points, as in RANSAC, and through pixels of the masks, because a pane may have
+    no points on its frame. The agreement of the masks ranks them. The best ones are followed by random search, refined,
+    shaken and refined again, as the loss has many local minima where posts or plants hide parts of the pane.
+
+    Args:
+        objective: views of the pane, at least two, and candidate points, of which there may be none.
+        hypotheses: number of planes drawn through triplets of points, and again through the masks.
+        refine: number of planes that are refined at last.
+        rng: source of randomness.
+    """
+    beam = first_hypotheses(objective, hypotheses, rng)
+    for tilt, shift, tolerance in ROUNDS:
+        beam = _followed(beam, objective, (tilt, shift), tolerance, rng)
+    beam = _agreed(refined(beam, objective, (COARSE, MIDDLE)), objective)
+    tilt, shift, tolerance = SHAKE
+    shaken = _followed(beam, objective, (tilt, shift), tolerance, rng)
+    best_first = np.argsort(contradiction(beam, objective, (COARSE, MIDDLE)), kind="stable")
+    leading = joined([beam.select(best_first[:refine]), shaken.select(np.arange(min(refine, len(shaken))))])
+    finished = _agreed(refined(leading, objective, (MIDDLE, FINE)), objective)
+    return finished.select(np.array([np.argmin(contradiction(finished, objective))]))
+
+
+def contradiction(
+    planes: FramedPlanes,
+    objective: Objective,
+    tolerances: tuple[float, ...] = (COARSE, MIDDLE, FINE),
+    *,
+    edges: int = EDGES,
+) -> Array:
+    """[H] what tells against planes, their masks included, at several tolerances; in no unit, near 0 on the pane."""
+    costs = [objective.terms(planes, tolerance, edges=edges).cost for tolerance in tolerances]
+    mean: Array = np.mean(costs, axis=0) - AGREEMENT_WEIGHT * _agreement(planes, objective)
+    return mean
+
+
+def first_hypotheses(objective: Objective, count: int, rng: np.random.Generator) -> FramedPlanes:
+    """The planes, of those drawn through points and masks, on which the masks agree best, or their edges.
+
+    Areas lead there from afar. But where a pane fills most of the photographs they agree by more than nine tenths on
+    planes that are off by a right angle, and only edges tell.
+    """
+    drawn = [planes_through_masks(objective.views, count, rng)]
+    if len(objective.points) >= 3:
+        through = random_planes(objective.points, count, rng)
+        drawn.append(through.select(np.argsort(-objective.support(through), kind="stable")[: count // 4]))
+    usual = USUAL_FRAME * objective.extent
+    planes = joined([FramedPlanes(part, np.full(len(part), usual)) for part in drawn])
+    scores = _agreement(planes, objective) + AGREEMENT_WEIGHT * objective.support(planes.planes)
+    best_first = _agreed(planes.select(np.argsort(-scores, kind="stable")[:POOL]), objective, least=BY_AREAS)
+    costs = contradiction(best_first, objective, (ROUNDS[0][2],), edges=COARSE_EDGES)
+    by_edges = np.argsort(costs, kind="stable")
+    by_areas = np.arange(len(best_first))[:BY_AREAS]
+    return best_first.select(np.concatenate([by_areas, by_edges[by_edges >= BY_AREAS][:BY_EDGES]]))
+
+
+def _followed(
+    beam: FramedPlanes, objective: Objective, spread: tuple[float, float], tolerance: float, rng: np.random.Generator
+) -> FramedPlanes:
+    """The best plane around each of the beam's, best first."""
+    tilt, shift = spread
+    shifts = shift * objective.reach(beam.planes)
+    around = planes_nearby(beam.planes, objective.anchors(beam.planes), CHILDREN, tilt=tilt, shift=shifts, rng=rng)
+    factors = np.exp(FRAME_SPREAD * rng.standard_normal((len(beam), 1 + CHILDREN)))
+    factors[:, 0] = 1
+    family = FramedPlanes(around, (beam.frames[:, None] * factors).ravel())
+    costs = objective.terms(family, tolerance, edges=COARSE_EDGES).cost.reshape(factors.shape)
+    best = np.arange(len(beam)) * (1 + CHILDREN) + costs.argmin(axis=1)
+    return family.select(best[np.argsort(costs.min(axis=1), kind="stable")])
+
+
+def _agreed(planes: FramedPlanes, objective: Objective, *, least: int = 0) -> FramedPlanes:
+    """The first so many planes, and all others that the masks do not rule out beside the best.
+
+    Where other panes or posts hide much of a pane, edges that meet by chance may outdo its own.
+    """
+    agreement = _agreement(planes, objective)
+    kept = (agreement >= LEAST_OF_BEST * agreement.max()) | (np.arange(len(planes)) < least)
+    return planes.select(np.flatnonzero(kept))
+
+
+def _agreement(planes: FramedPlanes, objective: Objective) -> Array:
+    return mask_agreement(planes.planes, objective.views, pixels_per_view=PIXELS // len(objective.views))
+
+
+log = logging.getLogger("glassplat.panes")
+
+
+class Fit(NamedTuple):
+    """A plane and what it was fitted to, for messages."""
+
+    source: str
+    plane: FramedPlanes
+
+
+def score(plane: FramedPlanes, evidence: Objective) -> float:
+    """How well masks and points support a plane: 1 where all outlines meet and all points lie on it, free of scale."""
+    return 1 - float(contradiction(plane, evidence)[0])
+
+
+def best_supported(label: int, fits: Sequence[Fit], evidence: Objective) -> FramedPlanes:
+    """The plane with the highest score, the first one of equals; says so in the log.
+
+    Args:
+        label: of the pane.
+        fits: at least one.
+        evidence: the masks, and the points that were measured, not made by training. A first scene explains reflections
+            by Gaussians behind the pane, and many of them lie where nothing is.
+    """
+    scores = [score(fit.plane, evidence) for fit in fits]
+    kept = int(np.argmax(scores))
+    for fit, found in zip(fits, scores, strict=True):
+        apart = np.degrees(angle(fit.plane, fits[kept].plane))
+        verdict = "kept" if fit is fits[kept] else f"{apart:.2f} degrees from the one that is kept"
+        log.info(
+            "pane %d: the plane fitted to %s scores %.3f, with %.0f %% of %d points along its edge on it; %s",
+            label, fit.source, found, 100 * evidence.support(fit.plane.planes)[0], len(evidence.points), verdict,
+        )  # fmt: skip
+    return fits[kept].plane
+
+
+def angle(one: FramedPlanes, other: FramedPlanes) -> float:
+    """Radians between the first planes of two sets, whichever way they face."""
+    first, second = one.planes.normals[0], other.planes.normals[0]
+    return float(np.arctan2(np.linalg.norm(np.cross(first, second)), abs(first @ second)))

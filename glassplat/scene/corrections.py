@@ -1,0 +1,257 @@
+"""Per-photograph corrections: exposure, camera pose, and the photographer's frame."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+
+import torch
+from torch import Tensor
+
+from glassplat.scene.camera import Camera
+
+
+def neighbours(name: str, names: Sequence[str]) -> list[int]:
+    """Rows of the last of `names` before `name` and of the first after it; one of them at an end.
+
+    Numbers in names count as numbers: 9 comes before 10. Photographs of other folders are no neighbours, since nobody
+    knows when they were taken; the list is empty where there are no others.
+    """
+    folder, here = PurePosixPath(name).parent, _in_order(name)
+    beside = [row for row, known in enumerate(names) if PurePosixPath(known).parent == folder and known != name]
+    before = [row for row in beside if _in_order(names[row]) < here]
+    after = [row for row in beside if _in_order(names[row]) > here]
+    return [
+        *([max(before, key=lambda row: _in_order(names[row]))] if before else []),
+        *([min(after, key=lambda row: _in_order(names[row]))] if after else []),
+    ]
+
+
+def _in_order(name: str) -> tuple[list[tuple[int, str]], str]:
+    """What names are sorted by: their parts, with numbers by value."""
+    parts = re.findall(r"\d+|\D+", name)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts], name
+
+
+EXPOSURE_TENSORS = ("affine",)
+
+
+@dataclass(frozen=True)
+class Exposures:
+    """For each photograph what makes its colours of those of the scene: c' = c + A c + b, sRGB.
+
+    Cameras change exposure and white balance from one photograph to the next. In sRGB, a power of the radiance, both
+    are nearly factors on the channels.
+
+    Attributes:
+        affine: [V, 3, 4] A and b; zero for a photograph in the scene's own colours.
+        names: of the V photographs.
+    """
+
+    affine: Tensor
+    names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if tuple(self.affine.shape) != (len(self.names), 3, 4):
+            raise ValueError(
+                f"affine has shape {list(self.affine.shape)} for {len(self.names)} photographs; expected "
+                f"[{len(self.names)}, 3, 4]"
+            )
+
+    def __len__(self) -> int:
+        """Number of photographs."""
+        return len(self.names)
+
+    def of(self, name: str) -> Tensor | None:
+        """[3, 4] that of a photograph; None for one that has none, whose colours are the scene's."""
+        return self.affine[self.names.index(name)] if name in self.names else None
+
+    def interpolated(self, name: str) -> Exposures:
+        """The same with a transform for a photograph that has none: the mean of its neighbours' in the order of names.
+
+        Itself where the photograph has its own, or no neighbours.
+        """
+        rows = [] if name in self.names else neighbours(name, self.names)
+        if not rows:
+            return self
+        return Exposures(torch.cat([self.affine, self.affine[rows].mean(dim=0, keepdim=True)]), (*self.names, name))
+
+    def applied(self, image: Tensor, name: str) -> Tensor:
+        """An image [..., 3] of the scene in the colours of a photograph; differentiable in both."""
+        own = self.of(name)
+        if own is None:
+            return image
+        return image @ (torch.eye(3, dtype=image.dtype, device=image.device) + own[:, :3].T) + own[:, 3]
+
+    def undone(self, photo: Tensor, name: str) -> Tensor:
+        """A photograph [..., 3] in the colours of the scene: what `applied` would have made the photograph."""
+        own = self.of(name)
+        if own is None:
+            return photo
+        own = own.to(photo)
+        return (photo - own[:, 3]) @ torch.linalg.inv(torch.eye(3).to(photo) + own[:, :3].T)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+        return {name: getattr(self, name) for name in EXPOSURE_TENSORS}
+
+    def with_tensors(self, tensors: Mapping[str, Tensor]) -> Exposures:
+        """The same with its tensors replaced by name."""
+        unknown = set(tensors) - set(EXPOSURE_TENSORS)
+        if unknown:
+            raise ValueError(f"unknown tensors {sorted(unknown)}; exposures have {sorted(EXPOSURE_TENSORS)}")
+        return replace(self, affine=tensors.get("affine", self.affine))
+
+    def to(self, device: torch.device | str) -> Exposures:
+        """The same on another device."""
+        return self.with_tensors({name: tensor.to(device) for name, tensor in self.tensors().items()})
+
+    @staticmethod
+    def neutral(names: tuple[str, ...] = ()) -> Exposures:
+        """All photographs in the scene's own colours."""
+        return Exposures(torch.zeros(len(names), 3, 4), names)
+
+
+POSE_TENSORS = ("twists",)
+
+
+@dataclass(frozen=True)
+class PoseCorrections:
+    """For each photograph a small motion of its camera about its own centre, in axes parallel to the world's.
+
+    cam_from_world = [R | t] becomes exp(twist turned by R) cam_from_world. In these axes a motion that all cameras have
+    in common is the mean of their twists, and that of a camera between two others the mean of theirs.
+
+    Attributes:
+        twists: [V, 6] rotation vector in radians, and translation in scene extents, so that both are small numbers
+            whatever the capture's units. Zero for a camera that stays.
+        names: of the V photographs; one that is missing keeps its camera.
+    """
+
+    twists: Tensor
+    names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if tuple(self.twists.shape) != (len(self.names), 6):
+            raise ValueError(
+                f"twists have shape {list(self.twists.shape)} for {len(self.names)} photographs; expected "
+                f"[{len(self.names)}, 6]"
+            )
+
+    def __len__(self) -> int:
+        """Number of photographs."""
+        return len(self.names)
+
+    def corrected(self, camera: Camera, name: str, extent: float) -> Camera:
+        """The camera of a photograph where it really is; differentiable in the twists.
+
+        Args:
+            camera: as the capture says.
+            name: of the photograph.
+            extent: of the scene, world units.
+        """
+        if name not in self.names:
+            return camera
+        twist = self.twists[self.names.index(name)]
+        cam_axes_from_world = camera.cam_from_world[:3, :3].to(twist)
+        return moved_camera(camera, (twist.reshape(2, 3) @ cam_axes_from_world.T).reshape(6), extent)
+
+    def interpolated(self, name: str) -> PoseCorrections:
+        """The same with a motion for a photograph that has none: the mean of its neighbours' in the order of names.
+
+        Itself where the photograph has its own, or no neighbours.
+        """
+        rows = [] if name in self.names else neighbours(name, self.names)
+        if not rows:
+            return self
+        return PoseCorrections(
+            torch.cat([self.twists, self.twists[rows].mean(dim=0, keepdim=True)]), (*self.names, name)
+        )
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+        return {"twists": self.twists}
+
+    def with_tensors(self, tensors: Mapping[str, Tensor]) -> PoseCorrections:
+        """The same with its tensors replaced by name."""
+        unknown = set(tensors) - set(POSE_TENSORS)
+        if unknown:
+            raise ValueError(f"unknown tensors {sorted(unknown)}; pose corrections have {sorted(POSE_TENSORS)}")
+        return replace(self, twists=tensors.get("twists", self.twists))
+
+    def to(self, device: torch.device | str) -> PoseCorrections:
+        """The same on another device."""
+        return replace(self, twists=self.twists.to(device))
+
+    @staticmethod
+    def none(names: tuple[str, ...] = ()) -> PoseCorrections:
+        """All cameras where they were said to be."""
+        return PoseCorrections(torch.zeros(len(names), 6), names)
+
+
+def moved_camera(camera: Camera, twist: Tensor, extent: float) -> Camera:
+    """The camera after a motion in its own frame.
+
+    Args:
+        camera: before it.
+        twist: [6] rotation vector, radians, and translation, in extents.
+        extent: world units.
+    """
+    pose = camera.cam_from_world
+    return replace(camera, cam_from_world=motion(twist, extent).to(pose) @ pose.to(twist.device))
+
+
+def motion(twist: Tensor, extent: float) -> Tensor:
+    """[4, 4] the rigid motion of a twist [6], as `moved_camera` takes it; smooth everywhere, also at zero."""
+    x, y, z, *shift = twist.unbind()
+    zero = torch.zeros_like(x)
+    u, v, w = (extent * along for along in shift)
+    rows = [zero, -z, y, u, z, zero, -x, v, -y, x, zero, w, zero, zero, zero, zero]
+    found: Tensor = torch.linalg.matrix_exp(torch.stack(rows).reshape(4, 4))
+    return found
+
+
+Direction = tuple[float, float, float]
+
+LEVEL_SHARE = 0.2
+"""Of the image's own horizontal axis, which decides where a camera looks straight down or up."""
+TILT_PENALTY = 0.01
+"""Against an upward direction that only fits because all cameras look the same way."""
+
+
+def upward(cameras: Sequence[Camera]) -> Direction:
+    """The direction away from the ground, as the cameras tell: unit, world axes.
+
+    Handheld cameras are tilted up and down, but hardly rolled: their x axes are level. Of the directions at right
+    angles to these the one along which images stand upright is taken; where all cameras look the same way, that of
+    the mean image.
+    """
+    rotations = torch.stack([camera.cam_from_world[:3, :3] for camera in cameras]).double().cpu()
+    level, upright = rotations[:, 0], -rotations[:, 1].mean(dim=0)
+    spread = level.T @ level / len(cameras) + TILT_PENALTY * torch.eye(3, dtype=torch.float64)
+    x, y, z = torch.nn.functional.normalize(torch.linalg.solve(spread, upright), dim=0).tolist()
+    return (x, y, z)
+
+
+def world_from_photographer(camera: Camera, up: Direction | None) -> Tensor:
+    """[4, 4] the frame of whoever holds the camera: its origin, x to the right, y down, z ahead; differentiable.
+
+    Args:
+        camera: held; OpenCV axes, not mirrored.
+        up: the direction in which people stand, unit; None leans the frame with the camera.
+    """
+    rotation = camera.cam_from_world[:3, :3].T
+    if up is not None:
+        rotation = _stood_up(rotation, torch.tensor(up, dtype=rotation.dtype, device=rotation.device))
+    top = torch.cat([rotation, camera.center[:, None]], dim=1)
+    return torch.cat([top, top.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
+
+
+def _stood_up(world_from_cam: Tensor, up: Tensor) -> Tensor:
+    """[3, 3] the rotation whose y axis points down and whose z axis points where the camera does."""
+    right, ahead = world_from_cam[:, 0], world_from_cam[:, 2]
+    across = torch.linalg.cross(ahead, up) + LEVEL_SHARE * (right - (right @ up) * up)
+    across = torch.nn.functional.normalize(across, dim=0)
+    return torch.stack([across, -up, torch.linalg.cross(across, -up)], dim=1)

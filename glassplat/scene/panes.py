@@ -1,0 +1,245 @@
+"""Panes as learnable rectangles (TR-Gaussians, Section III-A2), and what cameras see through them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from glassplat.scene.camera import Camera, constant
+
+LEAST_SINE = 1e-6
+"""Of the angle between a pane's normal and its tangent."""
+PANE_TENSORS = ("centers", "raw_normals", "logit_reflectances", "log_transmittances")
+
+
+@dataclass(frozen=True)
+class Planes:
+    """K rectangles that reflect, one per pane.
+
+    The rectangle's size and in-plane orientation get no gradient (the hit mask is piecewise
+    constant in them); they are set large enough to cover the pane, and the rendered mask cuts
+    the exact shape.
+
+    Attributes:
+        centers: [K, 3] a point on each plane, the rectangle's middle; world units.
+        raw_normals: [K, 3] normals before normalisation.
+        logit_reflectances: [K] base reflectance R0 before the sigmoid.
+        tangents: [K, 3] direction of the rectangle's first side; made orthogonal to the normal in use.
+        half_sizes: [K, 2] half the side lengths along tangent and bitangent; world units.
+        labels: pane label of each plane, as found in the masks.
+        mirrors: labels of the planes that transmit nothing; their base reflectance gets no gradient.
+        log_transmittances: [K, 3] logarithm of the share of red, green and blue light that gets through, of what does
+            not come back. None where all panes are clear.
+    """
+
+    centers: Tensor
+    raw_normals: Tensor
+    logit_reflectances: Tensor
+    tangents: Tensor
+    half_sizes: Tensor
+    labels: tuple[int, ...]
+    mirrors: tuple[int, ...] = ()
+    log_transmittances: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        for name, tensor in self.tensors().items():
+            if tensor.shape[0] != len(self.labels):
+                raise ValueError(
+                    f"{name} has {tensor.shape[0]} rows for {len(self.labels)} plane labels; expected one row per plane"
+                )
+        if not set(self.mirrors) <= set(self.labels):
+            raise ValueError(f"mirrors {self.mirrors} are not all among the plane labels {self.labels}")
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    @property
+    def normals(self) -> Tensor:
+        """[K, 3] unit normals."""
+        return torch.nn.functional.normalize(self.raw_normals, dim=-1)
+
+    @property
+    def base_reflectances(self) -> Tensor:
+        """[K] reflectance at normal incidence R0, in (0, 1)."""
+        logits = self.logit_reflectances
+        if self.mirrors:
+            fixed = constant(tuple(label in self.mirrors for label in self.labels), torch.bool, logits.device)
+            logits = torch.where(fixed, logits.detach(), logits)
+        return torch.sigmoid(logits)
+
+    @property
+    def transmittances(self) -> Tensor | None:
+        """[K, 3] share of red, green and blue light that gets through; None where all panes are clear.
+
+        Training keeps it in (0, 1]. There is no bound here, which would take the gradient of what lies beyond it.
+        """
+        return None if self.log_transmittances is None else self.log_transmittances.exp()
+
+    def that_may_tint(self) -> Planes:
+        """The same planes, still clear where they were, with transmittances that can be learnt."""
+        clear = self.centers.new_zeros(len(self), 3)
+        return self if self.log_transmittances is not None else replace(self, log_transmittances=clear)
+
+    def axes(self) -> tuple[Tensor, Tensor]:
+        """Unit in-plane axes (tangent, bitangent), each [K, 3]; right-handed with the normal."""
+        normals = self.normals
+        flat = self.tangents - (self.tangents * normals).sum(-1, keepdim=True) * normals
+        tangent = torch.nn.functional.normalize(flat, dim=-1)
+        return tangent, torch.linalg.cross(normals, tangent)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+        named = {name: getattr(self, name) for name in (*PANE_TENSORS, "tangents", "half_sizes")}
+        return {name: tensor for name, tensor in named.items() if tensor is not None}
+
+    def with_tensors(self, tensors: Mapping[str, Tensor]) -> Planes:
+        """The same planes with some tensors replaced by name."""
+        unknown = set(tensors) - set(self.tensors())
+        if unknown:
+            raise ValueError(f"unknown tensors {sorted(unknown)}; planes have {sorted(self.tensors())}")
+        return Planes(**(self.tensors() | dict(tensors)), labels=self.labels, mirrors=self.mirrors)
+
+    def select(self, rows: Sequence[int]) -> Planes:
+        """The planes at the given positions, in that order."""
+        index = constant(tuple(rows), torch.int64, self.centers.device)
+        chosen = {name: tensor[index] for name, tensor in self.tensors().items()}
+        labels = tuple(self.labels[k] for k in rows)
+        return Planes(**chosen, labels=labels, mirrors=tuple(label for label in self.mirrors if label in labels))
+
+    def joined(self, other: Planes) -> Planes:
+        """These planes and others, in the order of their labels."""
+        if (self.log_transmittances is None) != (other.log_transmittances is None):
+            return self.that_may_tint().joined(other.that_may_tint())
+        mine, theirs = self.tensors(), other.tensors()
+        together = Planes(
+            **{name: torch.cat([mine[name], theirs[name]]) for name in mine},
+            labels=(*self.labels, *other.labels),
+            mirrors=(*self.mirrors, *other.mirrors),
+        )
+        return together.select(sorted(range(len(together)), key=together.labels.__getitem__))
+
+    def to(self, device: torch.device | str) -> Planes:
+        """The same planes on another device."""
+        return self.with_tensors({name: tensor.to(device) for name, tensor in self.tensors().items()})
+
+    @staticmethod
+    def rectangle(
+        center: Sequence[float],
+        normal: Sequence[float],
+        half_sizes: Sequence[float],
+        *,
+        tangent: Sequence[float] | None = None,
+        label: int = 1,
+    ) -> Planes:
+        """A single plane, with a base reflectance of one half.
+
+        Args:
+            center: [3] its middle, world units.
+            normal: [3] of any length.
+            half_sizes: half its sides along tangent and bitangent, world units.
+            tangent: [3] direction of its first side; some direction in the plane if None.
+            label: what to call it.
+
+        Raises:
+            ValueError: a value is not finite, a size is not above 0, or a direction has no length in the plane.
+        """
+        middle, across, half = (
+            torch.tensor(list(values), dtype=torch.float32) for values in (center, normal, half_sizes)
+        )
+        if tangent is None:
+            axis = torch.eye(3)[int(across.abs().argmin())]
+        else:
+            axis = torch.tensor(list(tangent), dtype=torch.float32)
+        shapes = [tuple(vector.shape) for vector in (middle, across, axis, half)]
+        if shapes != [(3,), (3,), (3,), (2,)]:
+            raise ValueError(f"center, normal, tangent and half_sizes have the shapes {shapes}; expected 3, 3, 3 and 2")
+        numbers = torch.cat([middle, across, axis, half])
+        if not bool(numbers.isfinite().all()) or not bool((half > 0).all()):
+            raise ValueError(f"a pane of {center}, {normal}, {half_sizes}; expected finite numbers, sizes above 0")
+        if float(torch.linalg.cross(across, axis).norm()) <= LEAST_SINE * float(across.norm() * axis.norm()):
+            raise ValueError(f"a pane with the normal {normal} and the tangent {tangent}; expected two directions")
+        return Planes(middle[None], across[None], torch.zeros(1), axis[None], half[None], (label,))
+
+    @staticmethod
+    def empty() -> Planes:
+        """No planes at all."""
+        return Planes(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3), torch.zeros(0, 2), ())
+
+
+LARGEST_ANGLE = math.radians(1.0)
+LARGEST_OFFSET = 0.02
+"""Of the middle of one pane from the plane of the other, as a share of the larger one's longer half side."""
+
+
+@torch.no_grad()
+def coplanar_groups(planes: Planes, rows: Sequence[int]) -> list[list[int]]:
+    """Which of some panes lie in one plane with others, directly or by way of third ones; the largest of each first.
+
+    Args:
+        planes: the panes.
+        rows: positions of those that are asked about.
+
+    Returns:
+        Every row in one group, the groups in the order of their first rows.
+    """
+    groups: list[list[int]] = []
+    for row in rows:
+        near = [group for group in groups if any(_coplanar(planes, row, other) for other in group)]
+        joined = [*(other for group in near for other in group), row]
+        groups = sorted([*(group for group in groups if group not in near), joined], key=min)
+    areas = planes.half_sizes.prod(dim=1)
+    return [sorted(group, key=lambda row: (-float(areas[row]), row)) for group in groups]
+
+
+def _coplanar(planes: Planes, one: int, other: int) -> bool:
+    normals, between = planes.normals[[one, other]], planes.centers[one] - planes.centers[other]
+    angle = torch.linalg.cross(normals[0], normals[1]).norm().clamp(max=1).asin()
+    offset = (normals @ between).abs().amax()
+    return bool(angle <= LARGEST_ANGLE) and bool(offset <= LARGEST_OFFSET * planes.half_sizes[[one, other]].amax())
+
+
+@torch.no_grad()
+def behind_panes(points: Tensor, planes: Planes, cameras: Sequence[Camera]) -> Tensor:
+    """[N] bool: which points some camera sees through some pane.
+
+    A point counts if a camera, on either side of a pane, has the point in its image and the segment from the camera's
+    centre to the point crosses the pane's rectangle.
+
+    Args:
+        points: [N, 3] world positions.
+        planes: the panes.
+        cameras: the training views.
+    """
+    found = torch.zeros(points.shape[0], dtype=torch.bool, device=points.device)
+    if len(planes) == 0:
+        return found
+    # The views are taken one by one: all of them at once would need views x panes x points values.
+    for camera in (camera.to(points.device) for camera in cameras):
+        found |= crosses_pane(points, planes, camera.center) & in_image(points, camera)
+    return found
+
+
+def crosses_pane(points: Tensor, planes: Planes, eye: Tensor) -> Tensor:
+    """[N] bool: whether the segment from `eye` to the point crosses any of the panes."""
+    normals = planes.normals
+    eye_distance = ((eye - planes.centers) * normals).sum(-1)
+    distances = points @ normals.T - (planes.centers * normals).sum(-1)
+    behind = eye_distance * distances < 0
+    share = torch.where(behind, eye_distance / (eye_distance - distances), 0)
+    inside = behind
+    for axis, half in zip(planes.axes(), planes.half_sizes.T, strict=True):
+        start = ((eye - planes.centers) * axis).sum(-1)
+        end = points @ axis.T - (planes.centers * axis).sum(-1)
+        inside = inside & ((start + share * (end - start)).abs() <= half)
+    return inside.any(dim=1)
+
+
+def in_image(points: Tensor, camera: Camera) -> Tensor:
+    """[N] bool: whether the points lie in the image of a camera, hidden or not."""
+    pixels, depths = camera.project(points)
+    size = pixels.new_tensor([camera.width, camera.height])
+    return (depths > 0) & ((pixels >= 0) & (pixels <= size)).all(dim=1)

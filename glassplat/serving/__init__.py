@@ -1,1 +1,0 @@
-"""What the servers of this package share."""

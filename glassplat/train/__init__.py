@@ -1,1 +1,0 @@
-"""Training: stages as data, one loop without method names, typed messages out."""

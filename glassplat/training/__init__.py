@@ -1,0 +1,1 @@
+"""Training: the loop, stages, losses, densification and checkpoints."""

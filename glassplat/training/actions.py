@@ -1,0 +1,384 @@
+"""Recurring edits of the training state, and the strategies that combine them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from glassplat.captures.dataset import Dataset
+from glassplat.captures.view import PointCloud
+from glassplat.render.layers import contributions
+from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.panes import behind_panes
+from glassplat.scene.scene import Scene
+from glassplat.training.densify import (
+    Moments,
+    apply_edit,
+    densified,
+    exploring_noise,
+    forget,
+    keep,
+    perturb_opacities,
+    resampled,
+    reset_opacity,
+)
+from glassplat.training.losses import LossTerm, mean_opacity, mean_scale, of_all, weighted
+from glassplat.training.messages import Working
+from glassplat.training.options import DefaultDensify, McmcDensify, Rate, Rhythm, Strategy
+from glassplat.training.points import gaussians_from_points, in_morton_order
+from glassplat.training.stage import Action, AverageLast, Clock, Every, Motion, TrainState, Work
+
+MEGAPIXEL = 1e6
+GAUSSIANS_PER_PIXEL = 0.5
+"""Where `McmcDensify` stops to grow unless told otherwise; default densification ends near it (docs/experiments.md)."""
+GROWTH_SHARE = 1 / 300
+"""Share of the run in which `McmcDensify` grows by its factor: 100 of the published 30,000 iterations."""
+LARGE_ARE_PRUNED = ("primary", "surroundings")
+"""The sets from which what is too large is removed; glass is as large as its pane."""
+MOST_GROWTH = 2.0
+"""Largest factor of one relocation, however short the run."""
+
+
+@dataclass(frozen=True)
+class GrowSh:
+    """Raises the SH degree in use by one, up to the highest that is stored."""
+
+    when: Every
+    part: str = "primary"
+    name: str = "grow SH"
+
+    def due(self, clock: Clock) -> bool:
+        """Whether to act after this step."""
+        return self.when.due(clock)
+
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`, if there is anything to edit."""
+        gaussians = state.scene.gaussian_sets()[self.part]
+        if gaussians.active_sh_degree == gaussians.max_sh_degree:
+            return False
+        raised = replace(gaussians, active_sh_degree=gaussians.active_sh_degree + 1)
+        state.scene = state.scene.with_gaussians(self.part, raised)
+        return True
+
+
+def threshold_factor(dataset: Dataset) -> float:
+    """How much higher the densification threshold is on small photographs; 1 from a megapixel on.
+
+    The published threshold was found on photographs of about a megapixel. The loss is a mean over pixels, so a
+    Gaussian a few pixels wide has a larger gradient in a smaller image, and a quarter-megapixel capture would grow
+    more Gaussians than it has pixels (docs/experiments.md).
+    """
+    camera = dataset.train[0].camera
+    return max(1.0, math.sqrt(MEGAPIXEL / (camera.width * camera.height)))
+
+
+def limit_of(densifier: DefaultDensify, dataset: Dataset) -> int | None:
+    """The largest number of Gaussians to grow to: the one that was asked for, or one that suits the photographs."""
+    if densifier.cap is not None or densifier.per_pixel == 0:
+        return densifier.cap
+    return round(densifier.per_pixel * sum(view.camera.width * view.camera.height for view in dataset.train))
+
+
+@dataclass(frozen=True)
+class Densify:
+    """Clones, splits and prunes one set of Gaussians by its screen gradients."""
+
+    densifier: DefaultDensify
+    part: str = "primary"
+
+    @property
+    def name(self) -> str:
+        """What the log calls it."""
+        return f"densify {self.part}"
+
+    def due(self, clock: Clock) -> bool:
+        """Whether to act after this step."""
+        least = self.densifier.interval
+        if self.densifier.whole_passes:
+            least = max(least, min(clock.views, 2 * least))
+        return Every(0.0, self.densifier.start, self.densifier.stop, least).due(clock)
+
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`, if there is anything to edit."""
+        statistics = state.statistics.pop(self.part, None)
+        gaussians = state.scene.gaussian_sets().get(self.part)
+        if statistics is None or gaussians is None or len(gaussians) == 0:
+            return False
+        factor = threshold_factor(dataset) if self.densifier.adapt_to_size else 1.0
+        densifier = replace(
+            self.densifier,
+            cap=limit_of(self.densifier, dataset),
+            gradient_threshold=self.densifier.gradient_threshold * factor,
+            pull_threshold=self.densifier.pull_threshold * factor,
+        )
+        edited, moments = densified(
+            densifier,
+            gaussians,
+            state.optimizer.moments,
+            statistics,
+            extent=state.scene.extent,
+            generator=state.generator(self.name),
+            part=self.part,
+            prune_large=self.part in LARGE_ARE_PRUNED and clock.progress > self.densifier.prune_large_start,
+        )
+        put_in_order(state, edited, moments, self.part)
+        return True
+
+
+@dataclass(frozen=True)
+class PruneIdle:
+    """Removes the Gaussians of one set that add next to nothing to any training view.
+
+    What stood behind a pane for a reflection, and has lost that to the mirrored image, ends as such.
+
+    Attributes:
+        densifier: holds what is next to nothing, and when.
+        part: the set.
+        measure: [N] what each of its Gaussians adds to a view, in pixels.
+    """
+
+    densifier: DefaultDensify
+    part: str = "primary"
+    measure: Callable[[Scene, Camera], Tensor] = contributions
+
+    @property
+    def name(self) -> str:
+        """What the log calls it."""
+        return f"prune idle {self.part}"
+
+    def due(self, clock: Clock) -> bool:
+        """Whether to act after this step."""
+        return self.densifier.least_contribution > 0 and clock.is_at(self.densifier.contribution_moments)
+
+    @torch.no_grad()
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
+        """Edits `state`, if there is anything to edit, and tells how far it is."""
+        gaussians = state.scene.gaussian_sets()[self.part]
+        most = torch.zeros_like(gaussians.logit_opacities)
+        for done, view in enumerate(dataset.train):
+            yield Working("looking for Gaussians that no view needs", done, len(dataset.train))
+            most = torch.maximum(most, self.measure(state.scene, view.camera))
+        busy = most >= self.densifier.least_contribution
+        # A scene without Gaussians is reported; surroundings that nothing mirrors yet may still be needed.
+        if bool(busy.all()) or (self.part != "primary" and not bool(busy.any())):
+            return False
+        kept, state.optimizer.moments = apply_edit(gaussians, state.optimizer.moments, keep(busy), part=self.part)
+        state.scene = state.scene.with_gaussians(self.part, kept)
+        state.statistics.pop(self.part, None)
+        return True
+
+
+def put_in_order(state: TrainState, gaussians: Gaussians, moments: Moments, part: str = "primary") -> None:
+    """Replaces a part of the scene and its moments, sorted so that neighbours in space are neighbours in memory."""
+    order = in_morton_order(gaussians.means)
+    ordered, moments = apply_edit(gaussians, moments, order, part=part)
+    state.scene = state.scene.with_gaussians(part, ordered)
+    # Of a set that has vanished, a scene has no parameters.
+    known = state.scene.parameters()
+    state.optimizer.moments = {name: pair for name, pair in moments.items() if name in known}
+
+
+def cap_of(densifier: McmcDensify, dataset: Dataset) -> int:
+    """The number of Gaussians to grow to: the one that was asked for, or one that suits the photographs."""
+    if densifier.cap is not None:
+        return densifier.cap
+    camera = dataset.train[0].camera
+    return round(GAUSSIANS_PER_PIXEL * camera.width * camera.height)
+
+
+def growth_of(densifier: McmcDensify, iterations: int) -> float:
+    """The factor by which the set grows at one relocation, so that it reaches its cap at the same share of any run."""
+    factor: float = densifier.growth ** (densifier.interval / (GROWTH_SHARE * iterations))
+    return min(factor, MOST_GROWTH)
+
+
+@dataclass(frozen=True)
+class Relocate:
+    """Moves dead primary Gaussians onto live ones and adds new ones (3DGS-MCMC)."""
+
+    densifier: McmcDensify
+    name: str = "densify primary"
+
+    def due(self, clock: Clock) -> bool:
+        """Whether to act after this step."""
+        return Every(0.0, self.densifier.start, self.densifier.stop, self.densifier.interval).due(clock)
+
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`, if there is anything to edit."""
+        densifier = replace(self.densifier, growth=growth_of(self.densifier, clock.iterations))
+        edited, moments = resampled(
+            densifier,
+            state.scene.primary,
+            state.optimizer.moments,
+            cap=cap_of(self.densifier, dataset),
+            generator=state.generator(self.name),
+        )
+        put_in_order(state, edited, moments)
+        # Nothing here reads the screen gradients, but what was gathered no longer fits the rows.
+        state.statistics.pop("primary", None)
+        return True
+
+
+@dataclass(frozen=True)
+class Explore:
+    """Moves the primary Gaussians that a step's view shows at random, the transparent ones most (3DGS-MCMC).
+
+    The paper moves all of them in every step, as `densifier.reach` may ask for. Those that the view does not show have
+    nothing to pull them back, and what few views show would wander off.
+
+    Attributes:
+        densifier: holds how strong the noise is, and what it reaches.
+        rate: learning rate of the positions, which the noise follows.
+    """
+
+    densifier: McmcDensify
+    rate: Rate
+
+    def __call__(self, state: TrainState, clock: Clock, visible: Tensor | None) -> None:
+        """Edits `state`."""
+        primary, extent = state.scene.primary, state.scene.extent
+        rate = self.rate.at(clock.progress, 1.0, clock.iterations)
+        offsets = exploring_noise(
+            self.densifier, primary, rate=rate, extent=extent, generator=state.generator("explore")
+        )
+        if visible is not None and self.densifier.reach == "shown":
+            offsets *= visible[:, None]
+        state.scene = replace(state.scene, primary=primary.with_tensors({"means": primary.means + offsets}))
+
+
+@dataclass(frozen=True)
+class ResetOpacity:
+    """Lowers the opacity of a set of Gaussians to a ceiling (3DGS)."""
+
+    when: Every
+    ceiling: float = 0.01
+    part: str = "primary"
+    name: str = "reset opacity"
+
+    def due(self, clock: Clock) -> bool:
+        """Whether to act after this step."""
+        return self.when.due(clock)
+
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
+        """Edits `state`, if there is anything to edit."""
+        gaussians = state.scene.gaussian_sets()[self.part]
+        lowered, state.optimizer.moments = reset_opacity(
+            gaussians, state.optimizer.moments, ceiling=self.ceiling, part=self.part
+        )
+        state.scene = state.scene.with_gaussians(self.part, lowered)
+        return True
+
+
+@dataclass(frozen=True)
+class PerturbOpacity:
+    """Adds noise to the opacity of what is seen through a pane (TR-Gaussians, Section III-C3)."""
+
+    when: Every
+    amplitude: float = 0.4
+    bounds: tuple[float, float] = (0.01, 0.99)
+    name: str = "perturb opacity"
+
+    def due(self, clock: Clock) -> bool:
+        """Whether to act after this step."""
+        return self.amplitude > 0 and self.when.due(clock)
+
+    @torch.no_grad()
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
+        """Edits `state`, if there is anything to edit, and tells how far it is."""
+        means, planes = state.scene.primary.means, state.scene.planes
+        selected = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+        for done, view in enumerate(dataset.train):
+            yield Working("looking for what is seen through panes", done, len(dataset.train))
+            selected |= behind_panes(means, planes, [view.camera])
+        if "logit_strength" in state.scene.primary.channels:
+            # What mirrors is there.
+            selected &= state.scene.primary.channels["logit_strength"] < 0
+        perturbed = perturb_opacities(
+            state.scene.primary,
+            selected,
+            amplitude=self.amplitude,
+            bounds=self.bounds,
+            generator=state.generator(self.name),
+        )
+        state.scene = replace(state.scene, primary=perturbed)
+        state.optimizer.moments = forget(state.optimizer.moments, ("primary.logit_opacities",), selected)
+        return bool(selected.any())
+
+
+@dataclass(frozen=True)
+class Population:
+    """What a strategy contributes to every stage of a recipe.
+
+    Attributes:
+        opacity: of the first Gaussians.
+        spread: standard deviation of the first Gaussians, as a share of the distance to their neighbours.
+        edits: what changes the number of primary Gaussians.
+        resets: opacity resets; a recipe decides in which stages they happen.
+        motions: what follows the optimiser in every step.
+        terms: regularisers of the objective.
+        densify_until: share of the run until which `edits` read screen gradients.
+    """
+
+    opacity: float = 0.1
+    spread: float = 1.0
+    edits: tuple[Action, ...] = ()
+    resets: tuple[ResetOpacity, ...] = ()
+    motions: tuple[Motion, ...] = ()
+    terms: tuple[LossTerm, ...] = ()
+    densify_until: float = 0.0
+
+    def initial(self, points: PointCloud, sh_degree: int) -> Gaussians:
+        """The first primary Gaussians, one per point."""
+        return gaussians_from_points(points, sh_degree=sh_degree, opacity=self.opacity, spread=self.spread)
+
+
+def population_of(
+    strategy: Strategy, *, default: DefaultDensify, mcmc: McmcDensify, rhythm: Rhythm, means_rate: Rate
+) -> Population:
+    """What the strategy of this name contributes; the options of the other one are not looked at.
+
+    Args:
+        strategy: name on the command line.
+        default: options of `default`.
+        mcmc: options of `mcmc`.
+        rhythm: when opacities are reset, and what is averaged in the end.
+        means_rate: learning rate of the positions, which the noise of `mcmc` follows.
+    """
+    population = mcmc_population(mcmc, means_rate) if strategy == "mcmc" else default_population(default, rhythm)
+    if rhythm.averaged_passes == 0:
+        return population
+    return replace(population, motions=(*population.motions, AverageLast(rhythm.averaged_passes)))
+
+
+def default_population(densifier: DefaultDensify, rhythm: Rhythm) -> Population:
+    """3DGS: clone, split, prune, and reset the opacities; and what adds to no view is removed in the end."""
+    reset = ResetOpacity(Every(rhythm.beat, 0.0, rhythm.reset_stop, rhythm.least, only_multiples_of=3))
+    edits = (Densify(densifier), PruneIdle(densifier))
+    return Population(edits=edits, resets=(reset,), densify_until=densifier.stop)
+
+
+def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
+    """3DGS-MCMC: relocate, add, explore, and regularise opacities and scales; opacities are never reset.
+
+    The regularisers are those of TR-Gaussians, Eq. 20, which adds them to whatever the objective is otherwise. They
+    act on what a step's view shows directly, and the noise on what it shows, also as mirror images. The papers' act on
+    everything (`reach`), which hardly differs where every view shows most of the scene; what a few of many views show,
+    such as a room photographed all around, fades and wanders.
+    """
+    everywhere = densifier.reach == "all"
+    terms = weighted(
+        LossTerm("opacity", densifier.opacity_weight, of_all(mean_opacity) if everywhere else mean_opacity),
+        LossTerm("scale", densifier.scale_weight, of_all(mean_scale) if everywhere else mean_scale),
+    )
+    return Population(
+        opacity=densifier.initial_opacity,
+        spread=densifier.initial_spread,
+        edits=(Relocate(densifier),),
+        motions=(Explore(densifier, means_rate),) if densifier.noise_rate != 0 else (),
+        terms=terms,
+    )

@@ -1,0 +1,294 @@
+"""Checkpoints: every tensor of a training state in one safetensors file, no pickle."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from glassplat.errors import InputError, input_checked
+from glassplat.files.records import ByName, Field, Items, Nullable, Number, Optional, Text, Whole, checked
+from glassplat.files.scene_folder import DIRECTION, EXTENT, SH_DEGREE, direction
+from glassplat.files.sidecars import HIGHEST_LABEL, REGION
+from glassplat.files.tensors_file import TensorsFile, opened_tensors, write_tensors
+from glassplat.scene.corrections import Exposures, PoseCorrections
+from glassplat.scene.gaussians import DISC_SCALES, PER_GAUSSIAN, Gaussians
+from glassplat.scene.panes import Planes
+from glassplat.scene.scene import OPTIONAL_SETS, Environment, Scene
+from glassplat.training.densify import ScreenStatistics
+from glassplat.training.stage import Optimizer, TrainState
+
+FORMAT = "glassplat-checkpoint-1"
+LABELS = Items(Whole(1, HIGHEST_LABEL))
+HEADER: dict[str, Field] = {
+    "method": Optional(Nullable(Text())),
+    "step": Whole(0),
+    "seed": Whole(),
+    "seconds": Number(0),
+    "extent": EXTENT,
+    "labels": LABELS,
+    "mirrors": Optional(LABELS, ()),
+    "region": Optional(REGION),
+    "active_sh_degree": ByName(SH_DEGREE),
+    "updates": ByName(Whole(0)),
+    "paused": Optional(ByName(Whole(0)), {}),
+    "hurried": Optional(ByName(Number(0)), {}),
+    "records": Optional(ByName(Number()), {}),
+    "photographs": Optional(Items(Text()), ()),
+    "corrected": Optional(Items(Text()), ()),
+    "up": Optional(DIRECTION),
+}
+"""What is `Optional` was added after the first checkpoints were written."""
+GAUSSIAN_SHAPES = {"means": (3,), "quats": (4,), "log_scales": None, "logit_opacities": ()}
+PLANE_SHAPES: dict[str, tuple[int, ...] | None] = {
+    "centers": (3,),
+    "raw_normals": (3,),
+    "logit_reflectances": (),
+    "tangents": (3,),
+    "half_sizes": (2,),
+}
+FURTHER_PLANE_SHAPES: dict[str, tuple[int, ...] | None] = {"log_transmittances": (3,)}
+"""Of panes that are tinted."""
+SCALE_SHAPES = [(DISC_SCALES,), (DISC_SCALES + 1,)]
+SH_SHAPES = [(count, 3) for count in (0, 1, 4, 9, 16)]
+
+
+def save_checkpoint(path: Path, state: TrainState) -> None:
+    """Writes `state` so that training goes on from it with the same result; atomic.
+
+    Raises:
+        OSError: the disk is full or not writable; an older file at `path` stays as it was.
+    """
+    scene = state.scene
+    tensors: dict[str, Tensor] = {}
+    for part, gaussians in scene.gaussian_sets().items():
+        tensors |= {f"scene/{part}/{name}": t for name, t in gaussians.tensors().items()}
+    tensors |= {f"scene/planes/{name}": t for name, t in scene.planes.tensors().items()}
+    if not scene.environment.is_empty:
+        tensors |= {f"scene/environment/{name}": t for name, t in scene.environment.tensors().items()}
+    if len(scene.poses):
+        tensors |= {f"scene/poses/{name}": t for name, t in scene.poses.tensors().items()}
+    if len(scene.exposures):
+        tensors |= {f"scene/exposures/{name}": t for name, t in scene.exposures.tensors().items()}
+    for name, (first, second) in state.optimizer.moments.items():
+        tensors |= {f"first/{name}": first, f"second/{name}": second}
+    for part, statistics in state.statistics.items():
+        tensors |= {f"statistics/{part}/{name}": t for name, t in vars(statistics).items()}
+    tensors |= {f"means/{name}": mean for name, mean in state.means.items()}
+    header = {
+        "format": FORMAT,
+        "method": state.method,
+        "step": state.step,
+        "seed": state.seed,
+        "seconds": state.seconds,
+        "extent": scene.extent,
+        "labels": list(scene.planes.labels),
+        "mirrors": list(scene.planes.mirrors),
+        "region": scene.environment.region,
+        "active_sh_degree": {part: g.active_sh_degree for part, g in scene.gaussian_sets().items()},
+        "updates": state.optimizer.updates,
+        "paused": state.optimizer.paused,
+        "hurried": state.optimizer.hurried,
+        "records": state.records,
+        "photographs": list(scene.exposures.names),
+        "corrected": list(scene.poses.names),
+        "up": scene.up,
+    }
+    write_tensors(path, tensors, header)
+
+
+def load_checkpoint(
+    path: Path, *, method: str | None = None, seed: int | None = None, iterations: int | None = None
+) -> TrainState:
+    """Reads what `save_checkpoint` wrote.
+
+    Args:
+        path: the file.
+        method: what the run that goes on trains; None takes any.
+        seed: that of the run; None takes any.
+        iterations: the length of the run; None takes any step.
+
+    Raises:
+        InputError: the file is truncated, is no checkpoint of glassplat, or one of another run.
+        FileNotFoundError: there is no such file.
+    """
+    with opened_checkpoint(path) as file:
+        state = restored_state(file.header, file.tensors())
+    check_belongs(state, path, method=method, seed=seed, iterations=iterations)
+    return state
+
+
+def recorded_seconds(path: Path) -> float:
+    """Training time up to a checkpoint; reads its header and no tensor, so it costs nothing.
+
+    Raises:
+        InputError: the file is truncated, or is no checkpoint of glassplat.
+        FileNotFoundError: there is no such file.
+    """
+    with opened_checkpoint(path) as file:
+        return float(file.header["seconds"])
+
+
+def check_belongs(
+    state: TrainState, path: Path, *, method: str | None, seed: int | None, iterations: int | None
+) -> None:
+    """Refuses the checkpoint of another run, with which training would go on to nonsense.
+
+    Raises:
+        InputError: another method's or seed's, or of a step beyond the run's end.
+    """
+    remedy = "put the run's own checkpoint there, or train again"
+    if method and state.method and state.method != method:
+        raise InputError(f"{path} is a checkpoint of {state.method}; expected one of {method}: {remedy}")
+    if seed is not None and state.seed != seed:
+        raise InputError(f"{path} is of a run with the seed {state.seed}; expected {seed}: {remedy}")
+    if iterations is not None and state.step > iterations:
+        raise InputError(f"{path} is of step {state.step}; expected one of at most {iterations}: {remedy}")
+
+
+@contextmanager
+def opened_checkpoint(path: Path) -> Iterator[TensorsFile]:
+    """An open checkpoint, its header checked; what is wrong with its contents is an error that names the file."""
+    if not os.path.isfile(path):
+        raise FileNotFoundError(f"no checkpoint at {path}; expected the file that training writes there")
+    try:
+        with opened_tensors(path, FORMAT, "a checkpoint") as file:
+            yield TensorsFile(checked(file.header, HEADER, f"the header of {path}"), file.file)
+    except InputError as error:
+        raise InputError(f"{path} holds no training state: {error}; use an older one or train again") from error
+    except ValueError as error:
+        raise InputError(f"{error}; use an older checkpoint or train again") from error
+
+
+def restored_state(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> TrainState:
+    """The training state of a checkpoint's header, which is checked, and tensors.
+
+    Raises:
+        InputError: the tensors do not belong to the header, or to one another.
+    """
+    check_types(tensors)
+    with input_checked():
+        scene = restored_scene(header, tensors)
+    first, second = under(tensors, "first/"), under(tensors, "second/")
+    if not first.keys() == second.keys() <= header["updates"].keys():
+        raise InputError("not every parameter that was stepped has both moments and a count of its updates")
+    check_like(second, first, "the second moments")
+    lost = sorted(first.keys() - scene.parameters().keys())
+    if lost:
+        raise InputError(f"it has moments of {', '.join(lost)}, but no such parameters")
+    return TrainState(
+        scene=scene,
+        method=header["method"],
+        seed=header["seed"],
+        step=header["step"],
+        seconds=header["seconds"],
+        records=dict(header["records"]),
+        optimizer=Optimizer(
+            {name: (first[name], second[name]) for name in first},
+            updates=dict(header["updates"]),
+            paused=dict(header["paused"]),
+            hurried=dict(header["hurried"]),
+        ),
+        statistics=restored_statistics(under(tensors, "statistics/"), scene),
+        means=under(tensors, "means/"),
+    )
+
+
+def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Scene:
+    """The scene; ValueError where a tensor is missing or of another shape."""
+    empty = Scene(Gaussians.empty(), extent=header["extent"])
+    if header["active_sh_degree"].keys() - set(OPTIONAL_SETS) != empty.gaussian_sets().keys():
+        raise InputError(
+            f"it holds the sets of Gaussians {sorted(header['active_sh_degree'])}; expected primary, glass, and "
+            f"{' and '.join(OPTIONAL_SETS)} where there are any"
+        )
+    if "scene/glass/logit_mark" not in tensors:
+        raise InputError("the glass has no logit_mark")
+    sets = {
+        part: restored_gaussians(under(tensors, f"scene/{part}/"), part, degree)
+        for part, degree in header["active_sh_degree"].items()
+    }
+    planes = under(tensors, "scene/planes/")
+    further = {name: shape for name, shape in FURTHER_PLANE_SHAPES.items() if name in planes}
+    check_shapes(planes, PLANE_SHAPES | further, "planes")
+    distant = under(tensors, "scene/environment/")
+    check_shapes(distant, {"raw": None} if distant else {}, "environment")
+    environment = Environment(**distant, region=header["region"]) if distant else empty.environment
+    exposed = under(tensors, "scene/exposures/")
+    check_shapes(exposed, {"affine": (3, 4)} if exposed else {}, "exposures")
+    moved = under(tensors, "scene/poses/")
+    check_shapes(moved, {"twists": (6,)} if moved else {}, "poses")
+    return Scene(
+        poses=PoseCorrections(**moved, names=tuple(header["corrected"])) if moved else empty.poses,
+        extent=header["extent"],
+        planes=Planes(**planes, labels=header["labels"], mirrors=header["mirrors"]),
+        environment=environment,
+        up=direction(header["up"], "the header"),
+        exposures=Exposures(**exposed, names=tuple(header["photographs"])) if exposed else empty.exposures,
+        **sets,
+    )
+
+
+def restored_gaussians(tensors: Mapping[str, Tensor], part: str, active_sh_degree: int) -> Gaussians:
+    """A set of Gaussians from its named tensors; ValueError where one is missing or of another shape."""
+    channels = {name: t for name, t in tensors.items() if name not in PER_GAUSSIAN}
+    main = {name: t for name, t in tensors.items() if name in PER_GAUSSIAN}
+    check_shapes(tensors, {**GAUSSIAN_SHAPES, "sh": None, **dict.fromkeys(channels, ())}, part)
+    if tuple(main["sh"].shape[1:]) not in SH_SHAPES:
+        raise InputError(f"sh of {part} has shape {list(main['sh'].shape)}; expected [N, 0, 1, 4, 9 or 16, 3]")
+    if tuple(main["log_scales"].shape[1:]) not in SCALE_SHAPES:
+        raise InputError(f"log_scales of {part} has shape {list(main['log_scales'].shape)}; expected [N, 2 or 3]")
+    return Gaussians(**main, channels=channels, active_sh_degree=active_sh_degree)
+
+
+def restored_statistics(tensors: Mapping[str, Tensor], scene: Scene) -> dict[str, ScreenStatistics]:
+    """The statistics of the sets of Gaussians that have some."""
+    found = {}
+    for part in sorted({name.partition("/")[0] for name in tensors}):
+        gaussians = scene.gaussian_sets().get(part)
+        if gaussians is None:
+            raise InputError(f"it holds statistics of {part}; expected those of {', '.join(scene.gaussian_sets())}")
+        expected = vars(ScreenStatistics.zeros(len(gaussians)))
+        known = under(tensors, f"{part}/")
+        check_like(known, expected, f"the statistics of {part}")
+        if known.keys() != expected.keys():
+            raise InputError(f"the statistics of {part} are {sorted(known)}; expected {sorted(expected)}")
+        found[part] = ScreenStatistics(**known)
+    return found
+
+
+def check_types(tensors: Mapping[str, Tensor]) -> None:
+    """Raises InputError unless all tensors hold floating-point numbers of one precision."""
+    for name, tensor in tensors.items():
+        if not tensor.is_floating_point():
+            raise InputError(f"{name} holds {tensor.dtype}; expected floating-point numbers")
+        first = next(iter(tensors.values()))
+        if tensor.dtype != first.dtype:
+            raise InputError(f"{name} holds {tensor.dtype}, other tensors {first.dtype}; expected one precision")
+
+
+def check_shapes(tensors: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...] | None], of: str) -> None:
+    """Raises InputError unless there is just one tensor of each name, its rows of the shape given; None for any."""
+    if tensors.keys() != shapes.keys():
+        raise InputError(f"{of} has the tensors {sorted(tensors)}; expected {sorted(shapes)}")
+    for name, shape in shapes.items():
+        found = tuple(tensors[name].shape)
+        if shape is not None and (not found or found[1:] != shape):
+            raise InputError(f"{name} of {of} has shape {list(found)}; expected rows of {list(shape)}")
+
+
+def check_like(tensors: Mapping[str, Tensor], examples: Mapping[str, Tensor], of: str) -> None:
+    """Raises InputError unless each tensor has the shape of the example of the same name."""
+    for name, tensor in tensors.items():
+        if name not in examples or tensor.shape != examples[name].shape:
+            expected = list(examples[name].shape) if name in examples else "none of that name"
+            raise InputError(f"{name} of {of} has shape {list(tensor.shape)}; expected {expected}")
+
+
+def under(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The tensors whose name begins with a prefix, which is cut off."""
+    return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}

@@ -1,0 +1,178 @@
+"""Learning of exposures, of poses and of the photographer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from glassplat.captures.dataset import Dataset
+from glassplat.render.planar import Planar
+from glassplat.scene.activations import logit
+from glassplat.scene.camera import Camera
+from glassplat.scene.corrections import Exposures, PoseCorrections, upward
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.panes import Planes
+from glassplat.scene.scene import Scene
+from glassplat.training.actions import Densify
+from glassplat.training.options import DefaultDensify, PhotoExposure, Photographer, PoseRefinement, Rate
+from glassplat.training.stage import Clock, Entry, Stage, TrainState, Work, carried_out
+
+
+def exposures_begun(options: PhotoExposure, scene: Scene, dataset: Dataset) -> Scene:
+    """The first scene, with transforms that change nothing yet."""
+    names = tuple(view.name for view in dataset.train)
+    return replace(scene, exposures=Exposures.neutral(names)) if options.rate else scene
+
+
+def exposures_learnt(options: PhotoExposure, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+    """The stages, in which the transforms learn as well."""
+    if not options.rate:
+        return stages
+    rate = {"exposures.affine": Rate(options.rate, options.rate * options.rate_end)}
+    # Before the motions that take means over steps.
+    return tuple(replace(s, rates={**s.rates, **rate}, motions=(center_exposures, *s.motions)) for s in stages)
+
+
+def center_exposures(state: TrainState, clock: Clock, visible: Tensor | None) -> None:
+    """Takes the mean of all transforms off each of them.
+
+    What all photographs have in common belongs to the scene: were it twice as bright and all photographs half as much,
+    training would see no difference, and views that nobody photographed would have the wrong colours.
+    """
+    affine = state.scene.exposures.affine.detach()
+    affine -= affine.mean(dim=0)
+
+
+def poses_begun(options: PoseRefinement, scene: Scene, dataset: Dataset) -> Scene:
+    """The first scene, with all cameras where they are said to be."""
+    names = tuple(view.name for view in dataset.train)
+    return replace(scene, poses=PoseCorrections.none(names)) if options.rate else scene
+
+
+def poses_learnt(options: PoseRefinement, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+    """The stages, in which the cameras learn as well."""
+    if not options.rate:
+        return stages
+    rate = {"poses.twists": Rate(options.rate, options.rate * options.rate_end)}
+    # Before the motions that take means over steps.
+    return tuple(replace(s, rates={**s.rates, **rate}, motions=(center_poses, *s.motions)) for s in stages)
+
+
+def center_poses(state: TrainState, clock: Clock, visible: Tensor | None) -> None:
+    """Takes the mean of all motions off each of them, translation and rotation.
+
+    Were all cameras and the scene moved together, training would see no difference, and test cameras stay behind.
+    """
+    twists = state.scene.poses.twists.detach()
+    twists -= twists.mean(dim=0)
+
+
+NEAREST, FARTHEST = 0.03, 0.6
+"""Of the cloud from the camera, as shares of the distance to the panes: what a body measures in the capture's units is
+not known, and from head to feet it is ten times as far as from the camera to the head."""
+SPREAD = 0.2
+"""Standard deviation of each Gaussian, as a share of its distance from the camera."""
+OPACITY = 0.05
+
+
+def first_photographer(
+    planes: Planes, cameras: Sequence[Camera], *, count: int, sh_degree: int, seed: int
+) -> Gaussians:
+    """A faint grey cloud behind the camera, as dense in the logarithm of the distance from it everywhere.
+
+    Args:
+        planes: the panes, at least one.
+        cameras: of the training views.
+        count: of Gaussians.
+        sh_degree: highest degree of their colours.
+        seed: fixes the places.
+
+    Returns:
+        In the photographer's frame, with x to the right, y down and z ahead.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    distance = distance_to_panes(planes, cameras)
+    low, high = math.log(NEAREST * distance), math.log(FARTHEST * distance)
+    radii = torch.exp(low + (high - low) * torch.rand(count, generator=generator))
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    # Behind the camera; where the face is, all around it.
+    directions[:, 2] = -directions[:, 2].abs()
+    device = planes.centers.device
+    found = Gaussians(
+        means=radii[:, None] * directions,
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        log_scales=torch.log(SPREAD * radii)[:, None].repeat(1, 3),
+        logit_opacities=torch.full((count,), logit(OPACITY)),
+        sh=torch.zeros(count, (sh_degree + 1) ** 2, 3),
+    )
+    return found.to(device)
+
+
+def distance_to_panes(planes: Planes, cameras: Sequence[Camera]) -> float:
+    """The median, over the cameras, of the distance to the nearest rectangle; world units."""
+    centers = torch.stack([camera.center for camera in cameras]).to(planes.centers)
+    offsets = centers[:, None] - planes.centers
+    along = torch.stack([(offsets * axis).sum(-1) for axis in planes.axes()], dim=-1)
+    outside = (along.abs() - planes.half_sizes).clamp(min=0)
+    across: Tensor = (offsets * planes.normals).sum(-1, keepdim=True)
+    return float(torch.cat([outside, across], dim=-1).norm(dim=-1).amin(dim=1).median())
+
+
+PART = "photographer"
+
+
+@dataclass(frozen=True)
+class AddPhotographer:
+    """Puts somebody behind the camera once there are panes.
+
+    Attributes:
+        options: who.
+        seed: of the first Gaussians' places.
+        after: what comes before that: it finds the panes.
+    """
+
+    options: Photographer
+    seed: int
+    after: Entry | None
+
+    def __call__(self, state: TrainState, dataset: Dataset) -> Work:
+        """Edits `state`, and tells how far it is."""
+        if self.after is not None:
+            yield from carried_out(self.after(state, dataset))
+        cameras = [view.camera for view in dataset.train]
+        body = first_photographer(
+            state.scene.planes,
+            cameras,
+            count=self.options.count,
+            sh_degree=self.options.sh_degree,
+            seed=self.seed,
+        )
+        up = upward(cameras) if self.options.upright else None
+        state.scene = replace(state.scene, photographer=body, up=up)
+        return True
+
+
+def photographer_learnt(
+    options: Photographer, stages: tuple[Stage, ...], densify: DefaultDensify, seed: int
+) -> tuple[Stage, ...]:
+    """The stages: in those that know panes the photographer is shown and learns, from the first of them on."""
+    if not options.learn:
+        return stages
+    first = next(number for number, stage in enumerate(stages) if isinstance(stage.renderer, Planar))
+    entry = AddPhotographer(options, seed, after=stages[first].entry)
+    learning = [_learning(options, stage, densify) for stage in stages[first:]]
+    return (*stages[:first], replace(learning[0], entry=entry), *learning[1:])
+
+
+def _learning(options: Photographer, stage: Stage, densify: DefaultDensify) -> Stage:
+    assert isinstance(stage.renderer, Planar)
+    return replace(
+        stage,
+        renderer=replace(stage.renderer, photographer="present"),
+        rates={**stage.rates, **options.rates.of(PART)},
+        actions=(*stage.actions, Densify(densify, part=PART)),
+    )

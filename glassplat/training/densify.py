@@ -1,0 +1,523 @@
+"""Changes of the set of Gaussians: clone, split and prune (3DGS), relocate (3DGS-MCMC), and opacity perturbation.
+
+Every change is an `Edit`: for each row of the new set the old row it comes from, whether it is a new Gaussian, and
+the tensors in which it differs from that old row. Strategies build edits and `apply_edit` carries them out.
+
+In MCMC nothing is cloned, split or pruned by thresholds on gradients. Dead Gaussians are relocated onto live ones, a
+few new ones are added in the same way, and noise on the positions lets the transparent ones explore.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from glassplat.kernels.screen_statistics import Sums, Views, add_views
+from glassplat.scene.activations import logit
+from glassplat.scene.camera import rotation_from_quat
+from glassplat.scene.gaussians import Gaussians
+from glassplat.training.options import DefaultDensify, McmcDensify
+
+Moments = Mapping[str, tuple[Tensor, Tensor]]
+"""Adam's first and second moment by dotted parameter name (`primary.means`), shaped like the parameter."""
+
+
+@dataclass(frozen=True)
+class Edit:
+    """How a new set of M Gaussians is made from an old one.
+
+    Attributes:
+        source: [M] int64 row of the old set that each new row copies.
+        fresh: [M] bool; true where the row is a new Gaussian, whose moments start at zero.
+        replaced: tensors whose values differ from the copies, by name, one row per new Gaussian.
+    """
+
+    source: Tensor
+    fresh: Tensor
+    replaced: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, tensor in {"fresh": self.fresh, **self.replaced}.items():
+            if tensor.shape[0] != len(self):
+                raise ValueError(
+                    f"{name} has {tensor.shape[0]} rows where source has {len(self)}; expected one per new Gaussian"
+                )
+
+    def __len__(self) -> int:
+        return self.source.shape[0]
+
+    def result(self, gaussians: Gaussians, name: str) -> Tensor:
+        """The tensor `name` of the new set, without making the rest of it."""
+        return self.replaced[name] if name in self.replaced else gaussians.tensors()[name][self.source]
+
+    def then(self, following: Edit) -> Edit:
+        """This edit and, on its result, `following`, as one edit of the original set."""
+        replaced = {name: tensor[following.source] for name, tensor in self.replaced.items()}
+        fresh = self.fresh[following.source] | following.fresh
+        return Edit(self.source[following.source], fresh, replaced | dict(following.replaced))
+
+
+def keep(mask: Tensor) -> Edit:
+    """Keeps the Gaussians where `mask` [N] is true, in their order."""
+    source = mask.nonzero().squeeze(1)
+    return Edit(source, torch.zeros_like(source, dtype=torch.bool))
+
+
+def clone(count: int, index: Tensor) -> Edit:
+    """Keeps all `count` Gaussians and appends a copy of each one in `index` [I]."""
+    everything = torch.arange(count, device=index.device)
+    source = torch.cat([everything, index])
+    return Edit(source, torch.arange(source.shape[0], device=index.device) >= count)
+
+
+@torch.no_grad()
+def split(
+    gaussians: Gaussians, index: Tensor, *, generator: torch.Generator, children: int = 2, shrink: float = 1.6
+) -> Edit:
+    """Replaces each Gaussian in `index` [I] by smaller ones drawn from it (3DGS, Section 5.2).
+
+    The survivors come first, in their order; then the first child of every parent, the second of
+    every parent, and so on.
+
+    Args:
+        gaussians: the set that is edited.
+        index: rows to split, each at most once.
+        generator: source of the children's positions, on the device of `gaussians`.
+        children: how many take the place of one parent.
+        shrink: factor by which a child's axes are shorter than its parent's.
+    """
+    count = len(gaussians)
+    survives = torch.ones(count, dtype=torch.bool, device=index.device)
+    survives[index] = False
+    parents = index.repeat(children)
+    source = torch.cat([survives.nonzero().squeeze(1), parents])
+    fresh = torch.arange(source.shape[0], device=index.device) >= count - index.shape[0]
+
+    means, log_scales = gaussians.means[source], gaussians.log_scales[source]
+    means[fresh] += _drawn_offsets(gaussians.quats[parents], gaussians.deviations[parents], generator)
+    log_scales[fresh] -= math.log(shrink)
+    return Edit(source, fresh, {"means": means, "log_scales": log_scales})
+
+
+def _drawn_offsets(quats: Tensor, deviations: Tensor, generator: torch.Generator) -> Tensor:
+    """[N, 3] one random offset from the centre of each Gaussian, distributed as the Gaussian."""
+    unit = torch.randn(deviations.shape, generator=generator, dtype=deviations.dtype, device=deviations.device)
+    return (rotation_from_quat(quats) @ (unit * deviations)[..., None]).squeeze(-1)
+
+
+@torch.no_grad()
+def apply_edit(
+    gaussians: Gaussians, moments: Moments, edit: Edit, *, part: str = "primary"
+) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
+    """The edited Gaussians and moments; nothing is changed in place and nothing requires a gradient.
+
+    Args:
+        gaussians: the set that is edited.
+        moments: moments of any number of parameters; those of other scene parts pass through as
+            they are, and a tensor without moments (not trained yet) stays without.
+        edit: what to do.
+        part: the scene part that `gaussians` is, first half of the names in `moments`.
+    """
+    edited = gaussians.with_tensors({name: edit.result(gaussians, name) for name in gaussians.tensors()})
+
+    def moved(moment: Tensor) -> Tensor:
+        rows = moment[edit.source]
+        rows[edit.fresh] = 0
+        return rows
+
+    owned = {f"{part}.{name}" for name in gaussians.tensors()}
+    return edited, {name: (moved(m), moved(v)) if name in owned else (m, v) for name, (m, v) in moments.items()}
+
+
+@torch.no_grad()
+def append(
+    gaussians: Gaussians, moments: Moments, new: Gaussians, *, part: str = "primary"
+) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
+    """The Gaussians followed by `new` ones, whose moments are zero.
+
+    Raises:
+        ValueError: the two sets do not hold the same tensors.
+    """
+    old_tensors, new_tensors = gaussians.tensors(), new.tensors()
+    if set(old_tensors) != set(new_tensors):
+        raise ValueError(f"cannot append Gaussians with {sorted(new_tensors)} to Gaussians with {sorted(old_tensors)}")
+    joined = gaussians.with_tensors({name: torch.cat([old_tensors[name], new_tensors[name]]) for name in old_tensors})
+
+    def extended(name: str, moment: Tensor) -> Tensor:
+        return torch.cat([moment, torch.zeros_like(new_tensors[name.removeprefix(f"{part}.")])])
+
+    owned = {f"{part}.{name}" for name in old_tensors}
+    return joined, {
+        name: (extended(name, m), extended(name, v)) if name in owned else (m, v) for name, (m, v) in moments.items()
+    }
+
+
+@torch.no_grad()
+def forget(moments: Moments, names: Collection[str], rows: Tensor | None = None) -> dict[str, tuple[Tensor, Tensor]]:
+    """The moments with those of some parameters zeroed, because their values were replaced.
+
+    Args:
+        moments: moments by dotted parameter name.
+        names: dotted names of the replaced parameters; names without moments are passed over.
+        rows: boolean mask or indices of the replaced rows; all rows if None.
+    """
+
+    def cleared(moment: Tensor) -> Tensor:
+        remaining = moment.clone()
+        remaining[... if rows is None else rows] = 0
+        return remaining
+
+    return {name: (cleared(m), cleared(v)) if name in names else (m, v) for name, (m, v) in moments.items()}
+
+
+@dataclass(frozen=True)
+class ScreenStatistics:
+    """What the views since the last densification saw of each Gaussian.
+
+    Gradients are in normalised device coordinates, in which the image spans [-1, 1] both ways: thresholds do not
+    depend on its resolution. Sums and counts have two rows, over all views and over those that see the Gaussian
+    directly. In a mirror it is farther away: whether it is too coarse is seen where it is close, and in mirrors only
+    where no view shows it directly.
+
+    Attributes:
+        gradient_sum: [2, N] sum over views of the norm of the loss gradient with respect to the centre on screen.
+        pull_sum: [2, N] the same of what single pixels contribute to that gradient, added up without signs.
+        view_count: [2, N] number of views that saw the Gaussian; one in or through a pane counts by how much of what is
+            drawn is left in the image. Gradients are smaller by as much; counted as a full view, a weak reflection
+            would look as if it needed no more detail.
+        max_radius: [N] largest radius on screen, as a share of the longer image side.
+    """
+
+    gradient_sum: Tensor
+    pull_sum: Tensor
+    view_count: Tensor
+    max_radius: Tensor
+
+    @staticmethod
+    def zeros(count: int, *, device: torch.device | str = "cpu") -> ScreenStatistics:
+        """Statistics of `count` Gaussians that no view has seen."""
+        gradients, pulls, views = torch.zeros(3, 2, count, device=device)
+        return ScreenStatistics(gradients, pulls, views, torch.zeros(count, device=device))
+
+    def add(self, views: Views) -> None:
+        """Adds the views of one training step, in place."""
+        add_views(Sums(self.gradient_sum, self.pull_sum, self.view_count, self.max_radius), views)
+
+    @torch.no_grad()
+    def add_in_space(self, means_gradient: Tensor, distances: Tensor) -> None:
+        """Adds a training step in which rays met the Gaussians in space, in place (EnvGS, Section 5.1).
+
+        A gradient times half of the distance at which a Gaussian was met is what on a screen would be one in normalised
+        device coordinates; without that factor, what is far away would get too few Gaussians.
+
+        Args:
+            means_gradient: [N, 3] gradient of one view's loss with respect to the centres.
+            distances: [N] at which they were met, world units.
+        """
+        norms = means_gradient.norm(dim=-1)
+        pulls = 0.5 * distances * norms
+        for total, added in ((self.gradient_sum, pulls), (self.pull_sum, pulls), (self.view_count, norms > 0)):
+            total += added
+
+    @property
+    def mean_gradient(self) -> Tensor:
+        """[N] mean gradient norm over the views that saw the Gaussian, direct ones if there are any; 0 if none did."""
+        return self._mean(self.gradient_sum)
+
+    @property
+    def mean_pull(self) -> Tensor:
+        """[N] mean pull of single pixels over the views that saw the Gaussian, as `mean_gradient`."""
+        return self._mean(self.pull_sum)
+
+    def _mean(self, total: Tensor) -> Tensor:
+        over_all, over_direct = total / self.view_count.clamp(min=1)
+        return torch.where(self.view_count[1] > 0, over_direct, over_all)
+
+
+@torch.no_grad()
+def densified(
+    options: DefaultDensify,
+    gaussians: Gaussians,
+    moments: Moments,
+    statistics: ScreenStatistics,
+    *,
+    extent: float,
+    generator: torch.Generator,
+    part: str = "primary",
+    prune_large: bool = False,
+) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
+    """A set of Gaussians and their moments after cloning, splitting and pruning.
+
+    Statistics start again at `ScreenStatistics.zeros` afterwards.
+
+    Args:
+        options: when and how.
+        gaussians: the set to edit.
+        moments: optimiser moments by dotted name; those of other parts pass through.
+        statistics: what was gathered since the last call, one row per Gaussian.
+        extent: radius of the capture in world units.
+        generator: source of randomness, on the device of `gaussians`.
+        part: the scene part that `gaussians` is.
+        prune_large: also remove what is too large; 3DGS does so once the opacities have been
+            reset for the first time.
+    """
+    if statistics.max_radius.shape[0] != len(gaussians):
+        raise ValueError(
+            f"statistics hold {statistics.max_radius.shape[0]} rows for {len(gaussians)} Gaussians; "
+            "start new statistics whenever the set has changed"
+        )
+    grown = _growth(options, gaussians, statistics, extent=extent, generator=generator)
+    radius = torch.where(grown.fresh, 0, statistics.max_radius[grown.source])
+    superfluous = _superfluous(options, gaussians, grown, radius, extent=extent, prune_large=prune_large)
+    return apply_edit(gaussians, moments, grown.then(keep(~superfluous)), part=part)
+
+
+def _growth(
+    options: DefaultDensify,
+    gaussians: Gaussians,
+    statistics: ScreenStatistics,
+    *,
+    extent: float,
+    generator: torch.Generator,
+) -> Edit:
+    large = gaussians.log_scales.amax(dim=1) > math.log(options.dense_fraction * extent)
+    needs = statistics.mean_gradient / options.gradient_threshold
+    if options.split_by == "pull":
+        needs = torch.where(large, statistics.mean_pull / options.pull_threshold, needs)
+    chosen = _within_cap(options, needs)
+    halved = split(gaussians, (chosen & large).nonzero().squeeze(1), generator=generator)
+    # What was not split moved forward by as many rows as were split before it.
+    row_after_split = (~(chosen & large)).cumsum(dim=0) - 1
+    return halved.then(clone(len(halved), row_after_split[chosen & ~large]))
+
+
+def _within_cap(options: DefaultDensify, need: Tensor) -> Tensor:
+    """[N] bool: what to clone or split, of what needs it by 1 or more; under a cap, what needs it most."""
+    chosen = need >= 1
+    if options.cap is None:
+        return chosen
+    room = max(options.cap - need.shape[0], 0)
+    order = torch.where(chosen, need, -1).argsort(descending=True, stable=True)
+    within = torch.zeros_like(chosen)
+    within[order[:room]] = True
+    return chosen & within
+
+
+def _superfluous(
+    options: DefaultDensify, gaussians: Gaussians, edit: Edit, radius: Tensor, *, extent: float, prune_large: bool
+) -> Tensor:
+    """[M] bool: which Gaussians of the edited set to remove; `radius` [M] as in `max_radius`."""
+    superfluous = torch.sigmoid(edit.result(gaussians, "logit_opacities")) < options.prune_opacity
+    if prune_large:
+        longest = edit.result(gaussians, "log_scales").amax(dim=1)
+        superfluous |= longest > math.log(options.prune_scale_fraction * extent)
+        if options.prune_radius_fraction is not None:
+            superfluous |= radius > options.prune_radius_fraction
+    return superfluous
+
+
+@torch.no_grad()
+def reset_opacity(
+    gaussians: Gaussians, moments: Moments, *, ceiling: float = 0.01, part: str = "primary"
+) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
+    """Lowers every opacity to at most `ceiling` and forgets the opacities' moments (3DGS, Section 5.2).
+
+    What the photographs need grows back; what does not is pruned.
+    """
+    lowered = gaussians.logit_opacities.clamp(max=logit(ceiling))
+    return gaussians.with_tensors({"logit_opacities": lowered}), forget(moments, (f"{part}.logit_opacities",))
+
+
+MOST_COPIES = 51
+"""Gaussians that may share one place, the first one included; the sum of `shared_contribution` is exact up to here."""
+MOST_LOGIT = 16.0
+"""Opacity 1 - 1e-7, all that float32 tells from 1. The terms of the alternating sum grow with the logit."""
+
+
+@torch.no_grad()
+def resampled(
+    options: McmcDensify,
+    gaussians: Gaussians,
+    moments: Moments,
+    *,
+    cap: int,
+    generator: torch.Generator,
+    part: str = "primary",
+) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
+    """A set of Gaussians and their moments after relocation and growth; what it renders stays nearly the same.
+
+    The moments are zeroed for every row that moved or is new, and for the live ones they were placed on, whose
+    opacity and size changed.
+
+    Args:
+        options: when and how.
+        gaussians: the set to edit.
+        moments: optimiser moments by dotted name; those of other parts pass through.
+        cap: largest number of Gaussians to grow to; a set that is larger stays as large.
+        generator: source of randomness, on the device of `gaussians`.
+        part: the scene part that `gaussians` is.
+    """
+    relocated, moments = apply_edit(gaussians, moments, relocation(options, gaussians, generator), part=part)
+    return apply_edit(relocated, moments, addition(options, relocated, cap, generator), part=part)
+
+
+def relocation(options: McmcDensify, gaussians: Gaussians, generator: torch.Generator) -> Edit:
+    """Moves every dead Gaussian onto a live one, drawn with a probability proportional to its opacity.
+
+    Without live ones nothing moves; where more than `MOST_COPIES` would share a place, the surplus stays dead.
+    """
+    live = _live(options, gaussians)
+    dead = (~live).nonzero().squeeze(1)
+    targets = drawn_by_opacity(gaussians, live, dead.shape[0], generator)
+    fits = rank_among_equals(targets) < MOST_COPIES - 1
+    source = torch.arange(len(gaussians), device=dead.device)
+    source[dead[: targets.shape[0]][fits]] = targets[fits]
+    return shared_among_copies(gaussians, source)
+
+
+def addition(options: McmcDensify, gaussians: Gaussians, cap: int, generator: torch.Generator) -> Edit:
+    """Appends new Gaussians up to the growth factor and the cap, placed as relocated ones are."""
+    count = len(gaussians)
+    # Rounded up, because a set of a few Gaussians would never grow otherwise.
+    room = max(min(cap, math.ceil(options.growth * count)) - count, 0)
+    targets = drawn_by_opacity(gaussians, _live(options, gaussians), room, generator)
+    targets = targets[rank_among_equals(targets) < MOST_COPIES - 1]
+    return shared_among_copies(gaussians, torch.cat([torch.arange(count, device=targets.device), targets]))
+
+
+@torch.no_grad()
+def exploring_noise(
+    options: McmcDensify, gaussians: Gaussians, *, rate: float, extent: float, generator: torch.Generator
+) -> Tensor:
+    """[N, 3] offsets of the centres in world units: the noise term of the paper's Langevin dynamics.
+
+    noise_rate * rate * sigmoid(-noise_sharpness (opacity - dead_opacity)) * covariance @ eta, eta standard normal.
+    The published factor multiplies an area by a rate that is a length, both in world units (`noise_units`), and so
+    depends on the capture's; else both are in scene extents, which is the same where the extent is one.
+
+    Args:
+        options: how strong it is, and where.
+        gaussians: the set whose centres are moved.
+        rate: learning rate of the positions per scene extent, as it stands at this step.
+        extent: radius of the capture in world units.
+        generator: source of randomness, on the device of `gaussians`.
+    """
+    shape, kind = gaussians.means.shape, gaussians.means.dtype
+    unit = torch.randn(shape, generator=generator, dtype=kind, device=gaussians.means.device)
+    rotations = rotation_from_quat(gaussians.quats)
+    variances = gaussians.deviations.square()
+    along_axes = (rotations.transpose(1, 2) @ unit[..., None]).squeeze(-1) * variances
+    directions = (rotations @ along_axes[..., None]).squeeze(-1)
+    directions = directions * extent if options.noise_units == "world" else directions / extent
+    opacities = torch.sigmoid(gaussians.logit_opacities)
+    gate = torch.sigmoid(-options.noise_sharpness * (opacities - options.dead_opacity))
+    return options.noise_rate * rate * gate[:, None] * directions
+
+
+def _live(options: McmcDensify, gaussians: Gaussians) -> Tensor:
+    """[N] bool: which Gaussians are opaque enough to stay."""
+    return torch.sigmoid(gaussians.logit_opacities) > options.dead_opacity
+
+
+def drawn_by_opacity(gaussians: Gaussians, live: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """[count] rows drawn with replacement, in proportion to their opacity; none at all if `live` [N] is all false."""
+    rows = live.nonzero().squeeze(1)
+    if not rows.shape[0]:
+        return rows
+    cumulative = torch.sigmoid(gaussians.logit_opacities[rows].double()).cumsum(dim=0)
+    unit = torch.rand(count, generator=generator, dtype=torch.float64, device=rows.device)
+    # A product that rounds up to the total would fall behind the last row.
+    found = torch.searchsorted(cumulative, unit * cumulative[-1], right=True).clamp(max=rows.shape[0] - 1)
+    return rows[found]
+
+
+def rank_among_equals(values: Tensor) -> Tensor:
+    """[I] how many equal values come before each one in `values` [I]."""
+    ordered, order = values.sort(stable=True)
+    ranks = torch.empty_like(values)
+    ranks[order] = torch.arange(values.shape[0], device=values.device) - torch.searchsorted(ordered, ordered)
+    return ranks
+
+
+def shared_among_copies(gaussians: Gaussians, source: Tensor) -> Edit:
+    """The edit in which new rows copy the rows `source` [M], and copies of one row share what it contributed."""
+    copies = torch.bincount(source, minlength=len(gaussians))[source]
+    shared = copies > 1
+    logit_opacities, log_scales = gaussians.logit_opacities[source], gaussians.log_scales[source]
+    opacities, shrink = shared_contribution(logit_opacities[shared], copies[shared])
+    logit_opacities[shared] = opacities
+    log_scales[shared] += shrink[:, None]
+    return Edit(source, shared, {"logit_opacities": logit_opacities, "log_scales": log_scales})
+
+
+def shared_contribution(logit_opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
+    """Opacity and size with which N copies at one place render like the one Gaussian they replace (relocation there).
+
+    The opacity o' satisfies 1 - (1 - o')^N = o, so that the centre stays as opaque. The size keeps the integral of
+    the composited profile sum_i o' G (1 - o' G)^(i-1) along a line through the centre: sigma' / sigma is o over
+    sum_{i=1..N} sum_{k<i} binom(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1). Summed over i first, the binomials become
+    binom(N, j) with j = k + 1, which leaves one sum.
+
+    Args:
+        logit_opacities: [I] raw opacities of the Gaussians that are replaced.
+        copies: [I] int64 number N of Gaussians at the place, 1 to `MOST_COPIES`.
+
+    Returns:
+        Raw opacities [I] of the copies, and [I] what to add to their log scales.
+    """
+    # log(1 - o) is -softplus of the logit, without the cancellation of forming 1 - o.
+    depth = torch.nn.functional.softplus(logit_opacities.double().clamp(max=MOST_LOGIT))
+    each = depth / copies
+    opacities = -torch.expm1(-each)
+    coefficients = _profile_coefficients().to(copies.device)[copies]
+    integral = torch.zeros_like(opacities)
+    for column in reversed(range(MOST_COPIES)):
+        integral = (integral + coefficients[:, column]) * opacities
+    shrink = torch.log(-torch.expm1(-depth)) - torch.log(integral)
+    return (torch.log(opacities) + each).to(logit_opacities.dtype), shrink.to(logit_opacities.dtype)
+
+
+@cache
+def _profile_coefficients() -> Tensor:
+    """[MOST_COPIES + 1, MOST_COPIES] float64: entry (N, j - 1) is binom(N, j) (-1)^(j-1) / sqrt(j)."""
+    orders = range(1, MOST_COPIES + 1)
+    rows = [[math.comb(n, j) * (-1) ** (j - 1) / math.sqrt(j) for j in orders] for n in range(MOST_COPIES + 1)]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+@torch.no_grad()
+def perturb_opacities(
+    gaussians: Gaussians,
+    selected: Tensor,
+    *,
+    generator: torch.Generator,
+    amplitude: float = 0.4,
+    bounds: tuple[float, float] = (0.01, 0.99),
+) -> Gaussians:
+    """Adds uniform noise to the opacity of the Gaussians that are seen through a pane.
+
+    Where the transmission image still holds part of the reflection, the depth loss and the gradient
+    loss have reached a balance; a random change of opacities upsets both at once.
+
+    Args:
+        gaussians: the primary Gaussians.
+        selected: [N] bool, which of them are seen through a pane (`behind_panes`).
+        generator: source of the noise, on the device of `gaussians`.
+        amplitude: the noise is uniform in [-amplitude, amplitude] and acts on the activated opacity.
+        bounds: range the new opacities are clamped to. The paper does not give it; the lower bound
+            lies above the pruning threshold and where a Gaussian still gets a gradient, so that
+            those that were wrongly lowered can return.
+
+    Returns:
+        The Gaussians; forget the opacity moments of those selected.
+    """
+    opacities = torch.sigmoid(gaussians.logit_opacities)
+    unit = torch.rand(opacities.shape, generator=generator, dtype=opacities.dtype, device=opacities.device)
+    noisy = (opacities + amplitude * (2 * unit - 1)).clamp(*bounds)
+    logit_opacities = torch.where(selected, torch.logit(noisy), gaussians.logit_opacities)
+    return gaussians.with_tensors({"logit_opacities": logit_opacities})

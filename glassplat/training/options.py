@@ -1,0 +1,457 @@
+"""Options that several methods share: learning rates, the schedule of densification, mirrors, photographs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Annotated, Literal
+
+import tyro
+
+from glassplat.options import (
+    ESSENTIAL,
+    Ascending,
+    Count,
+    InnerShare,
+    Internal,
+    LearningRate,
+    NotNegative,
+    Positive,
+    PositiveShare,
+    Range,
+    Several,
+    Share,
+    ShDegree,
+)
+
+PUBLISHED_ITERATIONS = 30_000
+"""Length of the runs for which 3DGS, and TR-Gaussians after it, chose their learning rates."""
+FASTEST_ITERATIONS = 3_000
+"""Shorter runs learn no faster than one of this length, the shortest for which higher rates were measured."""
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A learning rate over the run.
+
+    Attributes:
+        start: rate at the first iteration.
+        end: rate that it decays to exponentially; None keeps `start`.
+        decay: share of the run at which `end` is reached.
+        per_extent: multiply by the scene extent (for positions).
+        rest: factor for every SH coefficient but the constant one; only for `sh`.
+        short_run_power: a run of fewer iterations than the published 30,000 multiplies the rate by their ratio to this
+            power (`FASTEST_ITERATIONS` at the least), because Adam moves a parameter by about its rate at every step,
+            however small the gradient.
+    """
+
+    start: float
+    end: float | None = None
+    decay: float = 1.0
+    per_extent: bool = False
+    rest: float | None = None
+    short_run_power: float = 0.0
+
+    def at(self, progress: float, extent: float, iterations: int = PUBLISHED_ITERATIONS) -> float:
+        """The rate at a progress in [0, 1] of a run of so many iterations."""
+        length = min(max(iterations, FASTEST_ITERATIONS), PUBLISHED_ITERATIONS)
+        scale = (PUBLISHED_ITERATIONS / length) ** self.short_run_power
+        if self.per_extent:
+            scale *= extent
+        if self.end is None or self.start == 0:
+            return self.start * scale
+        decayed = min(progress / self.decay, 1.0)
+        return float(self.start ** (1 - decayed) * self.end**decayed * scale)
+
+
+@dataclass(frozen=True)
+class GaussianRates:
+    """Learning rates of a set of Gaussians (3DGS).
+
+    Attributes:
+        means: position, per scene extent, at the start of the run; decays to `means_end`.
+        decay: share of the run at which it has done so.
+        sh: constant SH coefficient; the others get a twentieth.
+        opacity, scale, rotation: of the raw values.
+        intensity: of the reflection intensity's logarithm.
+        short_run_power: in a run of n < 30,000 iterations the rates of position, colour, scale and rotation are
+            (30,000 / n) to this power times as large, n being 3,000 at the least; 0 keeps the published ones
+            (docs/experiments.md).
+    """
+
+    means: LearningRate = 1.6e-4
+    means_end: Internal[PositiveShare] = 1.6e-6
+    decay: Internal[PositiveShare] = 1.0
+    sh: LearningRate = 2.5e-3
+    opacity: LearningRate = 5e-2
+    scale: LearningRate = 5e-3
+    rotation: LearningRate = 1e-3
+    intensity: Internal[LearningRate] = 5e-3
+    short_run_power: Internal[Annotated[float, Range(0, 2)]] = 0.5
+
+    def of(self, part: str) -> dict[str, Rate]:
+        """The rates by dotted parameter name."""
+        power = self.short_run_power
+        return {
+            f"{part}.means": Rate(self.means, self.means_end, decay=self.decay, per_extent=True, short_run_power=power),
+            f"{part}.sh": Rate(self.sh, rest=1 / 20, short_run_power=power),
+            f"{part}.logit_opacities": Rate(self.opacity),
+            f"{part}.log_scales": Rate(self.scale, short_run_power=power),
+            f"{part}.quats": Rate(self.rotation, short_run_power=power),
+        }
+
+
+@dataclass(frozen=True)
+class PlaneRates:
+    """Learning rates of planes and glass, which the paper leaves out; see docs/experiments.md.
+
+    Attributes:
+        center: plane position in stage 2, per scene extent.
+        normal: plane normal in stage 2.
+        reflectance: logit of R0.
+        mark: logit of the glass mark.
+        transmittance: its logarithm, where panes may be tinted.
+        joint_factor: factor on `center` and `normal` in stage 3 (paper: 0.1).
+    """
+
+    center: LearningRate = 1e-4
+    normal: LearningRate = 1e-4
+    reflectance: LearningRate = 1e-2
+    mark: LearningRate = 5e-2
+    transmittance: LearningRate = 5e-3
+    joint_factor: Share = 0.1
+
+    def of(self, factor: float) -> dict[str, Rate]:
+        """The rates by dotted parameter name."""
+        return {
+            "planes.centers": Rate(self.center * factor, per_extent=True),
+            "planes.raw_normals": Rate(self.normal * factor),
+            "planes.logit_reflectances": Rate(self.reflectance),
+            "planes.log_transmittances": Rate(self.transmittance),
+            "glass.logit_mark": Rate(self.mark),
+        }
+
+
+@dataclass(frozen=True)
+class ReflectionRates:
+    """Learning rates of what reflects.
+
+    Attributes:
+        strength: logit of the reflection strength.
+        environment: raw texels of the environment.
+    """
+
+    strength: LearningRate = 2e-2
+    environment: LearningRate = 5e-2
+
+    def of(self) -> dict[str, Rate]:
+        """The rates by dotted parameter name."""
+        return {"primary.logit_strength": Rate(self.strength), "environment.raw": Rate(self.environment)}
+
+
+Strategy = Literal["default", "mcmc"]
+
+
+@dataclass(frozen=True)
+class Rhythm:
+    """When opacities are disturbed, when the SH degree grows, and how a run ends.
+
+    Times are shares of the run (3DGS: of 30,000 iterations).
+
+    Every third beat resets the opacities, as in 3DGS; `planar` perturbs them at the other two, so that
+    the two never meet (TR-Gaussians, Section III-C3).
+
+    Attributes:
+        beat: distance between beats, as a share of the run.
+        least: fewest iterations between beats; what a beat disturbs needs as many to recover.
+        reset_stop: share of the run after which no reset happens; the `mcmc` strategy has none.
+        sh: distance between rises of the SH degree, as a share of the run.
+        averaged_passes: passes over the views at the end of the run of which the scene becomes the mean; 0 keeps the
+            last step.
+    """
+
+    beat: Internal[PositiveShare] = 1 / 30
+    least: Internal[Several] = 250
+    reset_stop: Internal[Share] = 0.45
+    sh: Internal[PositiveShare] = 1 / 30
+    averaged_passes: Annotated[float, Range(0, 1000)] = 1.0
+
+
+@dataclass(frozen=True)
+class DefaultDensify:
+    """When and how 3DGS adds and removes Gaussians, with the criterion of AbsGS (arXiv 2404.10484) for splits.
+
+    A small Gaussian whose mean screen gradient exceeds a threshold is cloned; a large one at which single pixels pull
+    more than another threshold is split in two. Where a large Gaussian smears detail, pixels pull it to all sides;
+    3DGS, which looks at the gradient here too, lets it be. Nearly transparent ones are removed.
+
+    Attributes:
+        split_by: what tells that a large Gaussian is too large: the `pull` of single pixels, or as in 3DGS the
+            `gradient` that clones small ones.
+        interval: steps between densifications.
+        whole_passes: wait at least for about one pass over the views, twice the interval at the most, so that
+            every Gaussian has been seen when it is judged.
+        adapt_to_size: raise the thresholds where photographs are smaller than a megapixel, for which they were found.
+        start: share of the run after which densification begins.
+        stop: share of the run after which it ends.
+        gradient_threshold: mean gradient norm, in normalised device coordinates, above which a small Gaussian is
+            cloned.
+        pull_threshold: mean pull of single pixels, in the same unit, above which a large Gaussian is split by `pull`.
+        dense_fraction: Gaussians whose longest axis is above this share of the scene extent are
+            split, smaller ones cloned.
+        prune_opacity: Gaussians less opaque than this are removed.
+        prune_large_start: share of the run after which what is too large is removed as well; 1 never does.
+        prune_scale_fraction: with `prune_large`, Gaussians with an axis above this share of the
+            scene extent are removed.
+        prune_radius_fraction: with `prune_large`, Gaussians that any view saw with a radius above
+            this share of its longer side are removed; None keeps them. 3DGS states a limit of 20
+            pixels but clears the radii before it looks at them, so its published results have none.
+        cap: largest number of Gaussians to grow to; None takes `per_pixel`.
+        per_pixel: largest number of Gaussians to grow to for each pixel of all training photographs, which is reached
+            where these contradict each other, by cars and leaves, and never stop asking for more; 0 for no limit.
+        least_contribution: Gaussians that add less than so many pixels to every training view, directly and mirrored,
+            are removed; 0 keeps them.
+        contribution_moments: shares of the run at which they are: when the set has stopped growing, and in `planar`
+            once more when nothing is perturbed any longer.
+    """
+
+    split_by: Internal[Literal["pull", "gradient"]] = "pull"
+    interval: Internal[Several] = 100
+    whole_passes: Internal[bool] = True
+    adapt_to_size: Internal[bool] = True
+    start: Internal[Share] = 500 / 30_000
+    stop: Share = 15_000 / 30_000
+    gradient_threshold: Positive = 2e-4
+    pull_threshold: Positive = 1.2e-3
+    dense_fraction: Internal[Positive] = 0.01
+    prune_opacity: Share = 0.005
+    prune_large_start: Internal[Share] = 1.0
+    prune_scale_fraction: Internal[Positive] = 0.1
+    prune_radius_fraction: Internal[PositiveShare | None] = None
+    cap: Annotated[Count | None, ESSENTIAL] = None
+    per_pixel: NotNegative = 0.02
+    least_contribution: NotNegative = 0.2
+    contribution_moments: Internal[Annotated[tuple[Share, ...], Ascending()]] = (0.5, 0.8)
+
+    @staticmethod
+    def published() -> DefaultDensify:
+        """As 3DGS does it, which removes what is too large once the opacities have been reset."""
+        return DefaultDensify(
+            split_by="gradient",
+            whole_passes=False,
+            adapt_to_size=False,
+            prune_large_start=3000 / 30_000,
+            per_pixel=0.0,
+            least_contribution=0.0,
+        )
+
+
+@dataclass(frozen=True)
+class McmcDensify:
+    """When and how Gaussians are relocated, added and moved (Kheradmand et al. 2024).
+
+    Attributes:
+        cap: largest number of Gaussians to grow to; None takes half as many as a photograph has pixels, for what
+            detail can be told apart follows the pixels.
+        interval: steps between relocations.
+        start: share of the run after which relocation begins.
+        stop: share of the run after which relocation and growth end; the noise goes on.
+        growth: factor by which the number grows in every three hundredth of the run, until the cap: with the published
+            30,000 iterations at every relocation. A single relocation at most doubles it.
+        dead_opacity: Gaussians at most this opaque are relocated.
+        noise_rate: noise on the positions, as a multiple of their learning rate; 0 switches it
+            off.
+        noise_units: in which variances and learning rate are multiplied: scene `extents`, so that the noise is the same
+            whatever the capture's units, or as published `world` units.
+        noise_sharpness: how fast the noise fades above `dead_opacity`.
+        opacity_weight: lambda_o, weight of the mean opacity in the objective.
+        scale_weight: lambda_Sigma, weight of the mean standard deviation in the objective.
+        reach: what noise and regularisers act on at a step: what its view shows (`shown`; the regularisers on what it
+            shows directly), or as published on `all` Gaussians.
+        initial_opacity: opacity of the first Gaussians.
+        initial_spread: standard deviation of the first Gaussians, as a share of the distance to their neighbours. The
+            published 0.1 takes a thousand steps or more to grow over the gaps (docs/experiments.md).
+    """
+
+    cap: Annotated[Count | None, ESSENTIAL, tyro.conf.arg(aliases=("--cap",))] = None
+    interval: Internal[Several] = 100
+    start: Internal[Share] = 500 / 30_000
+    stop: Internal[Share] = 25_000 / 30_000
+    growth: Internal[Annotated[float, Range(1, 100)]] = 1.05
+    dead_opacity: Internal[InnerShare] = 0.005
+    noise_rate: NotNegative = 5e5
+    noise_units: Internal[Literal["extents", "world"]] = "extents"
+    noise_sharpness: Internal[NotNegative] = 100.0
+    opacity_weight: NotNegative = 0.01
+    scale_weight: NotNegative = 0.01
+    reach: Internal[Literal["shown", "all"]] = "shown"
+    initial_opacity: Internal[InnerShare] = 0.5
+    initial_spread: Internal[Positive] = 1.0
+
+    @staticmethod
+    def published() -> McmcDensify:
+        """As 3DGS-MCMC does it."""
+        return McmcDensify(reach="all", noise_units="world", initial_spread=0.1)
+
+
+@dataclass(frozen=True)
+class MirrorSearch:
+    """What is taken for a mirror when reflections begin, and as which.
+
+    Attributes:
+        begin_found: whether anything is; without, every strength grows from `first_strength` (the papers).
+        views: how many training views to look at.
+        spread: standard deviation over the views of a Gaussian's colour, sRGB, from which it looks like a mirror.
+        strength: reflection strength of what was found.
+        least_opacity: opacities of what was found are raised to this.
+        flatness: of what was found, the shortest axis as a share of the middle one, at most.
+        estimated_normals: turn what was found as the normals say that lie in `normals/` beside the photographs, and
+            only where there are none as the depths say.
+    """
+
+    begin_found: bool = True
+    views: Annotated[int, Range(2, 1000)] = 24
+    spread: Share = 0.03
+    strength: InnerShare = 0.73
+    least_opacity: InnerShare = 0.9
+    flatness: InnerShare = 0.37
+    estimated_normals: bool = True
+
+
+@dataclass(frozen=True)
+class NormalPropagation:
+    """How reflective Gaussians grow over their neighbours, and how the colours of the others are disturbed.
+
+    A reflective Gaussian has a nearly correct normal. Where it overlaps another one, the blended normal is nearly
+    correct too, so that the other receives a gradient that means something.
+
+    Attributes:
+        propagates: whether normals are propagated at all (ablation).
+        least_opacity: every opacity is raised to this, so that every visible Gaussian counts.
+        least_strength: every reflection strength is raised to this, so that it has a gradient.
+        reflective: Gaussians of at least this strength grow (paper: 0.1; its code: 0.02).
+        growth: factor on their two longer axes, or both of a disc; the shortest is the normal and stays.
+        sabotage: half width of the uniform noise on the constant colour (paper: 0.1; its code: 0.4 on the constant
+            coefficient, which is 0.113); 0 switches it off (ablation).
+        sabotaged: Gaussians of at most this strength are disturbed (paper: 0.1; its code: 0.05).
+    """
+
+    propagates: bool = True
+    least_opacity: InnerShare = 0.9
+    least_strength: InnerShare = 1e-3
+    reflective: InnerShare = 0.02
+    growth: Annotated[float, Range(1, 100)] = 1.5
+    sabotage: Share = 0.1
+    sabotaged: InnerShare = 0.05
+
+
+@dataclass(frozen=True)
+class PhotoExposure:
+    """An affine transform of colours for each photograph (3DGS's public code has one).
+
+    Attributes:
+        rate: learning rate at the start; 0 takes all photographs as exposed alike.
+        rate_end: that at the end of the run, as a share of `rate`.
+    """
+
+    rate: LearningRate = 0.0
+    rate_end: Internal[PositiveShare] = 0.1
+
+
+@dataclass(frozen=True)
+class PoseRefinement:
+    """A small rigid motion of each training camera, by the gradient that the image has to its pose.
+
+    Attributes:
+        rate: learning rate at the start, radians and extents; 0 takes the capture's cameras as they are.
+        rate_end: that at the end of the run, as a share of `rate`.
+    """
+
+    rate: LearningRate = 0.0
+    rate_end: Internal[PositiveShare] = 0.1
+
+
+@dataclass(frozen=True)
+class Photographer:
+    """Whether the panes show who took the photographs: Gaussians that the camera carries along.
+
+    Attributes:
+        learn: look for one.
+        upright: the body stands on the ground however the camera is tilted; if not, it leans with the camera.
+        count: Gaussians at first.
+        sh_degree: highest degree of their colours.
+        rates: learning rates.
+    """
+
+    learn: bool = False
+    upright: bool = True
+    count: Internal[Annotated[int, Range(1, 1_000_000)]] = 500
+    sh_degree: Internal[ShDegree] = 0
+    rates: Internal[GaussianRates] = field(default_factory=GaussianRates)
+
+
+Texels = Annotated[int, Range(1, 2048)]
+
+
+@dataclass(frozen=True)
+class PropagationSchedule:
+    """When normals are propagated: at the beats of `Rhythm`, but for those that reset opacities.
+
+    Attributes:
+        end: `settled` ends it when what reflects has stopped growing (the paper's criterion), `fixed` at `stop`.
+        stop: share of the run after which nothing is propagated any more.
+        patience: beats without growth after which it counts as settled; a strength needs some hundred steps to be seen,
+            however short the run. None is needed where nothing reflects nor looks as if it did.
+        pause: steps for which raised opacities are held.
+        last_reset: after the end, reset opacities only if they have been raised since the last time; if not, regular
+            resets go on as if nothing had been propagated.
+    """
+
+    end: Internal[Literal["settled", "fixed"]] = "settled"
+    stop: Share = 0.75
+    patience: Internal[Several] = 5
+    pause: Internal[Count] = 100
+    last_reset: Internal[bool] = True
+
+
+@dataclass(frozen=True)
+class SurroundingsStart:
+    """What the first surroundings are.
+
+    Attributes:
+        source: Gaussians all over the box of the scene (the paper's), or copies of what stands in the scene and does
+            not reflect, or both.
+        cells: along an edge of the box; None takes as many as suit the photographs, 32 at the most (paper: 32).
+        per_cell: Gaussians in each cell.
+        outside: share of the points left out of the box at either end of each axis.
+        opacity: of those in the box.
+    """
+
+    source: Annotated[Literal["box", "scene", "both"], ESSENTIAL] = "scene"
+    cells: Annotated[int, Range(1, 256)] | None = None
+    per_cell: Internal[Annotated[int, Range(1, 1000)]] = 5
+    outside: Internal[Annotated[float, Range(0, 0.45)]] = 0.005
+    opacity: Internal[InnerShare] = 0.1
+
+
+@dataclass(frozen=True)
+class SurroundingsOptions:
+    """How the surroundings learn.
+
+    Attributes:
+        start: what they are at first.
+        sh_degree: highest degree of the colours that turn with the ray.
+        rates: learning rates.
+        densify: when and how Gaussians are added and pruned, by gradients in space times half of the distance.
+        reset: share of the run between two resets of their opacities, while they are densified; 0 never resets them.
+    """
+
+    start: SurroundingsStart = field(default_factory=SurroundingsStart)
+    sh_degree: ShDegree = 1
+    rates: Internal[GaussianRates] = field(default_factory=GaussianRates)
+    densify: Internal[DefaultDensify] = field(
+        default_factory=partial(
+            DefaultDensify, split_by="gradient", stop=0.7, least_contribution=0.02, contribution_moments=(0.8,)
+        )
+    )
+    reset: Internal[Share] = 0.0

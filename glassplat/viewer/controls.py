@@ -1,0 +1,328 @@
+"""Controls in the browser: panes, keyframes of a film, photographs."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from functools import wraps
+from typing import Any
+
+import numpy as np
+import torch
+
+from glassplat.publish.camera_paths import interpolated
+from glassplat.render.layers import LABEL_COLORS
+from glassplat.scene.camera import Camera
+from glassplat.scene.panes import Planes
+from glassplat.viewer.drawing import LEAST_GAIN, MOST_GAIN, PaneMove, Shown, Wish, matrix_of, wxyz_of
+
+logger = logging.getLogger(__name__)
+
+
+def survived(callback: Callable[..., Any]) -> Callable[..., None]:
+    """The callback, whose errors end with it: viser's threads print tracebacks, and a training would end with them."""
+
+    @wraps(callback)
+    def call(*given: Any) -> None:
+        try:
+            callback(*given)
+        except Exception as error:  # noqa: BLE001 - Whatever a client did, the others and the server go on.
+            logger.warning("a browser asked for something that failed: %s: %s", type(error).__name__, error)
+
+    return call
+
+
+NO_PANE = "none"
+HANDLE_SHARE = 0.7
+"""Length of a gizmo's arrows, of the mean half side of its pane."""
+OUTLINE_PIXELS = 2.0
+
+
+class PaneGizmo:
+    """Arrows and arcs on one pane that move and turn it, with its outline; hidden until it is shown."""
+
+    def __init__(self, scene: Any, planes: Planes, row: int) -> None:
+        """Puts it where the pane is.
+
+        Args:
+            scene: a client's.
+            planes: of the scene that is looked at.
+            row: which of them.
+        """
+        self.label, self._name = planes.labels[row], f"/panes/{planes.labels[row]}"
+        axes = torch.stack([*(axis[row] for axis in planes.axes()), planes.normals[row]], dim=1)
+        self._start = wxyz_of(axes.detach().double().cpu().numpy())
+        self._center = planes.centers[row].detach().double().cpu().numpy()
+        half = planes.half_sizes[row].detach().double().cpu().numpy()
+        self._handle = scene.add_transform_controls(
+            self._name,
+            scale=HANDLE_SHARE * float(half.mean()),
+            wxyz=self._start,
+            position=self._center,
+            depth_test=False,
+            visible=False,
+        )
+        corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * [*half, 0]
+        scene.add_line_segments(
+            f"{self._name}/outline",
+            np.stack([corners, np.roll(corners, -1, axis=0)], axis=1).astype(np.float32),
+            LABEL_COLORS[row % len(LABEL_COLORS)],
+            thickness=OUTLINE_PIXELS,
+            thickness_units="screen",
+        )
+
+    def listen(self, changed: Callable[[], None]) -> None:
+        """From now on `changed` is called whenever it is moved."""
+        self._handle.on_update(survived(lambda _: changed()))
+
+    def show(self, visible: bool) -> None:
+        """Shows or hides it; where it stands counts in either case."""
+        self._handle.visible = visible
+
+    def put_back(self) -> None:
+        """Back to where the pane is in the scene."""
+        self._handle.wxyz, self._handle.position = self._start, self._center
+
+    def remove(self) -> None:
+        """Takes it and its outline off the view."""
+        self._handle.remove()
+
+    def move(self) -> PaneMove | None:
+        """How it was moved; None if it was not."""
+        wxyz, position = np.asarray(self._handle.wxyz), np.asarray(self._handle.position)
+        if np.array_equal(wxyz, self._start) and np.array_equal(position, self._center):
+            return None
+        turn = np.array([1.0, 0, 0, 0])
+        if not np.array_equal(wxyz, self._start):
+            turn = wxyz_of(matrix_of(wxyz) @ matrix_of(self._start).T)
+        return PaneMove(self.label, tuple(turn.tolist()), tuple((position - self._center).tolist()))
+
+
+class PaneControls:
+    """A folder of controls of the glass; to be made only for scenes that have panes."""
+
+    def __init__(self, handle: Any, planes: Planes) -> None:
+        """Lays them out; they do nothing yet.
+
+        Args:
+            handle: of the client.
+            planes: of the scene that is looked at; at least one.
+        """
+        gui = handle.gui
+        self._own = dict(zip(planes.labels, planes.base_reflectances.tolist(), strict=True))
+        self._gizmos = [PaneGizmo(handle.scene, planes, row) for row in range(len(planes))]
+        with gui.add_folder("Glass"):
+            self._glass = gui.add_dropdown("Panes", ("as it is", "mirror", "none"))
+            self._reflectances = {
+                label: gui.add_slider(f"R0 of pane {label}", 0.0, 1.0, 0.005, round(value, 3))
+                for label, value in self._own.items()
+            }
+            self._gain = gui.add_slider("Gain", LEAST_GAIN, MOST_GAIN, 0.05, 1.0)
+            self._chosen = gui.add_dropdown("Move pane", (NO_PANE, *map(str, planes.labels)))
+            self._back = gui.add_button("Put panes back")
+
+    def listen(self, changed: Callable[[], None]) -> None:
+        """From now on `changed` is called whenever something else is wished for, and arrows show as they are chosen."""
+        for control in (self._glass, *self._reflectances.values(), self._gain):
+            control.on_update(survived(lambda _: changed()))
+        for gizmo in self._gizmos:
+            gizmo.listen(changed)
+        self._chosen.on_update(survived(lambda _: self._show_gizmo()))
+        self._back.on_click(survived(lambda _: self._put_back(changed)))
+
+    def applied(self, wish: Wish) -> Wish:
+        """The wish, with the panes as the controls say."""
+        sliders = {label: within(slider.value, 0.0, 1.0) for label, slider in self._reflectances.items()}
+        changed = [(label, value) for label, value in sliders.items() if value != round(self._own[label], 3)]
+        moves = [move for gizmo in self._gizmos if (move := gizmo.move()) is not None]
+        return replace(
+            wish,
+            glass=self._glass.value,
+            reflectances=tuple(changed),
+            gain=within(self._gain.value, LEAST_GAIN, MOST_GAIN),
+            moves=tuple(moves),
+        )
+
+    def remove(self) -> None:
+        """Takes the gizmos off the view; the controls go with their layout."""
+        for gizmo in self._gizmos:
+            gizmo.remove()
+
+    def _show_gizmo(self) -> None:
+        for gizmo in self._gizmos:
+            gizmo.show(str(gizmo.label) == self._chosen.value)
+
+    def _put_back(self, changed: Callable[[], None]) -> None:
+        for gizmo in self._gizmos:
+            gizmo.put_back()
+        changed()
+
+
+def within(value: float, least: float, most: float) -> float:
+    """The value within a range, which a client need not keep to; the least where it is no number."""
+    return min(max(value, least), most) if value == value else least
+
+
+MOST_KEYFRAMES = 200
+FRUSTUM_SHARE = 0.06
+"""Size of a keyframe in the view, of the scene's extent."""
+PLAYED_PER_SECOND, SECONDS_BETWEEN = 8, 2
+KEYFRAME_COLOR = (249, 140, 10)
+
+
+class KeyframeControls:
+    """A folder of controls, and the keyframes as small cameras in the view. They outlive a new layout."""
+
+    def __init__(self, handle: Any, extent: float, camera: Callable[[], Camera | None]) -> None:
+        """Has no keyframe yet, and no controls before `lay_out`.
+
+        Args:
+            handle: of the client.
+            extent: of the scene, world units.
+            camera: where the client stands now, None while that is not known.
+        """
+        self._handle, self._extent, self._camera = handle, extent, camera
+        self._frusta: list[Any] = []
+        self.keyframes: tuple[Camera, ...] = ()
+        self._playing: threading.Event | None = None
+        # viser's threads call at once what is clicked in quick succession.
+        self._lock = threading.Lock()
+        self._step = threading.Lock()
+
+    def lay_out(self, go: Callable[[Camera], None], save: Callable[[str], None] | None) -> None:
+        """Puts the controls there.
+
+        Args:
+            go: moves the client's camera.
+            save: keeps the keyframes under a name; None where nothing may be written.
+        """
+        gui = self._handle.gui
+        with gui.add_folder("Keyframes", expand_by_default=False):
+            self._count = gui.add_markdown(self._counted())
+            gui.add_button("Add this view").on_click(survived(lambda _: self.add()))
+            gui.add_button("Remove the last").on_click(survived(lambda _: self.remove()))
+            gui.add_button("Play or stop").on_click(survived(lambda _: self.play(go)))
+            if save is not None:
+                name = gui.add_text("Name", "keyframes")
+                gui.add_button("Save keyframes").on_click(survived(lambda _: save(name.value)))
+
+    def add(self) -> None:
+        """One more keyframe, where the client stands."""
+        camera = self._camera()
+        with self._lock:
+            if camera is None or len(self._frusta) == MOST_KEYFRAMES:
+                return
+            frustum = self._handle.scene.add_camera_frustum(
+                f"/keyframes/{len(self._frusta)}",
+                2 * float(np.arctan(camera.height / 2 / camera.fy)),
+                camera.width / camera.height,
+                scale=FRUSTUM_SHARE * self._extent,
+                thickness=2.0,
+                thickness_units="screen",
+                color=KEYFRAME_COLOR,
+                wxyz=wxyz_of(camera.cam_from_world[:3, :3].double().numpy().T),
+                position=camera.center.double().numpy(),
+            )
+            self._frusta.append(frustum)
+            self.keyframes = (*self.keyframes, camera)
+            self._count.content = self._counted()
+
+    def remove(self) -> None:
+        """The last keyframe goes."""
+        with self._lock:
+            if self._frusta:
+                self._frusta.pop().remove()
+                self.keyframes = self.keyframes[:-1]
+                self._count.content = self._counted()
+
+    def play(self, go: Callable[[Camera], None]) -> None:
+        """Begins to move the client along the path as the film will, or stops that."""
+        keyframes = self.keyframes
+        with self._lock:
+            was_playing = self._playing is not None and not self._playing.is_set()
+            self.stop()
+            if was_playing or len(keyframes) < 2:
+                return
+            ended = self._playing = threading.Event()
+        frames = (len(keyframes) - 1) * SECONDS_BETWEEN * PLAYED_PER_SECOND + 1
+        # A thread of its own: viser has few, and all clients share them.
+        path = interpolated(keyframes, frames)
+        threading.Thread(target=_play, args=(path, go, ended, self._step), daemon=True).start()
+
+    def stop(self) -> None:
+        """Ends the playing, as when the client leaves or stands elsewhere; nothing moves it afterwards."""
+        with self._step:
+            if self._playing is not None:
+                self._playing.set()
+
+    def _counted(self) -> str:
+        count = len(self.keyframes)
+        return f"{count} {'keyframe' if count == 1 else 'keyframes'}" + (", a film needs two" if count < 2 else "")
+
+
+def _play(path: list[Camera], go: Callable[[Camera], None], ended: threading.Event, step: threading.Lock) -> None:
+    """Moves along a path until it or the playing ends; `step` is held while it moves."""
+    for camera in path:
+        with step:
+            if ended.is_set():
+                return
+            go(camera)
+        if ended.wait(1 / PLAYED_PER_SECOND):
+            return
+    ended.set()
+
+
+PHOTO_WIDTH = 360
+NO_PHOTOGRAPH = np.zeros((2, 3, 3), dtype=np.uint8)
+
+
+class PhotographControls:
+    """A folder of controls: a list of photographs to stand at, and the picture of the nearest one."""
+
+    def __init__(self, gui: Any, shown: Shown, at: int) -> None:
+        """Lays them out; they do nothing yet.
+
+        Args:
+            gui: of the client.
+            shown: what is looked at.
+            at: the photograph to begin with.
+        """
+        self._shown, self._at, self._on_screen = shown, at, -1
+        self._names = tuple(name for name, _ in shown.cameras)
+        with gui.add_folder("Photographs"):
+            self._name = gui.add_dropdown("Stand at", self._names, initial_value=self._names[at])
+            self._steps = gui.add_button_group("Step", ("previous", "next"))
+            self._photo = None
+            if shown.photographs:
+                self._photo = gui.add_image(NO_PHOTOGRAPH, label="Nearest photograph")
+
+    def listen(self, stand_at: Callable[[int], None]) -> None:
+        """From now on they move the camera to where a photograph was taken, with `stand_at`."""
+        names, steps = self._names, self._steps
+        self._name.on_update(
+            survived(lambda event: stand_at(names.index(self._name.value)) if event.client is not None else None)
+        )
+        steps.on_click(survived(lambda _: stand_at((self._at + (1 if steps.value == "next" else -1)) % len(names))))
+
+    def stands_at(self, index: int) -> None:
+        """The camera is where a photograph was taken."""
+        self._at = index
+        self._name.value = self._shown.cameras[index][0]
+
+    def show_nearest(self, index: int) -> None:
+        """Shows a photograph, unless it is there already; where it is gone or broken, says so in its place."""
+        name = self._shown.cameras[index][0]
+        if self._photo is None or index == self._on_screen or name not in self._shown.photographs:
+            return
+        self._at = self._on_screen = index
+        try:
+            photo = self._shown.photographs[name]()
+        except (OSError, ValueError) as error:
+            self._photo.image = NO_PHOTOGRAPH
+            self._photo.label = f"Nearest photograph: {name} cannot be read ({error})"
+            return
+        step = max(1, photo.shape[1] // PHOTO_WIDTH)
+        self._photo.image = photo[::step, ::step].numpy()
+        self._photo.label = f"Nearest photograph: {name}"

@@ -1,0 +1,305 @@
+"""Pane masks: names, values, polarity and sizes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from glassplat.captures.dataset import Dataset, load_dataset
+from glassplat.captures.masks import find_masks
+from glassplat.captures.view import View
+from glassplat.errors import InputError
+
+HEIGHT, WIDTH = 24, 32
+INSIDE = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+INSIDE[6:18, 8:20] = 1
+
+
+def annotated(data: Dataset) -> dict[str, View]:
+    return {view.name: view for view in (*data.train, *data.test) if view.pane_labels is not None}
+
+
+def labels_of(data: Dataset, name: str = "0001.png") -> np.ndarray:
+    labels = annotated(data)[name].pane_labels
+    assert labels is not None
+    assert labels.dtype == torch.uint8
+    return labels.numpy()
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "masks/0001.png",
+        "masks/0001.png.png",
+        "masks/0001.tif",
+        "masks/0001_mask.png",
+        "masks/0001.png_mask.bmp",
+        "images/0001_mask.png",
+    ],
+)
+def test_every_naming_is_found(capture, path: str) -> None:
+    capture.write_colmap()
+    capture.write_mask(path, INSIDE)
+    data = load_dataset(capture.root)
+    np.testing.assert_array_equal(labels_of(data), INSIDE)
+    assert list(annotated(data)) == ["0001.png"]
+    assert data.pane_labels == (1,)
+    assert data.warnings == ()
+
+
+def test_masks_of_nested_photographs(capture) -> None:
+    capture.names = [f"cam{index % 2}/{index // 2}.png" for index in range(10)]
+    capture.write_colmap()
+    capture.write_mask("masks/cam0/1.png", INSIDE)
+    capture.write_mask("masks/cam1/1.png", INSIDE * 2)
+    data = load_dataset(capture.root)
+    assert list(annotated(data)) == ["cam0/1.png", "cam1/1.png"]
+    assert data.pane_labels == (1, 2)
+    capture.write_mask("masks/2.png", INSIDE)
+    with pytest.raises(InputError, match=r"could belong to cam0/2\.png, cam1/2\.png"):
+        load_dataset(capture.root)
+
+
+def test_folder_may_be_left_out_where_the_name_is_unique(capture) -> None:
+    capture.names = [f"cam{index % 2}/{index}.png" for index in range(10)]
+    capture.write_colmap()
+    capture.write_mask("masks/3.png", INSIDE)
+    assert list(annotated(load_dataset(capture.root))) == ["cam1/3.png"]
+
+
+def test_labels_of_several_panes_stay(capture) -> None:
+    capture.write_colmap()
+    panes = INSIDE.copy()
+    panes[6:12, 8:20] = 7
+    capture.write_mask("masks/0001.png", panes)
+    capture.write_mask("masks/0002.png", INSIDE * 3)
+    data = load_dataset(capture.root)
+    assert data.pane_labels == (1, 3, 7)
+    np.testing.assert_array_equal(labels_of(data), panes)
+
+
+@pytest.mark.parametrize("kind", ["grey", "rgb", "red", "rgba", "one bit", "sixteen bit", "palette", "jpeg"])
+def test_every_way_to_store_black_and_white(capture, kind: str) -> None:
+    capture.write_colmap()
+    bright = INSIDE * 255
+    rgb = np.repeat(bright[:, :, None], 3, axis=2)
+    path = capture.root / "masks" / ("0001.jpg" if kind == "jpeg" else "0001.png")
+    path.parent.mkdir()
+    palette = Image.new("P", (WIDTH, HEIGHT))
+    palette.putpalette([255, 255, 255, 0, 0, 0])
+    palette.paste(1, (0, 0, WIDTH, HEIGHT))
+    palette.paste(0, (8, 6, 20, 18))
+    images = {
+        "grey": Image.fromarray(bright),
+        "rgb": Image.fromarray(rgb),
+        "red": Image.fromarray(rgb * np.array([1, 0, 0], dtype=np.uint8)),
+        "rgba": Image.fromarray(np.concatenate([rgb, np.full_like(rgb[:, :, :1], 255)], axis=2)),
+        "one bit": Image.fromarray(bright > 0),
+        "sixteen bit": Image.fromarray(INSIDE.astype(np.uint16) * 65535),
+        "palette": palette,
+        "jpeg": Image.fromarray(bright),
+    }
+    images[kind].save(path)
+    np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), INSIDE)
+
+
+def test_colour_table_keeps_labels(capture) -> None:
+    capture.write_colmap()
+    image = Image.new("P", (WIDTH, HEIGHT))
+    image.putpalette([0, 0, 0, 200, 10, 10, 10, 200, 10])
+    image.paste(2, (8, 6, 20, 18))
+    (capture.root / "masks").mkdir()
+    image.save(capture.root / "masks" / "0001.png")
+    np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), INSIDE * 2)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "message"),
+    [
+        (np.full((HEIGHT, WIDTH), np.nan, dtype=np.float32), "floating-point numbers"),
+        (INSIDE.astype(np.float32), "floating-point numbers"),
+        (INSIDE.astype(np.int32) * 300, "holds the value 300, which is neither a pane label"),
+        (INSIDE.astype(np.uint16) * 16000, "holds the value 16000, which is neither a pane label"),
+        (INSIDE.astype(np.int32) * -1, "values from -1 to 0"),
+        (INSIDE.astype(np.int32) * 10**6, "values from 0 to 1000000"),
+    ],
+)
+def test_values_that_are_neither_labels_nor_white_are_refused(capture, pixels: np.ndarray, message: str) -> None:
+    capture.write_colmap()
+    capture.write_mask("masks/0001.tif", pixels)
+    with pytest.raises(InputError, match=message) as caught:
+        load_dataset(capture.root)
+    assert "0001.tif" in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["masks", "masks/0001.png"])
+def test_a_link_to_nowhere_is_named(capture, name: str) -> None:
+    capture.write_colmap()
+    (capture.root / name).parent.mkdir(exist_ok=True)
+    (capture.root / name).symlink_to("/nowhere")
+    with pytest.raises(InputError, match=f"{name} is no f.* that can be read"):
+        load_dataset(capture.root)
+
+
+def test_a_mask_of_one_pixel_is_no_reduced_mask(capture) -> None:
+    capture.write_colmap()
+    capture.write_mask("masks/0001.png", np.ones((1, 1), dtype=np.uint8))
+    with pytest.raises(InputError, match="is 1x1 pixels large, its photograph 32x24"):
+        load_dataset(capture.root)
+
+
+def test_transparency_of_a_colour_table_says_nothing_about_panes(capture) -> None:
+    capture.write_colmap()
+    image = Image.new("P", (WIDTH, HEIGHT))
+    image.putpalette([0, 0, 0, 255, 255, 255])
+    image.paste(1, (8, 6, 20, 18))
+    (capture.root / "masks").mkdir()
+    image.save(capture.root / "masks" / "0001.png", transparency=bytes([0, 128]))
+    np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), INSIDE)
+
+
+@pytest.mark.parametrize("pixels", [INSIDE.astype(np.uint16) * 3, INSIDE.astype(np.uint16) * 3 * 257])
+def test_labels_may_be_stored_in_sixteen_bits(capture, pixels: np.ndarray) -> None:
+    capture.write_colmap()
+    capture.write_mask("masks/0001.png", pixels)
+    np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), INSIDE * 3)
+
+
+def test_soft_edges_are_cut_at_the_middle(capture) -> None:
+    capture.write_colmap()
+    soft = (INSIDE * 255).astype(np.uint8)
+    soft[6, 8:20] = np.linspace(40, 250, 12).astype(np.uint8)
+    capture.write_mask("masks/0001.png", soft)
+    np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), (soft >= 128).astype(np.uint8))
+
+
+@pytest.mark.parametrize("values", [{1: 1, 2: 255}, {1: 100, 2: 100}, {1: 128, 2: 255}])
+def test_ambiguous_values_are_refused(capture, values: dict[int, int]) -> None:
+    capture.write_colmap()
+    pixels = np.where(INSIDE > 0, values[1], 0).astype(np.uint8)
+    pixels[6:8, 8:20] = values[2]
+    path = capture.write_mask("masks/0001.png", pixels)
+    with pytest.raises(InputError, match=rf"{path} holds the grey values 0, .*neither pane labels"):
+        load_dataset(capture.root)
+
+
+def test_photograph_as_a_mask_is_refused(capture) -> None:
+    capture.write_colmap()
+    capture.write_mask("masks/0001.png", np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH).astype(np.uint8))
+    with pytest.raises(InputError, match="neither pane labels"):
+        load_dataset(capture.root)
+
+
+def test_several_colours_are_refused(capture) -> None:
+    capture.write_colmap()
+    pixels = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)
+    pixels[:5, :5, 0] = pixels[10:, 10:, 1] = 255
+    capture.write_mask("masks/0001.png", pixels)
+    with pytest.raises(InputError, match="several colours"):
+        load_dataset(capture.root)
+
+
+def test_labels_beside_black_and_white_are_refused(capture) -> None:
+    capture.write_colmap()
+    capture.write_mask("masks/0001.png", INSIDE)
+    capture.write_mask("masks/0002.png", INSIDE * 255)
+    with pytest.raises(InputError, match="some masks are label images"):
+        load_dataset(capture.root)
+
+
+def test_inverted_masks_are_recognised_by_their_border(capture) -> None:
+    capture.write_colmap()
+    for name in ("0001.png", "0002.png", "0003.png"):
+        capture.write_mask(f"masks/{name}", (1 - INSIDE) * 255)
+    data = load_dataset(capture.root)
+    np.testing.assert_array_equal(labels_of(data), INSIDE)
+    assert any("inverted" in warning for warning in data.warnings)
+    stated = load_dataset(capture.root, mask_polarity="bright")
+    np.testing.assert_array_equal(labels_of(stated), 1 - INSIDE)
+
+
+def test_stated_polarity_does_not_touch_label_images(capture) -> None:
+    capture.write_colmap()
+    capture.write_mask("masks/0001.png", INSIDE)
+    data = load_dataset(capture.root, mask_polarity="dark")
+    np.testing.assert_array_equal(labels_of(data), INSIDE)
+
+
+def test_panes_that_fill_the_image_are_not_inverted(capture) -> None:
+    capture.write_colmap()
+    for name in ("0001.png", "0002.png", "0003.png"):
+        capture.write_mask(f"masks/{name}", np.full((HEIGHT, WIDTH), 255, dtype=np.uint8))
+    data = load_dataset(capture.root)
+    assert labels_of(data).min() == 1
+    assert any("cover 100%" in warning for warning in data.warnings)
+
+
+def test_view_without_a_pane_is_mentioned(capture) -> None:
+    capture.write_colmap()
+    capture.write_mask("masks/0001.png", INSIDE * 255)
+    capture.write_mask("masks/0002.png", INSIDE * 0)
+    data = load_dataset(capture.root)
+    assert labels_of(data, "0002.png").max() == 0
+    assert any("0002.png" in warning for warning in data.warnings)
+
+
+@pytest.mark.parametrize(
+    ("path", "pixels", "message"),
+    [
+        ("masks/0001.png", INSIDE * 0, "none of the 1 masks .* marks a pane"),
+        ("masks/other.png", INSIDE, r"1 masks in .* match no photograph: other\.png; .* such as 0000\.png"),
+        ("masks/0001.png", INSIDE[:20], r"masks/0001\.png is 32x20 pixels large, its photograph 32x24"),
+        ("masks/readme.txt", None, "holds no mask images"),
+        ("masks/0001.png", None, "as an image"),
+    ],
+)
+def test_masks_that_cannot_be_used(capture, path: str, pixels: np.ndarray | None, message: str) -> None:
+    capture.write_colmap()
+    target = capture.root / path
+    target.parent.mkdir()
+    if pixels is None:
+        target.write_text("no image")
+    else:
+        Image.fromarray(pixels).save(target)
+    with pytest.raises(InputError, match=message):
+        load_dataset(capture.root)
+
+
+def test_two_masks_for_one_photograph_are_refused(capture) -> None:
+    capture.write_colmap()
+    capture.write_mask("masks/0001.png", INSIDE)
+    capture.write_mask("images/0001_mask.png", INSIDE)
+    with pytest.raises(InputError, match=r"0001\.png has 2 masks"):
+        load_dataset(capture.root)
+
+
+@pytest.mark.parametrize("factor", [2, 3])
+def test_integer_scaled_masks_take_the_nearest_pixel(capture, factor: int) -> None:
+    capture.write_colmap()
+    capture.write_mask("masks/0001.png", np.kron(INSIDE, np.ones((factor, factor), dtype=np.uint8)))
+    np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), INSIDE)
+
+
+def test_half_size_mask_covers_the_same_area(capture) -> None:
+    capture.write_colmap()
+    capture.write_mask("masks/0001.png", INSIDE[::2, ::2])
+    np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), INSIDE)
+
+
+def test_downscaling_keeps_labels_pure(capture) -> None:
+    capture.write_colmap()
+    capture.write_mask("masks/0001.png", INSIDE * 5)
+    labels = labels_of(load_dataset(capture.root, downscale=2.0))
+    np.testing.assert_array_equal(labels, INSIDE[1::2, 1::2] * 5)
+
+
+def test_no_masks_at_all(capture, tmp_path: Path) -> None:
+    capture.write_colmap()
+    data = load_dataset(capture.root)
+    assert not annotated(data)
+    assert data.pane_labels == ()
+    assert find_masks(tmp_path / "nowhere", {}).masks == {}

@@ -1,0 +1,89 @@
+"""Estimated normals beside photographs: where they are looked for, their axes, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from glassplat.captures.view import View, estimated_normals
+from glassplat.errors import InputError
+from glassplat.scene.camera import Camera
+
+SIZE = 12
+
+
+def view_in(folder: Path, pose: torch.Tensor | None = None) -> View:
+    camera = Camera(torch.eye(4) if pose is None else pose, 10.0, 10.0, 6.0, 6.0, SIZE, SIZE)
+    (folder / "images").mkdir(exist_ok=True)
+    path = folder / "images" / "a.jpg"
+    Image.fromarray(np.zeros((SIZE, SIZE, 3), dtype=np.uint8)).save(path)
+    return View("a.jpg", camera, path, lambda: torch.zeros(SIZE, SIZE, 3, dtype=torch.uint8))
+
+
+def write(folder: Path, name: str, vectors: np.ndarray) -> None:
+    (folder / "normals").mkdir(exist_ok=True)
+    path = folder / "normals" / name
+    if path.suffix == ".npy":
+        np.save(path, vectors)
+    else:
+        Image.fromarray(np.round(255 * (vectors + 1) / 2).astype(np.uint8)).save(path)
+
+
+def all_along(vector: tuple[float, float, float], size: int = SIZE) -> np.ndarray:
+    return np.tile(np.array(vector, dtype=np.float32), (size, size, 1))
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.npy", "a.jpg.npy"])
+def test_normals_towards_the_camera_point_backwards(tmp_path: Path, name: str) -> None:
+    write(tmp_path, name, all_along((0.0, 0.0, 1.0)))
+    found = estimated_normals(view_in(tmp_path))
+    assert found is not None
+    torch.testing.assert_close(found, torch.tensor([0.0, 0.0, -1.0]).expand(SIZE, SIZE, 3), atol=0.01, rtol=0)
+
+
+def test_they_turn_with_the_camera(tmp_path: Path) -> None:
+    write(tmp_path, "a.npy", all_along((0.0, 1.0, 0.0)))
+    pose = torch.eye(4)
+    # The camera's right is the world's up: +x of the camera is +z of the world.
+    pose[:3, :3] = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    found = estimated_normals(view_in(tmp_path, pose))
+    assert found is not None
+    torch.testing.assert_close(found[0, 0], -pose[1, :3])
+
+
+def test_larger_maps_are_averaged_and_holes_stay_holes(tmp_path: Path) -> None:
+    vectors = all_along((0.0, 0.0, 1.0), 3 * SIZE)
+    vectors[: 3 * SIZE // 2] = np.nan
+    write(tmp_path, "a.npy", vectors)
+    found = estimated_normals(view_in(tmp_path))
+    assert found is not None
+    assert int(found[: SIZE // 2].count_nonzero()) == 0 and bool((found[SIZE // 2 :, :, 2] == -1).all())
+
+
+def test_without_a_file_there_are_none(tmp_path: Path) -> None:
+    assert estimated_normals(view_in(tmp_path)) is None
+
+
+def test_what_is_no_map_of_normals_is_refused(tmp_path: Path) -> None:
+    view = view_in(tmp_path)
+    for vectors, message in [
+        (
+            np.zeros((SIZE, 2 * SIZE, 3), dtype=np.float32),
+            "24x12 pixels large, its photograph 12x12 here; expected the",
+        ),
+        (np.zeros((SIZE, SIZE), dtype=np.float32), r"holds float32 of shape \[12, 12\]; expected floats \[H, W, 3\]"),
+        (np.zeros((SIZE, SIZE, 3), dtype=np.int64), "holds int64 of shape"),
+    ]:
+        write(tmp_path, "a.npy", vectors)
+        with pytest.raises(InputError, match=message):
+            estimated_normals(view)
+    # The second was found by damaging files at random: NumPy evaluates the head as a part of a program.
+    head = b"\x93NUMPY\x01\x00v\x00\xd8'descr': '<f4', 'fortran_order': False, 'shape': (2, 3, 3), }" + b" " * 60
+    for damaged in (b"no", head):
+        (tmp_path / "normals" / "a.npy").write_bytes(damaged)
+        with pytest.raises(InputError, match="is no array that NumPy can read"):
+            estimated_normals(view)

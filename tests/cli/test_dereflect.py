@@ -1,0 +1,89 @@
+"""`glassplat dereflect`: every photograph, without its reflections, under its own name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from glassplat.cli.main import main
+from glassplat.cli.places import RECORD, claim_folder
+from glassplat.errors import InputError
+from glassplat.files.images import read_image
+from glassplat.scene.scene import without_glass
+from tests.cli.tiny_run import rendered, write_run
+from tests.training.tiny_capture import tiny_capture, true_scene
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.glob("*.png"))
+
+
+def message(capsys: pytest.CaptureFixture[str]) -> str:
+    return " ".join(capsys.readouterr().err.split())
+
+
+def largest_difference(image: np.ndarray, target: np.ndarray) -> int:
+    return int(np.abs(image.astype(int) - target.astype(int)).max())
+
+
+@pytest.mark.parametrize("source", ["photo", "render"])
+def test_the_reflection_is_gone_and_everything_else_is_there(source: str, tmp_path: Path) -> None:
+    run, output = write_run(tmp_path / "run"), tmp_path / "clean"
+    assert main(["dereflect", str(run), "--output", str(output), "--source", source]) == 0
+    assert names(output) == [f"{index}.png" for index in range(6)]
+    for index in (0, 3):
+        photo, truth = tiny_capture().train[index].photo.numpy(), rendered(without_glass(true_scene()), index).numpy()
+        image = read_image(output / f"{index}.png")
+        assert largest_difference(photo, truth) > 10
+        # The photographs are exact renders, up to rounding; in the dark a step of one is worth more of them.
+        assert largest_difference(image, truth) <= 6
+        elsewhere = (photo == truth).all(axis=2)
+        assert largest_difference(image[elsewhere], photo[elsewhere]) <= 1
+
+
+@pytest.mark.parametrize(("split", "expected"), [("test", ["0.png"]), ("train", [f"{k}.png" for k in range(1, 6)])])
+def test_a_split_can_be_chosen(split: str, expected: list[str], tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    assert main(["dereflect", str(run), "--output", str(tmp_path / "clean"), "--split", split]) == 0
+    assert names(tmp_path / "clean") == expected
+
+
+def test_a_splat_run_is_told_what_to_train(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = write_run(tmp_path / "run", planar=False)
+    assert main(["dereflect", str(run), "--output", str(tmp_path / "clean")]) == 2
+    text = message(capsys)
+    assert "splat run" in text and "glassplat train planar --data" in text
+    assert not (tmp_path / "clean").exists()
+
+
+def test_photographs_are_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = write_run(tmp_path / "run")
+    images = tmp_path / "capture" / "images"
+    before = {path.name: path.read_bytes() for path in images.iterdir()}
+    assert main(["dereflect", str(run), "--output", str(images)]) == 2
+    assert "images is not empty, and not from `glassplat dereflect`" in message(capsys)
+    before[RECORD] = b'{"command": "dereflect"}'
+    (images / RECORD).write_bytes(before[RECORD])
+    assert main(["dereflect", str(run), "--output", str(images)]) == 2
+    assert "is a photograph of the capture; nothing was written" in message(capsys)
+    assert {path.name: path.read_bytes() for path in images.iterdir()} == before
+
+
+def test_its_own_folder_is_written_again_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, output = write_run(tmp_path / "run"), tmp_path / "clean"
+    command = ["dereflect", str(run), "--output", str(output), "--split", "test"]
+    assert main(command) == 0
+    assert "replacing" not in capsys.readouterr().out
+    assert main(command) == 0
+    assert "replacing" in capsys.readouterr().out
+    assert main(["render", str(run), "--output", str(output)]) == 2
+
+
+def test_a_folder_belongs_to_who_wrote_it(tmp_path: Path) -> None:
+    assert claim_folder(tmp_path / "new", "render", Path("run")) is False
+    assert claim_folder(tmp_path / "new", "render", Path("run")) is True
+    (tmp_path / "new" / RECORD).write_text("[broken")
+    with pytest.raises(InputError, match=r"not from `glassplat render`.*Choose a new folder"):
+        claim_folder(tmp_path / "new", "render", Path("run"))

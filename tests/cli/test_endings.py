@@ -1,0 +1,207 @@
+"""How commands end: one readable message and an exit code, whatever was raised."""
+
+from __future__ import annotations
+
+import errno
+import json
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from glassplat.cli.console import LONGEST_QUOTE
+from glassplat.cli.evaluate import Evaluate
+from glassplat.cli.main import main
+from glassplat.errors import InputError
+from glassplat.kernels.backend.devices import CudaUnavailableError
+from glassplat.panes.options import PlaneFitError
+from glassplat.training.loop import TrainingDivergedError
+
+
+class PanicException(BaseException):
+    """As libraries in Rust raise it: no `Exception`."""
+
+
+def endless(number: int) -> int:
+    return endless(number + 1) + 1
+
+
+def too_large_for_numpy() -> None:
+    np.empty(10**17)
+
+
+def too_large_for_torch() -> None:
+    torch.empty(10**16)
+
+
+def library_without_memory() -> None:
+    try:
+        raise ImportError("_core.so: failed to map segment from shared object")
+    except ImportError as error:
+        raise RuntimeError("Cannot import the C++ backend") from error
+
+
+def too_deep() -> None:
+    endless(0)
+
+
+def too_deep_json() -> None:
+    json.loads("[" * 100_000)
+
+
+def too_long_name() -> None:
+    Path("x" * 5000).read_text()
+
+
+def folder_as_file() -> None:
+    Path("/").read_text()
+
+
+def file_as_folder() -> None:
+    Path("/dev/null/file").read_text()
+
+
+def no_such_file() -> None:
+    Path("/no/such/[bold]file").read_text()
+
+
+def raising(error: BaseException) -> Callable[[], None]:
+    def work() -> None:
+        raise error
+
+    work.__name__ = f"{type(error).__name__} {error}"
+    return work
+
+
+BAD_INPUT = [
+    (raising(InputError("expected [1, 2], got [/]; do [bold]this")), ["expected [1, 2], got [/]; do [bold]this"]),
+    (raising(PlaneFitError("no plane in [pane]")), ["no plane in [pane]"]),
+    (raising(CudaUnavailableError("no GPU; use --device cpu")), ["no GPU; use --device cpu"]),
+    (raising(FileNotFoundError("no folder x; expected a capture")), ["no folder x; expected a capture"]),
+    (no_such_file, ["/no/such/[bold]file: no such file or directory"]),
+    (file_as_folder, ["/dev/null/file: not a directory"]),
+    (folder_as_file, ["/: is a directory"]),
+    (too_long_name, ["file name too long"]),
+    (raising(PermissionError(errno.EACCES, "Permission denied", "/a/b")), ["/a/b: permission denied"]),
+    (raising(OSError(errno.EROFS, "Read-only file system", "/a/b")), ["/a/b: read-only file system"]),
+    (raising(OSError(errno.ELOOP, "Too many levels of symbolic links", "/a")), ["/a: too many levels"]),
+]
+FAILURES = [
+    (raising(TrainingDivergedError("loss term 'l1' is nan")), ["loss term 'l1' is nan"]),
+    (raising(OSError(errno.ENOSPC, "No space left on device", "/a/b")), ["/a/b: no space left on device; free some"]),
+    (raising(OSError(errno.EIO, "Input/output error")), ["input/output error"]),
+    (raising(torch.OutOfMemoryError("CUDA out of memory. Tried 2 GiB.\nMore")), ["CUDA out of memory;", "--device"]),
+    (too_large_for_torch, ["out of memory", "--downscale"]),
+    (too_large_for_numpy, ["out of memory", "--downscale"]),
+    (raising(MemoryError()), ["out of memory", "--downscale"]),
+    (library_without_memory, ["out of memory"]),
+    (raising(ImportError("libtorch_cpu.so: failed to map segment from shared object")), ["out of memory"]),
+]
+UNFORESEEN = [
+    (too_deep, "RecursionError"),
+    (too_deep_json, "RecursionError"),
+    (raising(KeyError("[bold]")), "KeyError: '[bold]'"),
+    (raising(ValueError("many\nlines\nof it")), "ValueError: many;"),
+    (raising(RuntimeError("x" * 10_000)), "RuntimeError: " + "x" * LONGEST_QUOTE + " ...;"),
+    (raising(RuntimeError()), "RuntimeError: ;"),
+    (raising(AssertionError("surrogate \udcff")), r"AssertionError: surrogate \udcff;"),
+    (raising(PanicException("a library in Rust")), "PanicException: a library in Rust;"),
+    (raising(ImportError("libcudart.so: cannot open shared object file")), "ImportError: libcudart.so"),
+]
+NAME = re.compile(r"the traceback is in (\S+\.log)\. Please report it")
+
+
+def ended(work: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> int:
+    """The exit code of a command that does this."""
+    monkeypatch.setattr(Evaluate, "ready", lambda self: None)
+    monkeypatch.setattr(Evaluate, "run", lambda self, console: work())
+    return main(["eval", "run"])
+
+
+@pytest.mark.parametrize(("work", "words"), BAD_INPUT, ids=lambda value: getattr(value, "__name__", None))
+def test_bad_input_is_explained_with_code_2(
+    work: Callable[[], None], words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert ended(work, monkeypatch) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and said.count("\n") == 1
+    assert all(word in said for word in words)
+
+
+@pytest.mark.parametrize(("work", "words"), FAILURES, ids=lambda value: getattr(value, "__name__", None))
+def test_a_failure_is_explained_with_code_1(
+    work: Callable[[], None], words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert ended(work, monkeypatch) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("stopped: ") and said.count("\n") == 1
+    assert all(word in said for word in words)
+    assert "did not foresee" not in said
+
+
+@pytest.mark.parametrize(("work", "words"), UNFORESEEN, ids=lambda value: getattr(value, "__name__", None))
+def test_what_nobody_foresaw_is_one_line_and_a_file_with_the_traceback(
+    work: Callable[[], None],
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    assert ended(work, monkeypatch) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("stopped: an error that glassplat did not foresee, ") and said.count("\n") == 1
+    assert words in said
+    found = NAME.search(said)
+    assert found is not None
+    assert [Path(found[1])] == list(tmp_path.iterdir())
+    saved = Path(found[1]).read_text(encoding="utf-8")
+    assert "Traceback (most recent call last)" in saved and "glassplat 0" in saved and "PyTorch" in saved
+    assert len(saved) < 100_000
+
+
+def test_where_no_file_can_be_written_the_line_says_where_the_error_was(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", "/dev/null")
+    assert ended(raising(KeyError("x")), monkeypatch) == 1
+    said = capsys.readouterr().err
+    assert re.search(r"raised in \S*test_endings.py, line \d+\n$", said) and said.count("\n") == 1
+
+
+def test_a_report_that_fails_itself_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def no_memory(error: BaseException) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("glassplat.cli.console.ending", no_memory)
+    assert ended(raising(KeyError("x")), monkeypatch) == 1
+    assert capsys.readouterr().err == "stopped: out of memory\n"
+
+
+def test_a_library_that_cannot_be_loaded_is_one_line_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    def broken(name: str) -> type:
+        raise OSError("libtorch_cpu.so: cannot enable executable stack")
+
+    monkeypatch.setattr("glassplat.cli.main.command_class", broken)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    assert main(["eval", "run"]) == 1
+    assert capsys.readouterr().err == "stopped: libtorch_cpu.so: cannot enable executable stack\n"
+
+
+def test_the_errors_known_by_name_are_those_of_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Known by name, so that they need no import; a class that is renamed would be taken for unforeseen.
+    from glassplat.cli.console import BAD_INPUT as BAD
+    from glassplat.cli.console import FAILURES as FAILED
+    from glassplat.cli.console import GPU_IS_FULL
+
+    kinds = (PlaneFitError, CudaUnavailableError, TrainingDivergedError)
+    assert [*BAD, *FAILED] == [f"{kind.__module__}.{kind.__qualname__}" for kind in kinds]
+    assert hasattr(torch, GPU_IS_FULL[0].rpartition(".")[2])

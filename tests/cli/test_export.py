@@ -1,0 +1,74 @@
+"""`glassplat export`: files that others read, and nothing written where it must not be."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import gsply
+import numpy as np
+import pytest
+import torch
+
+from glassplat.cli.main import main
+from glassplat.files.ply import read_gaussians
+from glassplat.files.sidecars import read_planes
+from glassplat.files.spz import read_spz
+from tests.cli.tiny_run import write_run
+from tests.training.tiny_capture import true_scene
+
+
+def exported(tmp_path: Path, *options: str) -> Path:
+    output = tmp_path / "out"
+    assert main(["export", str(write_run(tmp_path / "run")), "--output", str(output), *options]) == 0
+    return output
+
+
+def test_all_that_the_scene_has_is_written(tmp_path: Path) -> None:
+    output, scene = exported(tmp_path, "--formats", "ply", "spz"), true_scene()
+    read = read_gaussians(output / "scene.ply")
+    for name, tensor in scene.primary.tensors().items():
+        assert torch.equal(read.tensors()[name], tensor), name
+    assert torch.equal(read_planes(output / "planes.json").centers, scene.planes.centers)
+    assert len(read_gaussians(output / "glass.ply")) == len(scene.glass)
+    torch.testing.assert_close(read_spz(output / "scene.spz").means, scene.primary.means, rtol=0, atol=1e-4)
+
+
+def test_the_photographs_need_not_be_there(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    shutil.rmtree(tmp_path / "capture")
+    assert main(["export", str(run), "--output", str(tmp_path / "out"), "--formats", "ply"]) == 0
+
+
+def test_another_program_reads_the_ply(tmp_path: Path) -> None:
+    output, scene = exported(tmp_path, "--layer", "transmission", "--formats", "ply"), true_scene()
+    assert sorted(path.name for path in output.iterdir()) == ["cameras.json", "glassplat.json", "scene.ply"]
+    theirs = gsply.plyread(str(output / "scene.ply"))
+    np.testing.assert_array_equal(theirs.means, scene.primary.means)
+    np.testing.assert_array_equal(theirs.sh0, scene.primary.sh[:, 0])
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--as-mirror 4", "no pane 4"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(
+    options: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, output = write_run(tmp_path / "run"), tmp_path / "out"
+    assert main(["export", str(run), "--output", str(output), *options.split()]) == 2
+    assert words in " ".join(capsys.readouterr().err.split())
+    assert not output.exists()
+
+
+def test_foreign_folders_and_missing_runs_are_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, output = write_run(tmp_path / "run"), tmp_path / "out"
+    output.mkdir()
+    (output / "scene.ply").write_text("mine")
+    assert main(["export", str(run), "--output", str(output)]) == 2
+    assert (output / "scene.ply").read_text() == "mine"
+    assert main(["export", str(tmp_path / "none"), "--output", str(tmp_path / "new")]) == 2
+    assert "not a run directory" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "new").exists()

@@ -1,0 +1,61 @@
+"""The line that is shown while PyTorch is imported, and where it is not."""
+
+from __future__ import annotations
+
+import gc
+import io
+import sys
+
+import pytest
+from rich.console import Console
+
+from glassplat.cli.console import LINE, import_now
+
+MODULE = "glassplat.cli.progress"
+
+
+def terminal() -> Console:
+    return Console(file=io.StringIO(), force_terminal=True, legacy_windows=False, _environ={"TERM": "xterm"})
+
+
+def shown(console: Console) -> str:
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def test_a_terminal_shows_a_line_that_is_gone_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, MODULE, raising=False)
+    console = terminal()
+    assert import_now(MODULE, console).__name__ == MODULE
+    assert shown(console) == f"{LINE}\r\x1b[2K"
+
+
+def test_what_is_there_is_not_announced() -> None:
+    console = terminal()
+    assert import_now("glassplat.cli.console", console).LINE is LINE
+    assert shown(console) == ""
+
+
+def test_a_file_gets_no_such_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, MODULE, raising=False)
+    console = Console(file=io.StringIO())
+    import_now(MODULE, console)
+    assert shown(console) == ""
+
+
+def test_the_line_is_gone_before_an_error_is_printed() -> None:
+    console = terminal()
+    with pytest.raises(ModuleNotFoundError):
+        import_now("glassplat.no_such_module", console)
+    assert shown(console).endswith("\x1b[2K")
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_garbage_is_collected_afterwards_as_before(enabled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gc, "isenabled", lambda: enabled)
+    asked: list[str] = []
+    for name in ("disable", "freeze", "enable"):
+        monkeypatch.setattr(gc, name, lambda name=name: asked.append(name))
+    with pytest.raises(ModuleNotFoundError):
+        import_now("glassplat.no_such_module", terminal())
+    assert asked == (["disable", "freeze", "enable"] if enabled else [])

@@ -1,0 +1,163 @@
+"""`glassplat info` tells captures, photographs, runs and splat files apart, and what is wrong with them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from glassplat.cli.demo import SCENE
+from glassplat.cli.main import main
+from glassplat.files.ply import write_gaussians
+from glassplat.files.spz import write_spz
+from glassplat.scene.gaussians import Gaussians
+from tests.cli.tiny_run import write_run
+from tests.prepare.test_video import film
+from tests.training.tiny_capture import true_scene
+
+
+def told(path: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    """What is said of a path, and that people are told the same."""
+    assert main(["info", str(path), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert main(["info", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert found["kind"] in text and all(line.split("    ")[0] in text for line in found["next"])
+    return found
+
+
+def test_a_capture_is_described_with_its_panes(capsys: pytest.CaptureFixture[str]) -> None:
+    found = told(SCENE, capsys)
+    assert found["kind"] == "a capture" and found["healthy"]
+    assert found["facts"]["panes"].startswith("1; masks of 8")
+    assert "points behind panes" in found["facts"]
+    assert any("train planar" in line for line in found["next"])
+
+
+def test_a_capture_without_masks_is_to_be_annotated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(SCENE, tmp_path / "capture", ignore=shutil.ignore_patterns("masks", "gt"))
+    found = told(tmp_path / "capture", capsys)
+    assert found["facts"]["panes"] == "none marked"
+    assert any("glassplat annotate" in line for line in found["next"])
+
+
+def test_estimated_normals_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture = shutil.copytree(SCENE, tmp_path / "capture", ignore=shutil.ignore_patterns("masks", "gt"))
+    (capture / "normals").mkdir()
+    for photograph in sorted((capture / "images").iterdir())[1:4]:
+        (capture / "normals" / photograph.with_suffix(".npy").name).touch()
+    assert "normals" not in told(SCENE, capsys)["facts"]
+    assert told(capture, capsys)["facts"]["normals"].startswith("estimated for 3 training photographs")
+
+
+def test_photographs_are_to_be_prepared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(SCENE / "images", tmp_path / "photographs")
+    found = told(tmp_path / "photographs", capsys)
+    assert found["kind"] == "photographs without poses" and found["facts"]["photographs"] == 96
+    assert any("glassplat prepare" in line for line in found["next"])
+
+
+def test_a_video_is_looked_into(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    offsets = np.linspace(0, 40, 12)
+    found = told(film(tmp_path / "walk.avi", offsets), capsys)
+    assert found["kind"] == "a video" and found["healthy"] and found["facts"]["frames"] == 12
+    assert any("glassplat prepare" in line for line in found["next"])
+    (tmp_path / "notes.mp4").write_text("no video")
+    found = told(tmp_path / "notes.mp4", capsys)
+    assert found["kind"] == "a file that has the name of a video" and not found["next"]
+    assert "OpenCV can read no picture of it" in found["problems"][0]
+
+
+def test_without_opencv_a_video_is_told_by_its_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    (tmp_path / "walk.mp4").write_text("no video")
+    found = told(tmp_path / "walk.mp4", capsys)
+    assert found["kind"] == "a video, by its name" and "needs OpenCV" in found["problems"][0]
+
+
+def test_photographs_that_prepare_would_refuse_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for path in sorted((SCENE / "images").iterdir())[:25]:
+        shutil.copy(path, folder)
+    assert told(folder, capsys)["healthy"]
+    first, second, *_ = sorted(folder.iterdir())
+    first.write_bytes(first.read_bytes()[:900])
+    second.write_bytes(b"\0\0\0\x18ftypheic")
+    found = told(folder, capsys)
+    assert not found["healthy"]
+    assert f"2 are broken, tiny or of a kind that cannot be read ({first.name}, {second.name})" in found["problems"][0]
+
+
+def test_a_folder_of_few_photographs_is_said_to_be_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "few").mkdir()
+    shutil.copy(SCENE / "images" / "0000.jpg", tmp_path / "few")
+    assert told(tmp_path / "few", capsys)["problems"] == ["1 photographs are few; 30 and more do better"]
+
+
+def test_what_was_interrupted_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "c.partial").mkdir()
+    (tmp_path / "c.partial" / "settings.json").write_text('{"input": "photographs"}')
+    found = told(tmp_path / "c.partial", capsys)
+    assert not found["healthy"] and found["next"][0].endswith("--resume")
+
+
+def test_a_run_is_described_and_misses_its_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = write_run(tmp_path / "run")
+    found = told(run, capsys)
+    assert found["kind"] == "a planar run" and found["facts"]["panes"].startswith("1 (R0")
+    assert any("glassplat eval" in line for line in found["next"])
+    shutil.move(tmp_path / "capture", tmp_path / "elsewhere")
+    assert "no longer at" in " ".join(told(run, capsys)["problems"])
+    assert told(run / "point_cloud" / "iteration_1", capsys)["kind"] == "an exported scene"
+
+
+def test_a_run_without_a_scene_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = write_run(tmp_path / "run")
+    shutil.rmtree(run / "point_cloud")
+    (run / "checkpoint.safetensors").write_bytes(b"")
+    assert any("--resume" in problem for problem in told(run, capsys)["problems"])
+
+
+def small(gaussians: Gaussians) -> Gaussians:
+    return Gaussians(gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz"])
+def test_splat_files_are_counted_and_judged(suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gaussians = small(true_scene().primary)
+    path = tmp_path / f"splat{suffix}"
+    (write_gaussians if suffix == ".ply" else write_spz)(path, gaussians)
+    found = told(path, capsys)
+    assert found["facts"]["Gaussians"] == len(gaussians) and found["healthy"]
+    faint = gaussians.with_tensors({"logit_opacities": torch.full((len(gaussians),), -8.0)})
+    (write_gaussians if suffix == ".ply" else write_spz)(path, faint)
+    assert "nearly invisible" in told(path, capsys)["problems"][0]
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("nowhere", "there is nothing at"), ("notes.txt", "no file that is known"), ("empty", "nothing that is known")],
+)
+def test_what_is_not_known_is_said_to_be(
+    name: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "notes.txt").write_text("")
+    (tmp_path / "empty").mkdir()
+    assert main(["info", str(tmp_path / name)]) == 2
+    assert expected in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_damaged_capture_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(SCENE, tmp_path / "capture")
+    (tmp_path / "capture" / "images" / "0000.jpg").unlink()
+    assert main(["info", str(tmp_path / "capture")]) == 2
+    assert "1 of the 96 photographs of the COLMAP model are missing" in " ".join(capsys.readouterr().err.split())

@@ -1,0 +1,97 @@
+"""Lines that commands print, with names that somebody else chose."""
+
+from __future__ import annotations
+
+import io
+import logging
+import warnings
+
+import pytest
+from rich.console import Console
+from rich.table import Table
+
+from glassplat.cli.console import complain, heard_by, message_console, printable, say, warn
+
+AWKWARD = [
+    "/data/[bold]/run",
+    "/data/[/bold]/run",
+    "/data/[/]/run",
+    "/data/[red]x[/red]",
+    "[nan, 1.0, nan]",
+    "/a:smile:b/:x:",
+    "trailing\\",
+    "\\[escaped]",
+    "[link=file:///etc]x[/link]",
+    "/long/" + "path " * 40 + "end",
+    "/long/" + "path" * 60,
+    "",
+]
+
+
+@pytest.mark.parametrize("text", AWKWARD)
+def test_names_are_shown_as_they_are(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    complain("error", text)
+    assert capsys.readouterr().err == f"error: {text}\n"
+    warn(message_console(), text)
+    say(message_console(), text)
+    message_console().print(text)
+    assert capsys.readouterr().out == f"warning: {text}\n{text}\n{text}\n"
+
+
+@pytest.mark.parametrize("text", AWKWARD)
+def test_a_console_that_reads_markup_shows_them_too(text: str) -> None:
+    file = io.StringIO()
+    say(Console(file=file), text)
+    assert file.getvalue() == f"{text}\n"
+
+
+def test_only_a_terminal_breaks_lines() -> None:
+    file = io.StringIO()
+    say(Console(file=file, force_terminal=True, width=20, color_system=None), "one two three four five six seven")
+    assert file.getvalue().count("\n") > 1
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("a\x1b[31mb", r"a\x1b[31mb"),
+        ("a\x07\x9bb\x7f", r"a\x07\x9bb\x7f"),
+        ("caf\udce9", r"caf\udce9"),
+        ("two\nlines\tand a tab", "two\nlines\tand a tab"),
+        ("größer ± 1°", "größer ± 1°"),
+    ],
+)
+def test_what_no_terminal_should_get_is_written_out(text: str, shown: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert printable(text) == shown
+    complain("stopped", text)
+    assert "".join(capsys.readouterr().err.split()) == "".join(f"stopped: {shown}".split())
+
+
+def test_tables_show_names_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    table = Table("metric", "[bold]")
+    table.add_row("[/x]", ":smile:")
+    message_console().print(table)
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in ("[bold]", "[/x]", ":smile:"))
+
+
+def test_what_is_logged_and_warned_of_is_a_line_each(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+    monkeypatch.setattr(logging.getLogger(), "level", logging.WARNING)
+    package, library = logging.getLogger("glassplat.kernels"), logging.getLogger("somebody.else")
+    with heard_by(message_console()):
+        package.info("compiling [bold] for %s", "this :x: machine")
+        package.warning("cannot keep [/x]")
+        library.info("chatter")
+        library.warning("beware")
+        with warnings.catch_warnings():
+            warnings.simplefilter("default")
+            warnings.warn("an image of [127] megapixels", stacklevel=1)
+    assert capsys.readouterr().out.splitlines() == [
+        "compiling [bold] for this :x: machine",
+        "warning: cannot keep [/x]",
+        "warning: beware",
+        "warning: an image of [127] megapixels",
+    ]

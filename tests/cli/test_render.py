@@ -1,0 +1,93 @@
+"""`glassplat render` with edits of the panes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from glassplat.cli.main import main
+from glassplat.cli.places import SceneEdits
+from glassplat.errors import InputError
+from glassplat.files.images import read_image
+from glassplat.methods.recipe import RECIPES
+from glassplat.model.layers import DISC_LAYERS, LAYERS, Layer
+from glassplat.render.layers import PHOTOGRAPHED
+from glassplat.scene.scene import Scene, as_mirrors, shifted, tilted, with_reflectance, without_glass
+from tests.cli.tiny_run import rendered, write_run
+from tests.training.tiny_capture import true_scene
+
+EDITS = {
+    "--remove-glass": without_glass(true_scene()),
+    "--as-mirror 1": as_mirrors(true_scene(), [1]),
+    "--reflectance 1 0.8": with_reflectance(true_scene(), 1, 0.8),
+    "--tilt 1 -10 4.5 --shift 1 -0.1": shifted(tilted(true_scene(), 1, -10, 4.5), 1, -0.1),
+}
+
+
+@pytest.mark.parametrize(("options", "scene"), EDITS.items(), ids=EDITS)
+def test_edits_reach_the_picture(options: str, scene: Scene, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    assert main(["render", str(run), "--output", str(tmp_path / "out"), *options.split()]) == 0
+    image = read_image(tmp_path / "out" / "rgb" / "0.png").astype(int)
+    assert np.abs(image - rendered(scene, 0).numpy()).max() <= 1
+    assert np.abs(image - rendered(true_scene(), 0).numpy()).max() > 5
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--as-mirror 4", "no pane 4; the panes are 1"),
+        ("--reflectance 1 2", "expected a number from 0 to 1"),
+        ("--remove-glass --as-mirror 1", "without the other edits"),
+        ("--as-mirror 1 --reflectance 1 0.5", "give one of the two"),
+    ],
+)
+def test_edits_that_make_no_sense_write_nothing(
+    options: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = write_run(tmp_path / "run")
+    assert main(["render", str(run), "--output", str(tmp_path / "out"), *options.split()]) == 2
+    assert words in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("method", ["splat", "planar"])
+def test_every_layer_that_is_listed_can_be_rendered(method: str, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", planar=method == "planar")
+    assert main(["render", str(run), "--output", str(tmp_path / "out"), "--layers", *LAYERS[method]]) == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir() if path.is_dir()) == sorted(LAYERS[method])
+
+
+@pytest.mark.parametrize(
+    ("method", "layers", "words"),
+    [
+        ("splat", ["tint"], "splat renders no layer tint; expected --layers out of rgb, normal, depth, alpha"),
+        ("splat", ["rgb", "mask", "depth", "base"], "splat renders no layer mask, base; expected"),
+        ("planar", ["rgb", "environment"], "planar renders no layer environment; expected --layers out of rgb, "),
+        ("planar", [], "planar renders nothing without --layers; expected --layers out of rgb, "),
+    ],
+)
+def test_layers_that_a_method_lacks_are_refused_before_anything_is_rendered(
+    method: str, layers: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = write_run(tmp_path / "run", planar=method == "planar")
+    assert main(["render", str(run), "--output", str(tmp_path / "out"), "--layers", *layers]) == 2
+    said = capsys.readouterr()
+    assert words in said.err and "rendering" not in said.out
+    assert not (tmp_path / "out").exists()
+
+
+def test_layers_that_are_listed_can_be_asked_for() -> None:
+    assert set(LAYERS) == set(RECIPES)
+    known = (*LAYERS.values(), DISC_LAYERS, [PHOTOGRAPHED])
+    assert {layer for layers in known for layer in layers} == set(get_args(Layer))
+
+
+def test_a_scene_without_panes_cannot_be_edited() -> None:
+    bare = without_glass(true_scene())
+    assert SceneEdits().applied(bare) is bare
+    with pytest.raises(InputError, match="no panes to edit"):
+        SceneEdits(remove_glass=True).applied(bare)

@@ -1,0 +1,274 @@
+"""The first half second of a command: what is imported for which question, and what each command says of itself."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import glassplat
+from glassplat.cli.demo import SCENE
+from glassplat.cli.main import COMMANDS, command_class, main
+from glassplat.methods.planar_recipe import PlanarRecipe
+from glassplat.methods.recipe import recipe_to_json
+
+SLOW = ["torch", "numba", "scipy", "numpy", "PIL", "pycolmap", "OpenEXR", "safetensors"]
+IMPORTS = """
+import json, sys
+from glassplat.cli.main import main
+try:
+    code = main({arguments})
+except SystemExit as stop:
+    code = stop.code
+slow = [name for name in {slow} if name in sys.modules]
+print(json.dumps([code, slow, sorted(name for name in sys.modules if name.startswith("glassplat.cli."))]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["--help"], 0),
+        (["-h"], 0),
+        (["--version"], 0),
+        ([], 2),
+        (["trian"], 2),
+        (["--no-such-option"], 2),
+        (["--", "train"], 2),
+        (["Train"], 2),
+        ([""], 2),
+    ],
+)
+def test_the_list_of_commands_needs_none_of_the_libraries(arguments: list[str], code: int) -> None:
+    script = IMPORTS.format(arguments=arguments, slow=SLOW)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    found, slow, commands = json.loads(done.stdout.splitlines()[-1])
+    assert found == code
+    assert slow == []
+    assert not {f"glassplat.cli.{listed.module}" for listed in COMMANDS.values()} & set(commands)
+    assert "Traceback" not in done.stderr
+    assert all(name in done.stdout + done.stderr for name in COMMANDS) or arguments == ["--version"]
+
+
+@pytest.mark.parametrize("name", ["prepare", "annotate", "train", "eval", "export", "view", "video", "import", "info"])
+def test_a_command_does_not_wait_for_what_it_may_never_need(name: str) -> None:
+    late = ["scipy.spatial", "scipy.ndimage", "scipy.interpolate", "scipy.optimize", "viser", "cv2", "OpenEXR"]
+    late += [] if name in ("prepare", "annotate") else ["pycolmap"]
+    late += ["glassplat.evaluate.evaluate", "zstandard"] if name == "train" else []
+    done = subprocess.run(
+        [sys.executable, "-c", IMPORTS.format(arguments=[name, "--help"], slow=late)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert json.loads(done.stdout.splitlines()[-1])[:2] == [0, []]
+
+
+REFUSED = {
+    "prepare none --output new": "no folder or video none",
+    "annotate none": "no folder none",
+    "annotate capture --no-page": "nothing to do",
+    "train splat --data none --output new": "no folder none",
+    "train splat --data=capture --data=none --output new": "no folder none",
+    "train planar --data capture --output trained": "trained already holds a run",
+    "train planar --data capture --output new --resume": "nothing was saved yet in new",
+    "train planar --data capture --output splats.ply": "splats.ply is a file",
+    "eval capture": "capture is not a run directory",
+    "render capture --output new": "capture is not a run directory",
+    "render begun --output capture": "capture is not empty",
+    "dereflect none --output new": "none is not a run directory",
+    "dereflect begun --output capture": "capture is not empty",
+    "view none.ply": "no file none.ply",
+    "view splats.ply --port 0": "port is 0",
+    "view splats.ply --output splats.ply": "splats.ply is a file",
+    "video none --output film.webp": "none is not a run directory",
+    "video begun --output film.avi": "film.avi is no name of a film",
+    "video begun --output film.gif --path keyframes --keyframes none.json": "no file none.json",
+    "export none --output new": "none is not a run directory",
+    "export begun --output capture": "capture is not empty",
+    "import none.ply --output new": "no file none.ply",
+    "import splats.ply --output capture": "capture is not empty",
+    "info none": "there is nothing at none",
+    "info splats.txt": "splats.txt is no file that is known",
+    "demo --output splats.ply": "splats.ply is a file",
+}
+"""Command lines, and what is said of each without PyTorch."""
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a capture, two runs and files, as far as they are looked at before PyTorch is there."""
+    root = tmp_path_factory.mktemp("places")
+    for name in ("capture/images", "begun", "trained", "photographs"):
+        (root / name).mkdir(parents=True)
+    for name in ("begun/recipe.json", "trained/recipe.json", "trained/checkpoint.safetensors", "splats.ply"):
+        (root / name).write_bytes(b"")
+    (root / "splats.txt").write_bytes(b"")
+    for path in sorted((SCENE / "images").iterdir())[:3]:
+        shutil.copy(path, root / "photographs")
+    return root
+
+
+@pytest.mark.parametrize("line", REFUSED)
+def test_what_can_be_refused_at_once_is_refused_without_pytorch(line: str, places: Path) -> None:
+    script = IMPORTS.format(arguments=line.split(), slow=["torch", "numba"])
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=places)
+    assert json.loads(done.stdout.splitlines()[-1])[:2] == [2, []]
+    assert REFUSED[line] in " ".join(done.stderr.split()) and done.stderr.startswith("error: ")
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_a_command_explains_itself_without_pytorch(name: str) -> None:
+    script = IMPORTS.format(arguments=[name, "--help"], slow=["torch", "numba"])
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert json.loads(done.stdout.splitlines()[-1])[:2] == [0, []]
+
+
+WITHOUT_PYTORCH = """
+import importlib.abc, sys
+
+class Missing(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == "torch":
+            raise OSError("PyTorch was imported")
+
+sys.meta_path.insert(0, Missing())
+from glassplat.cli.main import main
+sys.exit(main({arguments!r}))
+"""
+FIRST_WORDS = {
+    "train splat --data SCENE --output new": "a COLMAP capture of 96 photographs",
+    "train planar --preset paper --data=SCENE --output new": "8 masks of panes",
+    "demo --output new": "training planar",
+    "info SCENE": "a capture format: COLMAP points: 6048",
+    "info run": "a planar run capture: gone iterations: 3000",
+    "eval run": "run: a planar run of 3000 iterations on gone",
+    "render run --output new": "run: a planar run of 3000 iterations on gone",
+    "dereflect run --output new": "run: a planar run of 3000 iterations on gone",
+    "export run --output new": "run: a planar run of 3000 iterations on gone",
+    "video run --output film.gif": "run: a planar run of 3000 iterations on gone",
+    "view splats.ply": "splats.ply: a splat file of 0.0 MB",
+    "info splats.ply": "a splat file bytes: 0",
+}
+"""Command lines, and what each says before it needs PyTorch."""
+
+
+@pytest.mark.parametrize("line", FIRST_WORDS)
+def test_a_command_begins_before_pytorch_is_imported(line: str, tmp_path: Path) -> None:
+    (tmp_path / "splats.ply").write_bytes(b"")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "recipe.json").write_text(recipe_to_json(PlanarRecipe()))
+    (tmp_path / "run" / "settings.json").write_text(json.dumps({"data": "gone", "iterations": 3000}))
+    script = WITHOUT_PYTORCH.format(arguments=line.replace("SCENE", str(SCENE)).split())
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert FIRST_WORDS[line] in " ".join(done.stdout.split())
+    assert (done.returncode, done.stderr) == (1, "stopped: PyTorch was imported\n")
+
+
+def test_photographs_are_described_without_pytorch(places: Path) -> None:
+    script = IMPORTS.format(arguments=["info", "photographs"], slow=["torch", "numba"])
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=places)
+    assert json.loads(done.stdout.splitlines()[-1])[:2] == [0, []]
+    assert "photographs without poses" in done.stdout
+
+
+def test_the_package_runs_as_a_module() -> None:
+    done = subprocess.run([sys.executable, "-m", "glassplat", "--version"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, f"glassplat {glassplat.__version__}\n")
+
+
+def test_a_command_imports_no_other(tmp_path: Path) -> None:
+    script = IMPORTS.format(arguments=["eval", str(tmp_path)], slow=SLOW)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    code, _, commands = json.loads(done.stdout.splitlines()[-1])
+    assert code == 2
+    assert "glassplat.cli.evaluate" in commands
+    assert not {
+        "glassplat.cli.publish",
+        "glassplat.cli.train",
+        "glassplat.cli.look",
+    } & set(commands)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_list_says_of_a_command_what_the_command_does(name: str) -> None:
+    described = inspect.getdoc(command_class(name)) or ""
+    assert described.splitlines()[0] == COMMANDS[name].summary
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main([name, "--help"])
+    assert stopped.value.code == 0
+    said = capsys.readouterr().out
+    assert f"usage: glassplat {name}" in said
+    assert " ".join(COMMANDS[name].summary.split()) in " ".join(said.split())
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["train"],
+        ["train", "splat"],
+        ["train", "nerf", "--data", "x", "--output", "y"],
+        ["eval"],
+        ["eval", "run", "--device", "tpu"],
+        ["render", "run"],
+        ["render", "run", "--output", "x", "--layers", "hit"],
+        ["dereflect", "run", "--output", "x", "--source", "[bold]"],
+        ["demo", "--iterations", "many"],
+        ["bench"],
+        ["bench", "scenes", "--data", "x", "--output", "y", "--seeds", "one"],
+    ],
+    ids=" ".join,
+)
+def test_options_that_cannot_be_understood_end_with_code_2(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == 2
+    said = capsys.readouterr().err
+    assert f"glassplat {arguments[0]}" in said and "Traceback" not in said
+
+
+def test_completions_for_a_shell_know_the_options_of_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--tyro-print-completion", "bash"])
+    said = capsys.readouterr().out
+    assert "--mask-polarity" in said and "--layers" in said
+
+
+SHELL = {
+    "glassplat --help >&-": (0, ""),
+    "glassplat trian 2>&-": (2, ""),
+    "glassplat --version >&- 2>&-": (0, ""),
+    "glassplat eval none 2>/dev/full": (2, ""),
+    "glassplat --help >/dev/full": (1, "stopped: no space left on device; free some space, then repeat the command\n"),
+    "PYTHONIOENCODING=ascii glassplat --help >/dev/null": (0, ""),
+    "LC_ALL=C PYTHONUTF8=0 glassplat [bold]-ä 2>/dev/null": (2, ""),
+}
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="the machine has no device that is always full")
+@pytest.mark.parametrize(("line", "expected"), SHELL.items(), ids=SHELL)
+def test_output_that_is_closed_full_or_narrow_changes_no_exit_code(line: str, expected: tuple[int, str]) -> None:
+    line = line.replace("glassplat", f"{sys.executable} -m glassplat")
+    done = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == expected
+
+
+def test_a_reader_that_leaves_ends_the_command_in_silence() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "glassplat", "--help"]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, "")

@@ -1,0 +1,82 @@
+"""`traced` from end to end on a tiny object: train, evaluate, render every layer, read back what is stored."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from glassplat.cli.main import main
+from glassplat.cli.runs import open_run
+from glassplat.model import layers
+from glassplat.training.checkpoint import load_checkpoint
+from tests.training.object_capture import few_steps, write_object_capture
+
+LAYERS = layers.LAYERS["traced"]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run of a few steps."""
+    capture = write_object_capture(tmp_path / "ball")
+    options = [*few_steps(capture, tmp_path / "run"), "--surroundings.start.cells", "3"]
+    assert main(["train", "traced", *options]) == 0
+    return tmp_path / "run"
+
+
+def test_it_is_measured_and_every_layer_can_be_rendered(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["eval", str(run)]) == 0
+    results = json.loads((run / "results.json").read_text())
+    assert results["method"] == "traced" and results["num_surroundings_gaussians"] > 0
+    for name in ("normal_error_deg", "reflective_normal_error_deg", "reflective_psnr", "strength_error"):
+        assert results[name] is not None and results[name] > 0, name
+    output = run.parent / "layers"
+    assert main(["render", str(run), "--layers", *LAYERS, "--output", str(output)]) == 0
+    assert all(len(list((output / layer).rglob("*.png"))) == 2 for layer in LAYERS)
+    assert main(["render", str(run), "--layers", "mask", "--output", str(run.parent / "none")]) == 2
+    assert "traced renders no layer mask" in capsys.readouterr().err
+
+
+def test_discs_have_a_median_depth_beside_all_other_layers(tmp_path: Path) -> None:
+    capture, run, output = write_object_capture(tmp_path / "ball"), tmp_path / "run", tmp_path / "layers"
+    options = [*few_steps(capture, run), "--surroundings.start.cells", "3", "--primitive", "disc"]
+    assert main(["train", "traced", *options]) == 0
+    listed = layers.layers_of(open_run(run, "cpu").recipe)
+    assert set(listed) == {*LAYERS, "median_depth"}
+    assert main(["render", str(run), "--layers", *listed, "--output", str(output)]) == 0
+    assert all(len(list((output / layer).rglob("*.png"))) == 2 for layer in listed)
+
+
+def test_the_stored_scene_is_the_trained_one(run: Path) -> None:
+    trained, stored = load_checkpoint(run / "checkpoint.safetensors").scene, open_run(run, "cpu").scene
+    assert trained.parameters().keys() == stored.parameters().keys()
+    for name, tensor in trained.parameters().items():
+        assert torch.equal(stored.parameters()[name], tensor), name
+
+
+def test_a_run_that_lost_its_surroundings_says_so(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = run / "point_cloud" / "iteration_12"
+    (folder / "surroundings.ply").unlink()
+    assert main(["eval", str(run)]) == 2
+    assert "no surroundings.ply in" in " ".join(capsys.readouterr().err.split())
+
+
+def test_broken_normals_beside_the_photographs_are_named(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture = run.parent / "ball"
+    (capture / "train" / "normals").mkdir()
+    shutil.copy(capture / "transforms_train.json", capture / "train" / "normals" / "r_0.npy")
+    options = [
+        "--data",
+        str(capture),
+        "--output",
+        str(run.parent / "other"),
+        "--iterations",
+        "12",
+        "--least-iterations",
+        "1",
+    ]
+    assert main(["train", "traced", *options, "--surroundings.start.cells", "3"]) == 2
+    assert "r_0.npy is no array that NumPy can read" in " ".join(capsys.readouterr().err.split())

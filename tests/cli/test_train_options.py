@@ -1,0 +1,196 @@
+"""The options of the command line: what is out of range ends in one line, and help shows what most runs need."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from glassplat.cli import main as cli
+from glassplat.cli.demo import SCENE
+from glassplat.cli.main import main
+from glassplat.errors import InputError
+from glassplat.methods.glossy_recipes import DeferredRecipe
+from glassplat.methods.planar_recipe import Perturbation, PlanarRecipe
+from glassplat.methods.recipe import RECIPES
+from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.options import check_options
+from glassplat.panes.options import PlaneFit
+from glassplat.training.options import GaussianRates, McmcDensify, NormalPropagation
+
+LARGE = str(10**30)
+WRONG = [
+    ["splat", "--sh-degree", "7"],
+    ["splat", "--sh-degree", "4"],
+    ["splat", "--sh-degree", "-1"],
+    ["planar", "--rates.means", "-1"],
+    ["planar", "--rates.means", "nan"],
+    ["planar", "--rates.means", "inf"],
+    ["splat", "--seed", LARGE],
+    ["splat", "--seed", "-1"],
+    ["planar", "--glass-count", "-1"],
+    ["planar", "--glass-count", "0"],
+    ["planar", "--glass-count", "1000000000000"],
+    ["planar", "--weights.depth", "-0.1"],
+    ["planar", "--weights.mask", "inf"],
+    ["planar", "--plane-fit.mirror-labels", "0"],
+    ["planar", "--downscale", "1000"],
+    ["splat", "--downscale", "1000"],
+    ["splat", "--downscale", "0.5"],
+    ["splat", "--downscale", "nan"],
+    ["splat", "--background", "-1", "0", "0"],
+    ["splat", "--background", "nan", "0", "0"],
+    ["splat", "--iterations", "0"],
+    ["splat", "--iterations", LARGE],
+    ["splat", "--densify.cap", "-5"],
+    ["splat", "--cap", LARGE],
+    ["splat", "--densify.stop", "1.5"],
+    ["splat", "--rhythm.averaged-passes", "-1"],
+    ["deferred", "--texels", "0"],
+    ["deferred", "--texels", LARGE],
+    ["deferred", "--region", "0", "0", "0", "-1"],
+    ["deferred", "--schedule.stop", "0.01"],
+]
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The message that a command line ends with."""
+    assert main(arguments) == 2
+    said = capsys.readouterr()
+    assert "Traceback" not in said.out + said.err
+    return " ".join(said.err.split())
+
+
+@pytest.mark.parametrize("arguments", WRONG, ids=" ".join)
+def test_a_wrong_option_ends_with_one_message(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    method, option, *_ = arguments
+    output = tmp_path / "run"
+    message = refused(["train", method, "--data", str(SCENE), "--output", str(output), *arguments[1:]], capsys)
+    named = {"--cap": "--mcmc.cap", "--downscale": "downscale"}.get(option, option)
+    assert message.startswith("error: ") and named in message and "expected" in message
+    assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    ("recipe", "named"),
+    [
+        (PlanarRecipe(rates=GaussianRates(means_end=0.0)), "--rates.means-end"),
+        (PlanarRecipe(plane_fit=PlaneFit(seed=10**30)), "--plane-fit.seed"),
+        (PlanarRecipe(stage_shares=(0.0, 0.0, 0.0)), "--stage-shares"),
+        (PlanarRecipe(stage_shares=(math.nan, 1.0, 1.0)), "--stage-shares"),
+        (PlanarRecipe(stage_shares=(1.0, -1.0, 1.0)), "--stage-shares"),
+        (PlanarRecipe(perturbation=Perturbation(bounds=(0.9, 0.1))), "--perturbation.bounds"),
+        (SplatRecipe(mcmc=McmcDensify(growth=0.5)), "--mcmc.growth"),
+        (DeferredRecipe(refinements=(0.6, 0.4)), "--refinements"),
+        (DeferredRecipe(propagation=NormalPropagation(least_opacity=1.0)), "--propagation.least-opacity"),
+    ],
+    ids=str,
+)
+def test_what_only_python_sets_is_checked_as_well(recipe: Any, named: str) -> None:
+    with pytest.raises(InputError, match=f"{named} is .*expected"):
+        check_options(recipe)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["demo", "--iterations", "0"],
+        ["demo", "--seed", "-1"],
+        ["render", "run", "--output", "y", "--shift", "1", "nan"],
+        ["render", "run", "--output", "y", "--tilt", "1", "inf", "0"],
+        ["render", "run", "--output", "y", "--reflectance", "1", "2"],
+    ],
+    ids=" ".join,
+)
+def test_so_do_those_of_other_commands(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    (option,) = [word for word in arguments if word.startswith("--")][-1:]
+    message = refused(arguments, capsys)
+    assert option in message and "expected" in message
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["train", "splat", "--data", "", "--output", "x"], "--data"),
+        (["train", "splat", "--data=", "--output", "x"], "--data"),
+        (["train", "splat", "--data", "x", "--output", ""], "--output"),
+        (["eval", ""], "eval"),
+    ],
+    ids=str,
+)
+def test_an_empty_argument_is_not_the_current_folder(
+    arguments: list[str], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    message = refused(arguments, capsys)
+    assert named in message and "empty" in message
+
+
+def help_of(arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit) as stopped:
+        main(["train", *arguments])
+    assert stopped.value.code == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("method", RECIPES)
+def test_help_shows_what_most_runs_need_and_says_how_to_see_the_rest(
+    method: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    brief = help_of([method, "--help"], capsys, monkeypatch)
+    assert len(brief.splitlines()) <= 80 and "--help-advanced" in brief
+    assert {"--data", "--output", "--iterations", "--preset", "--background", "--strategy", "--cap"} <= options(brief)
+    full = help_of([method, "--help-advanced"], capsys, monkeypatch)
+    assert options(brief) - {"--help-advanced"} < options(full)
+    assert "--rates.means" in options(full) - options(brief)
+    assert len(settings(brief)) <= 25 and len(settings(full)) <= 60
+
+
+@pytest.mark.parametrize("option", [["--rhythm.beat", "0.1"], ["--densify.split-by", "pull"], ["--blend", "srgb"]])
+def test_what_a_preset_decides_is_no_option(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["train", "planar", "--data", str(SCENE), "--output", "y", *option])
+    assert stopped.value.code == 2 and option[0] in capsys.readouterr().err
+
+
+def settings(text: str) -> set[str]:
+    """The options of a help text, a switch counted once."""
+    return {name for name in options(text) if "no-" not in name and not name.startswith("--help")}
+
+
+def options(text: str) -> set[str]:
+    return set(re.findall(r"(?<![\w-])--[a-z0-9.-]+", text))
+
+
+def test_help_shows_the_defaults_of_the_preset(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = [
+        " ".join(help_of(["planar", "--help-advanced", *preset], capsys, monkeypatch).replace("│", " ").split())
+        for preset in ([], ["--preset", "paper"])
+    ]
+    assert all("--view-dependence-weight FLOAT" in text for text in shown)
+    assert ["the paper has no such term. (default: 0.0)" in text for text in shown] == [False, True]
+
+
+def test_the_recipe_of_a_preset_is_recorded(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    arguments = ["--data", str(SCENE), "--output", str(run), "--downscale", "4", "--iterations", "3"]
+    assert main(["train", "splat", "--preset", "paper", *arguments]) == 0
+    recorded = (run / "recipe.json").read_text()
+    assert '"split_by": "gradient"' in recorded and '"short_run_power": 0.0' in recorded
+    assert main(["train", "splat", *arguments, "--resume"]) == 2
+    assert main(["train", "splat", "--preset", "paper", *arguments, "--resume"]) == 0
+
+
+def test_every_method_is_offered(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = []
+    monkeypatch.setattr(cli, "run", taken.append)
+    for method, kind in RECIPES.items():
+        assert main(["train", method, "--data", str(SCENE), "--output", "y"]) == 0
+        assert type(taken[-1].recipe) is kind

@@ -1,0 +1,169 @@
+"""How a training is followed, in a terminal and in a file."""
+
+from __future__ import annotations
+
+import io
+import re
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from glassplat.cli import progress as training_progress
+from glassplat.cli.demo import SCENE
+from glassplat.cli.main import main
+from glassplat.cli.progress import FIRST_PAUSE, LONGEST_PAUSE, StepLines, TrainingProgress, in_words
+from glassplat.training.messages import (
+    ActionDone,
+    CheckpointWritten,
+    Message,
+    RunBegun,
+    StageEntered,
+    StepDone,
+    Working,
+)
+from tests.training.tiny_capture import write_tiny_capture
+
+COUNTS = {"primary": 1000, "glass": 20, "planes": 1}
+BUSY = [Working("looking for Gaussians that no view needs", done, 40) for done in range(40)]
+
+
+def step(number: int, loss: float = 0.25) -> StepDone:
+    return StepDone(number, "1.png", loss, {"photometric": loss}, COUNTS)
+
+
+class FakeClock:
+    """Moves on by a second whenever it is set to, and never by itself."""
+
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def lines_of(messages: list[Message], seconds: float, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What is written to a file while messages come at a distance in time."""
+    clock, file = FakeClock(), io.StringIO()
+    monkeypatch.setattr(training_progress, "StepLines", lambda console: StepLines(console, clock))
+    with TrainingProgress(Console(file=file, width=40), 1000) as progress:
+        for message in messages:
+            progress.show(message)
+            clock.now += seconds
+    return file.getvalue().splitlines()
+
+
+def test_lines_come_soon_at_first_and_then_every_few_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = lines_of([step(number) for number in range(1, 101)], 0.5, monkeypatch)
+    shown = [int(line.split()[1]) for line in lines]
+    pauses = [0.5 * (later - earlier) for earlier, later in pairwise(shown)]
+    assert shown[0] == 1 + FIRST_PAUSE / 0.5
+    assert pauses == [2.0, 4.0, 8.0, *[LONGEST_PAUSE] * 3]
+    left = in_words((1000 - shown[-1]) / 2)
+    assert lines[-1] == f"step {shown[-1]} of 1000: loss 0.2500, 1020 Gaussians, {left} left"
+
+
+def test_the_time_left_is_that_of_this_sitting_and_its_last_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = lines_of([RunBegun(899, 1000), *(step(number) for number in range(900, 1000))], 6.0, monkeypatch)
+    assert lines[0] == "going on from step 899 of 1000"
+    assert lines[-1].endswith(f"{in_words(6 * (1000 - int(lines[-1].split()[1])))} left")
+
+
+def test_what_takes_long_between_steps_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = lines_of([Working("fitting planes to the masks", 0, 1), step(7), *BUSY], 1.0, monkeypatch)
+    assert lines[0] == "step 0: fitting planes to the masks"
+    busy = [line for line in lines if "no view needs" in line]
+    assert len(busy) >= 3
+    assert all(re.fullmatch(r"step 7: looking for .* needs, \d+ of 40 done", line) for line in busy)
+
+
+def test_what_is_quick_between_steps_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert lines_of([step(1), *BUSY], 0.01, monkeypatch) == []
+
+
+def test_a_checkpoint_is_named_in_the_next_line_and_makes_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    messages: list[Message] = [CheckpointWritten(3), *(step(number) for number in range(4, 10))]
+    lines = lines_of(messages, 1.0, monkeypatch)
+    assert lines and all(line.endswith("left, saved at step 3") or "not known yet" in line for line in lines)
+
+
+def test_events_are_lines_but_for_frequent_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    actions = [ActionDone(5, name, COUNTS) for name in ("densify primary", "grow SH", "reset opacity")]
+    lines = lines_of([RunBegun(0, 1000, anew=True), StageEntered(0, "1 [stage]", COUNTS), *actions], 0.0, monkeypatch)
+    assert lines == [
+        "warning: an earlier run in this folder was begun and never saved; it is replaced",
+        "step 0: stage 1 [stage], 1000 primary, 20 glass, 1 planes",
+        "step 5: reset opacity",
+    ]
+
+
+def terminal(messages: list[Message], error: Exception | None = None) -> str:
+    """What a terminal is sent."""
+    file = io.StringIO()
+    console = Console(file=file, force_terminal=True, width=150, color_system=None)
+    try:
+        with TrainingProgress(console, 1000) as progress:
+            for message in messages:
+                progress.show(message)
+            if error is not None:
+                raise error
+    except ValueError:
+        pass
+    return file.getvalue()
+
+
+def test_an_error_before_the_first_step_stands_below_no_bar() -> None:
+    shown = terminal([Working("preparing the first scene", 0, 1)], ValueError("broken"))
+    assert shown == "preparing the first scene\n"
+
+
+def test_the_bar_shows_loss_count_work_and_checkpoint() -> None:
+    shown = terminal([step(499), CheckpointWritten(499), *BUSY[:13], step(500, 0.5)])
+    last = shown.rpartition("\x1b[2K")[2]
+    assert all(text in last for text in ("500/1000", "loss 0.2550", "1020 Gaussians", "saved at 499"))
+    assert "looking for Gaussians that no view needs 12/40" in terminal([step(499), *BUSY[:13]])
+
+
+def test_a_closed_terminal_does_not_hide_why_a_run_ends() -> None:
+    class Closed(io.StringIO):
+        is_closed = False
+
+        def write(self, text: str) -> int:
+            if self.is_closed:
+                raise OSError(5, "Input/output error")
+            return super().write(text)
+
+    file = Closed()
+    with (
+        pytest.raises(KeyboardInterrupt),
+        TrainingProgress(Console(file=file, force_terminal=True), 1000) as progress,
+    ):
+        progress.show(step(1))
+        file.is_closed = True
+        raise KeyboardInterrupt
+    file.is_closed = False
+
+
+def test_a_training_into_a_file_says_how_it_goes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training_progress, "FIRST_PAUSE", 0.0)
+    monkeypatch.setattr(training_progress, "LONGEST_PAUSE", 0.0)
+    capture = write_tiny_capture(tmp_path / "capture")
+    options = ["--data", str(capture), "--output", str(tmp_path / "run"), "--iterations", "20"]
+    assert main(["train", "splat", *options, "--checkpoint-every", "1e-9"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert re.search(r"step 20 of 20: loss 0\.\d+, \d+ Gaussians, 0 s left, saved at step 19", shown)
+
+
+@pytest.mark.parametrize("seconds", ["0", "-1", "nan"])
+def test_the_distance_of_checkpoints_is_positive(
+    seconds: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--data", str(SCENE), "--output", str(tmp_path / "run"), "--checkpoint-every", seconds]
+    assert main(["train", "splat", *options]) == 2
+    assert "--checkpoint-every is" in capsys.readouterr().err
+
+
+def test_durations_in_words() -> None:
+    assert (in_words(20), in_words(90), in_words(5400)) == ("20 s", "2 min", "1 h 30 min")

@@ -1,0 +1,175 @@
+"""What looks like a mirror is found, and is taken for one that faces as the depths say."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from glassplat.captures.view import CAMERA_FROM_PICTURE, FOLDER, View
+from glassplat.methods.mirrors import FACING, facing, made_mirrors, mirror_lookalikes, neighbours, seen_normals
+from glassplat.render.splat import Splat
+from glassplat.scene.activations import SH_ZERO
+from glassplat.scene.camera import Camera, rotation_from_quat
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Environment, Scene
+from glassplat.training.options import MirrorSearch
+from glassplat.training.points import as_discs
+from tests.training.brightened_views import brightened_views
+
+SIZE, GREY = 96, 0.4
+TILT_DEG = 35.0
+SEARCH = MirrorSearch()
+
+
+def slope(*, discs: bool = False) -> Scene:
+    """A grey wall of 24 x 24 Gaussians that leans back by `TILT_DEG`, each turned in a way of its own."""
+    generator = torch.Generator().manual_seed(0)
+    along = torch.linspace(-1, 1, 24)
+    x, y = torch.meshgrid(along, along, indexing="xy")
+    z = 4 + math.tan(math.radians(TILT_DEG)) * y
+    means = torch.stack([x, y, z], dim=-1).reshape(-1, 3)
+    count = len(means)
+    gaussians = Gaussians(
+        means=means,
+        quats=torch.randn(count, 4, generator=generator),
+        log_scales=torch.tensor([0.06, 0.06, 0.05]).log().repeat(count, 1),
+        logit_opacities=torch.full((count,), 1.0),
+        sh=torch.cat([torch.full((count, 1, 3), (GREY - 0.5) / SH_ZERO), torch.full((count, 3, 3), 0.05)], dim=1),
+        channels={"logit_strength": torch.full((count,), -7.0)},
+        active_sh_degree=1,
+    )
+    if discs:
+        gaussians = as_discs(gaussians)
+    return Scene(gaussians, 1.0, environment=Environment(torch.zeros(6, 2, 2, 3)))
+
+
+def camera() -> Camera:
+    return Camera(torch.eye(4), 120.0, 120.0, SIZE / 2, SIZE / 2, SIZE, SIZE)
+
+
+def views(*left: float) -> list[View]:
+    """Photographs of the wall, each with the left half brighter by so much."""
+    plain = slope()
+    with torch.no_grad():
+        base = Splat()(replace(plain, primary=replace(plain.primary, active_sh_degree=0)), camera()).rgb
+    return brightened_views(base, camera(), GREY, *left)
+
+
+def normal_axes(gaussians: Gaussians) -> Tensor:
+    """[N, 3] the shortest axis of ellipsoids."""
+    shortest = gaussians.log_scales.argmin(dim=1)
+    return rotation_from_quat(gaussians.quats).gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]
+
+
+def true_normal() -> Tensor:
+    tilt = math.radians(TILT_DEG)
+    return torch.tensor([0.0, math.sin(tilt), -math.cos(tilt)])
+
+
+def inner(scene: Scene) -> Tensor:
+    """[N] bool: what lies well inside of the wall."""
+    return scene.primary.means[:, :2].abs().amax(dim=1) < 0.6
+
+
+def test_what_looks_different_from_different_sides_looks_like_a_mirror() -> None:
+    scene = slope()
+    seen, found = mirror_lookalikes(SEARCH, scene, views(0.2, -0.2, 0.2, -0.2), Splat())
+    x = scene.primary.means[:, 0]
+    assert bool(seen.all()) and bool(found[x < -0.3].all()) and not bool(found[x > 0.3].any())
+
+
+def test_what_is_the_same_from_every_side_does_not_however_wrong_it_is() -> None:
+    assert not bool(mirror_lookalikes(SEARCH, slope(), views(0.2, 0.2, 0.2), Splat())[1].any())
+
+
+def test_mirrors_are_looked_for_in_the_region_and_where_something_is_seen() -> None:
+    scene = slope()
+    elsewhere = replace(scene, environment=replace(scene.environment, region=(9.0, 0.0, 0.0, 1.0)))
+    assert not bool(mirror_lookalikes(SEARCH, elsewhere, views(0.2, -0.2), Splat())[1].any())
+    behind = scene.with_parameters({"primary.means": scene.primary.means * torch.tensor([1.0, 1.0, -1.0])})
+    seen, found = mirror_lookalikes(SEARCH, behind, views(0.2, -0.2), Splat())
+    assert not bool(seen.any()) and not bool(found.any())
+
+
+@pytest.mark.parametrize("discs", [False, True])
+def test_depths_tell_which_way_a_surface_faces(discs: bool) -> None:
+    scene = slope(discs=discs)
+    with torch.no_grad():
+        sums = seen_normals(scene, views(0.0))[inner(scene)]
+    # A disc that is seen edge-on covers no pixel, and some hide behind others.
+    told = sums.norm(dim=1) > FACING
+    normals = normalize(sums[told], dim=1)
+    assert float(told.float().mean()) > 0.8
+    assert float((normals @ true_normal()).mean()) > math.cos(math.radians(4))
+
+
+@pytest.mark.parametrize("estimated", [True, False])
+def test_estimated_normals_say_it_before_depths_do(tmp_path: Path, estimated: bool) -> None:
+    scene, elsewhere = slope(), torch.tensor([0.6, 0.0, -0.8])
+    (tmp_path / FOLDER).mkdir()
+    in_picture = (elsewhere * torch.tensor(CAMERA_FROM_PICTURE)).expand(SIZE, SIZE, 3)
+    np.save(tmp_path / FOLDER / "0.npy", in_picture.numpy())
+    (view,) = views(0.0)
+    view = replace(view, image_path=tmp_path / "0.png")
+    chosen = inner(scene)
+    made = made_mirrors(replace(SEARCH, estimated_normals=estimated), scene, [view], chosen).select(chosen)
+    expected = elsewhere if estimated else true_normal()
+    assert float((normal_axes(made) @ expected).abs().min()) > math.cos(math.radians(8))
+
+
+def test_what_was_found_becomes_a_flat_mirror_and_nothing_else_changes() -> None:
+    scene = slope()
+    chosen = inner(scene) & (scene.primary.means[:, 0] < 0)
+    mirrors = made_mirrors(SEARCH, scene, views(0.0), chosen)
+    for name, tensor in mirrors.tensors().items():
+        assert torch.equal(tensor[~chosen], scene.primary.tensors()[name][~chosen]), name
+    found = mirrors.select(chosen)
+    assert float((normal_axes(found) @ true_normal()).abs().min()) > math.cos(math.radians(8))
+    assert torch.sigmoid(found.channels["logit_strength"]).tolist() == pytest.approx([0.73] * len(found))
+    assert bool((torch.sigmoid(found.logit_opacities) > 0.9 - 1e-6).all())
+    assert not bool(found.sh[:, 1:].any()) and torch.equal(found.sh[:, 0], scene.primary.sh[chosen, 0])
+    least, middle = found.log_scales.sort(dim=1).values[:, :2].unbind(1)
+    assert bool((least <= middle + math.log(0.37) + 1e-6).all())
+
+
+def test_a_normal_is_turned_on_the_shortest_way() -> None:
+    generator = torch.Generator().manual_seed(1)
+    gaussians = slope().primary
+    wanted = normalize(torch.randn(len(gaussians), 3, generator=generator), dim=1)
+    quats, _ = facing(gaussians, wanted, 0.0)
+    before, after = rotation_from_quat(gaussians.quats)[..., 2], rotation_from_quat(quats)[..., 2]
+    torch.testing.assert_close((after * wanted).sum(1).abs(), torch.ones(len(wanted)), atol=1e-5, rtol=0)
+    # No further than from one line to the other.
+    turn = (after * before).sum(1)
+    torch.testing.assert_close(turn, (before * wanted).sum(1).abs(), atol=1e-5, rtol=0)
+
+
+def test_a_normal_that_is_right_or_opposite_stays() -> None:
+    gaussians = slope().primary
+    now = normal_axes(gaussians)
+    for wanted in (now, -now):
+        quats, _ = facing(gaussians, wanted, 0.0)
+        torch.testing.assert_close(rotation_from_quat(quats), rotation_from_quat(gaussians.quats), atol=1e-5, rtol=0)
+
+
+def test_discs_are_turned_and_keep_their_size() -> None:
+    discs = slope(discs=True).primary
+    wanted = true_normal().expand(len(discs), 3)
+    quats, log_scales = facing(discs, wanted, -1.0)
+    assert torch.equal(log_scales, discs.log_scales)
+    cosines = (rotation_from_quat(quats)[..., 2] * wanted).sum(1).abs()
+    torch.testing.assert_close(cosines, torch.ones(len(discs)), atol=1e-5, rtol=0)
+
+
+def test_each_point_is_its_own_first_neighbour() -> None:
+    points = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [1.2, 0, 0]])
+    assert neighbours(points, 2).tolist() == [[0, 1], [1, 2], [2, 1]]
+    assert neighbours(points, 9).shape == (3, 3)
+    assert neighbours(points[:0], 4).shape[0] == 0

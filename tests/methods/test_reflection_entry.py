@@ -1,0 +1,117 @@
+"""Reflections begin: what is there to be mirrored, and what is taken for a mirror."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
+from glassplat.methods.mirrors import GrowShAfterPropagation
+from glassplat.methods.surroundings import AddEnvironment, AddSurroundings, BeginReflections
+from glassplat.render.splat import Splat
+from glassplat.scene.activations import logit
+from glassplat.scene.scene import Scene
+from glassplat.training.actions import GrowSh, ResetOpacity
+from glassplat.training.options import MirrorSearch, SurroundingsStart
+from glassplat.training.stage import TrainState
+from tests.training.progress_of import followed
+from tests.training.tiny_capture import tiny_capture
+
+Found = Callable[..., tuple[Tensor, Tensor]]
+"""Stands in for `mirror_lookalikes`."""
+
+
+def every_3rd(options: MirrorSearch, scene: Scene, views: object, renderer: object) -> tuple[Tensor, Tensor]:
+    """Takes every third Gaussian for a mirror."""
+    rows = torch.arange(len(scene.primary))
+    return torch.ones_like(rows, dtype=torch.bool), rows % 3 == 0
+
+
+def nothing(options: MirrorSearch, scene: Scene, views: object, renderer: object) -> tuple[Tensor, Tensor]:
+    """Finds no mirror."""
+    seen = torch.ones(len(scene.primary), dtype=torch.bool)
+    return seen, torch.zeros_like(seen)
+
+
+def begun(
+    found: Found,
+    search: MirrorSearch | None = None,
+    *,
+    near: bool = True,
+    harmonics_wait: bool = False,
+) -> tuple[TrainState, list[str]]:
+    """A state in which reflections have begun, and what was told on the way."""
+    state = TrainState(TracedRecipe(sh_degree=1).initialise(tiny_capture()), seed=0)
+    state.scene = replace(state.scene, primary=replace(state.scene.primary, active_sh_degree=1))
+    ones = {name: torch.ones_like(tensor) for name, tensor in state.scene.primary.tensors().items()}
+    state.optimizer.moments = {f"primary.{name}": (tensor, tensor.clone()) for name, tensor in ones.items()}
+    around = AddSurroundings(SurroundingsStart("scene"), 1) if near else None
+    entry = BeginReflections(AddEnvironment(2), around, search or MirrorSearch(), Splat(), harmonics_wait)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("glassplat.methods.surroundings.mirror_lookalikes", found)
+        messages, _ = followed(entry(state, tiny_capture()))
+    return state, [message.what for message in messages]
+
+
+def test_what_looks_like_a_mirror_becomes_one_and_the_rest_is_what_it_mirrors() -> None:
+    state, told = begun(every_3rd)
+    count = len(state.scene.primary)
+    chosen = torch.arange(count) % 3 == 0
+    strengths = torch.sigmoid(state.scene.primary.channels["logit_strength"])
+    assert strengths[chosen].tolist() == pytest.approx([0.73] * int(chosen.sum()))
+    assert strengths[~chosen].max() < 0.01
+    assert len(state.scene.surroundings) == int((~chosen).sum())
+    assert not state.scene.environment.is_empty and told == ["looking for mirrors"]
+    for name, (first, second) in state.optimizer.moments.items():
+        for moment in (first, second):
+            assert not bool(moment[chosen].any()) and bool((moment[~chosen] == 1).all()), name
+
+
+def test_the_papers_start_from_hardly_any_reflection() -> None:
+    state, _ = begun(every_3rd, MirrorSearch(begin_found=False))
+    assert float(state.scene.primary.channels["logit_strength"].max()) < logit(0.01)
+    assert all(bool((first == 1).all()) for first, _ in state.optimizer.moments.values())
+    # What looks like a mirror is not copied, all the same.
+    assert len(state.scene.surroundings) < len(state.scene.primary)
+
+
+def test_without_anything_near_and_without_a_search_no_mirrors_are_looked_for() -> None:
+    state, told = begun(every_3rd, MirrorSearch(begin_found=False), near=False)
+    assert told == [] and not state.scene.environment.is_empty and not len(state.scene.surroundings)
+
+
+@pytest.mark.parametrize("recipe", [DeferredRecipe(), TracedRecipe(), DeferredRecipe.paper(), TracedRecipe.paper()])
+def test_before_mirrors_are_searched_for_a_scene_is_learned_as_by_splat(recipe: DeferredRecipe | TracedRecipe) -> None:
+    for search in (MirrorSearch(), MirrorSearch(begin_found=False)):
+        bootstrap = replace(recipe, search=search, least_iterations=1).stages(0, 7000)[0]
+        kinds = {type(action) for action in bootstrap.actions}
+        assert ({GrowSh, ResetOpacity} <= kinds) == search.begin_found
+        hurried = bootstrap.rates["primary.means"].short_run_power > 0
+        assert hurried == (search.begin_found and recipe.hurry_matte)
+
+
+@pytest.mark.parametrize("kind", [DeferredRecipe, TracedRecipe])
+def test_mirrors_are_searched_for_but_not_in_the_papers(kind: type[DeferredRecipe | TracedRecipe]) -> None:
+    assert kind().search.begin_found and not kind.paper().search.begin_found
+
+
+@pytest.mark.parametrize(
+    ("found", "begin_found", "degree"), [(every_3rd, True, 0), (nothing, True, 1), (every_3rd, False, 1)]
+)
+def test_what_colors_have_learnt_of_mirrors_is_left_out_if_there_are_any(
+    found: Found, begin_found: bool, degree: int
+) -> None:
+    state, _ = begun(found, MirrorSearch(begin_found=begin_found), harmonics_wait=True)
+    assert state.scene.primary.active_sh_degree == degree
+    assert begun(found, MirrorSearch(begin_found=begin_found))[0].scene.primary.active_sh_degree == 1
+
+
+@pytest.mark.parametrize("recipe", [DeferredRecipe(), TracedRecipe()])
+def test_colors_wait_until_normals_have_spread(recipe: DeferredRecipe | TracedRecipe) -> None:
+    stage = recipe.stages(0, 7000)[1]
+    assert isinstance(stage.entry, BeginReflections) and stage.entry.harmonics_wait
+    assert any(isinstance(action, GrowShAfterPropagation) for action in stage.actions)

@@ -1,0 +1,88 @@
+"""What reflects, and what looks as if it should, as shares of what the views show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from glassplat.captures.view import View
+from glassplat.methods.mirrors import Search, evenly, in_region, residual_spreads
+from glassplat.render.deferred import Deferred
+from glassplat.render.layers import contributions
+from glassplat.scene.activations import SH_ZERO, logit
+from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Environment, Scene
+from tests.training.brightened_views import brightened_views
+
+SIZE = 24
+GREY = 0.5
+
+
+def two_discs(*, strength: float = 1e-3) -> Scene:
+    """Opaque grey Gaussians left and right of the z axis, the left one of this strength."""
+    gaussians = Gaussians(
+        means=torch.tensor([[-0.5, 0.0, 2.0], [0.5, 0.0, 2.0]]),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(2, 1),
+        log_scales=torch.tensor([[0.15, 0.15, 0.01]]).log().repeat(2, 1),
+        logit_opacities=torch.tensor([6.0, 6.0]),
+        sh=torch.full((2, 1, 3), (GREY - 0.5) / SH_ZERO),
+        channels={"logit_strength": torch.tensor([logit(strength), logit(1e-3)])},
+    )
+    environment = Environment(torch.zeros(6, 2, 2, 3), region=(0.0, 0.0, 2.0, 1.0))
+    return Scene(gaussians, 1.0, environment=environment)
+
+
+def camera() -> Camera:
+    return Camera(torch.eye(4), 20.0, 20.0, SIZE / 2, SIZE / 2, SIZE, SIZE)
+
+
+def views(*left: float) -> list[View]:
+    """Photographs of the discs, each with the left half brighter by so much."""
+    with torch.no_grad():
+        base = Deferred()(two_discs(), camera()).layers["base"]
+    return brightened_views(base, camera(), GREY, *left)
+
+
+@pytest.mark.parametrize("strength", [1e-3, 0.1, 0.5, 0.9])
+def test_what_reflects_counts_by_its_strength_and_by_what_is_seen_of_it(strength: float) -> None:
+    share = Search().reflective(two_discs(strength=strength), views(0, 0))
+    assert share == pytest.approx((strength + 1e-3) / 2, abs=1e-3)
+
+
+def test_what_lies_elsewhere_does_not_count() -> None:
+    scene = two_discs(strength=0.9)
+    scene = replace(scene, environment=replace(scene.environment, region=(-0.5, 0.0, 2.0, 0.3)))
+    assert in_region(scene).tolist() == [True, False]
+    assert Search().reflective(scene, views(0)) == pytest.approx(0.9, abs=1e-3)
+    everywhere = replace(scene, environment=replace(scene.environment, region=None))
+    assert Search().reflective(everywhere, views(0)) == pytest.approx(0.45, abs=1e-3)
+    nowhere = replace(scene, environment=replace(scene.environment, region=(0.0, 0.0, 9.0, 0.3)))
+    assert Search().reflective(nowhere, views(0)) == 0.0
+
+
+def test_a_residual_that_is_the_same_in_all_views_does_not_turn() -> None:
+    shown, spreads = residual_spreads(two_discs(), views(0.3, 0.3, 0.3, 0.3), Deferred())
+    torch.testing.assert_close(shown, 4 * contributions(two_discs(), camera()))
+    assert spreads.max() < 0.01
+    assert Search().turning(two_discs(), views(0.3, 0.3), Deferred()) == 0.0
+
+
+def test_a_residual_that_turns_has_the_spread_of_the_photographs() -> None:
+    _, spreads = residual_spreads(two_discs(), views(0.2, -0.2, 0.2, -0.2), Deferred())
+    # A Gaussian's own weights fall off as its colour in the picture does, so that it sees their weighted square.
+    assert 0.08 < float(spreads[0]) < 0.2
+    assert float(spreads[1]) < 0.01
+
+
+def test_only_what_does_not_reflect_yet_can_be_overlooked() -> None:
+    turning = views(0.3, -0.3, 0.3, -0.3)
+    assert Search().turning(two_discs(), turning, Deferred()) == pytest.approx(0.5, abs=1e-3)
+    assert Search().turning(two_discs(strength=0.9), turning, Deferred()) == 0.0
+
+
+def test_views_are_taken_evenly() -> None:
+    assert [view.name for view in evenly(views(*([0.0] * 9)), 3)] == ["0.png", "3.png", "6.png"]
+    assert len(evenly(views(0.0), 3)) == 1

@@ -1,0 +1,159 @@
+"""Models: loaded, rendered, edited and saved."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+import glassplat
+from glassplat import Camera, Gaussians, InputError, Model, Planar, PlanarRecipe, Scene, SplatRecipe
+from tests.cli.tiny_run import write_run
+from tests.training.tiny_capture import tiny_capture, true_scene
+
+LABEL = 1
+
+
+def model() -> Model:
+    cameras = {view.name: view.camera for view in tiny_capture().train}
+    return Model(true_scene(), PlanarRecipe(background=(0.0, 0.0, 0.0)), cameras, "tiny")
+
+
+def bare() -> Model:
+    scene = true_scene()
+    primary = dataclasses.replace(scene.primary, channels={})
+    return Model(Scene(primary, scene.extent), SplatRecipe(), model().cameras, "bare")
+
+
+def test_a_run_is_loaded_and_rendered_as_its_renderer_does(tmp_path: Path) -> None:
+    loaded = glassplat.load(write_run(tmp_path / "run"), device="cpu")
+    assert repr(loaded) == "Model('run': planar, 30 Gaussians, 1 pane, 6 cameras)"
+    assert (loaded.panes, loaded.layers[0], loaded.path) == ((LABEL,), "rgb", tmp_path / "run")
+    frame = loaded.render("2.png", layers=["reflection", "depth"])
+    torch.testing.assert_close(frame.rgb, Planar()(true_scene(), loaded.cameras["2.png"]).rgb)
+    assert {"reflection", "depth"} <= set(frame.layers)
+
+
+def test_gradients_reach_the_scene_and_the_camera() -> None:
+    whole = model()
+    camera = whole.cameras["2.png"]
+    pose = camera.cam_from_world.clone().requires_grad_()
+    logits = whole.scene.planes.logit_reflectances.clone().requires_grad_()
+    colors = whole.scene.primary.sh.clone().requires_grad_()
+    edited = whole.with_parameters({"planes.logit_reflectances": logits, "primary.sh": colors})
+    edited.render(dataclasses.replace(camera, cam_from_world=pose)).rgb.sum().backward()
+    for tensor in (pose, logits, colors):
+        assert tensor.grad is not None and float(tensor.grad.abs().sum()) > 0
+
+
+def test_every_layer_is_an_image(tmp_path: Path) -> None:
+    whole = model()
+    for layer in whole.layers:
+        image = whole.image("2.png", layer)
+        assert image.shape == (28, 40, 3) and not image.requires_grad
+        assert 0 <= float(image.min()) <= float(image.max()) <= 1
+    with pytest.raises(InputError, match=r"planar renders no layer base; expected .*reflection"):
+        whole.image("2.png", "base")
+    with pytest.raises(KeyError, match="nobody"):
+        whole.render("nobody.png")
+
+
+def test_edits_are_new_models() -> None:
+    whole = model()
+    before = whole.image("2.png", "strength")
+    mirror, without = whole.with_mirrors(LABEL), whole.without_glass()
+    assert float(mirror.image("2.png", "strength").mean()) > 1.5 * float(before.mean())
+    assert without.panes == () and torch.equal(without.image("2.png"), whole.without_pane(LABEL).image("2.png"))
+    assert float(whole.with_reflectance(LABEL, 0.01).image("2.png", "strength").mean()) < float(before.mean())
+    moved = whole.shifted(LABEL, 0.1).tilted(LABEL, 5.0)
+    assert not torch.equal(moved.scene.planes.centers, whole.scene.planes.centers)
+    assert not torch.equal(moved.scene.planes.normals, whole.scene.planes.normals)
+    assert torch.equal(whole.image("2.png", "strength"), before)
+    with pytest.raises(ValueError, match="no pane 7"):
+        whole.without_pane(7)
+
+
+def test_one_pane_of_two_is_taken_out_with_its_glass() -> None:
+    two = model().with_pane((3.0, 0.0, 2.0), (0.0, 0.0, 1.0), (0.5, 0.4))
+    assert two.panes == (1, 2) and len(two.scene.glass) > len(model().scene.glass)
+    back = two.without_pane(2)
+    assert back.panes == (1,) and torch.equal(back.scene.glass.means, model().scene.glass.means)
+
+
+def test_a_mirror_in_a_scene_that_knew_no_panes_shows_what_is_before_it() -> None:
+    plain = bare()
+    mirror = plain.with_pane((0.0, 0.0, 1.5), (0.0, 0.0, -1.0), (2.0, 2.0), base_reflectance=1)
+    assert mirror.recipe.method == "planar" and mirror.scene.planes.mirrors == (1,)
+    strength, reflection = (mirror.image("2.png", layer) for layer in ("strength", "reflection"))
+    assert float(strength.mean()) > 0.8 and float(reflection.std()) > 0.01
+    discs = plain.with_scene(true_scene())
+    discs = dataclasses.replace(discs, recipe=SplatRecipe(primitive="disc"))
+    with pytest.raises(ValueError, match="panes cannot be put into a scene of splat"):
+        discs.with_pane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("normal", "half_sizes", "tangent", "message"),
+    [
+        ((0.0, 0.0, 0.0), (1.0, 1.0), None, "expected two directions"),
+        ((0.0, 0.0, 1.0), (1.0, 0.0), None, "sizes above 0"),
+        ((0.0, 0.0, float("nan")), (1.0, 1.0), None, "expected finite numbers"),
+        ((0.0, 0.0, 1.0), (1.0, 1.0), (0.0, 0.0, 3.0), "expected two directions"),
+        ((0.0, 1.0), (1.0, 1.0), None, "expected 3, 3, 3 and 2"),
+    ],
+)
+def test_a_pane_that_is_none_is_refused(normal: tuple, half_sizes: tuple, tangent: tuple | None, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        model().with_pane((0.0, 0.0, 0.0), normal, half_sizes, tangent=tangent)
+
+
+@pytest.mark.parametrize(("name", "tolerance"), [("a.ply", 1e-6), ("a.spz", 0.1), ("folder", 0.0)])
+def test_what_is_saved_is_loaded_again(name: str, tolerance: float, tmp_path: Path) -> None:
+    whole = model()
+    path = whole.save(tmp_path / "out" / name)
+    again = glassplat.load(path, device="cpu")
+    assert list(again.cameras) == list(whole.cameras) and again.panes == whole.panes
+    torch.testing.assert_close(again.image("2.png"), whole.image("2.png"), atol=tolerance, rtol=0)
+    with pytest.raises(FileExistsError, match="nothing was written"):
+        whole.save(path)
+
+
+def test_panes_of_what_was_there_are_not_taken_over(tmp_path: Path) -> None:
+    model().save(tmp_path / "a.ply")
+    with pytest.raises(FileExistsError, match=r"planes\.json"):
+        bare().save(tmp_path / "b.ply")
+    bare().save(tmp_path / "b.ply", overwrite=True)
+    assert glassplat.load(tmp_path / "b.ply", device="cpu").panes == ()
+
+
+def test_a_model_is_saved_as_a_page_and_as_nothing_unknown(tmp_path: Path) -> None:
+    assert "<html" in model().save(tmp_path / "page.html").read_text()[:200]
+    with pytest.raises(InputError, match=r"expected a name that ends in \.ply, .*\.html, or a folder's"):
+        model().save(tmp_path / "a.obj")
+
+
+@pytest.mark.parametrize("name", ["none", "none.ply"])
+def test_what_is_not_there_is_named(name: str, tmp_path: Path) -> None:
+    with pytest.raises((InputError, FileNotFoundError), match=name):
+        glassplat.load(tmp_path / name)
+
+
+def test_a_camera_looks_where_it_should() -> None:
+    camera = Camera.look_at((0, -1, -4), (0, 0, 0), up=(0, -1, 0), width=64, height=48)
+    pixel, depth = camera.project(torch.tensor([[0.0, 0.0, 0.0], [0.0, -0.5, 0.0], [0.5, 0.0, 0.0]]))
+    torch.testing.assert_close(pixel[0], torch.tensor([32.0, 24.0]), atol=1e-4, rtol=0)
+    assert float(depth[0]) == pytest.approx(17**0.5)
+    assert float(pixel[1, 1]) < 24 and float(pixel[2, 0]) > 32
+    with pytest.raises(ValueError, match="expected another place"):
+        Camera.look_at((0, 0, 0), (0, 1, 0), up=(0, -1, 0))
+
+
+def test_metrics_are_those_of_the_test_views() -> None:
+    assert model().evaluate(tiny_capture())["psnr"] > 40
+
+
+def test_gaussians_of_a_model_are_plain_data() -> None:
+    primary = model().scene.primary
+    assert isinstance(primary, Gaussians) and len(primary.joined(primary)) == 2 * len(primary)

@@ -1,0 +1,309 @@
+"""A whole run: interrupted, resumed, and the files it leaves."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+import resource
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from glassplat.captures.dataset import load_dataset
+from glassplat.errors import InputError
+from glassplat.methods.planar_recipe import PlanarRecipe, ReflectionWeights
+from glassplat.methods.recipe import recipe_from_json, recipe_to_json
+from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.model.run_directory import RunDirectory, RunSettings
+from glassplat.model.training import run_training
+from glassplat.panes.options import PlaneFitError
+from glassplat.scene.scene import Scene
+from glassplat.training.checkpoint import load_checkpoint, recorded_seconds, save_checkpoint
+from glassplat.training.messages import CheckpointWritten, Message, RunBegun, StepDone, Working
+from tests.training.tiny_capture import tiny_capture, write_tiny_capture
+
+SETTINGS = RunSettings("tiny", iterations=12)
+RECIPE = SplatRecipe(sh_degree=1)
+
+
+def run(
+    path: Path,
+    *,
+    resume: bool = False,
+    interrupt_at: int | None = None,
+    by: signal.Signals = signal.SIGINT,
+    heard: list[Message] | None = None,
+    checkpoint_every: float = math.inf,
+) -> Any:
+    def listen(message: Message) -> None:
+        if heard is not None:
+            heard.append(message)
+        if isinstance(message, StepDone) and message.step == interrupt_at:
+            signal.raise_signal(by)
+
+    return run_training(
+        RECIPE,
+        SETTINGS,
+        RunDirectory(path),
+        tiny_capture(),
+        resume=resume,
+        listen=listen,
+        checkpoint_every=checkpoint_every,
+    )
+
+
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_an_interrupted_run_resumes_to_the_same_scene(tmp_path: Path, by: signal.Signals) -> None:
+    before = signal.getsignal(by)
+    whole = run(tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "stopped", interrupt_at=5, by=by)
+    assert load_checkpoint(RunDirectory(tmp_path / "stopped").checkpoint).step == 5
+    resumed = run(tmp_path / "stopped", resume=True)
+    assert_same(whole.scene, resumed.scene)
+    assert signal.getsignal(by) is before
+
+
+def assert_same(first: Scene, second: Scene) -> None:
+    for name, tensor in first.parameters().items():
+        assert torch.equal(tensor, second.parameters()[name]), name
+
+
+def test_a_hang_up_that_is_ignored_stays_ignored(tmp_path: Path) -> None:
+    previous = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert run(tmp_path, interrupt_at=5, by=signal.SIGHUP).step == 12
+    finally:
+        signal.signal(signal.SIGHUP, previous)
+
+
+def test_a_run_in_another_thread_cannot_be_asked_but_trains(tmp_path: Path) -> None:
+    states: list[Any] = []
+    thread = threading.Thread(target=lambda: states.append(run(tmp_path)))
+    thread.start()
+    thread.join()
+    assert [state.step for state in states] == [12]
+
+
+@pytest.mark.parametrize("gone", [OSError(errno.EIO, "Input/output error"), SystemExit(1), KeyboardInterrupt()])
+@pytest.mark.parametrize("asked", [False, True])
+def test_nothing_is_lost_when_nobody_is_there_to_hear_it(gone: BaseException, asked: bool, tmp_path: Path) -> None:
+    """As when a terminal is closed, or `train | head` has seen enough."""
+
+    def listen(message: Message) -> None:
+        if isinstance(message, StepDone) and message.step == 7:
+            if asked:
+                signal.raise_signal(signal.SIGHUP)
+            raise gone
+
+    directory = RunDirectory(tmp_path)
+    with pytest.raises(KeyboardInterrupt if asked and isinstance(gone, OSError) else type(gone)):
+        run_training(RECIPE, SETTINGS, directory, tiny_capture(), resume=False, listen=listen)
+    assert load_checkpoint(directory.checkpoint).step == 7
+    assert_same(run(tmp_path, resume=True).scene, run(tmp_path / "whole").scene)
+
+
+def test_checkpoints_come_by_time_and_are_told(tmp_path: Path) -> None:
+    often: list[Message] = []
+    run(tmp_path / "often", checkpoint_every=1e-9, heard=often)
+    assert [m.step for m in often if isinstance(m, CheckpointWritten)] == list(range(1, 13))
+    once: list[Message] = []
+    run(tmp_path / "once", heard=once)
+    assert [m.step for m in once if isinstance(m, CheckpointWritten)] == [12]
+    log = RunDirectory(tmp_path / "once").log.read_text()
+    assert '"CheckpointWritten"' in log and '"Working"' not in log
+
+
+def test_a_run_says_from_where_it_goes_on(tmp_path: Path) -> None:
+    heard: list[Message] = []
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, interrupt_at=5, heard=heard)
+    assert isinstance(heard[0], Working) and heard[1] == RunBegun(0, 12)
+    heard.clear()
+    run(tmp_path, resume=True, heard=heard)
+    assert heard[0] == RunBegun(5, 12)
+    assert min(message.step for message in heard if isinstance(message, StepDone)) == 6
+
+
+@pytest.mark.parametrize("tail", [b'{"message": "StepDone", "st', b"\0" * 4000, b"[" * 9000, b"\xff\xfe\n[]\n7\n{}\n"])
+def test_a_log_that_ends_in_the_middle_is_cut_and_goes_on(tail: bytes, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, interrupt_at=11)
+    log = RunDirectory(tmp_path).log
+    log.write_bytes(log.read_bytes() + tail)
+    run(tmp_path, resume=True)
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [line["step"] for line in lines if line["message"] == "StepDone"] == [10]
+    assert [line["step"] for line in lines if line["message"] == "RunBegun"] == [0, 11]
+
+
+@contextmanager
+def no_room_beyond(size: int) -> Iterator[None]:
+    """Lets no file grow beyond a size, as a disk that is full."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, handler)
+
+
+def test_a_full_disk_leaves_the_last_checkpoint(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, interrupt_at=5)
+    directory = RunDirectory(tmp_path)
+    before = directory.checkpoint.read_bytes()
+    room = max(directory.log.stat().st_size + 4000, len(before) // 2)
+    assert room < len(before)
+    with no_room_beyond(room), pytest.raises(OSError, match="could not write"):
+        run(tmp_path, resume=True)
+    assert directory.checkpoint.read_bytes() == before
+    assert not list(tmp_path.glob("*.tmp*"))
+    assert_same(run(tmp_path, resume=True).scene, run(tmp_path / "whole").scene)
+
+
+def test_a_disk_too_full_for_the_log_is_told(tmp_path: Path) -> None:
+    with no_room_beyond(0), pytest.raises(OSError, match="could not write"):
+        run(tmp_path)
+
+
+def test_nothing_saved_is_nothing_to_go_on_from(tmp_path: Path) -> None:
+    directory, heard = RunDirectory(tmp_path / "run"), list[Message]()
+    with pytest.raises(InputError, match=r"nothing was saved yet in .*; begin again without --resume"):
+        run(directory.path, resume=True)
+    assert not directory.path.exists()
+    directory.begin(RECIPE, SETTINGS, tiny_capture())
+    with pytest.raises(InputError, match="begin again without --resume"):
+        run(directory.path, resume=True)
+    run(directory.path, heard=heard)
+    assert RunBegun(0, 12, anew=True) in heard
+    directory.checkpoint.unlink()
+    with pytest.raises(InputError, match="holds a trained scene, but no checkpoint"):
+        run(directory.path, resume=True)
+    with pytest.raises(InputError, match="already holds a trained scene"):
+        run(directory.path)
+
+
+@pytest.mark.parametrize(
+    "name", ["cameras.json", "settings.json", "recipe.json", "index.html", "results.json", "point_cloud/iteration_7/x"]
+)
+def test_files_of_somebody_else_are_not_overwritten(name: str, tmp_path: Path) -> None:
+    file = tmp_path / name
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text("{}")
+    with pytest.raises(InputError, match="choose another --output"):
+        run(tmp_path)
+    assert file.read_text() == "{}"
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [file]
+
+
+def test_two_trainings_do_not_share_a_folder(tmp_path: Path) -> None:
+    refused: list[str] = []
+
+    def listen(message: Message) -> None:
+        if isinstance(message, StepDone) and message.step == 3:
+            for resume in (False, True):
+                with pytest.raises(InputError) as caught:
+                    run(tmp_path, resume=resume)
+                refused.append(str(caught.value))
+
+    run_training(RECIPE, SETTINGS, RunDirectory(tmp_path), tiny_capture(), resume=False, listen=listen)
+    assert len(refused) == 2 and all("another training is writing into" in text for text in refused)
+
+
+def test_a_run_too_short_for_its_stages_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    settings = replace(SETTINGS, iterations=6)
+    with pytest.raises(InputError, match=r"6 iterations leave no room for the stage '2 .*'; expected at least 8"):
+        run_training(
+            PlanarRecipe(), settings, RunDirectory(tmp_path / "run"), tiny_capture(), resume=False, listen=print
+        )
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_scene_that_cannot_be_begun_leaves_no_folder(tmp_path: Path) -> None:
+    bare = replace(tiny_capture(), pane_labels=())
+    with pytest.raises(PlaneFitError, match="needs to know where the panes are"):
+        run_training(PlanarRecipe(), SETTINGS, RunDirectory(tmp_path / "run"), bare, resume=False, listen=print)
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_log_has_every_tenth_step_once(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, interrupt_at=11)
+    run(tmp_path, resume=True)
+    lines = [json.loads(line) for line in RunDirectory(tmp_path).log.read_text().splitlines()]
+    assert [line["step"] for line in lines if line["message"] == "StepDone"] == [10]
+
+
+def test_the_training_time_is_read_without_the_tensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    state = run(tmp_path)
+    monkeypatch.setattr("glassplat.training.checkpoint.restored_state", None)
+    assert recorded_seconds(RunDirectory(tmp_path).checkpoint) == state.seconds > 0
+
+
+@pytest.mark.parametrize("content", [b"", b"no checkpoint at all"])
+def test_the_time_of_a_broken_checkpoint_is_not_guessed(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "broken").write_bytes(content)
+    with pytest.raises(InputError, match="truncated or not a checkpoint"):
+        recorded_seconds(tmp_path / "broken")
+
+
+def test_the_exported_scene_is_the_trained_one(tmp_path: Path) -> None:
+    state = run(tmp_path)
+    scene, iterations = RunDirectory(tmp_path).latest_scene()
+    assert iterations == 12
+    assert scene.extent == state.scene.extent
+    for name, tensor in state.scene.primary.tensors().items():
+        assert torch.equal(tensor, scene.primary.tensors()[name]), name
+
+
+def test_a_broken_test_photograph_ends_a_run_at_the_start(tmp_path: Path) -> None:
+    dataset = load_dataset(write_tiny_capture(tmp_path / "capture"))
+    path = dataset.test[0].image_path
+    os.truncate(path, path.stat().st_size // 2)
+
+    def listen(message: Message) -> None:
+        assert not isinstance(message, StepDone) or message.step < 2000, "the photograph was not found"
+
+    with pytest.raises(InputError, match=path.name):
+        run_training(
+            RECIPE, RunSettings("", 10**6), RunDirectory(tmp_path / "run"), dataset, resume=False, listen=listen
+        )
+
+
+def test_the_checkpoint_of_another_method_is_not_gone_on_with(tmp_path: Path) -> None:
+    run(tmp_path)
+    state = load_checkpoint(RunDirectory(tmp_path).checkpoint)
+    for changed, message in (
+        (replace(state, method="planar"), "is a checkpoint of planar; expected one of splat"),
+        (replace(state, step=13), "is of step 13; expected one of at most 12"),
+        (replace(state, seed=1), "is of a run with the seed 1; expected 0"),
+    ):
+        save_checkpoint(RunDirectory(tmp_path).checkpoint, changed)
+        with pytest.raises(InputError, match=message):
+            run(tmp_path, resume=True)
+
+
+@pytest.mark.parametrize(
+    "recipe", [RECIPE, PlanarRecipe(fresnel="none", weights=ReflectionWeights(depth=0.0), background=(1.0, 1.0, 1.0))]
+)
+def test_a_recipe_survives_its_file(recipe: Any) -> None:
+    assert recipe_from_json(recipe_to_json(recipe)) == recipe
+    assert recipe_from_json(recipe_to_json(recipe)) != replace(recipe, sh_degree=0)
+
+
+def test_a_recipe_with_a_choice_that_there_is_no_more_is_refused() -> None:
+    text = recipe_to_json(PlanarRecipe()).replace('"fresnel": "pane"', '"fresnel": true')
+    with pytest.raises(InputError, match="fresnel is True; expected one of pane, schlick, none"):
+        recipe_from_json(text)

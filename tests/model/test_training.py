@@ -1,0 +1,104 @@
+"""Training from Python: message by message, in memory and in a run's directory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import glassplat
+from glassplat import Frame, InputError, LossTerm, Scene, SplatRecipe, Stage, StepDone, Training, View
+from tests.training.tiny_capture import tiny_capture
+
+RECIPE = SplatRecipe(sh_degree=1)
+
+
+def steps(training: Training) -> list[int]:
+    return [message.step for message in training if isinstance(message, StepDone)]
+
+
+def test_a_training_in_memory_can_be_watched_and_gone_on_with() -> None:
+    training = Training(tiny_capture(), RECIPE, iterations=6, device="cpu")
+    assert training.step == 0
+    with pytest.raises(RuntimeError, match="has not begun"):
+        _ = training.model
+    images = []
+    for message in training:
+        if isinstance(message, StepDone):
+            images.append(training.model.image("2.png"))
+            if message.step == 3:
+                break
+    assert not torch.equal(images[0], images[2])
+    assert (training.step, steps(training), training.step) == (3, [4, 5, 6], 6)
+    with pytest.raises(RuntimeError, match="no output"):
+        training.save()
+
+
+def test_the_same_run_in_memory_and_in_a_directory(tmp_path: Path) -> None:
+    inside = Training(tiny_capture(), RECIPE, iterations=5, device="cpu").run()
+    heard: list[object] = []
+    outside = Training(tiny_capture(), RECIPE, iterations=5, device="cpu", output=tmp_path / "run").run(heard.append)
+    assert torch.equal(inside.scene.primary.means, outside.scene.primary.means)
+    assert torch.equal(glassplat.load(tmp_path / "run", device="cpu").image("2.png"), outside.image("2.png"))
+    assert [type(message).__name__ for message in heard[:3]] == ["Working", "RunBegun", "StageEntered"]
+
+
+def test_who_leaves_the_loop_can_go_on_where_it_was_left(tmp_path: Path) -> None:
+    def training(**options: bool) -> Training:
+        return Training(tiny_capture(), RECIPE, iterations=6, device="cpu", output=tmp_path / "run", **options)
+
+    begun = training()
+    for message in begun:
+        if isinstance(message, StepDone) and message.step == 2:
+            break
+    assert steps(training(resume=True)) == [3, 4, 5, 6]
+    whole = Training(tiny_capture(), RECIPE, iterations=6, device="cpu").run()
+    assert torch.equal(glassplat.load(tmp_path / "run", device="cpu").scene.primary.means, whole.scene.primary.means)
+    with pytest.raises(InputError, match="already holds a run"):
+        training()
+
+
+def test_a_scene_is_saved_in_the_middle_of_a_run(tmp_path: Path) -> None:
+    training = Training(tiny_capture(), RECIPE, iterations=4, device="cpu", output=tmp_path / "run")
+    for message in training:
+        if isinstance(message, StepDone) and message.step == 2:
+            training.save()
+            saved = glassplat.load(tmp_path / "run", device="cpu")
+            assert torch.equal(saved.scene.primary.means, training.model.scene.primary.means)
+    assert (tmp_path / "run" / "point_cloud" / "iteration_4").is_dir()
+
+
+@dataclass(frozen=True)
+class Brighter(SplatRecipe):
+    """One more term, and all else as it is."""
+
+    def stages(self, seed: int, iterations: int = 30_000) -> tuple[Stage, ...]:
+        term = LossTerm("brightness", 10.0, brightness)
+        return tuple(replace(stage, losses=(*stage.losses, term)) for stage in super().stages(seed, iterations))
+
+
+def brightness(frame: Frame, view: View, scene: Scene) -> torch.Tensor:
+    return (1 - frame.rgb).square().mean()
+
+
+def test_a_recipe_of_ones_own_is_trained() -> None:
+    losses = []
+    for message in Training(tiny_capture(), Brighter(), iterations=4, device="cpu"):
+        if isinstance(message, StepDone):
+            losses.append(message.losses)
+    assert all("brightness" in terms for terms in losses)
+    assert losses[-1]["brightness"] < losses[0]["brightness"]
+
+
+def test_what_cannot_be_trained_is_refused_at_once(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no method is called 'nerf'; expected splat, planar"):
+        Training(tiny_capture(), "nerf")
+    with pytest.raises(InputError, match="expected at least"):
+        Training(tiny_capture(), "planar", iterations=2)
+    with pytest.raises(InputError, match="needs the output"):
+        Training(tiny_capture(), "splat", resume=True)
+    (tmp_path / "file").touch()
+    with pytest.raises(NotADirectoryError):
+        Training(tiny_capture(), "splat", output=tmp_path / "file")

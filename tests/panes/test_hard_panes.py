@@ -1,0 +1,150 @@
+"""Planes of panes that are hard to measure: few, ragged or oversized masks, bare frames, steep views, cut outlines."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from glassplat.panes.fit import fit_planes
+from glassplat.panes.options import PlaneFit, PlaneFitError
+from glassplat.scene.camera import Camera, rotation_from_quat
+from tests.panes.pane_scene import (
+    EYES,
+    FRONT,
+    Annotations,
+    Pane,
+    camera_from,
+    covers,
+    frame_and_clutter,
+    framed_scene_of,
+    label_image,
+    normal_error,
+    offset_error,
+    ragged,
+    scene_of,
+)
+
+QUICK = PlaneFit(hypotheses=300, refined=2)
+EXTENT = 3.0
+POINTS = frame_and_clutter([FRONT])
+BARE = frame_and_clutter([])
+
+
+def assert_found(pane: Pane, annotations: Annotations, points: torch.Tensor, *, degrees: float, percent: float) -> None:
+    planes = fit_planes(points, annotations, extent=EXTENT, options=QUICK)
+    assert normal_error(planes, 0, pane) < degrees
+    assert offset_error(planes, 0, pane) < percent / 100 * EXTENT
+    assert covers(planes, 0, pane.larger(0.95))
+
+
+def test_a_high_frame_seen_from_beyond_it_does_not_move_the_plane() -> None:
+    beyond = ((2.6, 0.0, 0.3), (-1.9, 0.4, 0.6), (0.2, 0.2, -1.2))
+    assert_found(FRONT, framed_scene_of(FRONT, 0.12, beyond), BARE, degrees=1, percent=1)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_ragged_masks_with_holes_and_specks_give_the_pane(seed: int) -> None:
+    annotations = [
+        (camera, ragged(labels, amplitude=1.5, seed=10 * seed + number))
+        for number, (camera, labels) in enumerate(scene_of([FRONT]))
+    ]
+    assert_found(FRONT, annotations, POINTS, degrees=1.5, percent=1)
+
+
+def test_masks_that_include_the_frame_give_the_pane() -> None:
+    assert_found(FRONT, scene_of([FRONT.larger(1.06)]), POINTS, degrees=0.5, percent=0.5)
+
+
+def test_cameras_close_to_the_plane_that_see_it_at_grazing_angles() -> None:
+    close = ((-1.2, -0.3, 1.7), (1.5, 0.2, 1.6), (0.2, -0.9, 1.3))
+    assert_found(FRONT, scene_of([FRONT], close), BARE, degrees=1, percent=1)
+
+
+@pytest.mark.parametrize("quat", [(0.9, 0.3, 0.1, 0.2), (0.8, -0.4, 0.2, -0.3)])
+def test_a_pane_at_any_tilt_is_found_without_points(quat: tuple[float, ...]) -> None:
+    turn = rotation_from_quat(torch.tensor(quat, dtype=torch.float64)).numpy()
+    tilted = Pane(FRONT.center, turn @ FRONT.normal, turn @ FRONT.tangent, FRONT.half_sizes)
+    assert tilted.normal @ (np.array(EYES) - FRONT.center).mean(axis=0) > 0
+    assert_found(tilted, scene_of([tilted]), BARE, degrees=1, percent=1)
+
+
+def test_a_pane_that_every_image_cuts_is_found() -> None:
+    targets = ((1.0, 0.4, 2.0), (1.0, -0.6, 2.0), (-0.6, 0.4, 2.0), (-0.6, -0.6, 2.0))
+    eyes = ((0.4, 0.1, 0.4), (1.3, -0.6, 0.5), (-0.6, 0.5, 0.5), (-0.4, -0.6, 0.4))
+    cameras = [camera_from(eye, np.array(target)) for eye, target in zip(eyes, targets, strict=True)]
+    annotations = [(camera, label_image(camera, [FRONT])) for camera in cameras]
+    for _, labels in annotations:
+        border = torch.cat([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+        assert bool((border == 1).any())
+    planes = fit_planes(POINTS, annotations, extent=EXTENT, options=QUICK)
+    assert normal_error(planes, 0, FRONT) < 1
+    assert offset_error(planes, 0, FRONT) < 0.01 * EXTENT
+
+
+def test_two_panes_that_overlap_in_the_image_are_both_found() -> None:
+    near = Pane(np.array([0.7, 0.1, 1.2]), np.array([-0.6, 0.0, -0.8]), np.array([0.8, 0.0, -0.6]), (0.4, 0.35))
+    panes, eyes = [FRONT, near], (*EYES, (0.3, 0.6, -1.1))
+    annotations = scene_of(panes, eyes)
+    assert all(bool((label_image(camera, [FRONT]) == 1)[labels == 2].any()) for camera, labels in annotations)
+    planes = fit_planes(frame_and_clutter(panes), annotations, extent=EXTENT, options=QUICK)
+    for index, pane in enumerate(panes):
+        assert normal_error(planes, index, pane) < 1
+        assert offset_error(planes, index, pane) < 0.01 * EXTENT
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.6])
+def test_a_pane_is_found_that_is_mostly_seen_through_another(turn: float) -> None:
+    normal = np.array([np.sin(turn), 0.0, -np.cos(turn)])
+    behind = Pane(np.array([0.4, -0.1, 3.0]), normal, np.array([np.cos(turn), 0.0, np.sin(turn)]), (0.8, 0.5))
+    eyes = (*EYES, (-1.3, 0.2, 0.4), (0.6, 0.3, -0.2), (2.2, -0.4, 4.4), (-0.8, 0.3, 4.9))
+    annotations = scene_of([FRONT, behind], eyes)
+    assert sum(float((labels == 2).sum()) < float((labels == 1).sum()) for _, labels in annotations) >= 4
+    planes = fit_planes(BARE, annotations, extent=EXTENT, options=QUICK)
+    for index, pane in enumerate((FRONT, behind)):
+        # Cameras stand on both sides.
+        error = normal_error(planes, index, pane)
+        assert min(error, 180 - error) < 1
+        assert offset_error(planes, index, pane) < 0.01 * EXTENT
+        assert covers(planes, index, pane.larger(0.95))
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_the_scale_of_the_capture_changes_nothing(scale: float) -> None:
+    def scaled(camera: Camera) -> Camera:
+        matrix = camera.cam_from_world.clone()
+        matrix[:3, 3] *= scale
+        return replace(camera, cam_from_world=matrix)
+
+    annotations = [(scaled(camera), labels) for camera, labels in scene_of([FRONT])]
+    planes = fit_planes(scale * POINTS, annotations, extent=scale * EXTENT, options=QUICK)
+    assert normal_error(planes, 0, FRONT) < 0.5
+    away = torch.tensor(FRONT.center) - planes.centers[0].double() / scale
+    assert abs(float(away @ planes.normals[0].double())) < 0.005 * EXTENT
+
+
+def test_masks_that_fill_their_images_are_refused_with_what_to_annotate() -> None:
+    annotations = [(camera, torch.ones_like(labels)) for camera, labels in scene_of([FRONT])]
+    with pytest.raises(
+        PlaneFitError, match=r"pane 1: its outline .* in 0 of 3 .* annotate views that show where it ends"
+    ):
+        fit_planes(BARE[:0], annotations, extent=EXTENT, options=QUICK)
+
+
+def test_a_plane_that_one_edge_leaves_free_is_refused_with_what_to_annotate() -> None:
+    wide = Pane(np.array([0.0, -10.3, 2.0]), FRONT.normal, FRONT.tangent, (10.0, 10.0))
+    cameras = [camera_from(eye, FRONT.center) for eye in EYES]
+    annotations = [(camera, label_image(camera, [wide])) for camera in cameras]
+    assert all(0.1 < float((labels == 1).float().mean()) < 0.9 for _, labels in annotations)
+    with pytest.raises(
+        PlaneFitError, match=r"could turn by \d+ degrees.*annotate more views, .* that show its outline"
+    ):
+        fit_planes(BARE[:0], annotations, extent=EXTENT, options=QUICK)
+
+
+def test_views_from_one_place_are_refused_with_what_to_annotate() -> None:
+    eyes = tuple((0.001 * i, 0.0, -1.0) for i in range(3))
+    with pytest.raises(
+        PlaneFitError, match=r"pane 1: its 3 annotated views .* annotate views of it from farther apart"
+    ):
+        fit_planes(POINTS, scene_of([FRONT], eyes), extent=EXTENT, options=QUICK)

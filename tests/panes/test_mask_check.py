@@ -1,0 +1,58 @@
+"""A mask that belongs to another photograph is named."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+
+from glassplat.panes.fit import fit_planes, meeting_of_each, odd_ones
+from glassplat.panes.masks import FramedPlanes, PlaneEquations, pane_views
+from glassplat.panes.options import PlaneFit
+from tests.panes.pane_scene import EYES, FRONT, Annotations, Pane, frame_and_clutter, scene_of
+
+QUICK = PlaneFit(hypotheses=300, refined=2)
+EXTENT = 3.0
+PLACES = (*EYES, (0.9, -0.5, -1.2), (-0.9, 0.4, -0.5), (0.3, 0.5, -0.7))
+NAMES = [f"photo{number}.jpg" for number in range(len(PLACES))]
+
+
+def warnings_of(annotations: Annotations, caplog: pytest.LogCaptureFixture) -> list[str]:
+    with caplog.at_level(logging.INFO, "glassplat.panes"):
+        fit_planes(frame_and_clutter([FRONT]), annotations, extent=EXTENT, names=NAMES, options=QUICK)
+    assert "outlines of the masks" in caplog.text
+    assert all(name in caplog.text for name in NAMES)
+    return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+
+
+def test_masks_that_fit_are_reported_and_nobody_is_warned(caplog: pytest.LogCaptureFixture) -> None:
+    assert warnings_of(scene_of([FRONT], PLACES), caplog) == []
+
+
+def test_masks_that_changed_places_are_named(caplog: pytest.LogCaptureFixture) -> None:
+    annotations = scene_of([FRONT], PLACES)
+    (first, one), (second, other) = annotations[1], annotations[4]
+    annotations[1], annotations[4] = (first, other), (second, one)
+    (warning,) = warnings_of(annotations, caplog)
+    assert "2 of its 6 masks do not fit" in warning
+    assert "photo1.jpg" in warning and "photo4.jpg" in warning and "photo0.jpg" not in warning
+
+
+def test_a_post_before_the_pane_is_no_wrong_mask(caplog: pytest.LogCaptureFixture) -> None:
+    post = Pane(np.array([0.7, -0.1, 1.3]), FRONT.normal, FRONT.tangent, (0.08, 2.0))
+    annotations = [(camera, labels.where(labels == 1, 0)) for camera, labels in scene_of([FRONT, post], PLACES)]
+    assert warnings_of(annotations, caplog) == []
+
+
+def test_views_without_any_outline_say_nothing() -> None:
+    (camera, labels), *others = scene_of([FRONT])
+    views = pane_views([(camera, labels.new_ones(labels.shape)), *others], 1)
+    plane = FramedPlanes(PlaneEquations(FRONT.normal[None], np.array([FRONT.normal @ FRONT.center])), np.zeros(1))
+    assert not odd_ones(meeting_of_each(plane, views)[1:]).any()
+
+
+def test_the_odd_ones_are_told_from_what_meets_nothing() -> None:
+    assert odd_ones(np.array([0.9, 0.1, np.nan, 0.8])).tolist() == [False, True, False, False]
+    assert odd_ones(np.array([0.2, 0.1, 0.1])).all()
+    assert not odd_ones(np.full(3, np.nan)).any()

@@ -1,0 +1,149 @@
+"""Mirrors are told from glass by how the photographs depend on the mirrored scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from glassplat.captures.view import View
+from glassplat.panes.material import (
+    FEWEST_PIXELS,
+    LEAST_SHARE,
+    WINDOW,
+    about_local_mean,
+    glass_gaussians,
+    likeness,
+    mirror_labels,
+    mirrors_among,
+    pane_pixels,
+    window_sums,
+)
+from glassplat.render.planar import Planar
+from glassplat.scene.corrections import Exposures
+from glassplat.scene.scene import Scene
+from tests.render.tiny_scene import camera_at, in_single_precision, pane, showcase, shown_panes
+
+
+def scene_with(base_reflectance: float) -> Scene:
+    scene = in_single_precision(showcase(pane(2.0, half=0.8, base_reflectance=base_reflectance)))
+    solid = scene.primary.with_tensors(
+        {
+            "logit_opacities": torch.full((len(scene.primary),), 5.0),
+            "log_scales": scene.primary.log_scales + 1.2,
+        }
+    )
+    return replace(scene, glass=glass_gaussians(scene.planes, opacity=0.99), primary=solid)
+
+
+def photographs(scene: Scene) -> list[View]:
+    views = []
+    for x in (-0.4, 0.0, 0.4):
+        camera = camera_at(x, 0.0, -0.3)
+        camera = replace(camera, cam_from_world=camera.cam_from_world.float())
+        with torch.no_grad():
+            photo = (255 * Planar()(scene, camera).rgb.clamp(0, 1)).to(torch.uint8)
+        labels = shown_panes(scene.planes, camera)[0].to(torch.uint8)
+        views.append(View.in_memory(f"{x}", camera, photo=photo, pane_labels=labels))
+    return views
+
+
+@pytest.mark.parametrize(("base_reflectance", "expected"), [(0.995, (1,)), (0.08, ())])
+def test_a_mirror_is_found_and_glass_is_not(base_reflectance: float, expected: tuple[int, ...]) -> None:
+    views = photographs(scene_with(base_reflectance))
+    unknown = scene_with(0.2)
+    assert mirror_labels(unknown, views) == expected
+
+
+def test_an_exposure_does_not_turn_a_mirror_into_glass() -> None:
+    """Photographed at 0.3 of its brightness, a mirror has the slope of glass."""
+    affine = torch.zeros(3, 3, 4)
+    affine[:, :, :3] = -0.7 * torch.eye(3)
+    views = photographs(scene_with(0.995))
+    exposures = Exposures(affine, tuple(view.name for view in views))
+    dark = [
+        View.in_memory(v.name, v.camera, photo=(exposures.applied(v.photo.float(), v.name)).to(torch.uint8),
+                       pane_labels=v.pane_labels)
+        for v in views
+    ]  # fmt: skip
+    assert mirror_labels(scene_with(0.2), dark) == ()
+    assert mirror_labels(replace(scene_with(0.2), exposures=exposures), dark) == (1,)
+
+
+def test_a_pane_of_which_hardly_anything_is_known_stays_glass() -> None:
+    """Of a glass front that mirrors what no photograph shows, some spots may well agree with it."""
+    scene = scene_with(0.2)
+    known = [pane_pixels(scene, view) for view in photographs(scene_with(0.995))]
+    assert mirrors_among((1,), known) == (1,)
+    count = sum(len(view[1].mirrored) for view in known)
+    assert count >= FEWEST_PIXELS
+    larger = round(1.05 * count / LEAST_SHARE / len(known))
+    assert mirrors_among((1,), [{1: view[1]._replace(shown=larger)} for view in known]) == ()
+
+
+def test_views_without_masks_say_nothing() -> None:
+    scene = scene_with(0.995)
+    bare = [replace(view, read_pane_labels=None) for view in photographs(scene)]
+    assert mirror_labels(scene, [*bare, *photographs(scene)]) == (1,)
+
+
+def test_likeness_is_slope_and_correlation() -> None:
+    mirrored = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    found = likeness(mirrored, 0.1 * mirrored)
+    assert found.slope == pytest.approx(0.1, abs=1e-4)
+    assert found.correlation == pytest.approx(1.0, abs=1e-4)
+    assert not found.is_mirror
+
+
+def test_local_means_ignore_what_lies_outside_the_region() -> None:
+    image = torch.full((20, 30, 3), 0.3)
+    region = torch.zeros(20, 30, dtype=torch.bool)
+    region[:, :15] = True
+    image[:, 15:] = 100.0
+    torch.testing.assert_close(about_local_mean(image, region)[region], torch.zeros(300, 3), atol=1e-6, rtol=0)
+
+
+def mean_by_pooling(image: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
+    """The definition: every window by itself."""
+    side = 2 * max(round(WINDOW * image.shape[1] / 2), 1) + 1
+    inside = region.to(image.dtype)[..., None]
+    stacked = torch.cat([image * inside, inside], dim=-1).permute(2, 0, 1)[None]
+    sums = torch.nn.functional.avg_pool2d(stacked, side, stride=1, padding=side // 2)[0].permute(1, 2, 0)
+    return sums[..., :3] / sums[..., 3:].clamp(min=1e-6)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (31, 48), (90, 7), (20, 200)])
+def test_local_means_are_those_of_every_window_by_itself(size: tuple[int, int]) -> None:
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(*size, 3, generator=generator)
+    region = torch.rand(size, generator=generator) < 0.3
+    expected = image - mean_by_pooling(image, region)
+    torch.testing.assert_close(about_local_mean(image, region), expected, atol=1e-6, rtol=0)
+
+
+def test_a_large_window_is_no_more_work_than_a_small_one() -> None:
+    """On photographs of 3000 pixels the window has 450 x 450 of them: summed one by one, hours for ten views."""
+
+    def work(reach: int) -> int:
+        with CountedElements() as counted:
+            window_sums(torch.ones(60, 400, 4), reach)
+        return counted.elements
+
+    assert work(1) == work(30) == work(350)
+
+
+class CountedElements(TorchDispatchMode):
+    """Counts the elements that all operations return; none of them may read more for each."""
+
+    elements = 0
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        assert "pool" not in func.name() and "conv" not in func.name(), "work that grows with the window"
+        result = func(*args, **(kwargs or {}))
+        self.elements += result.numel()
+        return result

@@ -1,0 +1,111 @@
+"""Which plane is kept where Gaussians and measured points lead to different ones."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from glassplat.panes.fit import fit_planes
+from glassplat.panes.masks import FramedPlanes, PlaneEquations, pane_views
+from glassplat.panes.objective import Objective
+from glassplat.panes.options import PlaneFit
+from glassplat.panes.search import Fit, best_supported, first_hypotheses, score
+from tests.panes.pane_scene import FRONT, Pane, camera_from, frame_and_clutter, label_image, normal_error, scene_of
+
+QUICK = PlaneFit(hypotheses=300, refined=2)
+EXTENT = 3.0
+CLOSE = ((-0.15, 0.0, -1.0), (0.15, 0.05, -1.0), (0.0, -0.1, -0.9))
+"""Places so near one another that masks leave the plane open by some degrees."""
+
+
+def turned(pane: Pane, degrees: float) -> Pane:
+    """The pane turned about the upright axis through its middle."""
+    cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    rotation = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+    return replace(pane, normal=rotation @ pane.normal, tangent=rotation @ pane.tangent)
+
+
+MEASURED = frame_and_clutter([FRONT], frame=60, wall=200)
+MISLEADING = frame_and_clutter([turned(FRONT, 10)], frame=400, wall=200)
+
+
+def framed(pane: Pane) -> FramedPlanes:
+    return FramedPlanes(PlaneEquations(pane.normal[None], np.array([pane.normal @ pane.center])), np.zeros(1))
+
+
+def test_the_measured_points_win_where_gaussians_mislead(caplog: pytest.LogCaptureFixture) -> None:
+    annotations = scene_of([FRONT], CLOSE)
+    misled = fit_planes(MISLEADING, annotations, extent=EXTENT, options=QUICK)
+    assert normal_error(misled, 0, FRONT) > 3
+    caplog.clear()
+    with caplog.at_level(logging.INFO, "glassplat.panes"):
+        planes = fit_planes(MISLEADING, annotations, extent=EXTENT, measured=MEASURED, options=QUICK)
+    assert normal_error(planes, 0, FRONT) < 1.5
+    assert "fitted to the measured points scores" in caplog.text
+    assert "fitted to the Gaussians scores" in caplog.text
+    assert caplog.text.count("; kept") == 1
+
+
+def test_gaussians_decide_where_measured_points_lead_to_no_plane(caplog: pytest.LogCaptureFixture) -> None:
+    annotations = scene_of([FRONT], CLOSE)
+    with caplog.at_level(logging.INFO, "glassplat.panes"):
+        planes = fit_planes(MEASURED, annotations, extent=EXTENT, measured=torch.zeros(0, 3), options=QUICK)
+    assert normal_error(planes, 0, FRONT) < 3
+    assert "of 0 points along its edge" in caplog.text
+
+
+@pytest.mark.parametrize("degrees", [1.0, 5.0, 40.0])
+def test_the_better_plane_is_kept_in_either_order(degrees: float) -> None:
+    views = pane_views(scene_of([FRONT]), 1)
+    evidence = Objective(views, np.zeros((0, 3)), EXTENT, 0.01 * EXTENT)
+    fits = [Fit("one", framed(FRONT)), Fit("other", framed(turned(FRONT, degrees)))]
+    assert best_supported(1, fits, evidence) is fits[0].plane
+    assert best_supported(1, fits[::-1], evidence) is fits[0].plane
+
+
+def test_virtual_points_behind_a_mirror_do_not_speak_against_its_plane() -> None:
+    """Nothing lies on the mirror, and everything that was measured in it lies behind."""
+    views = pane_views(scene_of([FRONT]), 1)
+    virtual = np.random.default_rng(0).uniform([-2, -1, 2.5], [2, 1, 6], (5000, 3))
+    evidence = Objective(views, virtual, EXTENT, 0.01 * EXTENT)
+    wall = replace(FRONT, center=FRONT.center + np.array([0, 0, 0.6]))
+    assert score(framed(FRONT), evidence) > score(framed(wall), evidence) + 0.2
+
+
+def test_the_score_does_not_depend_on_the_unit_of_length() -> None:
+    def scaled(factor: float) -> float:
+        annotations = [
+            (replace(camera, cam_from_world=with_translation(camera.cam_from_world, factor)), labels)
+            for camera, labels in scene_of([FRONT])
+        ]
+        points = factor * frame_and_clutter([FRONT], wall=0).numpy()
+        evidence = Objective(pane_views(annotations, 1), points, factor * EXTENT, 0.01 * factor * EXTENT)
+        pane = replace(turned(FRONT, 2), center=factor * FRONT.center)
+        return score(framed(pane), evidence)
+
+    assert scaled(1000.0) == pytest.approx(scaled(1.0), rel=1e-9)
+
+
+def with_translation(matrix: torch.Tensor, factor: float) -> torch.Tensor:
+    scaled = matrix.clone()
+    scaled[:3, 3] *= factor
+    return scaled
+
+
+def test_a_pane_that_fills_the_photographs_is_among_the_first_hypotheses() -> None:
+    """Its masks overlap on almost any plane, so that ranking by it left only planes 24 degrees off."""
+    wide = Pane(np.array([0.5, 0.0, 2.0]), FRONT.normal, FRONT.tangent, (2.2, 0.8))
+    eyes = [(-2.0 + 0.5 * number, 0.05 * (-1) ** number, 0.3 + 0.1 * (number % 3)) for number in range(7)]
+    cameras = [
+        camera_from(eye, np.array([0.6 * eye[0] + 0.4, 0.15 * (-1) ** number, 2.0])) for number, eye in enumerate(eyes)
+    ]
+    views = pane_views([(camera, label_image(camera, [wide])) for camera in cameras], 1)
+    evidence = Objective(views, np.zeros((0, 3)), EXTENT, 0.01 * EXTENT)
+    for seed in range(8):
+        followed = first_hypotheses(evidence, 300, np.random.default_rng((seed, 1)))
+        cosines = np.abs(followed.planes.normals @ wide.normal)
+        assert np.degrees(np.arccos(cosines.max())) < 15

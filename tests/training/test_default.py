@@ -1,0 +1,120 @@
+"""Adaptive density control: statistics, growth, pruning and the opacity reset."""
+
+import math
+
+import pytest
+import torch
+
+from glassplat.kernels.screen_statistics import Views
+from glassplat.scene.gaussians import Gaussians
+from glassplat.training.densify import ScreenStatistics, densified, reset_opacity
+from glassplat.training.options import DefaultDensify
+
+EXTENT = 2.0
+
+
+def make_gaussians(scales: list[float], opacities: list[float] | None = None) -> Gaussians:
+    count = len(scales)
+    return Gaussians(
+        means=torch.arange(3.0 * count).reshape(count, 3),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
+        log_scales=torch.tensor(scales).log()[:, None].repeat(1, 3),
+        logit_opacities=torch.logit(torch.tensor(opacities or [0.5] * count)),
+        sh=torch.zeros(count, 1, 3),
+    )
+
+
+def seen(gradients: list[float], pulls: list[float] | None = None, radius: float = 0.01) -> ScreenStatistics:
+    """What one view saw; pixels pull six times as strongly as the gradient says unless given."""
+    count = len(gradients)
+    pulls = pulls or [6 * gradient for gradient in gradients]
+    sums = (torch.tensor(values).expand(2, -1) for values in (gradients, pulls, [1.0] * count))
+    return ScreenStatistics(*sums, torch.full((count,), radius))
+
+
+def edited(options: DefaultDensify, gaussians: Gaussians, statistics: ScreenStatistics, **extra: bool) -> Gaussians:
+    rng = torch.Generator().manual_seed(0)
+    return densified(options, gaussians, {}, statistics, extent=EXTENT, generator=rng, **extra)[0]
+
+
+def test_mirror_images_count_only_for_what_is_not_seen_directly() -> None:
+    statistics, radii = ScreenStatistics.zeros(2), torch.full((1, 2, 2), 6.0)
+    for weight, gradients in ((1.0, [8.0, 0.0]), (1.0, [4.0, 0.0]), (0.5, [90.0, 3.0])):
+        gradient = torch.tensor(gradients)[None, :, None] * torch.tensor([0.01, 0.0])
+        seen_here = radii * (gradient != 0).any(dim=-1, keepdim=True) if weight == 1 else radii
+        statistics.add(Views(gradient, 2 * gradient, seen_here, 200, 100, weight, direct=weight == 1))
+    assert statistics.view_count.tolist() == [[2.5, 0.5], [2, 0]]
+    # The first one is seen twice directly, the second only in the mirror.
+    assert statistics.mean_gradient.tolist() == pytest.approx([6, 3])
+    assert statistics.mean_pull.tolist() == pytest.approx([12, 6])
+
+
+def test_statistics_do_not_depend_on_the_resolution() -> None:
+    gradient, radii = torch.rand(1, 5, 2), torch.full((1, 5, 2), 6.0)
+    small, large = ScreenStatistics.zeros(5), ScreenStatistics.zeros(5)
+    small.add(Views(gradient, gradient, radii, 100, 80))
+    large.add(Views(gradient / 2, gradient / 2, radii * 2, 200, 160))
+    assert torch.allclose(small.gradient_sum, large.gradient_sum)
+    assert torch.allclose(small.max_radius, large.max_radius)
+
+
+def test_small_ones_are_cloned_large_ones_split_and_the_rest_kept() -> None:
+    gaussians = make_gaussians([0.001, 0.5, 0.001, 0.5])
+    after = edited(DefaultDensify(), gaussians, seen([1e-3, 1e-3, 1e-5, 1e-5]))
+    assert len(after) == 6
+    sizes = after.log_scales[:, 0].exp()
+    assert sizes.tolist() == pytest.approx([0.001, 0.001, 0.5, 0.5 / 1.6, 0.5 / 1.6, 0.001])
+    assert torch.equal(after.means[5], gaussians.means[0])
+
+
+def test_pixels_that_pull_against_each_other_split_what_is_large_only() -> None:
+    gaussians = make_gaussians([0.001, 0.5, 0.5])
+    after = edited(DefaultDensify(), gaussians, seen([0.0, 0.0, 1e-3], pulls=[1e-2, 1e-2, 1e-4]))
+    assert after.log_scales[:, 0].exp().tolist() == pytest.approx([0.001, 0.5, 0.5 / 1.6, 0.5 / 1.6])
+
+
+def test_transparent_gaussians_are_pruned_together_with_their_moments() -> None:
+    gaussians = make_gaussians([0.001] * 3, [0.5, 0.004, 0.5])
+    moments = {"primary.means": (gaussians.means + 1, gaussians.means + 2)}
+    rng = torch.Generator().manual_seed(0)
+    statistics = seen([0.0, 1.0, 0.0])
+    after, moments = densified(DefaultDensify(), gaussians, moments, statistics, extent=EXTENT, generator=rng)
+    assert torch.equal(after.means, gaussians.means[[0, 2]])
+    assert torch.equal(moments["primary.means"][0], gaussians.means[[0, 2]] + 1)
+
+
+def test_large_ones_are_pruned_only_when_asked() -> None:
+    gaussians = make_gaussians([0.1, 0.3])
+    assert len(edited(DefaultDensify(), gaussians, seen([0.0, 0.0]))) == 2
+    assert len(edited(DefaultDensify(), gaussians, seen([0.0, 0.0]), prune_large=True)) == 1
+    wide = seen([0.0, 0.0], radius=0.3)
+    assert len(edited(DefaultDensify(prune_radius_fraction=0.2), gaussians, wide, prune_large=True)) == 0
+
+
+def test_cap_lets_the_largest_gradients_grow() -> None:
+    gaussians = make_gaussians([0.001] * 4)
+    after = edited(DefaultDensify(cap=6), gaussians, seen([3e-4, 9e-4, 8e-4, 0.0]))
+    assert after.means[4:].tolist() == gaussians.means[[1, 2]].tolist()
+    assert len(edited(DefaultDensify(cap=3), gaussians, seen([1.0] * 4))) == 4
+
+
+def test_same_seed_same_bits() -> None:
+    gaussians, statistics = make_gaussians([0.5] * 8), seen([1.0] * 8)
+    first = edited(DefaultDensify(), gaussians, statistics)
+    second = edited(DefaultDensify(), gaussians, statistics)
+    assert torch.equal(first.means, second.means)
+
+
+def test_stale_statistics_are_refused() -> None:
+    with pytest.raises(ValueError, match="3 rows for 2 Gaussians"):
+        edited(DefaultDensify(), make_gaussians([0.1, 0.1]), ScreenStatistics.zeros(3))
+
+
+def test_reset_lowers_high_opacities_and_forgets_their_moments() -> None:
+    gaussians = make_gaussians([0.1] * 3, [0.9, 0.008, 0.01])
+    ones = torch.ones(3)
+    after, moments = reset_opacity(gaussians, {"primary.logit_opacities": (ones, ones), "primary.sh": (ones, ones)})
+    assert torch.sigmoid(after.logit_opacities).tolist() == pytest.approx([0.01, 0.008, 0.01])
+    assert not moments["primary.logit_opacities"][0].any()
+    assert moments["primary.sh"][0].all()
+    assert after.logit_opacities.max() <= math.log(0.01 / 0.99) + 1e-6

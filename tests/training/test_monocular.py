@@ -1,0 +1,48 @@
+"""Estimated normals as a term of the objective."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pytest
+import torch
+
+from glassplat.render.frame import Frame
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Scene
+from glassplat.training.losses import MonocularNormals
+from tests.captures.test_normal_maps import SIZE, all_along, view_in, write
+
+SCENE = Scene(Gaussians.empty(1), 1.0)
+
+
+def frame_of(normal: torch.Tensor, alpha: float = 1.0) -> Frame:
+    normals = normal.expand(SIZE, SIZE, 3)
+    return Frame(torch.zeros(SIZE, SIZE, 3), {"normal": normals, "alpha": torch.full((SIZE, SIZE), alpha)})
+
+
+def test_right_normals_of_any_length_cost_nothing_and_opposite_ones_two(tmp_path: Path) -> None:
+    write(tmp_path, "a.npy", all_along((0.0, 0.0, 1.0)))
+    term, view = MonocularNormals(), view_in(tmp_path)
+    for normal, expected in (((0.0, 0.0, -0.7), 0.0), ((0.0, 0.0, 1.0), 2.0), ((0.3, 0.0, 0.0), 1.0)):
+        assert float(term(frame_of(torch.tensor(normal)), view, SCENE)) == pytest.approx(expected)
+    assert float(term(frame_of(torch.tensor([0.0, 0.0, 1.0]), alpha=0.2), view, SCENE)) == 0
+
+
+def test_the_gradient_turns_normals(tmp_path: Path) -> None:
+    write(tmp_path, "a.npy", all_along((0.0, 0.0, 1.0)))
+    normal = torch.tensor([0.1, 0.0, -0.7], requires_grad=True)
+    (gradient,) = torch.autograd.grad(MonocularNormals()(frame_of(normal), view_in(tmp_path), SCENE), normal)
+    assert float(gradient[0]) > 0
+
+
+def test_views_without_a_file_have_no_such_term(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    frame = frame_of(torch.tensor([0.0, 0.0, 1.0]))
+    with caplog.at_level(logging.WARNING):
+        assert MonocularNormals()(frame, view_in(tmp_path), SCENE) is None
+        assert not caplog.text
+        (tmp_path / "normals").mkdir()
+        term = MonocularNormals()
+        assert term(frame, view_in(tmp_path), SCENE) is term(frame, view_in(tmp_path), SCENE) is None
+    assert caplog.text.count("no normals for a.jpg") == 1

@@ -1,0 +1,100 @@
+"""Opacity perturbation of what is seen through a pane."""
+
+import pytest
+import torch
+
+from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.panes import Planes, behind_panes
+from glassplat.training.densify import perturb_opacities
+
+PANE = Planes(
+    centers=torch.zeros(1, 3),
+    raw_normals=torch.tensor([[0.0, 0.0, -2.0]]),
+    logit_reflectances=torch.zeros(1),
+    tangents=torch.tensor([[1.0, 0.0, 0.0]]),
+    half_sizes=torch.tensor([[1.0, 0.5]]),
+    labels=(1,),
+)
+
+
+def camera_at(z: float, *, backwards: bool = False, focal: float = 50.0) -> Camera:
+    """A camera on the z axis that looks along +z, or along -z."""
+    rotation = torch.diag(torch.tensor([-1.0, 1.0, -1.0]) if backwards else torch.ones(3))
+    matrix = torch.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = -rotation @ torch.tensor([0.0, 0.0, z])
+    return Camera(matrix, focal, focal, 50.0, 50.0, 100, 100)
+
+
+FRONT = camera_at(-2.0)
+
+
+@pytest.mark.parametrize(
+    ("point", "selected"),
+    [
+        ((0.0, 0.0, 1.0), True),
+        ((1.4, 0.0, 1.0), True),
+        ((1.6, 0.0, 1.0), False),
+        ((0.0, 0.7, 1.0), True),
+        ((0.0, 0.8, 1.0), False),
+        ((0.0, 0.0, -0.5), False),
+        ((0.0, 0.0, -3.0), False),
+    ],
+    ids=["behind", "inside sideways", "beside", "inside upwards", "above", "before the pane", "behind the camera"],
+)
+def test_selection_follows_the_ray_through_the_rectangle(point: tuple[float, ...], selected: bool) -> None:
+    assert behind_panes(torch.tensor([point]), PANE, [FRONT]).tolist() == [selected]
+
+
+def test_a_pane_is_looked_through_from_either_side() -> None:
+    points = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    backwards = camera_at(2.0, backwards=True)
+    assert behind_panes(points, PANE, [backwards]).tolist() == [False, True]
+    assert behind_panes(points, PANE, [backwards, FRONT]).all()
+
+
+def test_points_outside_of_the_image_are_not_seen() -> None:
+    point = torch.tensor([[1.0, 0.0, 1.0]])
+    assert behind_panes(point, PANE, [FRONT]).all()
+    assert not behind_panes(point, PANE, [camera_at(-2.0, focal=500.0)]).any()
+    assert behind_panes(point, PANE, [camera_at(-2.0, focal=500.0), FRONT]).all()
+
+
+def test_no_panes_select_nothing() -> None:
+    assert not behind_panes(torch.rand(4, 3), Planes.empty(), [FRONT]).any()
+
+
+def make_gaussians(count: int) -> Gaussians:
+    return Gaussians(
+        means=torch.tensor([0.0, 0.0, 1.0]).repeat(count, 1)
+        * torch.where(torch.arange(count) % 2 == 0, 1, -0.5)[:, None],
+        quats=torch.ones(count, 4),
+        log_scales=torch.zeros(count, 3),
+        logit_opacities=torch.zeros(count),
+        sh=torch.zeros(count, 1, 3),
+    )
+
+
+def test_noise_is_uniform_on_the_activated_opacity_of_the_selected() -> None:
+    gaussians = make_gaussians(20_000)
+    selected = behind_panes(gaussians.means, PANE, [FRONT])
+    after = perturb_opacities(gaussians, selected, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(selected, torch.arange(20_000) % 2 == 0)
+    noise = torch.sigmoid(after.logit_opacities)[selected] - 0.5
+    assert noise.abs().max() <= 0.4 + 1e-6
+    assert noise.mean().item() == pytest.approx(0, abs=0.01)
+    assert noise.var().item() == pytest.approx(0.8**2 / 12, rel=0.05)
+    assert torch.equal(after.logit_opacities[~selected], gaussians.logit_opacities[~selected])
+
+
+def test_opacities_stay_within_bounds_and_finite() -> None:
+    gaussians = make_gaussians(1000)
+    extreme = gaussians.with_tensors({"logit_opacities": torch.linspace(-60, 60, 1000)})
+    selected = behind_panes(extreme.means, PANE, [FRONT])
+    after = perturb_opacities(extreme, selected, generator=torch.Generator().manual_seed(0))
+    opacities = torch.sigmoid(after.logit_opacities)[selected]
+    assert opacities.min() >= 0.01 - 1e-6
+    assert opacities.max() <= 0.99 + 1e-6
+    again = perturb_opacities(extreme, selected, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(again.logit_opacities, after.logit_opacities)

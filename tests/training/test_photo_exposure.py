@@ -1,0 +1,92 @@
+"""Exposures are learned beside the scene, stored with it, and taken up again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from glassplat.captures.dataset import Dataset
+from glassplat.captures.view import View
+from glassplat.files.scene_folder import read_scene, write_scene
+from glassplat.methods.recipe import RECIPES
+from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
+from glassplat.training.corrections import center_exposures, exposures_begun
+from glassplat.training.loop import train
+from glassplat.training.options import PhotoExposure
+from glassplat.training.stage import TrainState
+from tests.training.tiny_capture import tiny_capture, true_scene
+
+LEARNED, OFF = PhotoExposure(rate=0.003), PhotoExposure(rate=0)
+CAPTURE = replace(tiny_capture(), measured_points=False)
+"""With random points no plane is fitted before training."""
+
+
+def darkened(dataset: Dataset) -> Dataset:
+    """The capture with every other photograph darker, and the ones between brighter by as much."""
+    views = [
+        View.in_memory(v.name, v.camera, photo=(v.photo * (0.7 if index % 2 else 1.3)).clamp(max=255).to(torch.uint8))
+        for index, v in enumerate(dataset.train)
+    ]
+    return replace(dataset, train=tuple(views))
+
+
+def trained(recipe: SplatRecipe, steps: int = 240) -> TrainState:
+    dataset = darkened(tiny_capture())
+    scene = exposures_begun(recipe.exposure, replace(true_scene(), planes=type(true_scene().planes).empty()), dataset)
+    state = TrainState(scene, 0)
+    frozen = tuple(
+        replace(
+            stage,
+            rates={n: r for n, r in stage.rates.items() if n.startswith("exposures")},
+            actions=(),
+            motions=tuple(motion for motion in stage.motions if motion is center_exposures),
+        )
+        for stage in recipe.stages(0)
+    )
+    for _ in train(frozen, dataset, state, steps):
+        pass
+    return state
+
+
+def test_dark_photographs_are_told_from_bright_ones() -> None:
+    affine = trained(SplatRecipe(exposure=LEARNED)).scene.exposures.affine
+    brightness = affine[:, :, :3].sum(dim=(1, 2)) / 3
+    assert bool((brightness[1::2] < brightness[::2] - 0.2).all())
+
+
+def test_what_all_photographs_have_in_common_is_left_to_the_scene() -> None:
+    affine = trained(SplatRecipe(exposure=LEARNED)).scene.exposures.affine
+    assert float(affine.abs().max()) > 0.05
+    assert float(affine.mean(dim=0).abs().max()) < 1e-6
+
+
+@pytest.mark.parametrize("method", RECIPES)
+@pytest.mark.parametrize("iterations", [3000, 30_000])
+def test_every_stage_of_every_method_learns_them(method: str, iterations: int) -> None:
+    recipe = RECIPES[method](exposure=LEARNED)
+    stages = recipe.stages(0, iterations)
+    assert all("exposures.affine" in stage.rates for stage in stages)
+    assert all(stage.motions[0] is center_exposures for stage in stages)
+    assert recipe.initialise(CAPTURE).exposures.names == tuple(v.name for v in CAPTURE.train)
+
+
+@pytest.mark.parametrize("method", RECIPES)
+@pytest.mark.parametrize("iterations", [3000, 30_000])
+def test_switched_off_nothing_knows_of_them(method: str, iterations: int) -> None:
+    recipe = RECIPES[method](exposure=OFF)
+    assert not any("exposures.affine" in stage.rates for stage in recipe.stages(0, iterations))
+    assert len(recipe.initialise(CAPTURE).exposures) == 0
+
+
+def test_they_are_stored_with_the_scene_and_in_checkpoints(tmp_path: Path) -> None:
+    state = trained(SplatRecipe(exposure=LEARNED), steps=12)
+    write_scene(tmp_path / "scene", state.scene)
+    assert torch.equal(read_scene(tmp_path / "scene").exposures.affine, state.scene.exposures.affine)
+    save_checkpoint(tmp_path / "checkpoint.safetensors", state)
+    restored = load_checkpoint(tmp_path / "checkpoint.safetensors").scene.exposures
+    assert restored.names == state.scene.exposures.names
+    assert torch.equal(restored.affine, state.scene.exposures.affine)

@@ -1,0 +1,119 @@
+"""What happens when views show nothing, and when nothing is left to show."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from glassplat.captures.dataset import Dataset
+from glassplat.captures.view import View
+from glassplat.cli.main import main
+from glassplat.files.ply_table import write_table
+from glassplat.methods.glossy_recipes import DeferredRecipe
+from glassplat.methods.planar_recipe import PlanarRecipe
+from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.training.actions import PruneIdle
+from glassplat.training.loop import NoGaussiansError, Sight, train
+from glassplat.training.messages import Message, StepDone, Working
+from glassplat.training.options import DefaultDensify
+from glassplat.training.stage import Stage, TrainState
+from tests.training.tiny_capture import tiny_capture, true_scene, write_tiny_capture
+
+
+def looking_away(view: View) -> View:
+    """The view from a place that has everything behind it."""
+    pose = view.camera.cam_from_world.clone()
+    pose[2, 3] -= 1000
+    return replace(view, camera=replace(view.camera, cam_from_world=pose))
+
+
+def place_true_planes(state: TrainState, dataset: object) -> None:
+    truth = true_scene()
+    state.scene = replace(state.scene, planes=truth.planes, glass=truth.glass)
+
+
+def stages_of(recipe: SplatRecipe | PlanarRecipe | DeferredRecipe) -> tuple[Stage, ...]:
+    panes = recipe.method == "planar"
+    return tuple(replace(s, entry=place_true_planes) if s.entry and panes else s for s in recipe.stages(seed=0))
+
+
+def fresh_state() -> TrainState:
+    return TrainState(SplatRecipe(sh_degree=1).initialise(tiny_capture()), 0)
+
+
+def some_views_away(count: int) -> Dataset:
+    views = tiny_capture().train
+    return replace(tiny_capture(), train=(*(looking_away(view) for view in views[:count]), *views[count:]))
+
+
+@pytest.mark.parametrize("recipe", [SplatRecipe(), PlanarRecipe(), DeferredRecipe()], ids=lambda recipe: recipe.method)
+def test_a_view_that_shows_nothing_does_not_end_a_run(recipe: SplatRecipe | PlanarRecipe | DeferredRecipe) -> None:
+    scene = (recipe if recipe.method == "deferred" else SplatRecipe()).initialise(tiny_capture())
+    state = TrainState(scene, 0)
+    dataset = some_views_away(2)
+    steps = [m for m in train(stages_of(recipe), dataset, state, 24) if isinstance(m, StepDone)]
+    assert len(steps) == 24 and state.step == 24
+
+
+def test_views_that_all_show_nothing_end_it_after_one_pass() -> None:
+    state = fresh_state()
+    with pytest.raises(NoGaussiansError, match="none of the 6 training views shows a Gaussian, up to step 6"):
+        list(train(stages_of(SplatRecipe()), some_views_away(6), state, 600))
+
+
+def test_only_whole_passes_are_judged() -> None:
+    nothing, something = torch.zeros(3, dtype=torch.bool), torch.tensor([False, True, False])
+    sight = Sight(3)
+    for step, visible in ((1, nothing), (2, nothing), (3, nothing), (4, something), (5, nothing), (6, None)):
+        sight.note(visible, step)
+    for step in (7, 8, 9, 10):
+        sight.note(nothing, step)
+    with pytest.raises(NoGaussiansError):
+        sight.note(nothing, 11)
+
+
+def test_the_loss_of_the_last_gaussian_is_named_and_nothing_is_told_of_that_step() -> None:
+    (stage,) = stages_of(SplatRecipe())
+    ruthless = PruneIdle(DefaultDensify(least_contribution=1e9, contribution_moments=(0.5,)))
+    messages: list[Message] = []
+    with pytest.raises(NoGaussiansError, match="no Gaussians are left after step 6"):
+        # As they come: what was told before the end counts.
+        for message in train((replace(stage, actions=(ruthless,)),), tiny_capture(), fresh_state(), 12):
+            messages.append(message)
+    assert max(m.step for m in messages if isinstance(m, StepDone)) == 5
+    assert [(m.done, m.total) for m in messages if isinstance(m, Working)] == [(done, 6) for done in range(6)]
+
+
+def spoil(capture: Path, how: str) -> None:
+    """Breaks a capture such that little or nothing of it can be seen."""
+    settings = json.loads((capture / "transforms.json").read_text())
+    for name in ("fl_x", "fl_y"):
+        settings[name] *= {"long": 9e4, "short": 2e-3}.get(how, 1)
+    (capture / "transforms.json").write_text(json.dumps(settings))
+    points = {"far points": 1e6 * np.random.rand(50, 3), "one point": np.ones((50, 3))}
+    if how in points:
+        rows = np.concatenate([points[how], np.full((50, 3), 128)], axis=1)
+        write_table(capture / "points3d.ply", ["x", "y", "z", "red", "green", "blue"], rows)
+
+
+@pytest.mark.parametrize("how", ["long", "short", "far points", "one point", "few pixels"])
+@pytest.mark.parametrize("method", ["splat", "deferred"])
+def test_a_capture_that_shows_nothing_is_one_message(
+    method: str, how: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capture, run = write_tiny_capture(tmp_path / "capture"), tmp_path / "run"
+    spoil(capture, how)
+    options = ["--data", str(capture), "--output", str(run), "--iterations", "40"]
+    code = main(["train", method, *options, "--downscale", "40" if how == "few pixels" else "1"])
+    message = capsys.readouterr().err
+    if code == 0:
+        assert (run / "point_cloud" / "iteration_40" / "point_cloud.ply").is_file() and not message
+    elif code == 1:
+        assert message.startswith("stopped:") and "Gaussian" in message and "did not foresee" not in message
+    else:
+        assert message.startswith("error:")

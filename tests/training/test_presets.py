@@ -1,0 +1,343 @@
+"""The recipes as published: the documents name what restores the paper's way, and each such field does it."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from glassplat.cli import main
+from glassplat.cli.demo import SCENE
+from glassplat.kernels.maths.color import linear_from_srgb
+from glassplat.methods.glossy_recipes import DeferredRecipe
+from glassplat.methods.mirrors import ENDED, DensifyWhilePropagating, Propagate, ResetRaised
+from glassplat.methods.planar import PlaneEntry, planar_population
+from glassplat.methods.planar_recipe import PlanarRecipe, ReflectionWeights
+from glassplat.methods.recipe import RECIPES, recipe_of
+from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.options import check_options
+from glassplat.render.planar import Planar
+from glassplat.scene.scene import Scene
+from glassplat.training.actions import Densify, Explore, PerturbOpacity, Relocate, ResetOpacity, mcmc_population
+from glassplat.training.loop import differentiate, train
+from glassplat.training.messages import ActionDone, StepDone
+from glassplat.training.options import DefaultDensify, McmcDensify, PropagationSchedule, Rate, SurroundingsStart
+from glassplat.training.stage import Clock, Stage, TrainState, stage_starts
+from tests.render.test_seen_panes import CAMERA, vitrine
+from tests.training.progress_of import finished
+from tests.training.test_default import edited, make_gaussians, seen
+from tests.training.tiny_capture import tiny_capture, true_scene
+
+DOCS = Path(__file__).parents[2] / "docs"
+ASSIGNED = re.compile(r"`(\w[\w.]*) = ([^`]+)`")
+
+
+def documented(page: str) -> dict[str, Any]:
+    """What the column "the paper's way" of a page's tables sets, by the dotted names of a recipe's fields."""
+    rows = [line.split(" | ") for line in (DOCS / page).read_text().splitlines() if line.startswith("| ")]
+    cells = [row[3] for row in rows if len(row) == 5]
+    found = {name: ast.literal_eval(value) for cell in cells for name, value in ASSIGNED.findall(cell)}
+    assert len(found) > 5
+    return found
+
+
+def with_value(options: Any, name: str, value: Any) -> Any:
+    """Options of which the field with this dotted name has another value."""
+    first, _, rest = name.partition(".")
+    return replace(options, **{first: with_value(getattr(options, first), rest, value) if rest else value})
+
+
+def parsed(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The recipe of a command line of `train`."""
+    taken: list[Any] = []
+    monkeypatch.setattr(main, "run", taken.append)
+    assert main.main(["train", arguments[0], "--data", str(SCENE), "--output", "y", *arguments[1:]]) == 0
+    return taken[0].recipe
+
+
+def values_of(options: Any, name: str = "", *, rounded: bool = False) -> dict[str, Any]:
+    """Every single value of a recipe by its dotted name, numbers as the documents round them if asked."""
+    if dataclasses.is_dataclass(options):
+        fields = {f"{name}.{f.name}": getattr(options, f.name) for f in dataclasses.fields(options)}
+        return {
+            key: value
+            for inner, part in fields.items()
+            for key, value in values_of(part, inner, rounded=rounded).items()
+        }
+    number = isinstance(options, float) or (isinstance(options, tuple) and options and isinstance(options[0], float))
+    return {name: pytest.approx(options, rel=1e-4) if rounded and number else options}
+
+
+@pytest.mark.parametrize("method", RECIPES)
+def test_the_fields_that_the_documents_name_are_the_preset(method: str) -> None:
+    recipe = recipe_of(method)
+    for page in dict.fromkeys(["splat.md", f"{method}.md"]):
+        for name, value in documented(page).items():
+            recipe = with_value(recipe, name, value)
+    check_options(recipe)
+    assert values_of(recipe) == values_of(recipe_of(method, "paper"), rounded=True)
+
+
+@pytest.mark.parametrize("method", RECIPES)
+def test_the_preset_gives_defaults_that_options_override(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    paper = recipe_of(method, "paper")
+    assert parsed([method], monkeypatch) == recipe_of(method) != paper
+    assert parsed([method, "--preset", "paper"], monkeypatch) == paper
+    assert parsed([method, "--preset=paper"], monkeypatch) == paper
+    changed = parsed([method, "--sh-degree", "1", "--preset", "paper", "--densify.stop", "0.3"], monkeypatch)
+    assert changed == replace(paper, sh_degree=1, densify=replace(paper.densify, stop=0.3))
+
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+@pytest.mark.parametrize("method", RECIPES)
+def test_a_short_run_of_a_preset_learns(method: str, strategy: Any) -> None:
+    recipe = replace(recipe_of(method, "paper"), strategy=strategy, sh_degree=1)
+    recipe = replace(recipe, rhythm=replace(recipe.rhythm, beat=8 / 60, least=2, sh=0.1))
+    if method == "deferred":
+        recipe = replace(recipe, texels=8, first_texels=8, schedule=replace(recipe.schedule, stop=0.9))
+    if method == "traced":
+        around = replace(recipe.surroundings, start=SurroundingsStart(source="box", cells=3))
+        recipe = replace(recipe, surroundings=around, schedule=replace(recipe.schedule, stop=0.9))
+    stages = [
+        replace(s, entry=place_true_planes if isinstance(s.entry, PlaneEntry) else s.entry) for s in recipe.stages(0)
+    ]
+    state = TrainState(planeless(recipe) if method == "planar" else recipe.initialise(tiny_capture()), seed=0)
+    messages = list(train(tuple(stages), tiny_capture(), state, 60))
+    losses = [message.losses["photometric"] for message in messages if isinstance(message, StepDone)]
+    assert len(losses) == state.step == 60
+    assert all(torch.isfinite(tensor).all() for tensor in state.scene.parameters().values())
+    # The first and the second pass over the six views, before anything is disturbed.
+    assert sum(losses[6:12]) < sum(losses[:6])
+    done = {message.action for message in messages if isinstance(message, ActionDone)}
+    reflective = {"propagate normals"}
+    expected = {"splat": set(), "planar": {"perturb opacity"}, "deferred": reflective, "traced": reflective}
+    assert expected[method] <= done
+
+
+def planeless(recipe: PlanarRecipe) -> Scene:
+    """The first scene of a recipe, without the trial fit that the few points of the tiny capture do not do for."""
+    dataset = tiny_capture()
+    return Scene(planar_population(recipe).initial(dataset.points, recipe.sh_degree), dataset.extent)
+
+
+def place_true_planes(state: TrainState, dataset: object) -> None:
+    scene = true_scene()
+    state.scene = replace(state.scene, planes=scene.planes, glass=scene.glass)
+
+
+def moments(stages: tuple[Stage, ...], kind: type, iterations: int) -> list[list[int]]:
+    """The steps at which the actions of a kind are due, by stage."""
+    starts = stage_starts(stages, iterations)
+    return [
+        [
+            step
+            for step in range(start + 1, end + 1)
+            for action in stage.actions
+            if type(action) is kind and action.due(Clock(step, iterations, views=10))
+        ]
+        for stage, start, end in zip(stages, starts[:-1], starts[1:], strict=True)
+    ]
+
+
+def test_large_gaussians_are_split_by_the_gradient_if_asked() -> None:
+    gaussians = make_gaussians([0.5, 0.5])
+    # Pixels pull at the first without moving it, and the second moves without much pull.
+    statistics = seen([1e-5, 1e-3], pulls=[1e-2, 1.1e-3])
+    pulled, moved = (edited(DefaultDensify(split_by=by), gaussians, statistics) for by in ("pull", "gradient"))
+    assert len(pulled) == len(moved) == 3
+    assert torch.equal(pulled.means[0], gaussians.means[1]) and torch.equal(moved.means[0], gaussians.means[0])
+
+
+def test_densification_can_keep_its_interval_whatever_the_views() -> None:
+    def steps(densifier: DefaultDensify, views: int) -> list[int]:
+        action = Densify(densifier)
+        return [step for step in range(1, 1501) if action.due(Clock(step, 3000, views))]
+
+    assert steps(DefaultDensify(whole_passes=False), 150) == list(range(100, 1501, 100))
+    assert steps(DefaultDensify(), 150) == list(range(150, 1501, 150))
+
+
+@pytest.mark.parametrize(("adapts", "clones"), [(True, False), (False, True)])
+def test_thresholds_rise_on_small_photographs_if_asked(adapts: bool, clones: bool) -> None:
+    gaussians = make_gaussians([0.001] * 2)
+    state = TrainState(Scene(gaussians, 2.0), seed=0)
+    state.statistics["primary"] = seen([4e-4, 1e-5])
+    Densify(DefaultDensify(adapt_to_size=adapts)).apply(state, tiny_capture(), Clock(10, 100, 6))
+    assert (len(state.scene.primary) == 3) == clones
+
+
+@pytest.mark.parametrize(("step", "left"), [(3000, 2), (3100, 1)])
+def test_what_is_too_large_goes_once_opacities_have_been_reset(step: int, left: int) -> None:
+    state = TrainState(Scene(make_gaussians([0.01, 0.5]), 2.0), seed=0)
+    state.statistics["primary"] = seen([0.0, 0.0])
+    Densify(DefaultDensify.published()).apply(state, tiny_capture(), Clock(step, 30_000, 6))
+    assert len(state.scene.primary) == left
+
+
+def test_noise_and_regularisers_of_mcmc_can_reach_everything() -> None:
+    faint = make_gaussians([0.1] * 4, opacities=[0.001] * 4)
+    options = McmcDensify(reach="all")
+    state = TrainState(Scene(faint, 2.0), seed=0)
+    Explore(options, Rate(1e-3))(state, Clock(1, 100, 6), torch.tensor([True, False, True, False]))
+    assert bool((state.scene.primary.means != faint.means).any(dim=1).all())
+    view, scene = tiny_capture().train[0], true_scene()
+    frame = Planar()(scene, view.camera)
+    for reach, expected in (("all", torch.ones(len(scene.primary), dtype=torch.bool)), ("shown", frame.direct)):
+        raw = scene.primary.logit_opacities.clone().requires_grad_()
+        learning = scene.with_parameters({"primary.logit_opacities": raw})
+        opacity, _ = mcmc_population(replace(options, reach=reach), Rate(1e-3)).terms
+        (gradient,) = torch.autograd.grad(opacity.function(frame, view, learning), raw)
+        assert torch.equal(gradient != 0, expected)
+
+
+def test_the_published_perturbations_and_resets_meet_in_no_stage() -> None:
+    stages = PlanarRecipe.paper().stages(0)
+    assert moments(stages, ResetOpacity, 30_000) == [[3000], [6000], [9000, 12_000]]
+    perturbed = moments(stages, PerturbOpacity, 30_000)
+    assert perturbed == [[], [], [step for step in range(7000, 29_001, 1000) if step % 3000]]
+    here = PlanarRecipe().stages(0)
+    assert moments(here, ResetOpacity, 30_000) == [[], [], [9000, 12_000]]
+    assert moments(here, PerturbOpacity, 30_000)[2][-1] == 23_000
+
+
+@pytest.mark.parametrize("iterations", [200, 999, 1500, 7000, 7001, 30_000])
+def test_the_last_perturbation_leaves_time_to_settle(iterations: int) -> None:
+    (steps,) = [steps for steps in moments(PlanarRecipe.paper().stages(0), PerturbOpacity, iterations) if steps] or [
+        [0]
+    ]
+    assert iterations - steps[-1] >= iterations // 30
+
+
+def test_mcmc_can_grow_from_the_first_stage_on() -> None:
+    early, late = (PlanarRecipe(strategy="mcmc", early_growth=asked).stages(0) for asked in (True, False))
+    assert moments(early, Relocate, 3000)[0] and not any(moments(late, Relocate, 3000)[:2])
+    assert not any(moments(early, ResetOpacity, 3000)) and sum(map(len, moments(late, ResetOpacity, 3000))) == 1
+
+
+def test_perturbed_opacities_stay_within_their_bounds() -> None:
+    recipe = PlanarRecipe.paper()
+    (action,) = [a for a in recipe.stages(0)[-1].actions if isinstance(a, PerturbOpacity)]
+    state = TrainState(true_scene(), seed=0)
+    finished(replace(action, amplitude=1.0).apply(state, tiny_capture(), Clock(1, 1, 6)))
+    opacities = torch.sigmoid(state.scene.primary.logit_opacities)
+    assert bool(((opacities < 0.001) | (opacities > 0.999)).any()) and bool(opacities.isfinite().all())
+
+
+def test_only_the_nearest_pane_reflects_if_asked() -> None:
+    scene = vitrine(1, 2)
+    nearest, every = (Planar(nearest_only=asked)(scene, CAMERA) for asked in (True, False))
+    assert torch.equal(nearest.layers["transmission"], nearest.layers["without_panes"])
+    assert not torch.allclose(every.layers["transmission"], every.layers["without_panes"])
+    strength = nearest.layers["strength"][..., None]
+    through, mirrored = (linear_from_srgb(nearest.layers[name]) for name in ("without_panes", "reflection"))
+    torch.testing.assert_close(linear_from_srgb(nearest.rgb), (1 - strength) * through + strength * mirrored)
+    recipe = PlanarRecipe(panes="nearest")
+    assert recipe.renderer().nearest_only and all(s.renderer.nearest_only for s in recipe.stages(0)[1:])
+
+
+def test_mirrors_can_learn_their_reflectance() -> None:
+    def entered(fixed: bool, monkeypatch: pytest.MonkeyPatch) -> Scene:
+        recipe = PlanarRecipe(fixed_mirrors=fixed, detect_mirrors=False, seed_reflections=False)
+        entry = recipe.stages(0)[1].entry
+        assert isinstance(entry, PlaneEntry)
+        mirror = replace(true_scene().planes, mirrors=(1,))
+        monkeypatch.setattr("glassplat.methods.planar.fit_planes", lambda *a, **k: mirror)
+        state = TrainState(Scene(true_scene().primary, true_scene().extent), seed=0)
+        finished(entry(state, tiny_capture()))
+        return state.scene
+
+    with pytest.MonkeyPatch.context() as patch:
+        learned, fixed = (entered(asked, patch) for asked in (False, True))
+    assert learned.planes.mirrors == () and fixed.planes.mirrors == (1,)
+    assert torch.equal(learned.primary.means, true_scene().primary.means)
+    assert not torch.equal(fixed.primary.means, true_scene().primary.means)
+
+
+def test_the_mean_depth_can_learn_from_the_deviation() -> None:
+    view, scene = tiny_capture().train[0], true_scene()
+    gradients = []
+    for moving in (False, True):
+        weights = ReflectionWeights(depth=1.0, conflict=0.0, mask=0.0, intensity=0.0)
+        recipe = PlanarRecipe(moving_mean=moving, ssim_weight=0.0, weights=weights)
+        stage = recipe.stages(0)[-1]
+        stage = replace(stage, losses=tuple(term for term in stage.losses if term.name == "depth"))
+        gradients.append(differentiate(stage, scene, view, probed=False).gradients["primary.means"])
+    assert bool(gradients[0].any()) and not torch.allclose(*gradients)
+
+
+def test_all_views_and_mirror_images_can_count_alike() -> None:
+    view, scene = tiny_capture().train[0], true_scene()
+    direct, alike = (
+        PlanarRecipe(densify_by=by).stages(0)[-1].renderer(scene, view.camera, probed=True).screen
+        for by in ("direct", "all")
+    )
+    assert [record.direct for record in direct] == [True, True, False]
+    assert all(record.direct and record.weight == 1 for record in alike) and len(alike) == 3
+
+
+def test_positions_can_stop_to_slow_down_before_the_end() -> None:
+    rate = Rate(1e-2, 1e-4, decay=0.5)
+    assert rate.at(0.25, 1.0) == pytest.approx(1e-3)
+    assert rate.at(0.5, 1.0) == rate.at(0.9, 1.0) == pytest.approx(1e-4)
+
+
+def test_a_region_is_looked_for_only_if_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("glassplat.methods.surroundings.reflective_region", lambda cameras: (0.0, 0.0, 0.0, 1.0))
+
+    def region(**options: Any) -> Any:
+        recipe = DeferredRecipe(**options)
+        state, entry = TrainState(recipe.initialise(tiny_capture()), seed=0), recipe.stages(0)[1].entry
+        assert entry is not None
+        finished(entry(state, tiny_capture()))
+        return state.scene.environment.region
+
+    assert region() == (0.0, 0.0, 0.0, 1.0)
+    assert region(find_region=False) is None
+    assert region(find_region=False, region=(1.0, 2.0, 3.0, 4.0)) == (1.0, 2.0, 3.0, 4.0)
+
+
+def test_a_matte_scene_keeps_the_published_rates_if_asked() -> None:
+    def factors(asked: bool) -> Any:
+        (action,) = [a for a in DeferredRecipe(hurry_matte=asked).stages(0)[1].actions if isinstance(a, Propagate)]
+        return action.matte_rates
+
+    assert factors(True) and not factors(False)
+
+
+def test_densification_waits_longer_while_normals_spread() -> None:
+    recipe = DeferredRecipe(propagation_interval=500, densify=DefaultDensify(whole_passes=False))
+    (action,) = [a for a in recipe.stages(0)[1].actions if isinstance(a, DensifyWhilePropagating)]
+
+    def acted(ended: bool) -> list[int]:
+        state = TrainState(true_scene(), seed=0, records={ENDED: 1} if ended else {})
+        steps = []
+        for step in range(100, 1001, 100):
+            state.statistics["primary"] = seen([0.0] * len(state.scene.primary))
+            clock = Clock(step, 6000, 6)
+            steps += [step] if action.due(clock) and action.apply(state, tiny_capture(), clock) else []
+        return steps
+
+    assert acted(ended=False) == [500, 1000]
+    assert acted(ended=True) == list(range(200, 1001, 100))
+    assert not any(isinstance(a, DensifyWhilePropagating) for a in DeferredRecipe().stages(0)[1].actions)
+
+
+def test_the_reset_after_propagation_can_be_left_out() -> None:
+    def kinds(asked: bool) -> list[type]:
+        recipe = DeferredRecipe(schedule=PropagationSchedule(last_reset=asked))
+        return [type(action) for action in recipe.stages(0)[1].actions]
+
+    assert ResetRaised in kinds(True) and ResetRaised not in kinds(False)
+    assert ResetOpacity in kinds(False)
+
+
+@pytest.mark.parametrize("method", RECIPES)
+def test_a_preset_is_of_its_own_method(method: str) -> None:
+    assert recipe_of(method, "paper").method == method
+    assert SplatRecipe.paper().rates.short_run_power == 0

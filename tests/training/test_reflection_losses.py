@@ -1,0 +1,143 @@
+"""Reflection and geometry losses."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+import torch
+from torch import Tensor
+
+from glassplat.captures.view import View
+from glassplat.kernels.panes import pane_layers
+from glassplat.render.frame import Frame
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.panes import Planes
+from glassplat.scene.scene import Scene
+from glassplat.training.losses import (
+    depth_deviation_loss,
+    gradient_conflict,
+    intensity_departure,
+    mask_loss,
+    tint_departure,
+)
+
+
+def frame_with(**layers: torch.Tensor) -> Any:
+    return Frame(rgb=torch.zeros(8, 9, 3), layers=layers)
+
+
+def conflict(transmission: torch.Tensor, reflection: torch.Tensor, pane: torch.Tensor, strength: torch.Tensor) -> float:
+    layers = {"without_panes": transmission, "reflection": reflection, "inner": pane_layers(pane, strength)[1]}
+    return float(gradient_conflict(frame_with(**layers), SimpleNamespace(), SimpleNamespace()))
+
+
+STEP = (torch.arange(9) >= 4).float()[None, :, None].expand(8, 9, 3)
+FLAT = torch.full((8, 9, 3), 0.5)
+ALL = torch.zeros(8, 9, dtype=torch.int32)
+EVEN = torch.full((8, 9), 0.1)
+
+
+def test_gradient_conflict_counts_shared_edges_on_panes_only() -> None:
+    assert conflict(STEP, STEP, ALL, EVEN) > 0
+    assert conflict(STEP, FLAT, ALL, EVEN) == 0
+    assert conflict(STEP, STEP, ALL - 1, EVEN) == 0
+
+
+def test_where_a_reflection_ends_is_no_edge_of_it() -> None:
+    """At the rectangle's rim, where no glass is, and where the next pane begins, with a frame behind each."""
+    right = STEP[..., 0] > 0
+    rim = torch.where(right, ALL, -1)
+    assert conflict(STEP, FLAT * STEP, rim, EVEN * right) == 0
+    assert conflict(STEP, FLAT * STEP, ALL, EVEN * right) == 0
+    assert conflict(STEP, FLAT + 0.3 * STEP, right.to(torch.int32), EVEN) == 0
+
+
+def test_edges_beside_a_rim_still_count() -> None:
+    narrow = torch.where(torch.arange(9) >= 2, ALL, -1)
+    assert conflict(STEP, STEP, narrow, EVEN) == conflict(STEP, STEP, ALL, EVEN)
+
+
+def test_gradient_conflict_depends_little_on_the_size_of_photographs() -> None:
+    """The same view at four sizes; without the factor the smallest has 14 times the loss of the largest."""
+    transmission, reflection = (_edges_and_ramps(seed, height=480, width=640) for seed in (0, 1))
+    losses = []
+    for shrink in (1, 2, 4, 8):
+        smaller = [_shrunk(image, shrink) for image in (transmission, reflection)]
+        everywhere = torch.zeros(smaller[0].shape[:2], dtype=torch.int32)
+        losses.append(conflict(*smaller, everywhere, torch.full(everywhere.shape, 0.1)))
+    assert max(losses) < 2.5 * min(losses)
+
+
+def _edges_and_ramps(seed: int, *, height: int, width: int) -> Tensor:
+    """A picture of overlapping soft-edged shapes, as natural as a few lines allow: edges at all scales."""
+    generator = torch.Generator().manual_seed(seed)
+    y, x = torch.meshgrid(torch.arange(height) / height, torch.arange(width) / height, indexing="ij")
+    image = torch.zeros(height, width, 3)
+    for _ in range(60):
+        center_x, center_y, log_size, angle, softness = torch.rand(5, generator=generator).tolist()
+        size = 0.5 * math.exp(-3 * log_size)
+        across = (x - 1.4 * center_x) * math.cos(6 * angle) + (y - center_y) * math.sin(6 * angle)
+        along = (y - center_y) * math.cos(6 * angle) - (x - 1.4 * center_x) * math.sin(6 * angle)
+        inside = torch.sigmoid((size - torch.maximum(across.abs(), along.abs())) / (1e-3 + 0.1 * size * softness))
+        color = torch.rand(3, generator=generator)
+        image = image + inside[..., None] * (color - image)
+    return image
+
+
+def _shrunk(image: Tensor, factor: int) -> Tensor:
+    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), factor).permute(1, 2, 0)
+
+
+def test_gradient_conflict_leaves_the_reflection_alone() -> None:
+    transmission = torch.rand(8, 9, 3, requires_grad=True)
+    reflection = torch.rand(8, 9, 3, requires_grad=True)
+    frame = frame_with(without_panes=transmission, reflection=reflection, inner=torch.ones(8, 9))
+    loss = gradient_conflict(frame, SimpleNamespace(), SimpleNamespace())
+    to_transmission, to_reflection = torch.autograd.grad(loss, [transmission, reflection], allow_unused=True)
+    assert float(to_transmission.abs().sum()) > 0 and to_reflection is None
+
+
+def test_mask_loss_applies_to_annotated_views_only() -> None:
+    frame = frame_with(mask=torch.full((8, 9), 0.25))
+    labels = torch.zeros(8, 9, dtype=torch.uint8)
+    labels[:4] = 2
+    assert mask_loss(frame, SimpleNamespace(pane_labels=None), SimpleNamespace()) is None
+    annotated = mask_loss(frame, SimpleNamespace(pane_labels=labels), SimpleNamespace())
+    torch.testing.assert_close(annotated, torch.tensor(0.5 * 0.75 + 0.5 * 0.25))
+
+
+def test_reflections_depart_from_what_they_mirror_as_much_darker_as_brighter() -> None:
+    def departure(intensity: float) -> float:
+        primary = SimpleNamespace(channels={"log_intensity": torch.tensor([0.0, intensity]).log1p()})
+        return float(intensity_departure(frame_with(), SimpleNamespace(), SimpleNamespace(primary=primary)))
+
+    assert departure(0.0) == 0
+    assert abs(departure(1.0) - departure(-0.5)) < 1e-6
+    assert departure(2.0) > departure(1.0) > 0
+
+
+def test_depth_deviation_loss_does_not_depend_on_the_unit_of_length() -> None:
+    deviation, hit = torch.rand(8, 9), torch.ones(8, 9)
+    metres = depth_deviation_loss(
+        frame_with(deviation=deviation, hit=hit), SimpleNamespace(), SimpleNamespace(extent=2.0)
+    )
+    millimetres = depth_deviation_loss(
+        frame_with(deviation=1000 * deviation, hit=hit), SimpleNamespace(), SimpleNamespace(extent=2000.0)
+    )
+    torch.testing.assert_close(metres, millimetres)
+
+
+def test_the_tint_term_is_zero_for_clear_glass_and_its_mean_square_otherwise() -> None:
+    def term(planes: Planes) -> Tensor | None:
+        return tint_departure(frame_with(), cast(View, None), Scene(Gaussians.empty(), 1.0, planes=planes))
+
+    clear = Planes.rectangle((0, 0, 0), (0, 0, 1), (1, 1))
+    assert term(clear) is None
+    still_clear = term(clear.that_may_tint())
+    assert still_clear is not None and float(still_clear) == 0
+    tinted = term(replace(clear, log_transmittances=torch.tensor([[-0.3, 0.0, 0.3]])))
+    assert tinted is not None and float(tinted) == pytest.approx(0.06)

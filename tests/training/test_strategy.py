@@ -1,0 +1,224 @@
+"""The MCMC strategy in both recipes: wiring, a short run, determinism and resuming."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from glassplat.captures.view import View
+from glassplat.methods.planar_recipe import PlanarRecipe
+from glassplat.methods.recipe import recipe_from_json, recipe_to_json
+from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.scene.scene import Scene
+from glassplat.training.actions import Densify, Explore, Relocate, ResetOpacity, cap_of, growth_of
+from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
+from glassplat.training.loop import differentiate, train
+from glassplat.training.losses import PhotometricLoss
+from glassplat.training.messages import ActionDone, Message, StepDone
+from glassplat.training.options import McmcDensify, Rhythm
+from glassplat.training.stage import AverageLast, Clock, Stage, TrainState, stage_starts
+from tests.training.tiny_capture import tiny_capture, true_scene
+
+OFTEN = McmcDensify(interval=2, start=0.1, cap=45)
+RECIPES: list[Any] = [
+    SplatRecipe(sh_degree=1, strategy="mcmc", mcmc=OFTEN),
+    PlanarRecipe(sh_degree=1, stage_shares=(0.2, 0.3, 0.5), strategy="mcmc", mcmc=OFTEN),
+]
+BOTH = pytest.mark.parametrize("recipe", RECIPES, ids=["splat", "planar"])
+
+
+def place_true_planes(state: TrainState, dataset: object) -> None:
+    """Stands in for the plane fit, which needs more masks than the tiny capture has."""
+    truth = true_scene()
+    state.scene = replace(state.scene, planes=truth.planes, glass=truth.glass)
+    state.statistics.clear()
+
+
+def stages_of(recipe: Any) -> tuple[Stage, ...]:
+    return tuple(replace(s, entry=place_true_planes) if s.entry else s for s in recipe.stages(seed=0))
+
+
+def fresh_state(recipe: Any, seed: int = 0) -> TrainState:
+    scene = SplatRecipe(sh_degree=1, strategy="mcmc", mcmc=recipe.mcmc).initialise(tiny_capture())
+    return TrainState(scene, seed)
+
+
+def run(state: TrainState, recipe: Any, iterations: int = 20, until: int | None = None) -> list[Message]:
+    messages = []
+    for message in train(stages_of(recipe), tiny_capture(), state, iterations):
+        messages.append(message)
+        if isinstance(message, StepDone) and message.step == until:
+            break
+    return messages
+
+
+def in_front(scene: Scene, view: View) -> Tensor:
+    """[N] bool: what the tiny capture's camera shows of the primary Gaussians."""
+    return view.camera.project(scene.primary.means)[1] > 0
+
+
+@BOTH
+def test_a_short_run_relocates_grows_and_regularises(recipe: Any) -> None:
+    state = fresh_state(recipe)
+    before = len(state.scene.primary)
+    messages = run(state, recipe)
+    actions = [m.action for m in messages if isinstance(m, ActionDone)]
+    assert "densify primary" in actions
+    assert actions.count("reset opacity") == (1 if recipe.method == "planar" else 0)
+    assert before < len(state.scene.primary) <= OFTEN.cap
+    steps = [m for m in messages if isinstance(m, StepDone)]
+    assert all({"opacity", "scale"} <= set(m.losses) for m in steps)
+    assert all(torch.isfinite(tensor).all() for tensor in state.scene.parameters().values())
+
+
+@BOTH
+@pytest.mark.parametrize("pause", [3, 4, 11])
+def test_resuming_continues_to_the_same_result(recipe: Any, pause: int, tmp_path: Path) -> None:
+    whole, interrupted = fresh_state(recipe), fresh_state(recipe)
+    run(whole, recipe)
+    run(interrupted, recipe, until=pause)
+    save_checkpoint(tmp_path / "checkpoint.safetensors", interrupted)
+    resumed = load_checkpoint(tmp_path / "checkpoint.safetensors")
+    run(resumed, recipe)
+    for name, tensor in whole.scene.parameters().items():
+        assert torch.equal(tensor, resumed.scene.parameters()[name]), name
+
+
+@BOTH
+def test_the_strategy_decides_what_happens_to_the_primary_gaussians(recipe: Any) -> None:
+    for number, stage in enumerate(recipe.stages(seed=0)):
+        kinds = [type(action) for action in stage.actions]
+        # The later stages, which only `planar` has, hold its one reset.
+        assert kinds.count(Relocate) == 1 and kinds.count(ResetOpacity) == min(number, 1)
+        assert [type(motion) for motion in stage.motions] == [Explore, AverageLast]
+        assert all(action.part == "glass" for action in stage.actions if isinstance(action, Densify))
+    for stage in replace(recipe, strategy="default").stages(seed=0):
+        assert [type(motion) for motion in stage.motions] == [AverageLast]
+        assert not any(isinstance(action, Relocate) for action in stage.actions)
+        assert not {"opacity", "scale"} & {term.name for term in stage.losses}
+
+
+@pytest.mark.parametrize("iterations", [251, 1234, 7_000])
+@pytest.mark.parametrize("multi_stage", [True, False])
+def test_planar_grows_after_one_reset_when_joint_optimisation_begins(multi_stage: bool, iterations: int) -> None:
+    stages = PlanarRecipe(strategy="mcmc", multi_stage=multi_stage).stages(seed=0)
+    starts = stage_starts(stages, iterations)
+    due: dict[type, list[int]] = {ResetOpacity: [], Relocate: []}
+    for stage, start, end in zip(stages, starts, starts[1:], strict=False):
+        for step in range(start + 1, end + 1):
+            for action in stage.actions:
+                if type(action) in due and action.due(Clock(step, iterations, views=10)):
+                    due[type(action)].append(step)
+    joint = round(0.2 * iterations)
+    assert due[ResetOpacity] == [joint]
+    assert joint < due[Relocate][0] <= joint + 100
+
+
+def test_the_planar_objective_is_that_of_equation_20_but_for_two_terms() -> None:
+    recipe = RECIPES[1]
+    paper = replace(recipe, weights=replace(recipe.weights, intensity=0.0), view_dependence_weight=0.0)
+    *_, joint = paper.stages(seed=0)
+    assert joint.losses[0].function == PhotometricLoss(ssim_weight=0.2)
+    assert {term.name: term.weight for term in joint.losses} == pytest.approx(
+        {"photometric": 1.0, "depth": 0.005, "conflict": 0.2, "mask": 0.5, "opacity": 0.01, "scale": 0.01}
+    )
+
+
+def test_the_regularisers_reach_the_gaussians() -> None:
+    (stage,) = RECIPES[0].stages(seed=0)
+    scene, view = fresh_state(RECIPES[0]).scene, tiny_capture().train[0]
+    plain = replace(stage, losses=tuple(term for term in stage.losses if term.name not in ("opacity", "scale")))
+    gradients = [differentiate(s, scene, view, probed=False).gradients for s in (stage, plain)]
+    opacities, scales = torch.sigmoid(scene.primary.logit_opacities), scene.primary.log_scales.exp()
+    shown = in_front(scene, view)
+    expected = {
+        "primary.logit_opacities": shown * 0.01 * opacities * (1 - opacities) / shown.sum(),
+        "primary.log_scales": shown[:, None] * 0.01 * scales / (3 * shown.sum()) / scene.extent,
+    }
+    for name, gradient in expected.items():
+        assert torch.allclose(gradients[0][name] - gradients[1][name], gradient, rtol=1e-3, atol=1e-8), name
+
+
+@pytest.mark.parametrize("visible", [None, [True, False, True, False]])
+def test_the_noise_moves_what_the_view_shows(visible: list[bool] | None) -> None:
+    recipe = RECIPES[0]
+    state = fresh_state(recipe)
+    faint = state.scene.primary.select(torch.arange(4))
+    faint = faint.with_tensors({"logit_opacities": torch.full((4,), -9.0)})
+    state.scene = replace(state.scene, primary=faint)
+    (stage,) = recipe.stages(seed=0)
+    explore = stage.motions[0]
+    explore(state, Clock(1, 100, views=10), None if visible is None else torch.tensor(visible))
+    moved = (state.scene.primary.means != faint.means).any(dim=1).tolist()
+    assert moved == (visible or [True] * 4)
+
+
+def test_a_step_hands_on_what_its_view_shows() -> None:
+    (stage,) = RECIPES[0].stages(seed=0)
+    scene, view = fresh_state(RECIPES[0]).scene, tiny_capture().train[0]
+    visible = differentiate(stage, scene, view, probed=False).visible
+    assert visible is not None and torch.equal(visible, in_front(scene, view))
+    assert visible.any() and not visible.all()
+
+
+def test_the_strategy_decides_how_the_first_gaussians_look() -> None:
+    options = McmcDensify(initial_opacity=0.5, initial_spread=0.1)
+    recipes = SplatRecipe(strategy="mcmc", mcmc=options), SplatRecipe(mcmc=options)
+    sampled, default = (recipe.initialise(tiny_capture()).primary for recipe in recipes)
+    assert torch.sigmoid(sampled.logit_opacities).mean().item() == pytest.approx(0.5)
+    assert torch.allclose(sampled.log_scales.exp(), 0.1 * default.log_scales.exp())
+
+
+def test_the_default_cap_follows_the_photographs() -> None:
+    camera = tiny_capture().train[0].camera
+    assert cap_of(McmcDensify(), tiny_capture()) == round(camera.width * camera.height / 2)
+    assert cap_of(McmcDensify(cap=7), tiny_capture()) == 7
+
+
+@pytest.mark.parametrize("iterations", [3_000, 7_000, 30_000, 60_000])
+def test_the_cap_is_reached_at_the_same_share_of_any_run(iterations: int) -> None:
+    count, options = 6000.0, McmcDensify()
+    action = Relocate(options)
+    for step in range(1, iterations + 1):
+        if action.due(Clock(step, iterations, views=10)):
+            count *= growth_of(options, iterations)
+        if count >= 60_000:
+            break
+    assert step / iterations == pytest.approx(0.17, abs=0.02)
+
+
+def test_one_relocation_at_most_doubles_the_set() -> None:
+    assert growth_of(McmcDensify(), 30_000) == pytest.approx(1.05)
+    assert growth_of(McmcDensify(), 500) == 2.0
+
+
+def test_relocation_keeps_its_share_of_the_run() -> None:
+    action = Relocate(McmcDensify())
+    due = [step for step in range(1, 30_001) if action.due(Clock(step, 30_000, views=10))]
+    assert (due[0], due[1], due[-1]) == (600, 700, 25_000)
+
+
+def test_weights_and_noise_of_zero_are_left_out() -> None:
+    bare = McmcDensify(noise_rate=0.0, opacity_weight=0.0, scale_weight=0.0)
+    (stage,) = SplatRecipe(strategy="mcmc", mcmc=bare, rhythm=Rhythm(averaged_passes=0)).stages(seed=0)
+    assert not stage.motions and {term.name for term in stage.losses} == {"photometric"}
+
+
+@BOTH
+def test_a_recipe_survives_its_file(recipe: Any) -> None:
+    assert recipe_from_json(recipe_to_json(recipe)) == recipe
+
+
+def test_screen_gradients_are_collected_for_who_densifies_by_them() -> None:
+    sampled, default = (SplatRecipe(strategy=strategy).stages(seed=0)[0] for strategy in ("mcmc", "default"))
+    assert sampled.densify_until == 0
+    assert default.densify_until == SplatRecipe().densify.stop
+    first, *later = PlanarRecipe(strategy="mcmc").stages(seed=0)
+    assert first.densify_until == 0
+    # The glass is densified under either strategy.
+    assert {stage.densify_until for stage in later} == {PlanarRecipe().densify.stop}

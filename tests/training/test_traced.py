@@ -1,0 +1,283 @@
+"""The `traced` recipe: its stages, how surroundings begin, grow and are pruned, a short run, and resuming."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from glassplat.methods.glossy_recipes import TracedRecipe
+from glassplat.methods.mirrors import GrowShAfterPropagation, Propagate, RefineEnvironment
+from glassplat.methods.recipe import recipe_from_json, recipe_to_json
+from glassplat.methods.surroundings import AddSurroundings
+from glassplat.render.traced import Traced, mirrored_contributions
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Environment
+from glassplat.training.actions import Densify, GrowSh, PruneIdle, ResetOpacity
+from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
+from glassplat.training.densify import ScreenStatistics
+from glassplat.training.loop import differentiate, train
+from glassplat.training.messages import ActionDone, Message, StageEntered, StepDone
+from glassplat.training.options import (
+    DefaultDensify,
+    MirrorSearch,
+    PropagationSchedule,
+    Rhythm,
+    SurroundingsOptions,
+    SurroundingsStart,
+)
+from glassplat.training.stage import Clock, Every, TrainState, stage_starts
+from tests.training.progress_of import finished
+from tests.training.tiny_capture import tiny_capture
+
+RECIPE = TracedRecipe(
+    sh_degree=1,
+    least_strength=0.0,
+    least_iterations=1,
+    first_strength=0.3,
+    search=MirrorSearch(begin_found=False, spread=1.0),
+    bootstrap=0.2,
+    surroundings=SurroundingsOptions(
+        start=SurroundingsStart("both", cells=2),
+        densify=DefaultDensify(split_by="gradient", interval=5, whole_passes=False, stop=0.6, gradient_threshold=1e-7),
+    ),
+    texels=4,
+    first_texels=2,
+    region=(0.0, 0.0, 3.5, 1.0),
+    rhythm=Rhythm(beat=0.1, least=2, sh=0.1),
+    schedule=PropagationSchedule(end="fixed", stop=0.7, pause=2),
+)
+PAPER = replace(RECIPE, mirrors="surroundings")
+
+
+def fresh_state(recipe: TracedRecipe = RECIPE) -> TrainState:
+    return TrainState(recipe.initialise(tiny_capture()), seed=0)
+
+
+def surrounded_state(start: SurroundingsStart | None = None) -> TrainState:
+    """With surroundings, as their stage begins, but for what was learned before."""
+    state = fresh_state()
+    matte = torch.ones(len(state.scene.primary), dtype=torch.bool)
+    AddSurroundings(start or RECIPE.surroundings.start, 1)(state, tiny_capture(), matte)
+    return state
+
+
+def run(recipe: TracedRecipe, state: TrainState, iterations: int = 40) -> list[Message]:
+    return list(train(recipe.stages(seed=0), tiny_capture(), state, iterations))
+
+
+def losses(messages: Sequence[Message]) -> list[float]:
+    return [m.losses["photometric"] for m in messages if isinstance(m, StepDone)]
+
+
+DISCS = replace(RECIPE, primitive="disc")
+EVERY = [RECIPE, PAPER, replace(RECIPE, mirrors="environment"), DISCS, replace(DISCS, mirrors="environment")]
+
+
+@pytest.mark.parametrize("recipe", EVERY, ids=lambda recipe: f"{recipe.mirrors} {recipe.primitive}")
+def test_a_short_run_learns(recipe: TracedRecipe) -> None:
+    state = fresh_state(recipe)
+    found = losses(run(recipe, state))
+    assert len(found) == 40 and sum(found[6:8]) < sum(found[:2])
+    assert all(torch.isfinite(tensor).all() for tensor in state.scene.parameters().values())
+    assert bool(len(state.scene.surroundings)) == (recipe.mirrors != "environment")
+    assert state.scene.environment.is_empty == (recipe.mirrors == "surroundings")
+    recipe.renderer().check(state.scene)
+    assert {len(part) and part.are_discs for part in (state.scene.primary, state.scene.surroundings)} <= {
+        0,
+        recipe.primitive == "disc",
+    }
+
+
+def test_near_and_distant_things_are_mirrored_from_one_moment_on() -> None:
+    messages = run(RECIPE, fresh_state())
+    entered = {m.stage: m.counts.get("surroundings", 0) for m in messages if isinstance(m, StageEntered)}
+    assert list(entered) == ["1 bootstrap", "2 reflection", "3 refinement"]
+    assert entered["1 bootstrap"] == 0 < entered["2 reflection"]
+    assert all(isinstance(stage.renderer, Traced) for stage in RECIPE.stages(0)[1:])
+    assert sum(stage.share for stage in RECIPE.stages(0)) == pytest.approx(1)
+
+
+def test_with_surroundings_alone_there_is_no_environment_to_refine() -> None:
+    actions = [action for stage in PAPER.stages(0) for action in stage.actions]
+    assert not any(isinstance(action, RefineEnvironment) for action in actions)
+    (propagate,) = [action for action in PAPER.stages(0)[1].actions if isinstance(action, Propagate)]
+    assert isinstance(propagate.renderer, Traced)
+
+
+def test_surroundings_learn_grow_and_are_pruned() -> None:
+    state = fresh_state()
+    messages = run(RECIPE, state)
+    done = [m.action for m in messages if isinstance(m, ActionDone)]
+    assert {"densify surroundings", "propagate normals", "prune idle surroundings"} <= set(done)
+    steps = [m for m in messages if isinstance(m, StepDone)]
+    counts = [m.counts["surroundings"] for m in steps if "surroundings" in m.counts]
+    assert max(counts) > counts[0] and min(counts) < max(counts)
+    assert bool(state.scene.surroundings.sh[:, 0].any())
+
+
+def test_a_resumed_run_ends_in_the_same_scene(tmp_path: Path) -> None:
+    whole = fresh_state()
+    run(RECIPE, whole)
+    first = fresh_state()
+    for message in train(RECIPE.stages(seed=0), tiny_capture(), first, 40):
+        if isinstance(message, StepDone) and message.step == 17:
+            break
+    save_checkpoint(tmp_path / "checkpoint", first)
+    second = load_checkpoint(tmp_path / "checkpoint")
+    assert len(second.scene.surroundings) and "surroundings" in second.statistics
+    run(RECIPE, second)
+    for name, tensor in whole.scene.parameters().items():
+        assert torch.equal(second.scene.parameters()[name], tensor), name
+
+
+def test_a_short_run_is_one_of_splat() -> None:
+    recipe = replace(RECIPE, least_iterations=41)
+    state = fresh_state(recipe)
+    messages = list(train(recipe.stages(0, 40), tiny_capture(), state, 40))
+    assert [m.stage for m in messages if isinstance(m, StageEntered)] == ["as splat"]
+    assert not len(state.scene.surroundings)
+    recipe.renderer().check(state.scene)
+
+
+def test_recipes_survive_as_json() -> None:
+    for recipe in (RECIPE, TracedRecipe.paper()):
+        assert recipe_from_json(recipe_to_json(recipe)) == recipe
+
+
+def test_surroundings_are_copied_spread_or_both() -> None:
+    copied, spread, both = (
+        surrounded_state(SurroundingsStart(source, cells=2)).scene.surroundings for source in ("scene", "box", "both")
+    )
+    assert len(spread) == 40 and len(copied) > 10 and len(both) == 40 + len(copied)
+    assert set(copied.means[:, 0].tolist()) <= set(fresh_state().scene.primary.means[:, 0].tolist())
+
+
+def test_where_everything_reflects_there_is_nothing_to_copy() -> None:
+    state = fresh_state()
+    nothing = torch.zeros(len(state.scene.primary), dtype=torch.bool)
+    AddSurroundings(SurroundingsStart("scene", cells=2), 1)(state, tiny_capture(), nothing)
+    assert len(state.scene.surroundings) == 40
+
+
+def test_gradients_in_space_count_by_half_the_distance() -> None:
+    statistics = ScreenStatistics.zeros(3)
+    gradient = torch.tensor([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    for _ in range(2):
+        statistics.add_in_space(gradient, torch.tensor([2.0, 5.0, 4.0]))
+    assert statistics.mean_gradient.tolist() == [5.0, 0.0, 2.0]
+    assert statistics.view_count.tolist() == [[2.0, 0.0, 2.0]] * 2
+
+
+def test_a_step_gathers_gradients_of_what_rays_met() -> None:
+    state = surrounded_state()
+    strong = {"logit_strength": torch.full((len(state.scene.primary),), 1.0)}
+    state.scene = replace(state.scene, primary=replace(state.scene.primary, channels=strong))
+    stage = RECIPE.stages(0)[2]
+    result = differentiate(stage, state.scene, tiny_capture().train[0], probed=True)
+    (record,) = result.space
+    assert record.part == "surroundings" and bool(result.gradients["surroundings.means"].any())
+    assert not differentiate(stage, state.scene, tiny_capture().train[0], probed=False).space
+
+
+def test_what_reflections_never_show_is_pruned() -> None:
+    state = surrounded_state()
+    strong = {"logit_strength": torch.full((len(state.scene.primary),), 1.0)}
+    state.scene = replace(state.scene, primary=replace(state.scene.primary, channels=strong))
+    hidden = state.scene.surroundings.means.clone()
+    hidden[:7] += 1e3
+    state.scene = state.scene.with_parameters({"surroundings.means": hidden})
+    before = len(state.scene.surroundings)
+    densifier = DefaultDensify(least_contribution=1e-9, contribution_moments=(0.5,))
+    action = PruneIdle(densifier, "surroundings", mirrored_contributions)
+    assert action.due(Clock(20, 40, 6)) and finished(action.apply(state, tiny_capture(), Clock(20, 40, 6)))
+    assert 0 < len(state.scene.surroundings) <= before - 7
+    assert float(state.scene.surroundings.means.abs().max()) < 100
+    dull = {"logit_strength": torch.full((len(state.scene.primary),), -20.0)}
+    state.scene = replace(state.scene, primary=replace(state.scene.primary, channels=dull))
+    assert not finished(action.apply(state, tiny_capture(), Clock(20, 40, 6)))
+
+
+def test_opacities_of_surroundings_alone_are_reset() -> None:
+    state = surrounded_state()
+    before = state.scene.primary
+    ResetOpacity(Every(0.1), part="surroundings").apply(state, tiny_capture(), Clock(4, 40, 6))
+    assert torch.equal(state.scene.primary.logit_opacities, before.logit_opacities)
+    assert float(torch.sigmoid(state.scene.surroundings.logit_opacities).max()) <= 0.0101
+
+
+def test_the_preset_resets_surroundings_where_it_resets_the_scene() -> None:
+    def parts(recipe: TracedRecipe) -> set[str]:
+        return {a.part for s in recipe.stages(0) for a in s.actions if isinstance(a, ResetOpacity | Densify)}
+
+    assert parts(TracedRecipe.paper()) == {"primary", "surroundings"}
+    resets = [a for s in RECIPE.stages(0) for a in s.actions if isinstance(a, ResetOpacity)]
+    assert {a.part for a in resets} == {"primary"}
+
+
+def test_the_preset_is_that_of_the_public_configuration() -> None:
+    recipe = TracedRecipe.paper()
+    stages = recipe.stages(0, 40_000)
+
+    def steps(kind: type, part: str) -> list[int]:
+        starts = stage_starts(stages, 40_000)
+        return [
+            step
+            for stage, start, end in zip(stages, starts, starts[1:], strict=False)
+            for step in range(start + 1, end + 1)
+            for action in stage.actions
+            if isinstance(action, kind) and getattr(action, "part", "primary") == part
+            if action.due(Clock(step, 40_000, 100))
+        ]
+
+    assert steps(ResetOpacity, "surroundings") == [6000, 12_000, 18_000]
+    assert steps(Densify, "surroundings")[0] == 3500 and steps(Densify, "surroundings")[-1] == 21_000
+    assert steps(Densify, "primary")[-1] == 21_000
+    assert steps(GrowSh, "primary")[:4] == [1000, 2000, 3000, 4000]
+    assert steps(Propagate, "primary")[-1] <= 18_000 < steps(Propagate, "primary")[-1] + 2000
+    assert not any(isinstance(a, GrowShAfterPropagation) for stage in stages for a in stage.actions)
+    assert recipe.surroundings.densify.prune_opacity == 0.05
+    for stage in stages:
+        assert {"consistency", "monocular normals"} <= {term.name for term in stage.losses}
+
+
+def test_normals_of_discs_can_learn_from_the_first_step_on() -> None:
+    recipe = replace(DISCS, normals_throughout=True, consistency_weight=1.0)
+    scene = fresh_state(recipe).scene
+    # Depths count where most of a pixel is covered.
+    scene = scene.with_parameters({"primary.logit_opacities": torch.full((len(scene.primary),), 3.0)})
+    found = differentiate(recipe.stages(0)[0], scene, tiny_capture().train[0], probed=False)
+    assert found.losses["consistency"] > 0 and bool(found.gradients["primary.quats"].any())
+
+
+def test_surroundings_that_are_too_large_are_pruned() -> None:
+    state = surrounded_state()
+    large = state.scene.surroundings.log_scales.clone()
+    large[:3] = math.log(2.5 * state.scene.extent)
+    state.scene = state.scene.with_parameters({"surroundings.log_scales": large})
+    count = len(state.scene.surroundings)
+    state.statistics["surroundings"] = ScreenStatistics.zeros(count)
+    densifier = DefaultDensify(prune_large_start=0.1, prune_scale_fraction=2.0, prune_opacity=1e-6)
+    Densify(densifier, "surroundings").apply(state, tiny_capture(), Clock(20, 40, 6))
+    assert len(state.scene.surroundings) == count - 3
+
+
+def test_what_hardly_reflects_learns_to_without_an_environment() -> None:
+    recipe = replace(RECIPE, mirrors="surroundings", least_strength=0.02)
+    state = surrounded_state()
+    faint = {"logit_strength": torch.full((len(state.scene.primary),), -6.0)}
+    scene = replace(state.scene, primary=replace(state.scene.primary, channels=faint))
+    for stage in recipe.stages(0)[1:]:
+        found = differentiate(stage, scene, tiny_capture().train[0], probed=False)
+        assert bool(found.gradients["primary.logit_strength"].any())
+    assert recipe.renderer().least_strength == 0.02
+
+
+def test_a_scene_without_surroundings_is_refused() -> None:
+    scene = replace(surrounded_state().scene, surroundings=Gaussians.empty(), environment=Environment.empty())
+    with pytest.raises(ValueError, match="has no surroundings; expected one trained with `traced`"):
+        RECIPE.renderer().check(scene)

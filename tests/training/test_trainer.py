@@ -1,0 +1,170 @@
+"""The training loop: progress, determinism, resuming, and its refusal of broken losses."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from glassplat.errors import InputError
+from glassplat.methods.planar import PlaneEntry
+from glassplat.methods.planar_recipe import PlanarRecipe
+from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.scene.scene import Scene
+from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
+from glassplat.training.loop import TrainingDivergedError, differentiate, train
+from glassplat.training.losses import LossTerm, PhotometricLoss
+from glassplat.training.messages import ActionDone, StageEntered, StepDone
+from glassplat.training.points import gaussians_from_points
+from glassplat.training.stage import Stage, TrainState
+from tests.training.progress_of import finished
+from tests.training.tiny_capture import tiny_capture, true_scene
+
+
+def fresh_state(seed: int = 0) -> TrainState:
+    return TrainState(SplatRecipe(sh_degree=1).initialise(tiny_capture()), seed)
+
+
+def place_true_planes(state: TrainState, dataset: object) -> None:
+    """Stands in for the plane fit, which needs more masks than the tiny capture has."""
+    truth = true_scene()
+    state.scene = replace(state.scene, planes=truth.planes, glass=truth.glass)
+
+
+def planar_stages() -> tuple[Stage, ...]:
+    stages = PlanarRecipe(sh_degree=1, stage_shares=(0.2, 0.3, 0.5)).stages(seed=0)
+    return tuple(replace(s, entry=place_true_planes) if s.entry else s for s in stages)
+
+
+def run(state: TrainState, stages: tuple[Stage, ...], iterations: int, until: int | None = None) -> list[StepDone]:
+    steps = []
+    for message in train(stages, tiny_capture(), state, iterations):
+        if isinstance(message, StepDone):
+            steps.append(message)
+            if message.step == until:
+                break
+    return steps
+
+
+def assert_same_scene(first: Scene, second: Scene) -> None:
+    for name, tensor in first.parameters().items():
+        assert torch.equal(tensor, second.parameters()[name]), name
+
+
+def test_training_lowers_the_loss() -> None:
+    steps = run(fresh_state(), SplatRecipe(sh_degree=1).stages(seed=0), 60)
+    assert sum(s.loss for s in steps[-6:]) < 0.6 * sum(s.loss for s in steps[:6])
+
+
+def test_a_step_does_without_sympy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which takes half a second to import, and PyTorch imports it to look at gradients that are given."""
+    monkeypatch.setitem(sys.modules, "torch.fx.experimental.symbolic_shapes", None)
+    with pytest.raises(ModuleNotFoundError):
+        torch.autograd.grad([torch.ones((), requires_grad=True) * 1], [torch.ones(())], [torch.ones(())])
+    assert run(fresh_state(), planar_stages(), iterations=20, until=2)
+
+
+def test_planar_goes_through_its_stages() -> None:
+    state = fresh_state()
+    messages = list(train(planar_stages(), tiny_capture(), state, 20))
+    assert [(m.step, m.stage[0]) for m in messages if isinstance(m, StageEntered)] == [(0, "1"), (4, "2"), (10, "3")]
+    assert any(isinstance(m, ActionDone) for m in messages)
+    terms = [set(m.losses) for m in messages if isinstance(m, StepDone)]
+    assert terms[0] == {"photometric", "view dependence"}
+    assert {"photometric", "depth", "conflict"} <= terms[-1]
+    assert any("mask" in names for names in terms)
+
+
+def test_stage_two_moves_the_plane_and_stage_one_does_not_touch_what_is_frozen() -> None:
+    state = fresh_state()
+    run(state, planar_stages(), 20, until=4)
+    assert torch.equal(state.scene.primary.channels["log_intensity"], torch.zeros(len(state.scene.primary)))
+    before = true_scene().planes
+    run(state, planar_stages(), 20, until=10)
+    assert not torch.equal(state.scene.planes.centers, before.centers)
+
+
+def test_the_same_seed_gives_the_same_scene_and_another_seed_another() -> None:
+    states = [fresh_state(0), fresh_state(0), fresh_state(1)]
+    for state in states:
+        run(state, planar_stages(), 12)
+    assert_same_scene(states[0].scene, states[1].scene)
+    assert not torch.equal(states[0].scene.primary.sh, states[2].scene.primary.sh)
+
+
+def test_screen_gradients_are_collected_as_long_as_densification_reads_them() -> None:
+    stages, state = tuple(replace(stage, actions=()) for stage in planar_stages()), fresh_state()
+    seen = []
+    for until in (10, 20):
+        run(state, stages, 20, until=until)
+        seen.append({part: statistics.view_count.clone() for part, statistics in state.statistics.items()})
+    assert PlanarRecipe().densify.stop == 0.5
+    assert seen[0]["primary"].sum() > 0
+    assert seen[0]["glass"].sum() > 0
+    for part, views in seen[0].items():
+        assert torch.equal(views, seen[1][part]), part
+
+
+def test_collecting_screen_gradients_changes_no_other_gradient() -> None:
+    state = fresh_state()
+    run(state, planar_stages(), 20, until=12)
+    results = [
+        differentiate(planar_stages()[-1], state.scene, tiny_capture().train[0], probed=p) for p in (True, False)
+    ]
+    assert len(results[0].screen) == 3
+    assert not results[1].screen
+    assert results[0].losses == results[1].losses
+    for name, gradient in results[0].gradients.items():
+        assert torch.allclose(gradient, results[1].gradients[name], rtol=1e-4, atol=1e-9), name
+
+
+@pytest.mark.parametrize("pause", [3, 4, 7])
+def test_resuming_continues_to_the_same_result(pause: int, tmp_path: Path) -> None:
+    whole = fresh_state()
+    run(whole, planar_stages(), 12)
+    interrupted = fresh_state()
+    run(interrupted, planar_stages(), 12, until=pause)
+    save_checkpoint(tmp_path / "checkpoint.safetensors", interrupted)
+    resumed = load_checkpoint(tmp_path / "checkpoint.safetensors")
+    assert resumed.step == pause
+    run(resumed, planar_stages(), 12)
+    assert_same_scene(whole.scene, resumed.scene)
+
+
+def test_a_loss_that_is_not_finite_stops_training_and_is_named() -> None:
+    broken = Stage(
+        name="broken",
+        share=1.0,
+        renderer=SplatRecipe().renderer(),
+        losses=(
+            LossTerm("photometric", 1.0, PhotometricLoss(0.2)),
+            LossTerm("poison", 1.0, lambda f, v, s: f.rgb.sum() * float("nan")),
+        ),
+        rates=SplatRecipe().rates.of("primary"),
+    )
+    state = fresh_state()
+    with pytest.raises(TrainingDivergedError, match=r"'poison' is nan at step 1 in view '\d.png'"):
+        run(state, (broken,), 5)
+    assert state.step == 0
+    assert_same_scene(state.scene, fresh_state().scene)
+
+
+def test_a_truncated_checkpoint_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "checkpoint.safetensors"
+    save_checkpoint(file, fresh_state())
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(InputError, match="truncated or not a checkpoint"):
+        load_checkpoint(file)
+    with pytest.raises(FileNotFoundError, match="no checkpoint at"):
+        load_checkpoint(tmp_path / "nothing")
+
+
+def test_plane_entry_needs_annotated_views() -> None:
+    dataset = tiny_capture()
+    bare = replace(dataset, train=tuple(replace(view, read_pane_labels=None) for view in dataset.train))
+    entry = PlaneEntry(PlanarRecipe().plane_fit, 10, 0)
+    with pytest.raises(ValueError, match="mask"):
+        finished(entry(TrainState(Scene(gaussians_from_points(dataset.points), dataset.extent), 0), bare))
