@@ -73,7 +73,6 @@ def test_a_command_does_not_wait_for_what_it_may_never_need(name: str) -> None:
 REFUSED = {
     "prepare none --output new": "no folder or video none",
     "annotate none": "no folder none",
-    "annotate capture --no-page": "nothing to do",
     "train splat --data none --output new": "no folder none",
     "train splat --data=capture --data=none --output new": "no folder none",
     "train planar --data capture --output trained": "trained already holds a run",
@@ -224,8 +223,6 @@ def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[
         ["render", "run", "--output", "x", "--layers", "hit"],
         ["dereflect", "run", "--output", "x", "--source", "[bold]"],
         ["demo", "--iterations", "many"],
-        ["bench"],
-        ["bench", "scenes", "--data", "x", "--output", "y", "--seeds", "one"],
     ],
     ids=" ".join,
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from glassplat.kernels.trace.bvh import BITS, morton_codes
+from glassplat.kernels.trace.bvh import MORTON_BITS, morton_codes
 from glassplat.training.points import in_morton_order
 
 
@@ -19,14 +19,14 @@ def test_the_corners_of_a_cube_come_in_the_order_of_the_curve() -> None:
 
 def test_codes_interleave_the_bits_of_the_axes() -> None:
     generator = torch.Generator().manual_seed(1)
-    cells = torch.randint(0, 2**BITS, (40, 3), generator=generator)
-    cells[0], cells[1] = 0, 2**BITS - 1
+    cells = torch.randint(0, 2**MORTON_BITS, (40, 3), generator=generator)
+    cells[0], cells[1] = 0, 2**MORTON_BITS - 1
     expected = [
-        sum(((int(cell[axis]) >> bit) & 1) << (3 * bit + axis) for bit in range(BITS) for axis in range(3))
+        sum(((int(cell[axis]) >> bit) & 1) << (3 * bit + axis) for bit in range(MORTON_BITS) for axis in range(3))
         for cell in cells
     ]
     # Half a cell keeps the conversion from rounding across a border.
-    means = (cells.double() + torch.where((cells > 0) & (cells < 2**BITS - 1), 0.5, 0.0)) * 0.25 - 7
+    means = (cells.double() + torch.where((cells > 0) & (cells < 2**MORTON_BITS - 1), 0.5, 0.0)) * 0.25 - 7
     assert morton_codes(means).tolist() == expected
 
 

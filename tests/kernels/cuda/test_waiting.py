@@ -104,7 +104,7 @@ def test_the_stand_in_sees_what_waits(waits: Waits) -> None:
 
 def test_the_cuda_kernels_wait_where_the_stand_in_says() -> None:
     found: dict[str, int] = {}
-    for path in sorted(KERNELS.glob("*/cuda*.py")):
+    for path in sorted(path for path in KERNELS.glob("*/cuda*.py") if path.parent.name != "backend"):
         for function in ast.parse(path.read_text()).body:
             for node in ast.walk(function):
                 if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in WAITING:

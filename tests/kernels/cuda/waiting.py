@@ -29,7 +29,7 @@ FROM_HERE = {ATEN.lift_fresh.default}
 """What turns the program's numbers into a tensor."""
 INDEXED = {ATEN.index.Tensor, ATEN.index_put_.default, ATEN.index_put.default, ATEN._index_put_impl_.default}
 READ = {torch.Tensor.tolist, torch.Tensor.numpy, torch.Tensor.cpu}
-KERNEL_WAITS = {"bin_tiles": 1, "trace": 1}
+KERNEL_WAITS = {"bin_tiles": 1, "trace_gradients": 1}
 """How often these functions of CUDA kernels wait; the others never do (`test_waiting.py` looks)."""
 
 
