@@ -16,7 +16,7 @@ PACKAGE = "glassplat"
 DIAGRAM = ROOT / "docs" / "architecture.md"
 CHECKED_FOLDERS = (PACKAGE, "tests", "tools", "bench")
 
-MOST_FILE_LINES = 400
+MOST_FILE_LINES = 700
 MOST_TEST_FILE_LINES = 600
 MOST_FUNCTION_LINES = 60
 MOST_KERNEL_LINES = 120
@@ -253,7 +253,7 @@ def test_parameters_are_counted_without_self() -> None:
 
 def test_a_long_file_is_found() -> None:
     (message,) = violations(Path("glassplat/render/x.py"), "x = 1\n" * (MOST_FILE_LINES + 1), SMALL_ROWS)
-    assert "401 lines where 400 are the most" in message
+    assert "701 lines where 700 are the most" in message
 
 
 @pytest.mark.parametrize("path", ["glassplat/render/utils.py", "tests/helpers/x.py", "tools/Common.py"])
