@@ -61,11 +61,19 @@ PREVIEW = (16, 12)
 
 @dataclass(frozen=True)
 class DrawnPlace:
-    """A place and where it is photographed from: camera-to-world [4, 4] each, x right, y down, z forward."""
+    """A place and where it is photographed from.
+
+    Attributes:
+        place: what there is.
+        poses: camera-to-world [4, 4] each, x right, y down, z forward.
+        words: what was drawn.
+        room: [2, 3] lowest and highest corner of where the cameras stay; None if it was not drawn.
+    """
 
     place: Place
     poses: list[Array]
     words: str = ""
+    room: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -137,10 +145,10 @@ def _draw_once(generator: Generator, seed: int, views: int) -> DrawnPlace | None
     place = Place(things, panes, (*stage.lamps, *lights), ambient)
     walk = WALKS[setting][seed // len(SETTINGS) % len(WALKS[setting])]
     turns = walk != "front" or bool(generator.random() < 0.5)
-    poses = _draw_poses(generator, place, (walk, turns), views)
+    poses = _draw_poses(generator, place, stage, walk=walk, turns=turns, views=views)
     glass = ", ".join("mirror" if pane.refraction is None else f"index {pane.refraction:.2f}" for pane in panes)
     words = f"{stage.words}; {glass}; walk {walk}{'' if turns else ', never turned round'}"
-    return DrawnPlace(place, poses, words) if poses else None
+    return DrawnPlace(place, poses, words, np.array([stage.low, stage.high])) if poses else None
 
 
 def _between(generator: Generator, limits: tuple[float, float]) -> float:
@@ -439,20 +447,23 @@ def _touch(pane: Pane, other: Pane) -> bool:
     return min(_distance_to_pane(other, pane.center[:2] + step) for step in steps) < 0.3
 
 
-def _draw_poses(generator: Generator, place: Place, walk: tuple[Walk, bool], views: int) -> list[Array]:
+def _draw_poses(
+    generator: Generator, place: Place, stage: _Stage, *, walk: Walk, turns: bool, views: int
+) -> list[Array]:
     """Camera-to-world: two of three look at a pane, one of three past all of them, as level as people do.
 
     Args:
         generator: of what is drawn.
         place: that is photographed.
-        walk: its kind, and whether the camera is turned round on it; where it is not, all views look at a pane.
+        stage: the room in which the camera stays.
+        walk: its kind.
+        turns: whether the camera is turned round on it; where it is not, all views look at a pane.
         views: how many.
     """
-    kind, turns = walk
     course = (_between(generator, LINES), generator.uniform(-0.2, 0.2), _between(generator, (1.1, 1.6)))
     poses = []
     for number in range(views):
-        position = _draw_position(generator, place, (kind, number / max(views - 1, 1), course))
+        position = _draw_position(generator, place, stage, (walk, number / max(views - 1, 1), course))
         if position is None:
             return []
         pane = place.panes[number % len(place.panes)]
@@ -475,10 +486,10 @@ def _draw_target(generator: Generator, place: Place, position: Array) -> Array:
 
 
 def _draw_position(
-    generator: Generator, place: Place, walk: tuple[Walk, float, tuple[float, float, float]]
+    generator: Generator, place: Place, stage: _Stage, course: tuple[Walk, float, tuple[float, float, float]]
 ) -> Array | None:
     """Somewhere before the panes of glass or around them, or on a line past them; None if nothing is clear there."""
-    kind, progress, (distance, slope, height) = walk
+    kind, progress, (distance, slope, height) = course
     glass = [pane for pane in place.panes if pane.refraction]
     first, middle = glass[0], np.mean([pane.center for pane in glass], axis=0)[:2]
     facing = math.atan2(first.normal[1], first.normal[0])
@@ -495,7 +506,8 @@ def _draw_position(
             start = middle + (generator.uniform(-0.6, 0.6) * half * aside if kind == "front" else 0)
             step = stand * np.array([math.cos(angle), math.sin(angle)])
             position = np.append(start + step, generator.uniform(*EYES))
-        if is_clear(place, position):
+        indoors = np.all((position > stage.low) & (position < stage.high))
+        if indoors and is_clear(place, position):
             return position
     return None
 

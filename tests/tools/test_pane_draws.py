@@ -29,6 +29,8 @@ def test_a_seed_draws_the_same_place_every_time_and_another_one_does_not() -> No
 def test_cameras_stand_clear_of_everything_and_see_every_pane_and_lamps(seed: int) -> None:
     drawn = draw_place(seed, VIEWS)
     assert all(is_clear(drawn.place, pose[:3, 3]) for pose in drawn.poses)
+    assert drawn.room is not None
+    assert all((drawn.room[0] < pose[:3, 3]).all() and (pose[:3, 3] < drawn.room[1]).all() for pose in drawn.poses)
     seen = [drawn.place.view(pose, *PREVIEW) for pose in drawn.poses]
     for pane in drawn.place.panes:
         shares = np.array([(view.label == pane.label).mean() for view in seen])
