@@ -303,13 +303,16 @@ class Place:
 
 def _thing_record(thing: Thing) -> tuple[object, ...]:
     """Values of `pane_tracer.THING`."""
-    turned, frame = isinstance(thing, Carried), np.eye(4)
+    turned, world_from_thing = isinstance(thing, Carried), np.eye(4)
     if isinstance(thing, Carried):
-        frame, thing = np.linalg.inv(thing.world_from_thing), thing.thing
+        world_from_thing, thing = thing.world_from_thing, thing.thing
+    frame = np.linalg.inv(world_from_thing)
     low, high = thing.span
-    paint = thing.paint
+    paint, middle = thing.paint, world_from_thing @ [*(low + high) / 2, 1.0]
     pattern = (paint.code, paint.inks, paint.shade, paint.coarseness, paint_waves(paint.seed))
-    return (thing.shape, low, high, turned, frame[:3], *pattern)
+    # A little larger, lest rounding make a ray miss what it just touches.
+    square_radius = 1.001 * ((high - low) ** 2).sum() / 4
+    return (thing.shape, low, high, middle[:3], square_radius, turned, frame[:3], *pattern)
 
 
 def _pane_record(pane: Pane) -> tuple[object, ...]:

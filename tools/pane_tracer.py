@@ -38,6 +38,8 @@ THING = np.dtype(
         ("shape", "i8"),  # `BALL`, `BOX`, `ROOM` or `CYLINDER`
         ("low", "f8", 3),  # the corners of what surrounds it in its frame
         ("high", "f8", 3),
+        ("middle", "f8", 3),  # of the ball that holds it, in the world, and the square of the ball's radius
+        ("square_radius", "f8"),
         ("turned", "i8"),  # whether the frame differs from the world's
         ("frame", "f8", (3, 4)),  # thing_from_world, rigid
         ("pattern", "i8"),  # of the paint
@@ -244,7 +246,12 @@ def _nearest_thing(tables, origin, direction, after_mirror):
     """Distance and number of the first thing on a ray."""
     nearest, found = np.inf, -1
     for number in range(len(tables.things) if after_mirror else tables.direct):
-        distance = distance_to(tables.things[number], origin, direction)
+        thing = tables.things[number]
+        offset = minus(vector(thing.middle), origin)
+        along = dot(offset, direction)
+        if dot(offset, offset) - along * along > thing.square_radius:
+            continue
+        distance = distance_to(thing, origin, direction)
         if distance < nearest:
             nearest, found = distance, number
     return nearest, found
