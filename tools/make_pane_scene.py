@@ -4,8 +4,8 @@
     python -m tools.make_pane_scene --output scenes/room-1 --drawn 1
 
 `screens`: two panes of glass, one upright, one leaning, through which the other is seen, stand between things; a mirror
-hangs on a wall. With `--drawn` everything is drawn by chance (`tools/pane_draws.py`); `--case` puts a silver bowl
-behind glass (`tools/case_place.py`). docs/scenes.md describes the files. Needs nothing but glassplat's own
+hangs on a wall. With `--drawn` everything is drawn by chance (`tools/pane_draws.py`); `--window` and `--case` make
+other places with names (`tools/pane_places.py`). docs/scenes.md describes the files. Needs nothing but glassplat's own
 dependencies.
 """
 
@@ -24,30 +24,28 @@ from PIL import Image
 from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import Rotation
 
-from tools.case_place import case_place, case_poses
 from tools.make_demo_scene import TEST_EVERY, srgb_from_linear
-from tools.make_scenes import GOLDEN_ANGLE_RAD, as_bytes
-from tools.pane_draws import DrawnPlace, draw_place, standing_pane, world_from_cam
-from tools.pane_tracer import Ball, Box, Place, Seen
-from tools.photographer_body import passer_by, photographer
-from tools.tracer_panes import Array, Pane, SecondPane, Waves
-from tools.window_place import window_place, window_poses
+from tools.make_scenes import as_bytes
+from tools.pane_draws import PREVIEW, DrawnPlace, draw_place
+from tools.pane_places import (
+    case_place,
+    case_poses,
+    passer_by,
+    photographer,
+    screens_place,
+    screens_poses,
+    window_place,
+    window_poses,
+)
+from tools.pane_things import FOCAL_PER_WIDTH, SUBPIXELS, Box, Pane, Place, SecondPane
+from tools.pane_tracer import Array, Seen
 
-LOOKED_AT = np.array([0.0, 0.1, 0.8])
-ORBIT = (1.45, 1.75)
-"""Least and largest distance of cameras from the vertical through `LOOKED_AT`, world units."""
-HEIGHTS = (0.7, 1.7)
-FOCAL_PER_WIDTH = 0.85
-PREVIEW = (16, 12)
-"""Width and height at which views are compared before they are rendered."""
-SUBPIXELS = 3
-"""Rays per pixel and axis."""
 POINT_NOISE = 0.005
 """Standard deviation of the sparse points about the surfaces, world units."""
 GAP = 0.02
 """Between the two panes of double glazing, world units."""
-PASSERS = 77
-"""Keeps what is drawn for those who walk by apart from all else."""
+PASSERS, SENSOR = 77, 78
+"""Keep what is drawn for those who walk by, and for the sensor, apart from all else."""
 VIRTUAL_IN_GLASS, VIRTUAL_IN_MIRROR = 0.4, 1.0
 """Share of the sparse points seen in a pane that lie where it shows what it mirrors, as structure from motion finds."""
 
@@ -62,14 +60,16 @@ class Arguments:
     """Of the photographs, pixels; heights are three quarters of it."""
     views: int = 96
     """Photographs; every eighth is a test view."""
-    masks: int = 5
-    """Annotated training views of each pane."""
+    noise: float = 0.0
+    """Standard deviation of the sensor's noise in photographs, of 255."""
+    masks: int = 8
+    """Annotated training views."""
     points: int = 6000
     """Sparse points."""
     seed: int = 0
     """Of cameras and points of `screens`, `window` and `case`."""
     drawn: int | None = None
-    """Seed of a place drawn by chance, to make in place of `screens`."""
+    """Seed of a place drawn by chance, to make in place of `screens`; of all that is random in it, too."""
     window: bool = False
     """Make a large window before a dark case, photographed from the front, in place of `screens`."""
     case: bool = False
@@ -80,64 +80,18 @@ class Arguments:
     """Somebody stands behind the camera with a phone before the face, and is seen in panes and mirrors."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Share of red, green and blue light that panes of glass let through of what they do not reflect."""
-    waves: float = 0.0
-    """Unevenness of the glass: root of the mean square of the angles by which its normals are turned, degrees."""
     second_pane: float | None = None
     """Make the glass double: behind each pane is another, tilted by so many degrees against it."""
 
-
-def make_place() -> Place:
-    """The room, what is in it, and its panes."""
-    things = (
-        Box((-2.2, -2.2, 0.0), (2.2, 2.2, 2.6), seed=10, room=True),
-        Ball((0.35, 0.15, 0.25), 0.25, seed=20),
-        Ball((-0.6, -0.9, 0.3), 0.3, seed=30),
-        Box((-0.95, 0.85, 0.0), (-0.6, 1.15, 0.9), seed=40),
-        Box((0.85, -0.95, 0.0), (1.1, -0.7, 0.6), seed=50),
-        Box((0.5, 1.05, 0.0), (0.85, 1.3, 0.5), seed=60),
-    )
-    return Place(
-        things,
-        (
-            standing_pane(1, (0.0, -0.3, 0.85), turn_deg=10, lean_deg=0, half_sizes=(0.75, 0.55)),
-            standing_pane(2, (0.1, 0.65, 0.8), turn_deg=-20, lean_deg=25, half_sizes=(0.6, 0.5)),
-            standing_pane(3, (2.19, 0.0, 1.1), turn_deg=90, lean_deg=0, half_sizes=(0.7, 0.5), refraction=None),
-        ),
-    )
+    @property
+    def any_seed(self) -> int:
+        """Of all that is random."""
+        return self.seed if self.drawn is None else self.drawn
 
 
-def camera_poses(count: int, seed: int) -> list[Array]:
-    """Camera-to-world [4, 4]: two of three look at the panes from all around, one of three looks around in the room."""
-    generator = np.random.default_rng(seed)
-    poses = []
-    for number in range(count):
-        angle, distance = GOLDEN_ANGLE_RAD * number, generator.uniform(*ORBIT)
-        around = np.array([math.cos(angle), math.sin(angle), 0.0])
-        position = np.array([0.0, 0.1, generator.uniform(*HEIGHTS)]) + distance * around
-        target = LOOKED_AT + generator.normal(scale=0.15, size=3)
-        if number % 3 == 2:
-            # Across the room, past the panes.
-            turned = Rotation.from_euler("z", 180 + generator.choice([-55, 55]), degrees=True).as_matrix() @ around
-            target = position + turned + [0, 0, generator.uniform(-0.35, 0.25)]
-        poses.append(world_from_cam(position, target))
-    return poses
-
-
-def see(place: Place, pose: Array, width: int, height: int) -> Seen:
-    """What the rays of an image see; [H, W, SUBPIXELS^2, ...] each."""
-    fine = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS
-    x, y, dx, dy = np.meshgrid(np.arange(width), np.arange(height), fine, fine, indexing="xy")
-    focal = FOCAL_PER_WIDTH * width
-    rays = np.stack([(x + dx - width / 2) / focal, (y + dy - height / 2) / focal, np.ones_like(dx)], axis=-1)
-    directions = rays.reshape(-1, 3) @ pose[:3, :3].T
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    seen = place.seen(np.broadcast_to(pose[:3, 3], directions.shape), directions)
-    return Seen(*(layer.reshape(height, width, SUBPIXELS**2, *layer.shape[1:]) for layer in seen))
-
-
-def picture(radiance: Array) -> NDArray[np.uint8]:
-    """sRGB [H, W, 3] of the radiance [H, W, S, 3] of the rays in each pixel."""
-    return as_bytes(srgb_from_linear(np.clip(radiance.mean(axis=2), 0, 1)))
+def picture(radiance: Array, noise: Array | float = 0.0) -> NDArray[np.uint8]:
+    """sRGB [H, W, 3] of the radiance [H, W, S, 3] of the rays in each pixel; brighter than white is white."""
+    return as_bytes(srgb_from_linear(np.clip(radiance.mean(axis=2), 0, 1)) + noise)
 
 
 def whole_labels(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -145,11 +99,14 @@ def whole_labels(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.where(labels.min(axis=2) == labels.max(axis=2), labels[:, :, 0], 0).astype(np.uint8)
 
 
-def write_photograph(folder: Path, name: str, seen: Seen, *, annotated: bool) -> None:
+def write_photograph(arguments: Arguments, number: int, seen: Seen, *, annotated: bool) -> None:
     """Writes a photograph, with its mask if it is annotated."""
-    Image.fromarray(picture(seen.radiance)).save(folder / "images" / name)
+    name = view_name(number)
+    generator = np.random.default_rng([arguments.any_seed, number, SENSOR])
+    noise = generator.normal(scale=arguments.noise / 255, size=(*seen.radiance.shape[:2], 3))
+    Image.fromarray(picture(seen.radiance, noise)).save(arguments.output / "images" / name)
     if annotated:
-        Image.fromarray(seen.label[:, :, SUBPIXELS**2 // 2]).save(folder / "masks" / name)
+        Image.fromarray(seen.label[:, :, SUBPIXELS**2 // 2]).save(arguments.output / "masks" / name)
 
 
 def write_layers(folder: Path, name: str, seen: Seen) -> None:
@@ -192,20 +149,27 @@ def sparse_points(place: Place, poses: list[Array], count: int, seed: int) -> tu
     directions = np.einsum("nij,nj->ni", eyes[:, :3, :3], rays)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     origins = eyes[:, :3, 3].copy()
-    # Features slide over silver as the camera moves: no points lie there.
-    plain = ~place.silver_normals(origins, directions).any(axis=1)
-    origins, directions, count = origins[plain], directions[plain], int(plain.sum())
-    colors, length = place.matte(origins, directions)
+    bare, shown = place.without_panes(), place.seen(origins, directions)
+    met = bare.seen(origins, directions)
+    colors, length = met.radiance.copy(), met.distance.copy()
+    kept = has_features(met)
     for pane in place.panes:
-        to_pane = pane.distances(origins, directions)
         share = VIRTUAL_IN_GLASS if pane.refraction else VIRTUAL_IN_MIRROR
-        chosen = (to_pane < length) & (generator.random(count) < share)
-        met = pane.meeting(origins[chosen], directions[chosen], to_pane[chosen])
-        colors[chosen], beyond = place.matte(met.points, met.mirrored)
+        chosen = (shown.label == pane.label) & (generator.random(count) < share)
+        along = directions[chosen] @ pane.normal
+        points = origins[chosen] + shown.to_pane[chosen, None] * directions[chosen]
+        beyond = bare.seen(points, directions[chosen] - 2 * along[:, None] * pane.normal)
+        colors[chosen], kept[chosen] = beyond.radiance, has_features(beyond)
         # Straight on behind the pane, as far as the light has come.
-        length[chosen] = to_pane[chosen] + beyond
-    positions = origins + length[:, None] * directions + generator.normal(scale=POINT_NOISE, size=(count, 3))
-    return positions, as_bytes(srgb_from_linear(colors))
+        length[chosen] = shown.to_pane[chosen] + beyond.distance
+    noise = generator.normal(scale=POINT_NOISE, size=(count, 3))
+    positions = origins + length[:, None] * directions + noise
+    return positions[kept], as_bytes(srgb_from_linear(np.clip(colors[kept], 0, 1)))
+
+
+def has_features(seen: Seen) -> NDArray[np.bool_]:
+    """[N] whether structure from motion finds points: not on silver, where they slide, nor where pictures clip."""
+    return ~seen.normal.any(axis=1) & (seen.radiance < 1).any(axis=1)
 
 
 def write_model(folder: Path, arguments: Arguments, poses: list[Array], place: Place) -> None:
@@ -220,8 +184,7 @@ def write_model(folder: Path, arguments: Arguments, poses: list[Array], place: P
         values = " ".join(f"{value:.9f}" for value in (w, x, y, z, *inverse[:3, 3]))
         lines.append(f"{number + 1} {values} 1 {view_name(number)}\n\n")
     (folder / "images.txt").write_text("".join(lines))
-    seed = arguments.seed if arguments.drawn is None else arguments.drawn
-    positions, colors = sparse_points(place, poses, arguments.points, seed)
+    positions, colors = sparse_points(place, poses, arguments.points, arguments.any_seed)
     rows = [
         f"{number + 1} {x:.6f} {y:.6f} {z:.6f} {r} {g} {b} 0.5\n"
         for number, ((x, y, z), (r, g, b)) in enumerate(zip(positions, colors, strict=True))
@@ -269,16 +232,23 @@ def view_name(number: int) -> str:
 
 
 def annotated_views(place: Place, poses: list[Array], masks: int) -> set[int]:
-    """Numbers of the training views that get a mask: for each pane some of the third in which it is largest."""
+    """Numbers of the training views that get a mask, in which every pane is marked.
+
+    One after the other, for the pane that the masks show least often: of the third of views in which it is largest the
+    one farthest from those chosen before.
+    """
     training = [number for number in range(len(poses)) if number % TEST_EVERY]
-    labels = np.stack([see(place, poses[number], *PREVIEW).label for number in training])
-    chosen = set()
-    for pane in place.panes:
-        sizes = (labels == pane.label).sum(axis=(1, 2, 3))
-        # A pane that few views show is not looked for in others.
-        largest = [v for v in np.argsort(-sizes, kind="stable")[: len(training) // 3] if 4 * sizes[v] > sizes.max()]
-        chosen |= {training[index] for index in sorted(largest)[:: max(len(largest) // masks, 1)][:masks]}
-    return chosen
+    labels = np.stack([place.view(poses[number], *PREVIEW).label for number in training])
+    sizes = np.stack([(labels == pane.label).sum(axis=(1, 2, 3)) for pane in place.panes], axis=1)
+    centers = np.stack([poses[number][:3, 3] for number in training])
+    chosen: list[int] = []
+    for _ in range(masks):
+        shown = (4 * sizes[chosen] > sizes.max(axis=0)).sum(axis=0)
+        of_pane = sizes[:, shown.argmin()]
+        largest = [view for view in np.argsort(-of_pane, kind="stable")[: len(training) // 3] if of_pane[view]]
+        apart = [min([np.linalg.norm(centers[view] - centers[c]) for c in chosen], default=0.0) for view in largest]
+        chosen.append(int(largest[int(np.argmax(apart))]))
+    return {training[index] for index in chosen}
 
 
 def with_passer_by(arguments: Arguments, place: Place, number: int, pose: Array) -> Place:
@@ -302,19 +272,19 @@ def write_view(arguments: Arguments, place: Place, number: int, pose: Array, *, 
     """Writes all that there is of a view; true layers are those without a photographer, and beside them with one."""
     folder, name, size = arguments.output, view_name(number), (arguments.width, arguments.width * 3 // 4)
     peopled = replace(place, photographer=photographer(pose)) if arguments.photographer else place
-    seen = see(peopled, pose, *size)
+    seen = peopled.view(pose, *size)
     if number % TEST_EVERY:
         passed = with_passer_by(arguments, peopled, number, pose)
         if passed is not peopled:
-            alone, seen = seen, see(passed, pose, *size)
+            alone, seen = seen, passed.view(pose, *size)
             write_difference(folder / "gt/passers_by" / name, picture(seen.radiance), picture(alone.radiance))
-    write_photograph(folder, name, seen, annotated=annotated)
+    write_photograph(arguments, number, seen, annotated=annotated)
     if number % TEST_EVERY:
         return
     write_strength(folder / "gt/strength", name, seen)
     if place.silver:
         write_surface(folder / "images", name, seen.normal)
-    write_layers(folder / "gt", name, see(place, pose, *size) if arguments.photographer else seen)
+    write_layers(folder / "gt", name, place.view(pose, *size) if arguments.photographer else seen)
     if arguments.photographer:
         write_layers(folder / "gt/with_photographer", name, seen)
 
@@ -327,7 +297,7 @@ def chosen_place(arguments: Arguments) -> DrawnPlace:
         return DrawnPlace(window_place(), window_poses(arguments.views, arguments.seed))
     if arguments.case:
         return DrawnPlace(case_place(), case_poses(arguments.views, arguments.seed))
-    return DrawnPlace(make_place(), camera_poses(arguments.views, arguments.seed))
+    return DrawnPlace(screens_place(), screens_poses(arguments.views, arguments.seed))
 
 
 def with_glass(place: Place, arguments: Arguments) -> Place:
@@ -336,21 +306,23 @@ def with_glass(place: Place, arguments: Arguments) -> Place:
 
 
 def flawed(pane: Pane, arguments: Arguments) -> Pane:
-    """A pane in the tint, with the waves, and doubled as it is asked for."""
-    waves = Waves(math.radians(arguments.waves), seed=pane.label) if arguments.waves else None
+    """A pane in the tint, and doubled as it is asked for."""
     tilt = arguments.second_pane
     second = None if tilt is None else SecondPane(GAP, math.radians(tilt))
-    return replace(pane, tint=arguments.tint, waves=waves, second=second)
+    return replace(pane, tint=arguments.tint, second=second)
 
 
 def main(arguments: Arguments) -> None:
     """Makes the scene."""
     folder = arguments.output
+    if arguments.drawn is not None and arguments.passers_by:
+        raise ValueError("nobody walks by in drawn places; leave out --passers-by or --drawn")
     if folder.exists():
         raise FileExistsError(f"{folder} exists; expected a new folder, so remove it first")
     for part in ("images", "masks", "sparse/0", "gt/strength"):
         (folder / part).mkdir(parents=True)
     drawn = chosen_place(arguments)
+    print(folder.name, drawn.words, flush=True)
     place, poses = with_glass(drawn.place, arguments), drawn.poses
     write_model(folder / "sparse/0", arguments, poses, place)
     write_planes(folder / "gt/planes.json", place)

@@ -1,150 +1,90 @@
-"""A small exact ray tracer of luminous, matte things and thin panes, in numpy: what the laws of optics say, by itself.
+"""An exact ray tracer of luminous, matte things, thin panes and curved mirrors, compiled with Numba.
 
-Things shine with the radiance of their texture, the same in all directions, so that a picture has no noise. Panes are
-thin: light goes through without a bend, and what comes back is the sum over all passages between the two surfaces.
+Things shine with the radiance of their paint under the lamps, the same in all directions, so that a picture has no
+noise. Panes are thin: light goes through without a bend, and what comes back is the sum over all passages between the
+two surfaces, by Fresnel's law for each polarisation. Light is followed through up to `REFLECTIONS` reflections one
+after the other. `tools/pane_things.py` describes places; this file traces rays through their tables.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+import math
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit, prange
 from numpy.typing import NDArray
 
-from tools.scene_surfaces import INK, solid_noise
-from tools.tracer_panes import SELF, Array, Meeting, Pane
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
-TEXTURE_WAVES = 16
 REFLECTIONS = 3
 """How many reflections one after the other are followed."""
+SELF = 1e-6
+"""A ray does not meet the pane from which it starts: distances below this do not count, world units."""
+BALL, BOX, ROOM, CYLINDER = range(4)
+PATCHES, STRIPES, DOTS, PLAIN, GLOW = range(5)
+CHECK, STRIPE, DOT_SPACING, DOT_RADIUS = 0.25, 0.11, 0.22, 0.33
+"""Sizes in patterns, world units; radii of dots as a share of their spacing."""
+# Minimax polynomial of cos(2 pi x) in x^2 on [-1/2, 1/2], exact to 1e-12: unlike `math.cos` it is vectorised.
+C0, C1, C2 = 0.9999999999990647, -19.73920880157127, 64.93939395775345
+C3, C4, C5 = -85.45681453437972, 60.24458621793278, -26.42561649473334
+C6, C7, C8 = 7.899159802271778, -1.696874443601398, 0.24376212211887036
 
 
-class Thing(Protocol):
-    """Something opaque."""
-
-    @property
-    def seed(self) -> int:
-        """Chooses its texture."""
-        ...
-
-    @property
-    def shade(self) -> float:
-        """Factor on the radiance of its texture."""
-        ...
-
-    def distances(self, origins: Array, directions: Array) -> Array:
-        """How far [N] rays with unit directions go until they meet it; infinite where they do not."""
-        ...
-
-    def on_texture(self, points: Array) -> Array:
-        """Where [N, 3] in the texture the points of its surface lie."""
-        ...
-
-
-@dataclass(frozen=True)
-class Ball:
-    """A ball."""
-
-    center: tuple[float, float, float]
-    radius: float
-    seed: int
-    shade: float = 1.0
-
-    def distances(self, origins: Array, directions: Array) -> Array:
-        """See `Thing`."""
-        offset = origins - np.array(self.center)
-        along = (offset * directions).sum(axis=1)
-        discriminant = along**2 - (offset**2).sum(axis=1) + self.radius**2
-        near = -along - np.sqrt(np.maximum(discriminant, 0))
-        return np.where((discriminant > 0) & (near > 0), near, np.inf)
-
-    def on_texture(self, points: Array) -> Array:
-        """See `Thing`."""
-        return points
+WAVES, INKS = 16, 5
+THING = np.dtype(
+    [
+        ("shape", "i8"),  # `BALL`, `BOX`, `ROOM` or `CYLINDER`
+        ("low", "f8", 3),  # the corners of what surrounds it in its frame
+        ("high", "f8", 3),
+        ("middle", "f8", 3),  # of the ball that holds it, in the world, and the square of the ball's radius
+        ("square_radius", "f8"),
+        ("turned", "i8"),  # whether the frame differs from the world's
+        ("frame", "f8", (3, 4)),  # thing_from_world, rigid
+        ("pattern", "i8"),  # of the paint
+        ("inks", "f8", (INKS, 3)),  # colours of the paint; of glowing things the radiance
+        ("shade", "f8"),  # a factor on them
+        ("scale", "f8"),  # world units of the pattern's unit
+        ("waves", "f8", (3, 4, WAVES)),  # three noises: wave vectors in cycles per unit, phases in cycles
+    ]
+)
+PANE = np.dtype(
+    [
+        ("center", "f8", 3),
+        ("normal", "f8", 3),
+        ("tangent", "f8", 3),
+        ("bitangent", "f8", 3),
+        ("half_sizes", "f8", 2),
+        ("refraction", "f8"),  # refractive index, 0 for mirrors
+        ("tint", "f8", 3),
+        ("doubled", "i8"),  # whether there is a second pane
+        ("second_center", "f8", 3),
+        ("second_normal", "f8", 3),
+    ]
+)
+SILVER = np.dtype([("center", "f8", 3), ("low", "f8", 3), ("high", "f8", 3)])
+LAMP = np.dtype([("center", "f8", 3), ("power", "f8"), ("reach", "f8")])
 
 
-@dataclass(frozen=True)
-class Box:
-    """A box along the axes, seen from outside, or as a room from inside; its texture as coarse as it is told."""
-
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-    seed: int
-    room: bool = False
-    shade: float = 1.0
-    coarseness: float = 1.0
-
-    def distances(self, origins: Array, directions: Array) -> Array:
-        """See `Thing`."""
-        with np.errstate(divide="ignore"):
-            to_low, to_high = (np.array(self.low) - origins) / directions, (np.array(self.high) - origins) / directions
-        enters, leaves = np.minimum(to_low, to_high).max(axis=1), np.maximum(to_low, to_high).min(axis=1)
-        if self.room:
-            return leaves
-        return np.where((enters < leaves) & (enters > 0), enters, np.inf)
-
-    def on_texture(self, points: Array) -> Array:
-        """See `Thing`."""
-        return points / self.coarseness
-
-
-@dataclass(frozen=True)
-class Carried:
-    """A thing that is carried about, its texture with it.
+class Tables(NamedTuple):
+    """A place as records, which compiled code reads.
 
     Attributes:
-        thing: as it is in a frame of its own.
-        world_from_thing: [4, 4] rigid transform of that frame.
+        things: of `THING`.
+        direct: number of the things that are seen directly; those after them are met after a reflection only.
+        panes: of `PANE`.
+        silver: of `SILVER`.
+        lamps: of `LAMP`.
+        ambient: light everywhere, as a factor on inks.
     """
 
-    thing: Thing
-    world_from_thing: Array
-
-    @property
-    def seed(self) -> int:
-        """See `Thing`."""
-        return self.thing.seed
-
-    @property
-    def shade(self) -> float:
-        """See `Thing`."""
-        return self.thing.shade
-
-    def distances(self, origins: Array, directions: Array) -> Array:
-        """See `Thing`."""
-        return self.thing.distances(self.on_texture(origins), directions @ self.world_from_thing[:3, :3])
-
-    def on_texture(self, points: Array) -> Array:
-        """See `Thing`."""
-        return (points - self.world_from_thing[:3, 3]) @ self.world_from_thing[:3, :3]
-
-
-@dataclass(frozen=True)
-class Silver:
-    """An ellipsoid along the axes that mirrors all light, such as a bowl with its lid on.
-
-    Attributes:
-        center: world units.
-        radii: along the axes.
-    """
-
-    center: tuple[float, float, float]
-    radii: tuple[float, float, float]
-
-    def distances(self, origins: Array, directions: Array) -> Array:
-        """How far [N] rays from outside go until they meet it; infinite where they do not."""
-        offset, along = (origins - self.center) / self.radii, directions / np.array(self.radii)
-        square, middle = (along**2).sum(axis=1), -(offset * along).sum(axis=1)
-        discriminant = middle**2 - square * ((offset**2).sum(axis=1) - 1)
-        near = (middle - np.sqrt(np.maximum(discriminant, 0))) / square
-        return np.where((discriminant > 0) & (near > SELF), near, np.inf)
-
-    def normals(self, points: Array) -> Array:
-        """Unit normals [N, 3] of points on it, outwards."""
-        gradients = (points - self.center) / np.square(self.radii)
-        return gradients / np.linalg.norm(gradients, axis=1, keepdims=True)
+    things: np.ndarray
+    direct: int
+    panes: np.ndarray
+    silver: np.ndarray
+    lamps: np.ndarray
+    ambient: float
 
 
 class Seen(NamedTuple):
@@ -155,8 +95,10 @@ class Seen(NamedTuple):
         transmission: [N, 3] what comes through the first pane in its tint, with what panes behind it reflect.
         reflection: [N, 3] what the first pane would show as a perfect mirror; 0 without a pane.
         strength: [N] reflectance of the first pane.
-        label: [N] the first pane's label, 0 where there is none.
+        label: [N] number of the first pane, from 1, 0 where there is none.
         normal: [N, 3] of the silver in which a ray ends that goes straight through all panes, 0 where it does not.
+        distance: [N] to the thing or silver in which that ray ends.
+        to_pane: [N] to the first pane, infinite where there is none.
     """
 
     radiance: Array
@@ -165,133 +107,380 @@ class Seen(NamedTuple):
     strength: Array
     label: NDArray[np.uint8]
     normal: Array
+    distance: Array
+    to_pane: Array
 
 
-@dataclass(frozen=True)
-class Lamp:
-    """Makes what is near it shine more: `power` times its texture at the centre, half of that at a distance `reach`."""
-
-    center: tuple[float, float, float]
-    reach: float
-    power: float = 2.0
-
-    def gains(self, points: Array) -> Array:
-        """Radiance [N, 1] of points [N, 3] for that of their textures; photographs cut at 1 what is brighter."""
-        return self.power / (1 + ((points - self.center) ** 2).sum(axis=1, keepdims=True) / self.reach**2)
+def trace(tables: Tables, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> Seen:
+    """What rays [N, 3] with unit directions [N, 3] see; panes that light meets after `reflections` are not there."""
+    count = len(directions)
+    colors, scalars, labels = np.zeros((count, 4, 3)), np.zeros((count, 3)), np.zeros(count, dtype=np.uint8)
+    rays = np.ascontiguousarray(origins, dtype=float), np.ascontiguousarray(directions, dtype=float)
+    _trace_rays(tables, *rays, reflections, (colors, scalars, labels))
+    radiance, transmission, reflection, normal = np.moveaxis(colors, 1, 0)
+    strength, distance, to_pane = scalars.T
+    return Seen(radiance, transmission, reflection, strength, labels, normal, distance, to_pane)
 
 
-@dataclass(frozen=True)
-class Place:
-    """Things and panes.
+@njit(cache=True)
+def dot(a, b):
+    """Product of two vectors."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
-    Attributes:
-        things: what there is; one must be a room, so that every ray ends.
-        panes: glass and mirrors.
-        lamp: without one all shine alike.
-        photographer: things that stand where the rays come from: light meets them after a reflection only.
-        silver: curved things that mirror everything.
+
+@njit(cache=True)
+def moved(point, factor, step):
+    """Point + factor * step."""
+    return point[0] + factor * step[0], point[1] + factor * step[1], point[2] + factor * step[2]
+
+
+@njit(cache=True)
+def vector(row):
+    """The first three values of a row as a tuple, which costs no memory."""
+    return row[0], row[1], row[2]
+
+
+@njit(cache=True)
+def minus(a, b):
+    """Difference of two vectors."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@njit(cache=True)
+def mirrored(direction, normal):
+    """The direction after a reflection."""
+    return moved(direction, -2.0 * dot(direction, normal), normal)
+
+
+@njit(cache=True, parallel=True)
+def _trace_rays(tables, origins, directions, reflections, outputs):
+    for number in prange(len(directions)):
+        _trace_ray(tables, (vector(origins[number]), vector(directions[number])), reflections, number, outputs)
+
+
+@njit(cache=True)
+def _trace_ray(tables, ray, reflections, number, outputs):
+    """Writes what one ray sees into a row of the outputs."""
+    colors, scalars, labels = outputs
+    origin, direction = ray
+    normal, end = _silver_end(tables, origin, direction, _nearest_thing(tables, origin, direction, False)[0])
+    pane, to_pane = -1, np.inf
+    if reflections > 0:
+        pane, reached = _next_pane(tables, origin, direction, (SELF, end))
+        to_pane = reached if pane >= 0 else np.inf
+    stack = np.empty((1 + REFLECTIONS * (2 * len(tables.panes) + 1), 11))
+    start = moved(origin, to_pane, direction) if pane >= 0 else origin
+    trans = _radiance(tables, (start, direction), reflections, False, stack)
+    reflection, strength = (0.0, 0.0, 0.0), 0.0
+    if pane >= 0:
+        tint = tables.panes[pane].tint
+        trans = trans[0] * tint[0], trans[1] * tint[1], trans[2] * tint[2]
+        for met in range(1 + tables.panes[pane].doubled):
+            point, onwards, share = _meeting(tables.panes[pane], met, ray)
+            reflection = moved(reflection, share, _radiance(tables, (point, onwards), reflections - 1, True, stack))
+            strength += share
+        reflection = moved((0.0, 0.0, 0.0), 1.0 / max(strength, 1e-300), reflection)
+    for c in range(3):
+        colors[number, 0, c] = (1 - strength) * trans[c] + strength * reflection[c]
+        colors[number, 1, c], colors[number, 2, c], colors[number, 3, c] = trans[c], reflection[c], normal[c]
+    labels[number] = pane + 1
+    scalars[number, 0], scalars[number, 1], scalars[number, 2] = strength, end, to_pane
+
+
+@njit(cache=True)
+def _radiance(tables, ray, reflections, after_mirror, stack):
+    """Radiance along a ray: the sum over all ways on which light comes, of their share times what shines there.
+
+    Args:
+        tables: of the place.
+        ray: origin and unit direction.
+        reflections: how many more are followed.
+        after_mirror: whether the ray comes from a mirror already, so that it may meet the photographer.
+        stack: [D, 11] scratch: ways yet to be followed, as origin, direction, share, reflections, after_mirror.
     """
-
-    things: Sequence[Thing]
-    panes: Sequence[Pane]
-    lamp: Lamp | None = None
-    photographer: Sequence[Thing] = ()
-    silver: Sequence[Silver] = ()
-
-    def without_panes(self, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> tuple[Array, Array]:
-        """Radiance [N, 3] along rays that go straight through all panes, and how far [N] they go.
-
-        Silver mirrors panes, too; where light meets it after so many reflections, it is not there for it.
-        """
-        radiance, distance = self.matte(origins, directions)
-        if not reflections or not self.silver:
-            return radiance, distance
-        for points, normals, hit in self.silver_met(origins, directions, distance):
-            along = (directions[hit] * normals).sum(axis=1, keepdims=True)
-            onwards = directions[hit] - 2 * along * normals
-            radiance[hit] = self.as_mirrored().radiance(points, onwards, reflections - 1)
-            distance[hit] = np.linalg.norm(points - origins[hit], axis=1)
-        return radiance, distance
-
-    def silver_normals(self, origins: Array, directions: Array) -> Array:
-        """[N, 3] of the silver in which rays end that go straight through all panes, 0 where they end elsewhere."""
-        normals, distance = np.zeros_like(directions), self.matte(origins, directions)[1]
-        for points, outwards, hit in self.silver_met(origins, directions, distance):
-            normals[hit] = outwards
-            distance[hit] = np.linalg.norm(points - origins[hit], axis=1)
-        return normals
-
-    def silver_met(
-        self, origins: Array, directions: Array, distance: Array
-    ) -> Iterator[tuple[Array, Array, NDArray[np.bool_]]]:
-        """Of each silver thing where rays meet it [P, 3], its normals there, and which [N] rays these are.
-
-        Args:
-            origins: [N, 3] of the rays.
-            directions: [N, 3] unit.
-            distance: [N] how far they go, at most; asked anew for each thing.
-        """
-        for silver in self.silver:
-            to_silver = silver.distances(origins, directions)
-            hit = to_silver < distance
-            points = origins[hit] + to_silver[hit, None] * directions[hit]
-            yield points, silver.normals(points), hit
-
-    def as_mirrored(self) -> Place:
-        """The place as light sees it after a reflection: with the photographer."""
-        return replace(self, things=(*self.things, *self.photographer), photographer=())
-
-    def matte(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        """Radiance [N, 3] along rays of a place without panes and silver, and how far [N] they go."""
-        distances = np.stack([thing.distances(origins, directions) for thing in self.things])
-        distance, nearest = distances.min(axis=0), distances.argmin(axis=0)
-        points = origins + distance[:, None] * directions
-        radiance = np.empty_like(points)
-        for number, thing in enumerate(self.things):
-            of_it = nearest == number
-            radiance[of_it] = thing.shade * painted(thing.on_texture(points[of_it]), thing.seed)
-        return radiance if self.lamp is None else radiance * self.lamp.gains(points), distance
-
-    def radiance(self, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> Array:
-        """Radiance [N, 3] along rays; panes that light meets after so many reflections are not there for it."""
-        if not reflections or not len(origins) or not self.panes:
-            return self.without_panes(origins, directions, reflections)[0]
-        return self.seen(origins, directions, reflections).radiance
-
-    def seen(self, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> Seen:
-        """The radiance along rays and its layers; there must be a pane."""
-        radiance, end = self.without_panes(origins, directions, reflections)
-        mirrored = self.as_mirrored()
-        distances = np.stack([pane.distances(origins, directions) for pane in self.panes])
-        distances = np.where(distances < end, distances, np.inf)
-        order = distances.argsort(axis=0)
-        # From the last pane on the way to the first one.
-        for place in reversed(range(len(self.panes))):
-            transmission, reflection = radiance.copy(), np.zeros_like(radiance)
-            strength, label = np.zeros(len(end)), np.zeros(len(end), dtype=np.uint8)
-            for number, pane in enumerate(self.panes):
-                hit = (order[place] == number) & (distances[number] < np.inf)
-                label[hit] = pane.label
-                transmission[hit] *= pane.tint
-                reflection[hit], strength[hit] = mirrored.mirrored_in(
-                    pane.meetings(origins[hit], directions[hit], distances[number, hit]), reflections - 1
-                )
-            radiance = (1 - strength[:, None]) * transmission + strength[:, None] * reflection
-        return Seen(radiance, transmission, reflection, strength, label, self.silver_normals(origins, directions))
-
-    def mirrored_in(self, meetings: Sequence[Meeting], reflections: int) -> tuple[Array, Array]:
-        """What a pane mirrors [N, 3], as if it mirrored all light, and the share [N] of the light that it does."""
-        strength = np.sum([met.share for met in meetings], axis=0)
-        seen = [met.share[:, None] * self.radiance(met.points, met.mirrored, reflections) for met in meetings]
-        return np.sum(seen, axis=0) / np.maximum(strength, np.finfo(float).tiny)[:, None], strength
+    top = _push(stack, 0, ray, ((1.0, 1.0, 1.0), reflections, after_mirror))
+    red, green, blue = 0.0, 0.0, 0.0
+    while top > 0:
+        top -= 1
+        row = stack[top]
+        origin, direction, share = (row[0], row[1], row[2]), (row[3], row[4], row[5]), (row[6], row[7], row[8])
+        left, after = int(row[9]), row[10] > 0
+        end, thing = _nearest_thing(tables, origin, direction, after)
+        normal, silver_end = (0.0, 0.0, 0.0), end
+        if left > 0:
+            normal, silver_end = _silver_end(tables, origin, direction, end)
+            reached = SELF
+            while True:
+                pane, reached = _next_pane(tables, origin, direction, (reached, silver_end))
+                if pane < 0:
+                    break
+                strength = 0.0
+                for met in range(1 + tables.panes[pane].doubled):
+                    point, onwards, part = _meeting(tables.panes[pane], met, (origin, direction))
+                    returned = moved((0.0, 0.0, 0.0), part, share)
+                    top = _push(stack, top, (point, onwards), (returned, left - 1, True))
+                    strength += part
+                tint = tables.panes[pane].tint
+                through = 1.0 - strength
+                share = share[0] * through * tint[0], share[1] * through * tint[1], share[2] * through * tint[2]
+        point = moved(origin, silver_end, direction)
+        if silver_end < end:
+            top = _push(stack, top, (point, mirrored(direction, normal)), (share, left - 1, True))
+        else:
+            color = _shining(tables, tables.things[thing], point)
+            red, green, blue = red + share[0] * color[0], green + share[1] * color[1], blue + share[2] * color[2]
+    return red, green, blue
 
 
-def painted(points: Array, seed: int) -> Array:
-    """Radiance [N, 3] of a texture at points: patches of a few colours, some of them checked, with a fine grain."""
-    level = solid_noise(points, frequency=0.7, seed=seed, waves=TEXTURE_WAVES)
-    colors = INK[np.clip((level * len(INK)).astype(int), 0, len(INK) - 1)]
-    checks = np.floor(points / 0.25 + 0.5).sum(axis=-1) % 2 == 0
-    checked = solid_noise(points, frequency=0.4, seed=seed + 1, waves=TEXTURE_WAVES) > 0.5
-    grain = 0.75 + 0.5 * solid_noise(points, frequency=6.0, seed=seed + 2, waves=TEXTURE_WAVES)
-    shade = np.where(checks & checked, 0.45, 1.0) * grain
-    return np.clip(colors * shade[:, None], 0.01, 1.0)
+@njit(cache=True)
+def _push(stack, top, ray, state):
+    """Adds a way to those yet to be followed; how many there are then."""
+    for c in range(3):
+        stack[top, c], stack[top, 3 + c], stack[top, 6 + c] = ray[0][c], ray[1][c], state[0][c]
+    stack[top, 9], stack[top, 10] = state[1], 1.0 if state[2] else 0.0
+    return top + 1
+
+
+@njit(cache=True)
+def _nearest_thing(tables, origin, direction, after_mirror):
+    """Distance and number of the first thing on a ray."""
+    nearest, found = np.inf, -1
+    for number in range(len(tables.things) if after_mirror else tables.direct):
+        thing = tables.things[number]
+        offset = minus(vector(thing.middle), origin)
+        along = dot(offset, direction)
+        if dot(offset, offset) - along * along > thing.square_radius:
+            continue
+        distance = distance_to(thing, origin, direction)
+        if distance < nearest:
+            nearest, found = distance, number
+    return nearest, found
+
+
+@njit(cache=True)
+def _in_frame(frame, point, w):
+    """A point (w = 1) or direction (w = 0) in a thing's frame."""
+    return (
+        frame[0, 0] * point[0] + frame[0, 1] * point[1] + frame[0, 2] * point[2] + w * frame[0, 3],
+        frame[1, 0] * point[0] + frame[1, 1] * point[1] + frame[1, 2] * point[2] + w * frame[1, 3],
+        frame[2, 0] * point[0] + frame[2, 1] * point[1] + frame[2, 2] * point[2] + w * frame[2, 3],
+    )
+
+
+@njit(cache=True)
+def distance_to(thing, origin, direction):
+    """How far a ray goes until it meets a thing; infinite where it does not."""
+    if thing.turned:
+        origin, direction = _in_frame(thing.frame, origin, 1.0), _in_frame(thing.frame, direction, 0.0)
+    low, high = vector(thing.low), vector(thing.high)
+    if thing.shape == BALL:
+        enters, leaves = _through_ellipsoid(low, high, 3, (origin, direction))
+        return enters if 0 < enters < leaves else np.inf
+    enters, leaves = _through_slab(low[2], high[2], origin[2], direction[2])
+    if thing.shape == CYLINDER:
+        first, last = _through_ellipsoid(low, high, 2, (origin, direction))
+        enters, leaves = max(enters, first), min(leaves, last)
+    else:
+        for axis in range(2):
+            first, last = _through_slab(low[axis], high[axis], origin[axis], direction[axis])
+            enters, leaves = max(enters, first), min(leaves, last)
+        if thing.shape == ROOM:
+            return leaves
+    return enters if 0 < enters < leaves else np.inf
+
+
+@njit(cache=True)
+def _through_slab(low, high, origin, direction):
+    """Where a ray enters and leaves what lies between two parallel planes."""
+    if direction == 0:
+        return (-np.inf, np.inf) if low <= origin <= high else (np.inf, -np.inf)
+    to_low, to_high = (low - origin) / direction, (high - origin) / direction
+    return min(to_low, to_high), max(to_low, to_high)
+
+
+@njit(cache=True)
+def _through_ellipsoid(low, high, axes, ray):
+    """Where a ray enters and leaves the ellipsoid that fills a span; with two axes an endless upright cylinder."""
+    square, middle, rest = 0.0, 0.0, -1.0
+    for axis in range(axes):
+        scale = 2.0 / (high[axis] - low[axis])
+        offset, along = scale * (ray[0][axis] - 0.5 * (low[axis] + high[axis])), scale * ray[1][axis]
+        square, middle, rest = square + along * along, middle - offset * along, rest + offset * offset
+    discriminant = middle * middle - square * rest
+    if square == 0:
+        return (-np.inf, np.inf) if rest < 0 else (np.inf, -np.inf)
+    if discriminant <= 0:
+        return np.inf, -np.inf
+    root = math.sqrt(discriminant)
+    return (middle - root) / square, (middle + root) / square
+
+
+@njit(cache=True)
+def _silver_end(tables, origin, direction, end):
+    """Normal of the silver that a ray meets before `end`, and where it does; 0 and `end` where it meets none."""
+    normal = (0.0, 0.0, 0.0)
+    for silver in tables.silver:
+        low, high = vector(silver.low), vector(silver.high)
+        distance, leaves = _through_ellipsoid(low, high, 3, (origin, direction))
+        if SELF < distance < end and distance < leaves:
+            end = distance
+            normal = _round_normal(low, high, 3, moved(origin, distance, direction))
+    return normal, end
+
+
+@njit(cache=True)
+def _next_pane(tables, origin, direction, between):
+    """Number and distance of the first pane on a ray between two distances; -1 where there is none."""
+    nearest, found = between[1], -1
+    for number in range(len(tables.panes)):
+        pane = tables.panes[number]
+        center, normal = vector(pane.center), vector(pane.normal)
+        steepness = dot(direction, normal)
+        if steepness == 0:
+            continue
+        distance = dot(minus(center, origin), normal) / steepness
+        if between[0] < distance < nearest:
+            offset = minus(moved(origin, distance, direction), center)
+            across, up = abs(dot(offset, vector(pane.tangent))), abs(dot(offset, vector(pane.bitangent)))
+            if across <= pane.half_sizes[0] and up <= pane.half_sizes[1]:
+                nearest, found = distance, number
+    return found, nearest
+
+
+@njit(cache=True)
+def _meeting(pane, which, ray):
+    """Where a ray meets a pane or its second pane, where it goes on to, and the share of the light that does.
+
+    Light that goes to and fro between the two panes of double glazing is left out.
+    """
+    origin, direction = ray
+    center, normal = vector(pane.center), vector(pane.normal)
+    share = reflectance(abs(dot(direction, normal)), pane.refraction)
+    if pane.doubled and (dot(direction, normal) < 0) != (which == 0):
+        share *= (1 - share) ** 2
+    if which == 1:
+        center, normal = vector(pane.second_center), vector(pane.second_normal)
+    point = moved(origin, dot(minus(center, origin), normal) / dot(direction, normal), direction)
+    return point, mirrored(direction, normal), share
+
+
+@njit(cache=True)
+def reflectance(cosine, refraction):
+    """Share of unpolarised light that a pane returns, by the cosine between ray and normal; 1 for mirrors.
+
+    Fresnel's law for each polarisation, r; between the two surfaces light goes to and fro, 2 r / (1 + r) in all.
+    """
+    if refraction == 0:
+        return 1.0
+    inside = math.sqrt(1 - (1 - cosine * cosine) / refraction**2)
+    across = ((cosine - refraction * inside) / (cosine + refraction * inside)) ** 2
+    along = ((inside - refraction * cosine) / (inside + refraction * cosine)) ** 2
+    return across / (1 + across) + along / (1 + along)
+
+
+@njit(cache=True)
+def _shining(tables, thing, point):
+    """Radiance of a thing at a point of its surface: its paint's, by the light of lamps there."""
+    inks, pattern = thing.inks, thing.pattern
+    if pattern == GLOW:
+        return inks[0, 0], inks[0, 1], inks[0, 2]
+    local = _in_frame(thing.frame, point, 1.0) if thing.turned else point
+    gain = tables.ambient
+    if len(tables.lamps):
+        gain += _lamplight(tables, point, _normal(thing, local))
+    gain *= thing.shade
+    place = moved((0.0, 0.0, 0.0), 1.0 / thing.scale, local)
+    ink, dark = 0, 1.0
+    if pattern == PATCHES:
+        level = noise(thing.waves[0], place)
+        ink = min(max(int(level * len(inks)), 0), len(inks) - 1)
+        if _cell(place, CHECK) % 2 == 0 and noise(thing.waves[1], place) > 0.5:
+            dark = 0.45
+    elif pattern == STRIPES:
+        ink = math.floor((place[0] + place[1] + 0.7 * place[2]) / STRIPE) % 2
+    elif pattern == DOTS:
+        ink = 1 if _from_dot(place) < DOT_RADIUS else 0
+    shade = dark * (0.75 + 0.5 * noise(thing.waves[2], place))
+    return (
+        gain * min(max(inks[ink, 0] * shade, 0.01), 1.0),
+        gain * min(max(inks[ink, 1] * shade, 0.01), 1.0),
+        gain * min(max(inks[ink, 2] * shade, 0.01), 1.0),
+    )
+
+
+@njit(cache=True)
+def _cell(place, side):
+    """Sum of the whole coordinates of the cube of so large a side in which a place lies."""
+    return int(
+        math.floor(place[0] / side + 0.5) + math.floor(place[1] / side + 0.5) + math.floor(place[2] / side + 0.5)
+    )
+
+
+@njit(cache=True)
+def _from_dot(place):
+    """Distance to the middle of the nearest dot, as a share of their spacing."""
+    x, y, z = place[0] / DOT_SPACING, place[1] / DOT_SPACING, place[2] / DOT_SPACING
+    x, y, z = x - np.rint(x), y - np.rint(y), z - np.rint(z)
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@njit(cache=True, fastmath=True)
+def noise(waves, place):
+    """A smooth random pattern in space, in about [0, 1]: `scene_surfaces.solid_noise`."""
+    total = 0.0
+    for wave in range(waves.shape[1]):
+        cycles = place[0] * waves[0, wave] + place[1] * waves[1, wave] + place[2] * waves[2, wave] + waves[3, wave]
+        cycles -= np.rint(cycles)
+        x = cycles * cycles
+        # Written out, so that the compiler takes several waves at once.
+        total += (((((((C8 * x + C7) * x + C6) * x + C5) * x + C4) * x + C3) * x + C2) * x + C1) * x + C0
+    return 0.5 + total / math.sqrt(8.0 * waves.shape[1])
+
+
+@njit(cache=True)
+def _lamplight(tables, point, normal):
+    """Light of all lamps at a point, half of it whichever way that faces; lamps cast no shadows."""
+    light = 0.0
+    for lamp in range(len(tables.lamps)):
+        row = tables.lamps[lamp]
+        towards = minus(vector(row.center), point)
+        square = dot(towards, towards)
+        facing = 0.5 + 0.5 * dot(towards, normal) / math.sqrt(max(square, 1e-12))
+        light += row.power * facing / (1 + square / row.reach**2)
+    return light
+
+
+@njit(cache=True)
+def _round_normal(low, high, axes, point):
+    """Unit normal of the ellipsoid that fills a span, or with two axes of the upright cylinder."""
+    x = (2 * point[0] - low[0] - high[0]) / (high[0] - low[0]) ** 2
+    y = (2 * point[1] - low[1] - high[1]) / (high[1] - low[1]) ** 2
+    z = (2 * point[2] - low[2] - high[2]) / (high[2] - low[2]) ** 2 if axes == 3 else 0.0
+    return moved((0.0, 0.0, 0.0), 1 / math.sqrt(x * x + y * y + z * z), (x, y, z))
+
+
+@njit(cache=True)
+def _normal(thing, local):
+    """Unit normal in the world at a point in the frame of a thing, on the side from which that is seen."""
+    low, high, shape = vector(thing.low), vector(thing.high), thing.shape
+    x, y, z = (
+        (2 * local[0] - low[0] - high[0]) / (high[0] - low[0]),
+        (2 * local[1] - low[1] - high[1]) / (high[1] - low[1]),
+        (2 * local[2] - low[2] - high[2]) / (high[2] - low[2]),
+    )
+    if shape == BALL:
+        normal = _round_normal(low, high, 3, local)
+    elif shape == CYLINDER and x * x + y * y > z * z:
+        normal = _round_normal(low, high, 2, local)
+    elif shape == CYLINDER or abs(z) >= max(abs(x), abs(y)):
+        normal = 0.0, 0.0, math.copysign(1.0, z)
+    elif abs(y) >= abs(x):
+        normal = 0.0, math.copysign(1.0, y), 0.0
+    else:
+        normal = math.copysign(1.0, x), 0.0, 0.0
+    if shape == ROOM:
+        normal = -normal[0], -normal[1], -normal[2]
+    if not thing.turned:
+        return normal
+    a, b, c = thing.frame[0], thing.frame[1], thing.frame[2]
+    return moved(moved(moved((0.0, 0.0, 0.0), normal[0], vector(a)), normal[1], vector(b)), normal[2], vector(c))
