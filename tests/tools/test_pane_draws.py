@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from glassplat.data.dataset import load_dataset
+from glassplat.captures.dataset import load_dataset
 from glassplat.files.images import read_image
 from tools.make_pane_scene import Arguments, main
 from tools.pane_draws import CLEARANCE, PREVIEW, draw_place, is_clear
