@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from glassplat.prepare.report_page import PAGE
-from glassplat.scene.camera import Eye
+from glassplat.scene.camera import NumpyCamera
 from tools.browser import Browser
 from tools.marking_page import MarkingPage, marking_page
 
@@ -40,7 +40,7 @@ def true_corners(scene: Path) -> NDArray[np.float64]:
     return np.stack([center - u + v, center + u + v, center + u - v, center - u - v])
 
 
-def whole_views(eyes: Sequence[Eye], corners: NDArray[np.float64]) -> list[int]:
+def whole_views(eyes: Sequence[NumpyCamera], corners: NDArray[np.float64]) -> list[int]:
     """Views that show the whole pane, with a little room beside the photograph."""
     return [number for number, eye in enumerate(eyes) if eye.holds(corners, 0.2).all()]
 

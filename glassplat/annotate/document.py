@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw
 from glassplat.annotate.fit import Marks, Shape
 from glassplat.files.records import ByName, Choice, Field, Items, Number, Optional, Whole, checked, read_json
 from glassplat.files.writing import atomic_write
-from glassplat.scene.camera import Eye
+from glassplat.scene.camera import NumpyCamera
 
 Material = Literal["glass", "mirror", "screen"]
 
@@ -172,7 +172,7 @@ FARTHEST_OUTSIDE = 1e5
 """Pixels beyond which a point of a stroke is as good as at infinity."""
 
 
-def seen_outline(eye: Eye, corners: Array) -> Array:
+def seen_outline(eye: NumpyCamera, corners: Array) -> Array:
     """[P, 2] the outline of a polygon [K, 3] in a view, cut off where it passes the camera; empty if it is behind.
 
     It reaches far beside the photograph there, which keeps its edges straight: 1 / `NEAR` focal lengths at most.
@@ -210,7 +210,7 @@ def filled(outline: Array, size: tuple[int, int]) -> Mask:
     return inside
 
 
-def depths(eye: Eye, corners: Array) -> Array:
+def depths(eye: NumpyCamera, corners: Array) -> Array:
     """[H, W] camera z at which each pixel's ray meets the plane of a polygon; infinite where it does not."""
     center = corners.mean(axis=0)
     normal = np.linalg.svd(corners - center)[2][2]

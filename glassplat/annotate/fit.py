@@ -9,7 +9,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from glassplat.scene.camera import Eye
+from glassplat.scene.camera import NumpyCamera
 
 Array = NDArray[np.float64]
 
@@ -202,7 +202,7 @@ def tilt_deviation(information: Array) -> float:
     return 90.0 if least <= np.degrees(1) ** -2 * 1e-4 else min(float(np.degrees(1 / np.sqrt(least))), 90.0)
 
 
-def fitted_pane(marks: Marks, eyes: Sequence[Eye], shape: Shape) -> PaneFit:
+def fitted_pane(marks: Marks, eyes: Sequence[NumpyCamera], shape: Shape) -> PaneFit:
     """The outline that lies closest to all marks; single marks that are far off count little.
 
     Args:
@@ -224,7 +224,7 @@ def fitted_pane(marks: Marks, eyes: Sequence[Eye], shape: Shape) -> PaneFit:
     return PaneFit(fitted, error, largest, jacobian.T @ jacobian / spread**2)
 
 
-def _fitted(marks: Marks, eyes: Sequence[Eye], begun: PaneShape) -> tuple[float, PaneShape]:
+def _fitted(marks: Marks, eyes: Sequence[NumpyCamera], begun: PaneShape) -> tuple[float, PaneShape]:
     """What marks leave unexplained, and the shape that is nearest to them from where it begins."""
     from scipy.optimize import least_squares
 
@@ -238,13 +238,13 @@ def _fitted(marks: Marks, eyes: Sequence[Eye], begun: PaneShape) -> tuple[float,
     return cost, begun.stepped(step)
 
 
-def mark_residuals(marks: Marks, eyes: Sequence[Eye], shape: PaneShape) -> Array:
+def mark_residuals(marks: Marks, eyes: Sequence[NumpyCamera], shape: PaneShape) -> Array:
     """[R] distances of all marks from the shape, in accuracies; two for a corner, one for each pixel on an edge."""
     parts = [away / (ACCURACY * eyes[view].diagonal) for view, away in _distances(marks, eyes, shape)]
     return np.concatenate(parts)
 
 
-def corner_information(eye: Eye, shape: PaneShape) -> Array:
+def corner_information(eye: NumpyCamera, shape: PaneShape) -> Array:
     """[F, F] what marking every corner that a view holds would add to a fit's information."""
     held = eye.holds(shape.corners())
     marks = Marks([{0: pixel} if seen else {} for pixel, seen in zip(eye.project(shape.corners()), held, strict=True)])
@@ -254,7 +254,7 @@ def corner_information(eye: Eye, shape: PaneShape) -> Array:
     return jacobian.T @ jacobian
 
 
-def _jacobian(marks: Marks, eyes: Sequence[Eye], shape: PaneShape) -> Array:
+def _jacobian(marks: Marks, eyes: Sequence[NumpyCamera], shape: PaneShape) -> Array:
     """[R, F] by central differences."""
     columns = []
     for axis in np.eye(shape.freedom):
@@ -265,7 +265,7 @@ def _jacobian(marks: Marks, eyes: Sequence[Eye], shape: PaneShape) -> Array:
     return np.stack(columns, axis=1)
 
 
-def _distances(marks: Marks, eyes: Sequence[Eye], shape: PaneShape) -> list[tuple[int, Array]]:
+def _distances(marks: Marks, eyes: Sequence[NumpyCamera], shape: PaneShape) -> list[tuple[int, Array]]:
     """The view and the distances, in pixels, of each mark: [2] of a corner, [2] across an edge."""
     corners = shape.corners()
     found = []
@@ -285,11 +285,11 @@ def _across(line: Array, places: Array) -> Array:
     return np.asarray((along[0] * away[:, 1] - along[1] * away[:, 0]) / length)
 
 
-def _pixel_distances(marks: Marks, eyes: Sequence[Eye], shape: PaneShape) -> list[tuple[int, float]]:
+def _pixel_distances(marks: Marks, eyes: Sequence[NumpyCamera], shape: PaneShape) -> list[tuple[int, float]]:
     return [(view, float(np.linalg.norm(away))) for view, away in _distances(marks, eyes, shape)]
 
 
-def _starts(marks: Marks, eyes: Sequence[Eye], shape: Shape) -> list[PaneShape]:
+def _starts(marks: Marks, eyes: Sequence[NumpyCamera], shape: Shape) -> list[PaneShape]:
     """Outlines to begin with, one at least.
 
     An edge of one view only says nothing about the plane, but how far a pane goes: the second start is the pane that
@@ -307,7 +307,7 @@ def _starts(marks: Marks, eyes: Sequence[Eye], shape: Shape) -> list[PaneShape]:
     return [rectangle_pane(start) if shape == "rectangle" and len(marks.corners) == 4 else start for start in starts]
 
 
-def _cut_by_edges(marks: Marks, eyes: Sequence[Eye], pane: PaneShape, loose: Sequence[int]) -> Array:
+def _cut_by_edges(marks: Marks, eyes: Sequence[NumpyCamera], pane: PaneShape, loose: Sequence[int]) -> Array:
     """[K, 3] the corners of a pane, some edges of which are moved to where one view shows them."""
     corners = pane.corners()
     for number in loose:
@@ -325,7 +325,9 @@ def _cut_at(corners: Array, edge: int, line: tuple[Array, Array] | None) -> Arra
     return found
 
 
-def _line_on_plane(places: Mapping[int, Array], eyes: Sequence[Eye], pane: PaneShape) -> tuple[Array, Array] | None:
+def _line_on_plane(
+    places: Mapping[int, Array], eyes: Sequence[NumpyCamera], pane: PaneShape
+) -> tuple[Array, Array] | None:
     """Where the two sight lines of an edge that one view shows meet a pane's plane; None if they run away from it."""
     ((view, ends),) = places.items()
     rays, normal, center = eyes[view].rays(np.asarray(ends)), pane.frame[2], eyes[view].center
@@ -336,7 +338,7 @@ def _line_on_plane(places: Mapping[int, Array], eyes: Sequence[Eye], pane: PaneS
     return first, second
 
 
-def _first_corners(marks: Marks, eyes: Sequence[Eye]) -> Array:
+def _first_corners(marks: Marks, eyes: Sequence[NumpyCamera]) -> Array:
     """[K, 3] every corner: triangulated, where two edges meet, on the plane of the others, or completing them.
 
     Raises:
@@ -370,7 +372,7 @@ def _missing(marks: Marks, known: int) -> str:
     )
 
 
-def _triangulated(places: Mapping[int, Array], eyes: Sequence[Eye]) -> Array | None:
+def _triangulated(places: Mapping[int, Array], eyes: Sequence[NumpyCamera]) -> Array | None:
     """[3] the point nearest to all sight lines; None where they are too parallel."""
     centers = np.stack([eyes[view].center for view in places])
     rays = np.stack([eyes[view].rays(np.asarray(place)) for view, place in places.items()])
@@ -380,7 +382,7 @@ def _triangulated(places: Mapping[int, Array], eyes: Sequence[Eye]) -> Array | N
     return np.linalg.solve(across.sum(axis=0), np.einsum("vij,vj->i", across, centers))
 
 
-def _edge_line(places: Mapping[int, Array], eyes: Sequence[Eye]) -> tuple[Array, Array] | None:
+def _edge_line(places: Mapping[int, Array], eyes: Sequence[NumpyCamera]) -> tuple[Array, Array] | None:
     """Two points of an edge in space, where the planes of sight through it meet, as far out as the marks lie."""
     if len(places) < 2:
         return None
@@ -417,7 +419,7 @@ def _meeting(before: tuple[Array, Array] | None, after: tuple[Array, Array] | No
     return np.asarray((first + second) / 2)
 
 
-def _on_plane(marks: Marks, number: int, eyes: Sequence[Eye], center: Array, normal: Array) -> Array | None:
+def _on_plane(marks: Marks, number: int, eyes: Sequence[NumpyCamera], center: Array, normal: Array) -> Array | None:
     """[3] where the one sight line on a corner meets the plane of the others; None where nothing was marked."""
     for view, place in marks.corners[number].items():
         ray = eyes[view].rays(np.asarray(place))

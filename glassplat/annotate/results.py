@@ -25,7 +25,7 @@ from glassplat.files.sidecars import GLASS_REFLECTANCE, write_planes
 from glassplat.files.writing import atomic_write
 from glassplat.panes.masks import min_area_rectangle
 from glassplat.scene.activations import logit
-from glassplat.scene.camera import Eye
+from glassplat.scene.camera import NumpyCamera
 from glassplat.scene.panes import Planes
 
 Array = NDArray[np.float64]
@@ -108,7 +108,7 @@ RECORD = "annotated.json"
 MIRROR_REFLECTANCE = 0.999
 
 
-def write_results(root: Path, views: Sequence[View], eyes: Sequence[Eye], panes: Solved) -> list[str]:
+def write_results(root: Path, views: Sequence[View], eyes: Sequence[NumpyCamera], panes: Solved) -> list[str]:
     """Writes a mask for every photograph with a mark, and all planes; returns the masks' names.
 
     A mask tells of every pane what of it a photograph shows, also of panes that were not marked in this one.
@@ -157,7 +157,7 @@ def earlier_masks(root: Path) -> list[str]:
     return [name for name in known if not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts]
 
 
-def pane_labels(name: str, eye: Eye, panes: Solved) -> Labels:
+def pane_labels(name: str, eye: NumpyCamera, panes: Solved) -> Labels:
     """[H, W] label of the nearest pane at each pixel of a view, without what stands before it."""
     width, height = int(eye.size[0]), int(eye.size[1])
     labels, nearest = np.zeros((height, width), dtype=np.uint8), np.full((height, width), np.inf)
@@ -192,7 +192,7 @@ def in_photograph(view: View, labels: Labels) -> Labels:
     return found
 
 
-def planes_of(panes: Solved, eyes: Sequence[Eye]) -> Planes:
+def planes_of(panes: Solved, eyes: Sequence[NumpyCamera]) -> Planes:
     """A rectangle around each outline, its normal towards most cameras."""
     rows = [_rectangle(fit, eyes) for _, fit in panes]
     centers, normals, tangents, half_sizes = (
@@ -211,7 +211,7 @@ def planes_of(panes: Solved, eyes: Sequence[Eye]) -> Planes:
     )
 
 
-def _rectangle(fit: PaneFit, eyes: Sequence[Eye]) -> tuple[NDArray[np.float64], ...]:
+def _rectangle(fit: PaneFit, eyes: Sequence[NumpyCamera]) -> tuple[NDArray[np.float64], ...]:
     """Centre, normal, tangent and half sizes."""
     corners, axes = fit.shape.corners(), fit.shape.frame
     middle = corners.mean(axis=0)

@@ -32,7 +32,7 @@ from glassplat.captures.view import View
 from glassplat.errors import InputError, input_checked
 from glassplat.files.records import Field, Items, Text, Whole, checked
 from glassplat.files.writing import check_folder
-from glassplat.scene.camera import Eye
+from glassplat.scene.camera import NumpyCamera
 
 Array = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ LEAST_CORNERS = 3
 OFFERED = 3
 
 
-def settling_views(fit: PaneFit, eyes: Sequence[Eye], marked: Collection[int]) -> list[tuple[int, float]]:
+def settling_views(fit: PaneFit, eyes: Sequence[NumpyCamera], marked: Collection[int]) -> list[tuple[int, float]]:
     """Views that would make a plane surest if their corners were marked, with the doubt in degrees after that."""
     corners = fit.shape.corners()
     found = []
@@ -54,7 +54,7 @@ def settling_views(fit: PaneFit, eyes: Sequence[Eye], marked: Collection[int]) -
     return sorted(found, key=lambda pair: pair[1])[:OFFERED]
 
 
-def second_views(outline: Array, view: int, eyes: Sequence[Eye], points: Array) -> list[int]:
+def second_views(outline: Array, view: int, eyes: Sequence[NumpyCamera], points: Array) -> list[int]:
     """Views that show what one view shows inside of an outline [K, 2], from another place; the best first.
 
     The measured points [P, 3] inside of the outline tell, wherever they lie.
@@ -73,12 +73,12 @@ def second_views(outline: Array, view: int, eyes: Sequence[Eye], points: Array) 
     return [number for number in best if worth[number] > 0][:OFFERED]
 
 
-def first_view(eyes: Sequence[Eye], points: Array) -> int:
+def first_view(eyes: Sequence[NumpyCamera], points: Array) -> int:
     """The view that shows most of what was measured."""
     return int(np.argmax([eye.holds(points).sum() for eye in eyes])) if len(points) else 0
 
 
-def _worth(points: Array, eye: Eye, other: Eye) -> float:
+def _worth(points: Array, eye: NumpyCamera, other: NumpyCamera) -> float:
     """Share of the points that another view holds, times how different its sight of them is."""
     one, two = (points - camera.center for camera in (eye, other))
     cosine = (one * two).sum(1) / (np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1))
@@ -197,7 +197,7 @@ class Session:
     def __init__(self, dataset: Dataset) -> None:
         self.root = dataset.root
         self.views: tuple[View, ...] = tuple(sorted((*dataset.train, *dataset.test), key=lambda view: view.name))
-        self.eyes = [Eye.of(view.camera) for view in self.views]
+        self.eyes = [NumpyCamera.of(view.camera) for view in self.views]
         points = dataset.points.positions.double().numpy() if dataset.measured_points else np.zeros((0, 3))
         self._points: Array = points[:: max(1, len(points) // POINTS_USED)]
         self._numbers = {view.name: number for number, view in enumerate(self.views)}
@@ -383,7 +383,7 @@ class Session:
             lines.append(segments)
         return lines
 
-    def _sight_line(self, view: int, place: Array, eye: Eye) -> list[list[float]] | None:
+    def _sight_line(self, view: int, place: Array, eye: NumpyCamera) -> list[list[float]] | None:
         """The part of a sight line, from near to far, as another view sees it."""
         source = self.eyes[view]
         far = self._reach()
@@ -400,7 +400,7 @@ class Session:
         return max(float(np.median(np.linalg.norm(things - centers.mean(axis=0), axis=1))), 1e-6)
 
 
-def _places(eye: Eye, corners: Array) -> list[list[float] | None]:
+def _places(eye: NumpyCamera, corners: Array) -> list[list[float] | None]:
     """The pixels of corners; None for those behind the camera."""
     places = np.round(eye.project(corners), 2).tolist()
     return [place if depth > 0 else None for place, depth in zip(places, eye.in_camera(corners)[:, 2], strict=True)]

@@ -73,7 +73,7 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         losses=(*image, *population.terms),
         rates=(_rates_of_splat(recipe) if recipe.search.begin_found else recipe.rates).of("primary"),
         actions=(*population.edits, *_regular(recipe, population)),
-        motions=population.motions,
+        post_steps=population.post_steps,
         densify_until=population.densify_until,
     )
     beat = Every(recipe.rhythm.beat, 0.0, recipe.schedule.stop, recipe.rhythm.least, skip_multiples_of=3)
@@ -98,13 +98,13 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
             *_resets(recipe, population),
             RefineEnvironment(_doublings(recipe), recipe.texels),
         ),
-        motions=population.motions,
-        entry=first_reflections(recipe),
+        post_steps=population.post_steps,
+        setup=first_reflections(recipe),
         densify_until=population.densify_until,
     )
     refinement = replace(
         reflection,
-        entry=None,
+        setup=None,
         name="3 refinement",
         share=1 - recipe.schedule.stop,
         renderer=Deferred(recipe.background or BLACK, recipe.shading, depth=False),
@@ -128,8 +128,8 @@ def _matte_stages(recipe: DeferredRecipe, seed: int, iterations: int) -> tuple[S
         mcmc=recipe.mcmc,
     )
     (stage,) = plain.stages(seed)
-    entry = StayMatte(iterations, recipe.least_iterations, _environment(recipe))
-    return (replace(stage, name="as splat", entry=entry),)
+    setup = StayMatte(iterations, recipe.least_iterations, _environment(recipe))
+    return (replace(stage, name="as splat", setup=setup),)
 
 
 def _rates_of_splat(recipe: DeferredRecipe) -> GaussianRates:

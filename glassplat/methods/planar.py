@@ -42,7 +42,7 @@ from glassplat.training.losses import (
 from glassplat.training.messages import Working
 from glassplat.training.options import PUBLISHED_ITERATIONS, Rate
 from glassplat.training.points import gaussians_from_points
-from glassplat.training.stage import Clock, Every, Motion, Stage, TrainState, Work
+from glassplat.training.stage import Clock, Every, PostStep, Stage, TrainState, Work
 
 if TYPE_CHECKING:
     from glassplat.methods.planar_recipe import PlanarRecipe, ReflectionWeights
@@ -54,7 +54,7 @@ LEAST_COVERAGE = 0.5
 
 
 @dataclass(frozen=True)
-class PlaneEntry:
+class PaneSetup:
     """Fits the planes and places the glass when reflections begin (Appendix A).
 
     Attributes:
@@ -264,7 +264,7 @@ def stages_of(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERA
     """Initialisation, plane adjustment, joint optimisation (Section III-C4)."""
     first, second, third = recipe.stage_shares
     population = planar_population(recipe)
-    entry = PlaneEntry(
+    setup = PaneSetup(
         recipe.plane_fit,
         recipe.glass_count,
         seed,
@@ -280,18 +280,18 @@ def stages_of(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERA
         losses=(*image_terms(recipe.ssim_weight, recipe.view_dependence_weight), *population.terms),
         rates=recipe.rates.of("primary"),
         actions=(*population.edits, GrowSh(Every(recipe.rhythm.sh)), *_early_resets(recipe, population)),
-        motions=population.motions,
+        post_steps=population.post_steps,
         densify_until=population.densify_until,
     )
     if not recipe.multi_stage:
-        stages: tuple[Stage, ...] = (initialisation, replace(_joint(recipe, second + third), entry=entry))
+        stages: tuple[Stage, ...] = (initialisation, replace(_joint(recipe, second + third), setup=setup))
     else:
-        stages = (initialisation, _adjustment(recipe, second, entry), _joint(recipe, third))
+        stages = (initialisation, _adjustment(recipe, second, setup), _joint(recipe, third))
     stages = photographer_learnt(recipe.photographer, stages, recipe.densify, seed)
     return poses_learnt(recipe.poses, exposures_learnt(recipe.exposure, stages))
 
 
-def _adjustment(recipe: PlanarRecipe, share: float, entry: PlaneEntry) -> Stage:
+def _adjustment(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
     """Stage 2: the reflection's gradient reaches the planes, not the Gaussians."""
     population = planar_population(recipe)
     return Stage(
@@ -307,8 +307,8 @@ def _adjustment(recipe: PlanarRecipe, share: float, entry: PlaneEntry) -> Stage:
             *_early_resets(recipe, population),
             *_clearing(recipe),
         ),
-        motions=(*_glass_motions(recipe), *population.motions),
-        entry=entry,
+        post_steps=(*_glass_post_steps(recipe), *population.post_steps),
+        setup=setup,
         densify_until=recipe.densify.stop,
     )
 
@@ -334,12 +334,12 @@ def _joint(recipe: PlanarRecipe, share: float) -> Stage:
             *_clearing(recipe),
             PerturbOpacity(beat, recipe.perturbation.amplitude, recipe.perturbation.bounds),
         ),
-        motions=(*_glass_motions(recipe), *population.motions),
+        post_steps=(*_glass_post_steps(recipe), *population.post_steps),
         densify_until=recipe.densify.stop,
     )
 
 
-def _glass_motions(recipe: PlanarRecipe) -> tuple[Motion, ...]:
+def _glass_post_steps(recipe: PlanarRecipe) -> tuple[PostStep, ...]:
     """What keeps transmittances possible; before the means of the last passes are taken."""
     return (glass_only_darkens,) if recipe.tint else ()
 

@@ -42,7 +42,7 @@ def stages_of(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITERAT
         losses=(*image_terms(recipe.ssim_weight, recipe.view_dependence_weight), *population.terms),
         rates=recipe.rates.of("primary"),
         actions=(*population.edits, GrowSh(Every(recipe.rhythm.sh)), *population.resets),
-        motions=population.motions,
+        post_steps=population.post_steps,
         densify_until=population.densify_until,
     )
     stages, began = [first], 0.0

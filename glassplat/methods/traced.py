@@ -53,11 +53,11 @@ def stages_of(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHED_ITERA
         refinement = replace(refinement, losses=distant.losses, renderer=distant.renderer)
     if recipe.mirrors == "environment":
         return bootstrap, distant, refinement
-    entry = first_reflections(recipe.distant())
+    setup = first_reflections(recipe.distant())
     around = AddSurroundings(recipe.surroundings.start, recipe.surroundings.sh_degree)
-    entry = replace(entry, surroundings=around, harmonics_wait=not recipe.harmonics_from_start)
-    entry = replace(entry, environment=None) if recipe.mirrors == "surroundings" else entry
-    near = replace(_tracing(recipe, distant), entry=entry)
+    setup = replace(setup, surroundings=around, harmonics_wait=not recipe.harmonics_from_start)
+    setup = replace(setup, environment=None) if recipe.mirrors == "surroundings" else setup
+    near = replace(_tracing(recipe, distant), setup=setup)
     return bootstrap, near, _tracing(recipe, refinement)
 
 

@@ -151,7 +151,7 @@ class Run:
         check_output(directory, resume=resume)
         self._settings, self._directory, self._dataset = settings, directory, dataset
         self._resume, self._every = resume, checkpoint_every
-        self._sitting: Sitting | None = None
+        self._session: TrainingSession | None = None
         self.state: TrainState | None = None
 
     def to_the_end(self, listen: Listener) -> TrainState:
@@ -188,15 +188,15 @@ class Run:
                 directory.check_vacant()
                 directory.begin(self.recipe, settings, self._dataset)
             with open_log(directory.log, self.state.step) as log:
-                self._sitting = Sitting(directory, self.state, log=log, checkpoint_every=self._every)
-                yield from self._sitting.told(RunBegun(self.state.step, settings.iterations, anew))
-                yield from self._sitting.trained(self._stages, self._dataset, settings.iterations)
+                self._session = TrainingSession(directory, self.state, log=log, checkpoint_every=self._every)
+                yield from self._session.told(RunBegun(self.state.step, settings.iterations, anew))
+                yield from self._session.trained(self._stages, self._dataset, settings.iterations)
             self._export()
 
     @property
     def is_stopping(self) -> bool:
         """Whether the user has asked the run to end; it does after the step."""
-        return self._sitting is not None and self._sitting.is_stopping
+        return self._session is not None and self._session.is_stopping
 
     def save(self) -> None:
         """Writes a checkpoint and the scene, between two messages of which the last one is `StepDone` or later.
@@ -205,9 +205,9 @@ class Run:
             RuntimeError: the run has not begun.
             OSError: the disk is full or fails.
         """
-        if self._sitting is None or self.state is None:
+        if self._session is None or self.state is None:
             raise RuntimeError("nothing to save: the run has not begun")
-        self._sitting.save()
+        self._session.save()
         self._export()
 
     def _export(self) -> None:
@@ -242,7 +242,7 @@ def resumed_state(recipe: Any, settings: RunSettings, directory: RunDirectory) -
     return state.to(settings.device)
 
 
-class Sitting:
+class TrainingSession:
     """One stretch of a run: from its beginning or a checkpoint to its end or an interrupt."""
 
     def __init__(self, directory: RunDirectory, state: TrainState, *, log: RunLog, checkpoint_every: float) -> None:

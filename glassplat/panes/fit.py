@@ -22,7 +22,7 @@ from glassplat.panes.masks import (
 )
 from glassplat.panes.objective import MIDDLE, Objective, edge_matches, pane_rectangle
 from glassplat.panes.options import PlaneFit, PlaneFitError
-from glassplat.panes.search import Fit, best_plane, best_supported, doubt
+from glassplat.panes.search import Fit, best_plane, best_supported, tilt_uncertainty
 from glassplat.scene.activations import logit
 from glassplat.scene.camera import Camera
 from glassplat.scene.panes import Planes
@@ -251,7 +251,7 @@ def _check_outline(label: int, views: Sequence[PaneView]) -> None:
 
 
 def _check_certainty(found: FramedPlanes, objective: Objective) -> None:
-    degrees = float(np.degrees(doubt(found, objective, MIDDLE)[0]))
+    degrees = float(np.degrees(tilt_uncertainty(found, objective, MIDDLE)[0]))
     if degrees <= MOST_DOUBT:
         return
     raise ValueError(

@@ -126,7 +126,7 @@ def _replaced(planes: FramedPlanes, index: NDArray[np.int64], others: FramedPlan
     return joined([planes, others]).select(order)
 
 
-def doubt(planes: FramedPlanes, objective: Objective, tolerance: float) -> Array:
+def tilt_uncertainty(planes: FramedPlanes, objective: Objective, tolerance: float) -> Array:
     """[H] angle, radians, by which each plane could turn before its cost shows a change of `NOTICEABLE`.
 
     The plane is free to shift and the frame to grow meanwhile. The Gauss-Newton matrix at the plane tells.

@@ -22,7 +22,7 @@ from glassplat.files.records import read_json
 from glassplat.files.writing import atomic_write
 from glassplat.panes.material import virtual_points
 from glassplat.prepare.workplace import RECORD
-from glassplat.scene.camera import Eye
+from glassplat.scene.camera import NumpyCamera
 from glassplat.scene.panes import Planes
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ def plan(views: Sequence[View], points: PointCloud, behind: NDArray[np.bool_], p
         behind: [N] which of them lie behind panes.
         planes: panes, if any are known.
     """
-    eyes = [Eye.of(view.camera) for view in views]
+    eyes = [NumpyCamera.of(view.camera) for view in views]
     axes = _from_above(eyes)
     centers = np.stack([eye.center for eye in eyes]) @ axes.T
     places = points.positions.cpu().double().numpy() @ axes.T
@@ -64,7 +64,7 @@ def plan(views: Sequence[View], points: PointCloud, behind: NDArray[np.bool_], p
     return f'<svg width="{width}" height="{height}" viewBox="0 0 {width} {height}">{"".join(drawn)}</svg>'
 
 
-def _from_above(eyes: Sequence[Eye]) -> Array:
+def _from_above(eyes: Sequence[NumpyCamera]) -> Array:
     """[2, 3] to the right and down in the plan, of world points; down is where cameras look on average."""
     up = -np.mean([eye.rotation[1] for eye in eyes], axis=0)
     up /= max(float(np.linalg.norm(up)), 1e-9)
@@ -115,7 +115,7 @@ def _line(pixels: Array, color: str, width: float) -> str:
     return f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="{width}"/>'
 
 
-def _headings(eyes: Sequence[Eye], axes: Array, on_page: Callable[[Array], Array]) -> list[str]:
+def _headings(eyes: Sequence[NumpyCamera], axes: Array, on_page: Callable[[Array], Array]) -> list[str]:
     strokes = []
     for eye in eyes:
         begin = on_page((eye.center @ axes.T)[None])[0]

@@ -198,7 +198,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Eye:
+class NumpyCamera:
     """A pinhole camera.
 
     Attributes:
@@ -214,10 +214,10 @@ class Eye:
     size: Array
 
     @staticmethod
-    def of(camera: Camera) -> Eye:
+    def of(camera: Camera) -> NumpyCamera:
         """The same camera."""
         pose = camera.cam_from_world.detach().cpu().double().numpy()
-        return Eye(
+        return NumpyCamera(
             rotation=pose[:3, :3],
             center=-pose[:3, :3].T @ pose[:3, 3],
             intrinsics=np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float64),

@@ -20,18 +20,18 @@ from glassplat.training.densify import (
     Moments,
     apply_edit,
     densified,
-    exploring_noise,
     forget,
     keep,
     perturb_opacities,
     resampled,
     reset_opacity,
+    sgld_noise,
 )
 from glassplat.training.losses import LossTerm, mean_opacity, mean_scale, of_all, weighted
 from glassplat.training.messages import Working
 from glassplat.training.options import DefaultDensify, McmcDensify, Rate, Rhythm, Strategy
 from glassplat.training.points import gaussians_from_points, in_morton_order
-from glassplat.training.stage import Action, AverageLast, Clock, Every, Motion, TrainState, Work
+from glassplat.training.stage import Action, AverageLast, Clock, Every, PostStep, TrainState, Work
 
 MEGAPIXEL = 1e6
 GAUSSIANS_PER_PIXEL = 0.5
@@ -225,7 +225,7 @@ class Relocate:
 
 
 @dataclass(frozen=True)
-class Explore:
+class AddNoise:
     """Moves the primary Gaussians that a step's view shows at random, the transparent ones most (3DGS-MCMC).
 
     The paper moves all of them in every step, as `densifier.reach` may ask for. Those that the view does not show have
@@ -243,9 +243,7 @@ class Explore:
         """Edits `state`."""
         primary, extent = state.scene.primary, state.scene.extent
         rate = self.rate.at(clock.progress, 1.0, clock.iterations)
-        offsets = exploring_noise(
-            self.densifier, primary, rate=rate, extent=extent, generator=state.generator("explore")
-        )
+        offsets = sgld_noise(self.densifier, primary, rate=rate, extent=extent, generator=state.generator("explore"))
         if visible is not None and self.densifier.reach == "shown":
             offsets *= visible[:, None]
         state.scene = replace(state.scene, primary=primary.with_tensors({"means": primary.means + offsets}))
@@ -319,7 +317,7 @@ class Population:
         spread: standard deviation of the first Gaussians, as a share of the distance to their neighbours.
         edits: what changes the number of primary Gaussians.
         resets: opacity resets; a recipe decides in which stages they happen.
-        motions: what follows the optimiser in every step.
+        post_steps: what follows the optimiser in every step.
         terms: regularisers of the objective.
         densify_until: share of the run until which `edits` read screen gradients.
     """
@@ -328,7 +326,7 @@ class Population:
     spread: float = 1.0
     edits: tuple[Action, ...] = ()
     resets: tuple[ResetOpacity, ...] = ()
-    motions: tuple[Motion, ...] = ()
+    post_steps: tuple[PostStep, ...] = ()
     terms: tuple[LossTerm, ...] = ()
     densify_until: float = 0.0
 
@@ -352,7 +350,7 @@ def population_of(
     population = mcmc_population(mcmc, means_rate) if strategy == "mcmc" else default_population(default, rhythm)
     if rhythm.averaged_passes == 0:
         return population
-    return replace(population, motions=(*population.motions, AverageLast(rhythm.averaged_passes)))
+    return replace(population, post_steps=(*population.post_steps, AverageLast(rhythm.averaged_passes)))
 
 
 def default_population(densifier: DefaultDensify, rhythm: Rhythm) -> Population:
@@ -379,6 +377,6 @@ def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
         opacity=densifier.initial_opacity,
         spread=densifier.initial_spread,
         edits=(Relocate(densifier),),
-        motions=(Explore(densifier, means_rate),) if densifier.noise_rate != 0 else (),
+        post_steps=(AddNoise(densifier, means_rate),) if densifier.noise_rate != 0 else (),
         terms=terms,
     )

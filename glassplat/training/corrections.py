@@ -19,7 +19,7 @@ from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify
 from glassplat.training.options import DefaultDensify, PhotoExposure, Photographer, PoseRefinement, Rate
-from glassplat.training.stage import Clock, Entry, Stage, TrainState, Work, carried_out
+from glassplat.training.stage import Clock, Setup, Stage, TrainState, Work, carried_out
 
 
 def exposures_begun(options: PhotoExposure, scene: Scene, dataset: Dataset) -> Scene:
@@ -34,7 +34,7 @@ def exposures_learnt(options: PhotoExposure, stages: tuple[Stage, ...]) -> tuple
         return stages
     rate = {"exposures.affine": Rate(options.rate, options.rate * options.rate_end)}
     # Before the motions that take means over steps.
-    return tuple(replace(s, rates={**s.rates, **rate}, motions=(center_exposures, *s.motions)) for s in stages)
+    return tuple(replace(s, rates={**s.rates, **rate}, post_steps=(center_exposures, *s.post_steps)) for s in stages)
 
 
 def center_exposures(state: TrainState, clock: Clock, visible: Tensor | None) -> None:
@@ -59,7 +59,7 @@ def poses_learnt(options: PoseRefinement, stages: tuple[Stage, ...]) -> tuple[St
         return stages
     rate = {"poses.twists": Rate(options.rate, options.rate * options.rate_end)}
     # Before the motions that take means over steps.
-    return tuple(replace(s, rates={**s.rates, **rate}, motions=(center_poses, *s.motions)) for s in stages)
+    return tuple(replace(s, rates={**s.rates, **rate}, post_steps=(center_poses, *s.post_steps)) for s in stages)
 
 
 def center_poses(state: TrainState, clock: Clock, visible: Tensor | None) -> None:
@@ -137,7 +137,7 @@ class AddPhotographer:
 
     options: Photographer
     seed: int
-    after: Entry | None
+    after: Setup | None
 
     def __call__(self, state: TrainState, dataset: Dataset) -> Work:
         """Edits `state`, and tells how far it is."""
@@ -163,9 +163,9 @@ def photographer_learnt(
     if not options.learn:
         return stages
     first = next(number for number, stage in enumerate(stages) if isinstance(stage.renderer, Planar))
-    entry = AddPhotographer(options, seed, after=stages[first].entry)
+    setup = AddPhotographer(options, seed, after=stages[first].setup)
     learning = [_learning(options, stage, densify) for stage in stages[first:]]
-    return (*stages[:first], replace(learning[0], entry=entry), *learning[1:])
+    return (*stages[:first], replace(learning[0], setup=setup), *learning[1:])
 
 
 def _learning(options: Photographer, stage: Stage, densify: DefaultDensify) -> Stage:

@@ -391,7 +391,7 @@ def addition(options: McmcDensify, gaussians: Gaussians, cap: int, generator: to
 
 
 @torch.no_grad()
-def exploring_noise(
+def sgld_noise(
     options: McmcDensify, gaussians: Gaussians, *, rate: float, extent: float, generator: torch.Generator
 ) -> Tensor:
     """[N, 3] offsets of the centres in world units: the noise term of the paper's Langevin dynamics.

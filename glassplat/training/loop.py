@@ -68,32 +68,34 @@ def train(stages: tuple[Stage, ...], dataset: Dataset, state: TrainState, iterat
         NoGaussiansError: nothing is left, or nothing is in sight of any view.
     """
     check_population(state)
-    sight = Sight(len(dataset.train))
+    visibility = VisibilityCheck(len(dataset.train))
     starts = stage_starts(stages, iterations)
     for stage, start, end in zip(stages, starts, starts[1:], strict=False):
         if state.step >= end:
             continue
         if state.step == start:
-            if stage.entry is not None:
-                yield from carried_out(stage.entry(state, with_corrected_cameras(dataset, state.scene)))
+            if stage.setup is not None:
+                yield from carried_out(stage.setup(state, with_corrected_cameras(dataset, state.scene)))
             yield StageEntered(state.step, stage.name, counts_of(state.scene))
         while state.step < end:
-            yield from advance(stage, dataset, state, iterations, sight)
+            yield from advance(stage, dataset, state, iterations, visibility)
 
 
-def advance(stage: Stage, dataset: Dataset, state: TrainState, iterations: int, sight: Sight) -> Iterator[Message]:
+def advance(
+    stage: Stage, dataset: Dataset, state: TrainState, iterations: int, visibility: VisibilityCheck
+) -> Iterator[Message]:
     """One optimisation step and the actions that are due after it."""
     view = scheduled_view(dataset, state)
     result = differentiate(stage, state.scene, view, probed=state.step < stage.densify_until * iterations)
     check_losses(result.losses, state.step + 1, view)
-    sight.note(result.visible, state.step)
+    visibility.note(result.visible, state.step)
     update(stage, state, result.gradients, iterations)
     collect_statistics(state, result.screen, view)
     collect_in_space(state, result)
     state.step += 1
     clock = Clock(state.step, iterations, len(dataset.train))
-    for motion in stage.motions:
-        motion(state, clock, result.visible)
+    for post_step in stage.post_steps:
+        post_step(state, clock, result.visible)
     done = []
     for action in stage.actions:
         if not action.due(clock):
@@ -125,7 +127,7 @@ def check_population(state: TrainState) -> None:
         )
 
 
-class Sight:
+class VisibilityCheck:
     """Whether the views show anything at all.
 
     One view that shows no Gaussian learns nothing, and the run goes on; a whole pass of them is a broken capture. That

@@ -216,7 +216,7 @@ class Action(Protocol):
         ...
 
 
-class Motion(Protocol):
+class PostStep(Protocol):
     """A change of values that belongs to every step, like the noise of Langevin dynamics; no message reports it."""
 
     def __call__(self, state: TrainState, clock: Clock, visible: Tensor | None) -> None:
@@ -230,7 +230,7 @@ class Motion(Protocol):
         ...
 
 
-class Entry(Protocol):
+class Setup(Protocol):
     """Prepares the state when a stage begins (fitting planes, adding an environment)."""
 
     def __call__(self, state: TrainState, dataset: Dataset) -> Work | None:
@@ -249,8 +249,8 @@ class Stage:
         losses: terms of the objective.
         rates: learning rate of every parameter that learns; one that is missing is frozen.
         actions: recurring edits, in the order in which they act.
-        motions: what follows the optimiser at every step, before the actions.
-        entry: what to do once when the stage begins.
+        post_steps: what follows the optimiser at every step, before the actions.
+        setup: what to do once when the stage begins.
         densify_until: share of the run until which screen gradients are collected, for whoever densifies by them.
     """
 
@@ -260,8 +260,8 @@ class Stage:
     losses: tuple[LossTerm, ...]
     rates: Mapping[str, Rate]
     actions: tuple[Action, ...] = ()
-    motions: tuple[Motion, ...] = ()
-    entry: Entry | None = None
+    post_steps: tuple[PostStep, ...] = ()
+    setup: Setup | None = None
     densify_until: float = 0.0
 
 
@@ -296,7 +296,7 @@ def missed_stages(stages: tuple[Stage, ...], iterations: int) -> list[Stage]:
     """The stages without a single step; one without a share that begins with nothing is meant to have none."""
     starts = stage_starts(stages, iterations)
     spans = zip(stages, starts[:-1], starts[1:], strict=True)
-    return [stage for stage, start, end in spans if start >= end and (stage.share > 0 or stage.entry is not None)]
+    return [stage for stage, start, end in spans if start >= end and (stage.share > 0 or stage.setup is not None)]
 
 
 LONGEST_SHARE = 0.1

@@ -16,17 +16,17 @@ from glassplat.annotate.fit import (
     rectangle_pane,
     tilt_deviation,
 )
-from glassplat.scene.camera import Eye
+from glassplat.scene.camera import NumpyCamera
 from tests.panes.pane_scene import EYES, FRONT, SIDE, Pane, camera_from
 
 U, V = np.array([-1.0, 1, 1, -1]), np.array([-1.0, -1, 1, 1])
 
 
-def eyes_on(pane: Pane, places: Sequence[Sequence[float]] = EYES) -> list[Eye]:
-    return [Eye.of(camera_from(place, pane.center)) for place in places]
+def eyes_on(pane: Pane, places: Sequence[Sequence[float]] = EYES) -> list[NumpyCamera]:
+    return [NumpyCamera.of(camera_from(place, pane.center)) for place in places]
 
 
-def corner_marks(pane: Pane, eyes: Sequence[Eye], *, noise: float = 0.0, seed: int = 0) -> Marks:
+def corner_marks(pane: Pane, eyes: Sequence[NumpyCamera], *, noise: float = 0.0, seed: int = 0) -> Marks:
     """Every corner marked in every view."""
     rng = np.random.default_rng(seed)
     corners = pane.at(U, V)
@@ -99,7 +99,7 @@ def test_a_corner_that_one_view_shows_is_enough_beside_three_others() -> None:
     np.testing.assert_allclose(hidden.shape.corners(), FRONT.at(U, V), atol=1e-3)
 
 
-def edge_marks(pane: Pane, eyes: Sequence[Eye], edges: Sequence[int], reach: float = 0.7) -> Marks:
+def edge_marks(pane: Pane, eyes: Sequence[NumpyCamera], edges: Sequence[int], reach: float = 0.7) -> Marks:
     """Two points on some edges in every view, without any corner."""
     corners = pane.at(U, V)
     found: list[dict[int, np.ndarray]] = [{} for _ in range(4)]
@@ -129,7 +129,9 @@ def test_where_a_long_front_ends_may_be_marked_in_one_photograph_only() -> None:
     """As on a walk along a facade: no photograph beside the one that shows its near end does so too."""
     front = Pane(np.array([0.0, 0, 0]), np.array([0.0, 0, 1.0]), np.array([1.0, 0, 0]), (7.0, 1.7))
     walk = {-1.5: -5.5, -2.5: -6.5, -4.0: -7.0, 1.5: -4.0, 5.5: 2.5}
-    eyes = [Eye.of(camera_from((x, 0.2, 5.0 - 0.2 * x), np.array([target, 0, 0]))) for x, target in walk.items()]
+    eyes = [
+        NumpyCamera.of(camera_from((x, 0.2, 5.0 - 0.2 * x), np.array([target, 0, 0]))) for x, target in walk.items()
+    ]
     corners = front.at(U, V)
     pieces = {0: (0.0, 0.2), 1: (0.0, 0.15), 3: (0.1, 0.3), 4: (0.45, 0.9)}
     rng = np.random.default_rng(0)

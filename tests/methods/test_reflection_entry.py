@@ -50,10 +50,10 @@ def begun(
     ones = {name: torch.ones_like(tensor) for name, tensor in state.scene.primary.tensors().items()}
     state.optimizer.moments = {f"primary.{name}": (tensor, tensor.clone()) for name, tensor in ones.items()}
     around = AddSurroundings(SurroundingsStart("scene"), 1) if near else None
-    entry = BeginReflections(AddEnvironment(2), around, search or MirrorSearch(), Splat(), harmonics_wait)
+    setup = BeginReflections(AddEnvironment(2), around, search or MirrorSearch(), Splat(), harmonics_wait)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("glassplat.methods.surroundings.mirror_lookalikes", found)
-        messages, _ = followed(entry(state, tiny_capture()))
+        messages, _ = followed(setup(state, tiny_capture()))
     return state, [message.what for message in messages]
 
 
@@ -113,5 +113,5 @@ def test_what_colors_have_learnt_of_mirrors_is_left_out_if_there_are_any(
 @pytest.mark.parametrize("recipe", [DeferredRecipe(), TracedRecipe()])
 def test_colors_wait_until_normals_have_spread(recipe: DeferredRecipe | TracedRecipe) -> None:
     stage = recipe.stages(0, 7000)[1]
-    assert isinstance(stage.entry, BeginReflections) and stage.entry.harmonics_wait
+    assert isinstance(stage.setup, BeginReflections) and stage.setup.harmonics_wait
     assert any(isinstance(action, GrowShAfterPropagation) for action in stage.actions)

@@ -7,7 +7,7 @@ import pytest
 
 from glassplat.panes.masks import FramedPlanes, PaneView, PlaneEquations, pane_views
 from glassplat.panes.objective import Objective, edge_matches, moved
-from glassplat.panes.search import doubt, refined
+from glassplat.panes.search import refined, tilt_uncertainty
 from tests.panes.pane_scene import EYES, FRONT, framed_scene_of, scene_of
 
 TRUTH = PlaneEquations(FRONT.normal[None], np.array([FRONT.normal @ FRONT.center]))
@@ -54,18 +54,18 @@ def test_doubt_is_small_where_all_sides_are_seen_and_large_where_one_is() -> Non
     views = pane_views(scene_of([FRONT]), 1)
     planes = FramedPlanes(TRUTH, np.zeros(1))
     nothing = (np.zeros((0, 3)), 3.0, 0.03)
-    assert doubt(planes, Objective(views, *nothing), 0.004)[0] < np.radians(1)
+    assert tilt_uncertainty(planes, Objective(views, *nothing), 0.004)[0] < np.radians(1)
     level = [
         replace(view, edge=view.edge[sides], outward=view.outward[sides]) for view in views for sides in [upper(view)]
     ]
-    assert doubt(planes, Objective(level, *nothing), 0.004)[0] > np.radians(10)
+    assert tilt_uncertainty(planes, Objective(level, *nothing), 0.004)[0] > np.radians(10)
 
 
 def test_edges_that_enter_an_image_or_leave_it_make_no_plane_surer() -> None:
     views = pane_views(scene_of([FRONT], [*EYES, (0.9, -0.5, 0.9), (-0.5, 0.4, 1.0)]), 1)
     steps = 1e-3 * np.random.default_rng(0).standard_normal((40, 3))
     around = moved(TRUTH.select(np.zeros(40, dtype=np.int64)), np.tile(FRONT.center, (40, 1)), steps)
-    doubts = doubt(FramedPlanes(around, np.zeros(40)), Objective(views, np.zeros((0, 3)), 2.0, 0.02), 0.004)
+    doubts = tilt_uncertainty(FramedPlanes(around, np.zeros(40)), Objective(views, np.zeros((0, 3)), 2.0, 0.02), 0.004)
     assert doubts.max() < 1.1 * doubts.min()
 
 

@@ -57,9 +57,9 @@ def fresh_state(recipe: DeferredRecipe = RECIPE) -> TrainState:
 
 def surrounded_state(recipe: DeferredRecipe) -> TrainState:
     """As the second stage begins."""
-    state, entry = fresh_state(recipe), recipe.stages(seed=0)[1].entry
-    assert entry is not None
-    finished(entry(state, tiny_capture()))
+    state, setup = fresh_state(recipe), recipe.stages(seed=0)[1].setup
+    assert setup is not None
+    finished(setup(state, tiny_capture()))
     return state
 
 

@@ -73,7 +73,7 @@ def trained(steps: int) -> TrainState:
         stage_shares=(0.2, 0.3, 0.5),
         densify=DefaultDensify(interval=1, start=0.0, stop=1.0, gradient_threshold=0.0, cap=60),
     )
-    stages = tuple(replace(s, entry=place_true_planes) if s.entry else s for s in recipe.stages(seed=0))
+    stages = tuple(replace(s, setup=place_true_planes) if s.setup else s for s in recipe.stages(seed=0))
     state = TrainState(SplatRecipe(sh_degree=1).initialise(tiny_capture()), seed=0)
     for _ in train(stages, tiny_capture(), state, steps):
         pass

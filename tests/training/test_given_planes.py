@@ -15,7 +15,7 @@ from glassplat.captures.view import PointCloud
 from glassplat.cli.main import main
 from glassplat.errors import InputError
 from glassplat.files.sidecars import read_planes, write_planes
-from glassplat.methods.planar import PlaneEntry, fitted_planes
+from glassplat.methods.planar import PaneSetup, fitted_planes
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.panes.options import PlaneFit, PlaneFitError
 from glassplat.scene.panes import Planes
@@ -69,7 +69,7 @@ def test_what_the_capture_calls_a_mirror_is_one(mirror: bool) -> None:
     given = replace(PANE, mirrors=PANE.labels if mirror else ())
     scene = replace(true_scene(), planes=Planes.empty(), glass=true_scene().glass.select(torch.zeros(0).long()))
     state = TrainState(scene, seed=0)
-    entry = PlaneEntry(PlaneFit(), glass_count=50, seed=0)
+    entry = PaneSetup(PlaneFit(), glass_count=50, seed=0)
     finished(entry(state, replace(tiny_capture(), planes=given)))
     assert state.scene.planes.mirrors == given.mirrors
     assert (float(state.scene.planes.base_reflectances) > 0.99) == mirror

@@ -12,10 +12,10 @@ from glassplat.scene.camera import rotation_from_quat
 from glassplat.scene.gaussians import Gaussians
 from glassplat.training.densify import (
     MOST_COPIES,
-    exploring_noise,
     rank_among_equals,
     relocation,
     resampled,
+    sgld_noise,
     shared_contribution,
 )
 from glassplat.training.options import McmcDensify
@@ -147,7 +147,7 @@ def test_without_live_ones_nothing_happens(opacities: list[float]) -> None:
     for name, tensor in before.tensors().items():
         assert torch.equal(after.tensors()[name], tensor)
         assert torch.equal(moments[f"primary.{name}"][0], tensor + 10)
-    assert exploring_noise(OPTIONS, before, rate=1e-4, extent=1.0, generator=rng()).shape == before.means.shape
+    assert sgld_noise(OPTIONS, before, rate=1e-4, extent=1.0, generator=rng()).shape == before.means.shape
 
 
 def test_a_single_live_one_is_doubled() -> None:
@@ -160,13 +160,13 @@ def test_the_same_seed_gives_the_same_set_and_another_seed_another() -> None:
     sets = [resampled(OPTIONS, before, {}, cap=1000, generator=rng(seed))[0] for seed in (3, 3, 4)]
     assert all(torch.equal(t, sets[1].tensors()[name]) for name, t in sets[0].tensors().items())
     assert not torch.equal(sets[0].means, sets[2].means)
-    noises = [exploring_noise(OPTIONS, before, rate=1e-4, extent=1.0, generator=rng(seed)) for seed in (3, 3, 4)]
+    noises = [sgld_noise(OPTIONS, before, rate=1e-4, extent=1.0, generator=rng(seed)) for seed in (3, 3, 4)]
     assert torch.equal(noises[0], noises[1]) and not torch.equal(noises[0], noises[2])
 
 
 def test_noise_leaves_opaque_ones_alone_and_follows_its_gate() -> None:
     gaussians = make_gaussians([0.99, 0.005, 0.5])
-    noise = exploring_noise(OPTIONS, gaussians, rate=1.6e-4, extent=1.0, generator=rng())
+    noise = sgld_noise(OPTIONS, gaussians, rate=1.6e-4, extent=1.0, generator=rng())
     assert torch.equal(gaussians.means[0] + noise[0], gaussians.means[0])
     assert noise[1].norm() > 1e-3
     assert noise[2].norm() < 1e-15
@@ -175,7 +175,7 @@ def test_noise_leaves_opaque_ones_alone_and_follows_its_gate() -> None:
 def test_noise_is_shaped_by_the_covariance() -> None:
     count = 40_000
     one = make_gaussians([0.005])
-    noise = exploring_noise(
+    noise = sgld_noise(
         OPTIONS, one.select(torch.zeros(count, dtype=torch.int64)), rate=1e-3, extent=2.0, generator=rng()
     )
     rotation = rotation_from_quat(one.quats[0])
@@ -187,14 +187,14 @@ def test_noise_is_shaped_by_the_covariance() -> None:
 def test_noise_does_not_depend_on_the_units_of_the_capture() -> None:
     metres = make_gaussians([0.004] * 5)
     millimetres = metres.with_tensors({"log_scales": metres.log_scales + math.log(1000)})
-    small = exploring_noise(OPTIONS, metres, rate=1e-4, extent=3.0, generator=rng())
-    large = exploring_noise(OPTIONS, millimetres, rate=1e-4, extent=3000.0, generator=rng())
+    small = sgld_noise(OPTIONS, metres, rate=1e-4, extent=3.0, generator=rng())
+    large = sgld_noise(OPTIONS, millimetres, rate=1e-4, extent=3000.0, generator=rng())
     assert torch.allclose(large, 1000 * small, rtol=1e-4)
 
 
 def test_published_noise_is_in_world_units() -> None:
     gaussians, extent, rate = make_gaussians([0.005] * 5), 6.6, 1.6e-4
-    published = exploring_noise(McmcDensify.published(), gaussians, rate=rate, extent=extent, generator=rng())
+    published = sgld_noise(McmcDensify.published(), gaussians, rate=rate, extent=extent, generator=rng())
     eta = torch.randn(gaussians.means.shape, generator=rng(), dtype=gaussians.means.dtype)
     rotations = rotation_from_quat(gaussians.quats)
     covariances = rotations @ torch.diag_embed((2 * gaussians.log_scales).exp()) @ rotations.transpose(1, 2)
@@ -210,6 +210,6 @@ def test_ranks_count_earlier_equals() -> None:
 def test_noise_leaves_discs_in_their_plane() -> None:
     solid = make_gaussians([0.01] * 40)
     discs = Gaussians(**{**vars(solid), "log_scales": solid.log_scales[:, :2].contiguous()})
-    offsets = exploring_noise(McmcDensify(), discs, rate=1.0, extent=1.0, generator=torch.Generator().manual_seed(0))
+    offsets = sgld_noise(McmcDensify(), discs, rate=1.0, extent=1.0, generator=torch.Generator().manual_seed(0))
     normals = rotation_from_quat(discs.quats)[:, :, 2]
     assert float((offsets * normals).sum(1).abs().max()) < 1e-4 * float(offsets.norm(dim=1).max())

@@ -43,7 +43,7 @@ def trained(recipe: SplatRecipe, steps: int = 240) -> TrainState:
             stage,
             rates={n: r for n, r in stage.rates.items() if n.startswith("exposures")},
             actions=(),
-            motions=tuple(motion for motion in stage.motions if motion is center_exposures),
+            post_steps=tuple(post_step for post_step in stage.post_steps if post_step is center_exposures),
         )
         for stage in recipe.stages(0)
     )
@@ -70,7 +70,7 @@ def test_every_stage_of_every_method_learns_them(method: str, iterations: int) -
     recipe = RECIPES[method](exposure=LEARNED)
     stages = recipe.stages(0, iterations)
     assert all("exposures.affine" in stage.rates for stage in stages)
-    assert all(stage.motions[0] is center_exposures for stage in stages)
+    assert all(stage.post_steps[0] is center_exposures for stage in stages)
     assert recipe.initialise(CAPTURE).exposures.names == tuple(v.name for v in CAPTURE.train)
 
 

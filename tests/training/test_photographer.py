@@ -91,14 +91,14 @@ def test_stages_with_panes_show_and_teach_the_photographer() -> None:
         assert isinstance(stage.renderer, Planar) and stage.renderer.photographer == "present"
         assert "photographer.means" in stage.rates
         assert any(isinstance(action, Densify) and action.part == "photographer" for action in stage.actions)
-    assert isinstance(stages[1].entry, AddPhotographer) and not isinstance(stages[2].entry, AddPhotographer)
+    assert isinstance(stages[1].setup, AddPhotographer) and not isinstance(stages[2].setup, AddPhotographer)
     assert PlanarRecipe(photographer=LEARNED).renderer().photographer == "absent"
 
 
 def test_switched_off_nothing_knows_of_anybody() -> None:
     for stage in PlanarRecipe().stages(0):
         assert not any("photographer" in name for name in stage.rates)
-        assert not isinstance(stage.entry, AddPhotographer)
+        assert not isinstance(stage.setup, AddPhotographer)
         assert not isinstance(stage.renderer, Planar) or stage.renderer.photographer == "absent"
 
 
@@ -120,9 +120,9 @@ def test_somebody_is_found_in_the_photographs(planes: Planes) -> None:
         replace(
             stage,
             rates={name: rate for name, rate in stage.rates.items() if name.startswith("photographer")},
-            entry=None,
+            setup=None,
             actions=(),
-            motions=(),
+            post_steps=(),
             losses=stage.losses[:1],
         )
         for stage in PlanarRecipe(photographer=LEARNED).stages(0)[2:]
@@ -171,7 +171,7 @@ def planar_stages() -> tuple[Stage, ...]:
     densify = replace(densify, gradient_threshold=1e-8, pull_threshold=1e-8)
     recipe = PlanarRecipe(sh_degree=1, stage_shares=(0.2, 0.3, 0.5), photographer=LEARNED, densify=densify)
     return tuple(
-        replace(s, entry=replace(s.entry, after=place_true_planes)) if isinstance(s.entry, AddPhotographer) else s
+        replace(s, setup=replace(s.setup, after=place_true_planes)) if isinstance(s.setup, AddPhotographer) else s
         for s in recipe.stages(seed=0)
     )
 

@@ -18,7 +18,7 @@ from glassplat.methods.glossy_recipes import DeferredRecipe
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.training.actions import PruneIdle
-from glassplat.training.loop import NoGaussiansError, Sight, train
+from glassplat.training.loop import NoGaussiansError, VisibilityCheck, train
 from glassplat.training.messages import Message, StepDone, Working
 from glassplat.training.options import DefaultDensify
 from glassplat.training.stage import Stage, TrainState
@@ -39,7 +39,7 @@ def place_true_planes(state: TrainState, dataset: object) -> None:
 
 def stages_of(recipe: SplatRecipe | PlanarRecipe | DeferredRecipe) -> tuple[Stage, ...]:
     panes = recipe.method == "planar"
-    return tuple(replace(s, entry=place_true_planes) if s.entry and panes else s for s in recipe.stages(seed=0))
+    return tuple(replace(s, setup=place_true_planes) if s.setup and panes else s for s in recipe.stages(seed=0))
 
 
 def fresh_state() -> TrainState:
@@ -68,13 +68,13 @@ def test_views_that_all_show_nothing_end_it_after_one_pass() -> None:
 
 def test_only_whole_passes_are_judged() -> None:
     nothing, something = torch.zeros(3, dtype=torch.bool), torch.tensor([False, True, False])
-    sight = Sight(3)
+    visibility = VisibilityCheck(3)
     for step, visible in ((1, nothing), (2, nothing), (3, nothing), (4, something), (5, nothing), (6, None)):
-        sight.note(visible, step)
+        visibility.note(visible, step)
     for step in (7, 8, 9, 10):
-        sight.note(nothing, step)
+        visibility.note(nothing, step)
     with pytest.raises(NoGaussiansError):
-        sight.note(nothing, 11)
+        visibility.note(nothing, 11)
 
 
 def test_the_loss_of_the_last_gaussian_is_named_and_nothing_is_told_of_that_step() -> None:

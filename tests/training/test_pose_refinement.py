@@ -121,7 +121,7 @@ def test_a_camera_that_is_off_finds_its_place() -> None:
     recipe = SplatRecipe(poses=REFINED)
     scene = poses_begun(recipe.poses, true_scene(), dataset)
     stages = tuple(
-        replace(s, renderer=Planar(), rates={"poses.twists": s.rates["poses.twists"]}, actions=(), motions=())
+        replace(s, renderer=Planar(), rates={"poses.twists": s.rates["poses.twists"]}, actions=(), post_steps=())
         for s in recipe.stages(0)
     )
     state = TrainState(scene, 0)
@@ -174,7 +174,7 @@ def test_every_stage_of_every_method_refines(method: str, iterations: int) -> No
     assert all("poses.twists" in stage.rates for stage in recipe.stages(0, iterations))
     capture = replace(tiny_capture(), measured_points=False)
     assert recipe.initialise(capture).poses.names == tuple(view.name for view in capture.train)
-    assert all(stage.motions[0] is center_poses for stage in recipe.stages(0, iterations))
+    assert all(stage.post_steps[0] is center_poses for stage in recipe.stages(0, iterations))
     off = replace(recipe, poses=PoseRefinement(rate=0.0))
     assert not any("poses.twists" in stage.rates for stage in off.stages(0, iterations))
     assert len(off.initialise(capture).poses) == 0

@@ -17,14 +17,14 @@ from glassplat.cli.demo import SCENE
 from glassplat.kernels.maths.color import linear_from_srgb
 from glassplat.methods.glossy_recipes import DeferredRecipe
 from glassplat.methods.mirrors import ENDED, DensifyWhilePropagating, Propagate, ResetRaised
-from glassplat.methods.planar import PlaneEntry, planar_population
+from glassplat.methods.planar import PaneSetup, planar_population
 from glassplat.methods.planar_recipe import PlanarRecipe, ReflectionWeights
 from glassplat.methods.recipe import RECIPES, recipe_of
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.options import check_options
 from glassplat.render.planar import Planar
 from glassplat.scene.scene import Scene
-from glassplat.training.actions import Densify, Explore, PerturbOpacity, Relocate, ResetOpacity, mcmc_population
+from glassplat.training.actions import AddNoise, Densify, PerturbOpacity, Relocate, ResetOpacity, mcmc_population
 from glassplat.training.loop import differentiate, train
 from glassplat.training.messages import ActionDone, StepDone
 from glassplat.training.options import DefaultDensify, McmcDensify, PropagationSchedule, Rate, SurroundingsStart
@@ -105,7 +105,7 @@ def test_a_short_run_of_a_preset_learns(method: str, strategy: Any) -> None:
         around = replace(recipe.surroundings, start=SurroundingsStart(source="box", cells=3))
         recipe = replace(recipe, surroundings=around, schedule=replace(recipe.schedule, stop=0.9))
     stages = [
-        replace(s, entry=place_true_planes if isinstance(s.entry, PlaneEntry) else s.entry) for s in recipe.stages(0)
+        replace(s, setup=place_true_planes if isinstance(s.setup, PaneSetup) else s.setup) for s in recipe.stages(0)
     ]
     state = TrainState(planeless(recipe) if method == "planar" else recipe.initialise(tiny_capture()), seed=0)
     messages = list(train(tuple(stages), tiny_capture(), state, 60))
@@ -184,7 +184,7 @@ def test_noise_and_regularisers_of_mcmc_can_reach_everything() -> None:
     faint = make_gaussians([0.1] * 4, opacities=[0.001] * 4)
     options = McmcDensify(reach="all")
     state = TrainState(Scene(faint, 2.0), seed=0)
-    Explore(options, Rate(1e-3))(state, Clock(1, 100, 6), torch.tensor([True, False, True, False]))
+    AddNoise(options, Rate(1e-3))(state, Clock(1, 100, 6), torch.tensor([True, False, True, False]))
     assert bool((state.scene.primary.means != faint.means).any(dim=1).all())
     view, scene = tiny_capture().train[0], true_scene()
     frame = Planar()(scene, view.camera)
@@ -244,12 +244,12 @@ def test_only_the_nearest_pane_reflects_if_asked() -> None:
 def test_mirrors_can_learn_their_reflectance() -> None:
     def entered(fixed: bool, monkeypatch: pytest.MonkeyPatch) -> Scene:
         recipe = PlanarRecipe(fixed_mirrors=fixed, detect_mirrors=False, seed_reflections=False)
-        entry = recipe.stages(0)[1].entry
-        assert isinstance(entry, PlaneEntry)
+        setup = recipe.stages(0)[1].setup
+        assert isinstance(setup, PaneSetup)
         mirror = replace(true_scene().planes, mirrors=(1,))
         monkeypatch.setattr("glassplat.methods.planar.fit_planes", lambda *a, **k: mirror)
         state = TrainState(Scene(true_scene().primary, true_scene().extent), seed=0)
-        finished(entry(state, tiny_capture()))
+        finished(setup(state, tiny_capture()))
         return state.scene
 
     with pytest.MonkeyPatch.context() as patch:
@@ -292,9 +292,9 @@ def test_a_region_is_looked_for_only_if_asked(monkeypatch: pytest.MonkeyPatch) -
 
     def region(**options: Any) -> Any:
         recipe = DeferredRecipe(**options)
-        state, entry = TrainState(recipe.initialise(tiny_capture()), seed=0), recipe.stages(0)[1].entry
-        assert entry is not None
-        finished(entry(state, tiny_capture()))
+        state, setup = TrainState(recipe.initialise(tiny_capture()), seed=0), recipe.stages(0)[1].setup
+        assert setup is not None
+        finished(setup(state, tiny_capture()))
         return state.scene.environment.region
 
     assert region() == (0.0, 0.0, 0.0, 1.0)

@@ -74,9 +74,9 @@ def test_a_run_has_room_for_every_stage_from_the_length_that_is_asked_for(recipe
 
 
 def test_a_stage_without_a_share_is_missed_only_for_what_it_begins_with() -> None:
-    def stages(entry: Any) -> Any:
+    def stages(setup: Any) -> Any:
         shares = (0.5, 0.0, 0.5)
-        return tuple(SimpleNamespace(name=f"{k}", share=s, entry=k == 1 and entry) for k, s in enumerate(shares))
+        return tuple(SimpleNamespace(name=f"{k}", share=s, setup=k == 1 and setup) for k, s in enumerate(shares))
 
     check_length(stages(None), 2)
     with pytest.raises(InputError, match="the stage '1' has no share"):
@@ -84,7 +84,7 @@ def test_a_stage_without_a_share_is_missed_only_for_what_it_begins_with() -> Non
 
 
 def test_a_stage_with_hardly_any_share_is_not_looked_for_for_ever() -> None:
-    stages: Any = tuple(SimpleNamespace(name=f"{share}", share=share, entry=None) for share in (0.5, 1e-12, 0.5))
+    stages: Any = tuple(SimpleNamespace(name=f"{share}", share=share, setup=None) for share in (0.5, 1e-12, 0.5))
     with pytest.raises(InputError, match="no room for the stage '1e-12'; expected at least") as caught:
         check_length(stages, 1000)
     assert int(str(caught.value).rpartition(" ")[2]) > 1e11

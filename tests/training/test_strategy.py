@@ -15,7 +15,7 @@ from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.recipe import recipe_from_json, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.scene.scene import Scene
-from glassplat.training.actions import Densify, Explore, Relocate, ResetOpacity, cap_of, growth_of
+from glassplat.training.actions import AddNoise, Densify, Relocate, ResetOpacity, cap_of, growth_of
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import differentiate, train
 from glassplat.training.losses import PhotometricLoss
@@ -40,7 +40,7 @@ def place_true_planes(state: TrainState, dataset: object) -> None:
 
 
 def stages_of(recipe: Any) -> tuple[Stage, ...]:
-    return tuple(replace(s, entry=place_true_planes) if s.entry else s for s in recipe.stages(seed=0))
+    return tuple(replace(s, setup=place_true_planes) if s.setup else s for s in recipe.stages(seed=0))
 
 
 def fresh_state(recipe: Any, seed: int = 0) -> TrainState:
@@ -95,10 +95,10 @@ def test_the_strategy_decides_what_happens_to_the_primary_gaussians(recipe: Any)
         kinds = [type(action) for action in stage.actions]
         # The later stages, which only `planar` has, hold its one reset.
         assert kinds.count(Relocate) == 1 and kinds.count(ResetOpacity) == min(number, 1)
-        assert [type(motion) for motion in stage.motions] == [Explore, AverageLast]
+        assert [type(post_step) for post_step in stage.post_steps] == [AddNoise, AverageLast]
         assert all(action.part == "glass" for action in stage.actions if isinstance(action, Densify))
     for stage in replace(recipe, strategy="default").stages(seed=0):
-        assert [type(motion) for motion in stage.motions] == [AverageLast]
+        assert [type(post_step) for post_step in stage.post_steps] == [AverageLast]
         assert not any(isinstance(action, Relocate) for action in stage.actions)
         assert not {"opacity", "scale"} & {term.name for term in stage.losses}
 
@@ -152,7 +152,7 @@ def test_the_noise_moves_what_the_view_shows(visible: list[bool] | None) -> None
     faint = faint.with_tensors({"logit_opacities": torch.full((4,), -9.0)})
     state.scene = replace(state.scene, primary=faint)
     (stage,) = recipe.stages(seed=0)
-    explore = stage.motions[0]
+    explore = stage.post_steps[0]
     explore(state, Clock(1, 100, views=10), None if visible is None else torch.tensor(visible))
     moved = (state.scene.primary.means != faint.means).any(dim=1).tolist()
     assert moved == (visible or [True] * 4)
@@ -206,7 +206,7 @@ def test_relocation_keeps_its_share_of_the_run() -> None:
 def test_weights_and_noise_of_zero_are_left_out() -> None:
     bare = McmcDensify(noise_rate=0.0, opacity_weight=0.0, scale_weight=0.0)
     (stage,) = SplatRecipe(strategy="mcmc", mcmc=bare, rhythm=Rhythm(averaged_passes=0)).stages(seed=0)
-    assert not stage.motions and {term.name for term in stage.losses} == {"photometric"}
+    assert not stage.post_steps and {term.name for term in stage.losses} == {"photometric"}
 
 
 @BOTH

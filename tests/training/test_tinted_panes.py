@@ -12,7 +12,7 @@ import torch
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import View
 from glassplat.files.scene_folder import read_scene, write_scene
-from glassplat.methods.planar import PlaneEntry
+from glassplat.methods.planar import PaneSetup
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.render.planar import Planar
 from glassplat.scene.scene import Scene
@@ -41,7 +41,7 @@ def panes_alone(stage: Stage) -> Stage:
     """A stage in which only the colour of the panes learns, from the photographs."""
     rates = {"planes.log_transmittances": replace(stage.rates["planes.log_transmittances"], start=0.02)}
     losses = tuple(term for term in stage.losses if term.name in ("photometric", "tint"))
-    return replace(stage, rates=rates, losses=losses, entry=None, actions=(), motions=stage.motions[:1])
+    return replace(stage, rates=rates, losses=losses, setup=None, actions=(), post_steps=stage.post_steps[:1])
 
 
 def clear_state() -> TrainState:
@@ -79,8 +79,8 @@ def test_glass_adds_no_light() -> None:
     state = clear_state()
     planes = replace(state.scene.planes, log_transmittances=torch.tensor([[0.3, -0.3, 0.0]]))
     state.scene = replace(state.scene, planes=planes)
-    (motion,) = panes_alone(PlanarRecipe(tint=True).stages(0)[-1]).motions
-    motion(state, Clock(1, 10, 6), None)
+    (post_step,) = panes_alone(PlanarRecipe(tint=True).stages(0)[-1]).post_steps
+    post_step(state, Clock(1, 10, 6), None)
     kept = state.scene.planes.log_transmittances
     assert kept is not None and kept.tolist() == [[0.0, pytest.approx(-0.3), 0.0]]
 
@@ -88,6 +88,6 @@ def test_glass_adds_no_light() -> None:
 def test_only_recipes_with_tint_know_of_it() -> None:
     for recipe in (PlanarRecipe(), PlanarRecipe(tint=True)):
         stages = recipe.stages(0)
-        entries = [stage.entry for stage in stages if isinstance(stage.entry, PlaneEntry)]
-        assert [entry.tint for entry in entries] == [recipe.tint]
+        entries = [stage.setup for stage in stages if isinstance(stage.setup, PaneSetup)]
+        assert [setup.tint for setup in entries] == [recipe.tint]
         assert any(term.name == "tint" for stage in stages for term in stage.losses) == recipe.tint

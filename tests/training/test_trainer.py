@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from glassplat.errors import InputError
-from glassplat.methods.planar import PlaneEntry
+from glassplat.methods.planar import PaneSetup
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.scene.scene import Scene
@@ -36,7 +36,7 @@ def place_true_planes(state: TrainState, dataset: object) -> None:
 
 def planar_stages() -> tuple[Stage, ...]:
     stages = PlanarRecipe(sh_degree=1, stage_shares=(0.2, 0.3, 0.5)).stages(seed=0)
-    return tuple(replace(s, entry=place_true_planes) if s.entry else s for s in stages)
+    return tuple(replace(s, setup=place_true_planes) if s.setup else s for s in stages)
 
 
 def run(state: TrainState, stages: tuple[Stage, ...], iterations: int, until: int | None = None) -> list[StepDone]:
@@ -165,6 +165,6 @@ def test_a_truncated_checkpoint_is_refused(tmp_path: Path) -> None:
 def test_plane_entry_needs_annotated_views() -> None:
     dataset = tiny_capture()
     bare = replace(dataset, train=tuple(replace(view, read_pane_labels=None) for view in dataset.train))
-    entry = PlaneEntry(PlanarRecipe().plane_fit, 10, 0)
+    setup = PaneSetup(PlanarRecipe().plane_fit, 10, 0)
     with pytest.raises(ValueError, match="mask"):
-        finished(entry(TrainState(Scene(gaussians_from_points(dataset.points), dataset.extent), 0), bare))
+        finished(setup(TrainState(Scene(gaussians_from_points(dataset.points), dataset.extent), 0), bare))
