@@ -385,7 +385,6 @@ def _training_renderer(recipe: PlanarRecipe, gradient: str) -> Planar:
         deviation=recipe.weights.depth != 0,
         deviation_depth_gradient=recipe.moving_mean,
         tells_mirrored=recipe.densify_by == "direct",
-        gate=recipe.weights.gate if gradient == "all" else 0.0,
     )
 
 

@@ -49,14 +49,12 @@ class ReflectionWeights:
         conflict: of edges that transmission and reflection share (Eq. 15).
         mask: of the difference between glass and annotation (Eq. 16).
         intensity: of the departure of a(u) from one, which the paper leaves free.
-        gate: not of a term: how much the gradient of the transmission is held back where panes mirror edges.
     """
 
     depth: NotNegative = 0.005
     conflict: NotNegative = 0.2
     mask: NotNegative = 0.5
     intensity: NotNegative = 0.05
-    gate: NotNegative = 70.0
 
 
 @dataclass(frozen=True)
@@ -169,7 +167,7 @@ class PlanarRecipe:
             detect_mirrors=False,
             fixed_mirrors=False,
             seed_reflections=False,
-            weights=ReflectionWeights(intensity=0.0, gate=0.0),
+            weights=ReflectionWeights(intensity=0.0),
             moving_mean=True,
             perturbation=Perturbation(stop=29 / 30, bounds=(1e-6, 1 - 1e-6)),
             rates=GaussianRates(short_run_power=0.0),

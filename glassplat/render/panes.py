@@ -180,9 +180,6 @@ def half_spaces_of(planes: Planes, camera: Camera) -> Tensor:
 
 FAINT = 0.5
 """A pane that is less visible in a pixel, as at its rim, leaves the layers to the pane behind it."""
-GATE_PIXELS = 960 * 720
-"""Size of photographs for which the strength of the gradient's gate is given; slopes per pixel are steeper in smaller
-ones, by the power 0.4 of the number of pixels as L_c suggests, whose product of two slopes grows by 0.8."""
 
 
 class Glazed(NamedTuple):
@@ -247,37 +244,6 @@ def glazed(
         layers = _joined_layers(layers, behind, farther, faint & (farther.strength > 0), blend)
         faint = faint & (mask < FAINT)
     return Glazed(image, *layers, share)
-
-
-def gated_transmission(image: Tensor, seen: SeenPanes, reflections: Tensor, gate: float) -> Tensor:
-    """The same image [H, W, 3], whose gradient is scaled down where the nearest pane mirrors edges.
-
-    An edge of the photograph that the mirrored layer explains should not be learnt by what stands behind the pane
-    (specular-aware gradient gating of RT-Splatting). The gradient is divided by 1 + gate * slope, the slope being that
-    of the mirrored colour per pixel of a photograph of `GATE_PIXELS`.
-
-    Args:
-        image: C_t without panes.
-        seen: the K panes, and their order.
-        reflections: [K, H, W, 4] what each pane mirrors.
-        gate: how strongly; 0 leaves the gradient as it is.
-    """
-    if gate == 0:
-        return image
-    with torch.no_grad():
-        pane = seen.order[0]
-        slopes = slopes_per_pixel(reflections[..., :3]).gather(0, pane.clamp(min=0).long()[None])[0]
-        size = (pane.numel() / GATE_PIXELS) ** 0.4
-        kept = torch.where(pane >= 0, 1 / (1 + gate * size * slopes), 1)[..., None]
-    return image * kept + image.detach() * (1 - kept)
-
-
-def slopes_per_pixel(images: Tensor) -> Tensor:
-    """[K, H, W] absolute central differences of images [K, H, W, C], both directions added up; 0 on the border."""
-    slopes = torch.zeros_like(images)
-    slopes[:, :, 1:-1] += (images[:, :, 2:] - images[:, :, :-2]).abs() / 2
-    slopes[:, 1:-1] += (images[:, 2:] - images[:, :-2]).abs() / 2
-    return slopes.mean(dim=-1)
 
 
 def tinted(image: Tensor, mask: Tensor, pane: Tensor, transmittances: Tensor, blend: Blend) -> Tensor:

@@ -34,7 +34,6 @@ from glassplat.render.panes import (
     Glazed,
     SeenPanes,
     curves,
-    gated_transmission,
     glass_owners,
     glazed,
     nearest_hits,
@@ -119,8 +118,6 @@ class Planar:
             the image without.
         tells_mirrored: whether the records of a probed frame tell mirror images from what is seen directly, and how
             much is left of either; if not, all of them count alike.
-        gate: how much the gradient of the transmission is held back where panes mirror edges, for training; see
-            `gated_transmission`.
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -133,7 +130,6 @@ class Planar:
     nearest_only: bool = False
     photographer: Shown = "absent"
     tells_mirrored: bool = True
-    gate: float = 0.0
 
     def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
         """Renders `scene` from `camera`, where the scene's tensors are."""
@@ -243,7 +239,7 @@ class Planar:
     ) -> Glazed:
         """Lays the panes and what they mirror before the image."""
         return glazed(
-            gated_transmission(first.image, seen, second.reflections, self.gate),
+            first.image,
             seen,
             masks,
             second.reflections,

@@ -12,7 +12,6 @@ from glassplat.kernels.maths.color import linear_from_srgb
 from glassplat.kernels.maths.pane import LAWS
 from glassplat.kernels.panes.reference import REFLECTANCE
 from glassplat.options import Blend
-from glassplat.render.panes import SeenPanes, gated_transmission
 from glassplat.render.planar import Planar, detached
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera, mirror_matrices, rotation_from_quat
@@ -270,28 +269,3 @@ def test_detached_cuts_every_tensor_off() -> None:
     scene = showcase()
     trainable = scene.primary.with_tensors({"means": scene.primary.means.clone().requires_grad_()})
     assert not detached(trainable).means.requires_grad
-
-
-def everywhere_one_pane(height: int, width: int) -> SeenPanes:
-    """A view all of whose pixels show the same pane."""
-    order = (torch.zeros(height, width, dtype=torch.int32),)
-    return SeenPanes(pane(2.0), torch.zeros(1), order, torch.ones(1, 1, 1, dtype=torch.bool), torch.zeros(1, 4))
-
-
-def test_the_gate_changes_no_image_and_nothing_where_no_pane_mirrors_edges() -> None:
-    gated = Planar(gate=70.0)
-    torch.testing.assert_close(gated(showcase(), CAMERA).rgb, Planar()(showcase(), CAMERA).rgb)
-    image = torch.rand(6, 8, 3, requires_grad=True)
-    flat = torch.full((1, 6, 8, 4), 0.5)
-    (gradient,) = torch.autograd.grad(gated_transmission(image, everywhere_one_pane(6, 8), flat, 70.0).sum(), image)
-    assert torch.equal(gradient, torch.ones_like(image))
-
-
-def test_the_gate_holds_the_gradient_back_where_a_pane_mirrors_an_edge() -> None:
-    image = torch.rand(6, 8, 3, requires_grad=True)
-    seen = everywhere_one_pane(6, 8)
-    step = (torch.arange(8) >= 4).float()[None, None, :, None].expand(1, 6, 8, 4)
-    (gradient,) = torch.autograd.grad(gated_transmission(image, seen, step, 70.0).sum(), image)
-    on_the_edge, elsewhere = gradient[:, 3:5], torch.cat([gradient[:, :3], gradient[:, 5:]], dim=1)
-    assert bool(((on_the_edge > 0) & (on_the_edge < 0.9)).all())
-    assert torch.equal(elsewhere, torch.ones_like(elsewhere))
