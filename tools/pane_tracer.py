@@ -16,7 +16,6 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 REFLECTIONS = 3
 """How many reflections one after the other are followed."""
