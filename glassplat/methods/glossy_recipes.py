@@ -89,7 +89,7 @@ class DeferredRecipe:
             would spoil its normals.
         propagation_interval: steps between densifications while normals spread; None keeps `densify.interval`.
         rates: learning rates of the Gaussians; they do not rise in short runs, which costs a mirror ball its normals
-            (docs/experiments.md).
+            (lab/training.md).
         reflection_rates: learning rates of strength and environment.
         rhythm: when opacities are reset and the SH degree grows.
         strategy: what decides how many Gaussians there are and where; `densify` or `mcmc` holds its options.

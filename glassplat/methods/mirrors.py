@@ -317,7 +317,7 @@ FOUND = 0.03
 """Share from which on something reflective has been found."""
 LOOKS_REFLECTIVE = 0.16
 """Share that turns with the view, below which propagation would cost more than it finds: two metal eggs with 0.07 lost
-1.3 dB by it at 7000 iterations, a mirror ball with 0.30 gained (docs/experiments.md)."""
+1.3 dB by it at 7000 iterations, a mirror ball with 0.30 gained (lab/glossy.md)."""
 NOTHING_FOUND = (
     "step %d: little or nothing reflective was found, so that normals are not propagated and the rest of the run "
     "learns as fast as splat; %s"

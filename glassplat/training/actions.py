@@ -35,7 +35,7 @@ from glassplat.training.stage import Action, AverageLast, Clock, Every, PostStep
 
 MEGAPIXEL = 1e6
 GAUSSIANS_PER_PIXEL = 0.5
-"""Where `McmcDensify` stops to grow unless told otherwise; default densification ends near it (docs/experiments.md)."""
+"""Where `McmcDensify` stops to grow unless told otherwise; default densification ends near it (lab/gaussians.md)."""
 GROWTH_SHARE = 1 / 300
 """Share of the run in which `McmcDensify` grows by its factor: 100 of the published 30,000 iterations."""
 LARGE_ARE_PRUNED = ("primary", "surroundings")
@@ -71,7 +71,7 @@ def threshold_factor(dataset: Dataset) -> float:
 
     The published threshold was found on photographs of about a megapixel. The loss is a mean over pixels, so a
     Gaussian a few pixels wide has a larger gradient in a smaller image, and a quarter-megapixel capture would grow
-    more Gaussians than it has pixels (docs/experiments.md).
+    more Gaussians than it has pixels (lab/gaussians.md).
     """
     camera = dataset.train[0].camera
     return max(1.0, math.sqrt(MEGAPIXEL / (camera.width * camera.height)))

@@ -76,7 +76,7 @@ class GaussianRates:
         intensity: of the reflection intensity's logarithm.
         short_run_power: in a run of n < 30,000 iterations the rates of position, colour, scale and rotation are
             (30,000 / n) to this power times as large, n being 3,000 at the least; 0 keeps the published ones
-            (docs/experiments.md).
+            (lab/training.md).
     """
 
     means: LearningRate = 1.6e-4
@@ -103,7 +103,7 @@ class GaussianRates:
 
 @dataclass(frozen=True)
 class PlaneRates:
-    """Learning rates of planes and glass, which the paper leaves out; see docs/experiments.md.
+    """Learning rates of planes and glass, which the paper leaves out; see lab/training.md.
 
     Attributes:
         center: plane position in stage 2, per scene extent.
@@ -270,7 +270,7 @@ class McmcDensify:
             shows directly), or as published on `all` Gaussians.
         initial_opacity: opacity of the first Gaussians.
         initial_spread: standard deviation of the first Gaussians, as a share of the distance to their neighbours. The
-            published 0.1 takes a thousand steps or more to grow over the gaps (docs/experiments.md).
+            published 0.1 takes a thousand steps or more to grow over the gaps (lab/gaussians.md).
     """
 
     cap: Annotated[Count | None, ESSENTIAL, tyro.conf.arg(aliases=("--cap",))] = None
