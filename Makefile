@@ -57,7 +57,7 @@ docs: $(STAMP)
 	$(BIN)/python -m tools.make_docs build/docs
 
 bench: $(STAMP)
-	$(BIN)/python -m bench
+	$(BIN)/python -m benchmarks
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

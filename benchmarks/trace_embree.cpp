@@ -1,4 +1,4 @@
-// Rays through discs with Embree's hierarchy and traversal: what `python -m bench.rays` holds the tracer against.
+// Rays through discs with Embree's hierarchy and traversal: what `python -m benchmarks.rays` holds the tracer against.
 //
 // Each disc is a primitive of one user geometry, whose callback does what glassplat/kernels/trace does with a Gaussian:
 // the same hit maths, the same nearest 16 hits, and the next search beyond the last of them. Embree's library brings no

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench.peak import peak_multiply_adds
-from bench.scene import bench_camera, room
-from bench.timing import Work, interleaved_seconds, median_seconds, paired_ratio
+from benchmarks.peak import peak_multiply_adds
+from benchmarks.scene import bench_camera, room
+from benchmarks.timing import Work, interleaved_seconds, median_seconds, paired_ratio
 from glassplat.files.writing import Table
 from glassplat.kernels import tiles as bin_tiles_module
 from glassplat.kernels.composite import composite

@@ -1,4 +1,4 @@
-"""`python -m bench.twin`: the kernels that blend beside the same loops in C++, compiled here and now; one thread.
+"""`python -m benchmarks.twin`: the kernels that blend beside the same loops in C++, compiled here and now; one thread.
 
 The anchor for what Numba makes of its vectors: same algorithm, same tensors, in turn, in one run.
 """
@@ -22,8 +22,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bench.scene import bench_camera, room
-from bench.timing import Work
+from benchmarks.scene import bench_camera, room
+from benchmarks.timing import Work
 from glassplat.files.writing import Table
 from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.composite.cpu_backward import composite_backward
@@ -160,7 +160,7 @@ def processor_milliseconds(work: Work) -> float:
 
 def main() -> None:
     """Measures and prints; says so where there is no compiler."""
-    parser = argparse.ArgumentParser(prog="python -m bench.twin", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.twin", description=__doc__)
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="of each pass, kernel and twin in turn")
     arguments = parser.parse_args()
     table = Table(

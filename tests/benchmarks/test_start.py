@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from bench.start import first_line, start_times
+from benchmarks.start import first_line, start_times
 
 
 def test_a_process_is_ended_with_its_first_line() -> None:

@@ -1,4 +1,4 @@
-"""`python -m bench.gpu`: checks the CUDA kernels on this machine's GPU, times them beside gsplat, and trains `planar`.
+"""`python -m benchmarks.gpu`: checks the CUDA kernels on this machine's GPU, times them beside gsplat, trains `planar`.
 
 Each part is a process of its own with a limit of time, because an error of a GPU spoils whatever its process does
 afterwards: one part that fails leaves the others. All limits together are below nine minutes. gsplat compiles itself
@@ -50,7 +50,7 @@ def main() -> int:
 
 def parsed() -> argparse.Namespace:
     """What the command line says."""
-    parser = argparse.ArgumentParser(prog="python -m bench.gpu", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.gpu", description=__doc__)
     parser.add_argument("--count", type=int, default=COUNT, help="Gaussians of the timings")
     parser.add_argument("--data", type=Path, default=DATA, help="capture to train on; the bundled showcase by default")
     parser.add_argument(
@@ -63,7 +63,7 @@ def parsed() -> argparse.Namespace:
 
 def succeeds(part: str, options: list[str]) -> bool:
     """Runs a part in a process of its own, which prints what it finds; says where it fails or takes too long."""
-    command, started = [sys.executable, "-m", "bench.gpu", "--part", part, *options], time.perf_counter()
+    command, started = [sys.executable, "-m", "benchmarks.gpu", "--part", part, *options], time.perf_counter()
     try:
         status = subprocess.run(command, cwd=ROOT, timeout=LIMITS[part], check=False).returncode
     except subprocess.TimeoutExpired:
@@ -97,21 +97,21 @@ def parity(arguments: argparse.Namespace) -> str:
 
 def frames(arguments: argparse.Namespace) -> str:
     """Frames, gradients and steps of both methods, and gsplat's."""
-    from bench.gpu_frames import measured
+    from benchmarks.gpu_frames import measured
 
     return measured(arguments.count).markdown()
 
 
 def operations(arguments: argparse.Namespace) -> str:
     """Milliseconds of each operation, forward and backward."""
-    from bench.gpu_operations import kernel_times
+    from benchmarks.gpu_operations import kernel_times
 
     return kernel_times(arguments.count).markdown()
 
 
 def train(arguments: argparse.Namespace) -> str:
     """A whole run of `planar`, and its quality."""
-    from bench.gpu_training import training
+    from benchmarks.gpu_training import training
 
     with tempfile.TemporaryDirectory() as folder:
         table = training(arguments.data, arguments.iterations, Path(folder) / "planar", cpu_run=arguments.cpu_run)

@@ -11,9 +11,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from bench.methods import frame_work, step_work, view_of
-from bench.scene import bench_camera, bench_scene, mirroring_scene
-from bench.timing import Work, interleaved_seconds, paired_ratio
+from benchmarks.methods import frame_work, step_work, view_of
+from benchmarks.scene import bench_camera, bench_scene, mirroring_scene
+from benchmarks.timing import Work, interleaved_seconds, paired_ratio
 from glassplat.captures.view import View
 from glassplat.files.writing import Table
 from glassplat.kernels.photometric import photometric

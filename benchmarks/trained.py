@@ -1,4 +1,4 @@
-"""A frame of a trained `deferred` run against `splat` with the same Gaussians: python -m bench.trained RUN."""
+"""A frame of a trained `deferred` run against `splat` with the same Gaussians: python -m benchmarks.trained RUN."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numba
 
-from bench.methods import doublings, frame_work, thread_count
-from bench.timing import clocks_of
+from benchmarks.methods import doublings, frame_work, thread_count
+from benchmarks.timing import clocks_of
 from glassplat.cli.runs import StoredRun, open_run
 from glassplat.files.writing import Table
 from glassplat.render.deferred import Deferred
@@ -41,7 +41,7 @@ def frame_costs(stored: StoredRun, renderer: Deferred, rounds: int) -> Table:
 
 def main() -> None:
     """Measures and prints."""
-    parser = argparse.ArgumentParser(prog="python -m bench.trained", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.trained", description=__doc__)
     parser.add_argument("run", type=Path, help="directory of a `deferred` run")
     parser.add_argument("--rounds", type=int, default=9, help="how often each test view is rendered")
     arguments = parser.parse_args()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bench.looking import WIDTH, answers, looking_times
+from benchmarks.looking import WIDTH, answers, looking_times
 from glassplat.viewer.render_loop import LEAST_WIDTH
 
 

@@ -1,4 +1,4 @@
-"""`python -m bench [--write]`: measures everything; with --write, puts the tables into docs/performance.md."""
+"""`python -m benchmarks [--write]`: measures everything; with --write, puts the tables into docs/performance.md."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 import numba
 import torch
 
-from bench.kernels import kernel_times, twin_ratios
-from bench.looking import looking_times
-from bench.methods import deferred_costs, method_costs, scaling
-from bench.steps import step_costs
+from benchmarks.kernels import kernel_times, twin_ratios
+from benchmarks.looking import looking_times
+from benchmarks.methods import deferred_costs, method_costs, scaling
+from benchmarks.steps import step_costs
 
 PAGE = Path(__file__).parent.parent / "docs" / "performance.md"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
@@ -34,7 +34,7 @@ def machine() -> str:
 
 def main() -> None:
     """Measures, prints, and writes if asked to."""
-    parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--write", action="store_true", help="put the tables into docs/performance.md")
     arguments = parser.parse_args()
     parts = [f"Machine: {machine()}.\n"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 
-from bench.parts import BEFORE, BETWEEN, STEPS, TOTAL, costs_of, parts_table
+from benchmarks.parts import BEFORE, BETWEEN, STEPS, TOTAL, costs_of, parts_table
 from glassplat.kernels.backend.cpu import Kernel
 from glassplat.training.messages import ActionDone, Message, StageEntered, StepDone, Working
 

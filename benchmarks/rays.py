@@ -1,7 +1,7 @@
-"""`python -m bench.rays [--embree FOLDER]`: rays through discs, beside Embree's traversal of the same; one thread.
+"""`python -m benchmarks.rays [--embree FOLDER]`: rays through discs, beside Embree's traversal of the same; one thread.
 
 Embree stands in `embreex`, of which the library alone is used: `pip install embreex==4.4.0.post1`, or unpack its wheel
-and name the folder. With it and a C++ compiler, `bench/trace_embree.cpp` gives it the tracer's own hit maths.
+and name the folder. With it and a C++ compiler, `benchmarks/trace_embree.cpp` gives it the tracer's own hit maths.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ import numba
 import torch
 from torch import Tensor
 
-from bench.kernels import backward
-from bench.timing import Work
-from bench.twin import compiled_library
+from benchmarks.kernels import backward
+from benchmarks.timing import Work
+from benchmarks.twin import compiled_library
 from glassplat.files.writing import Table
 from glassplat.kernels.records import Bvh, RawGaussians, Rays, Shapes
 from glassplat.kernels.trace import build_bvh, cpu, reach, shapes_of, trace
@@ -208,7 +208,7 @@ def new_tables(rays: int) -> tuple[Table, Table]:
 
 def main() -> None:
     """Measures and prints."""
-    parser = argparse.ArgumentParser(prog="python -m bench.rays", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.rays", description=__doc__)
     parser.add_argument("--embree", type=Path, default=Path(sysconfig.get_path("purelib")), help="holds embreex.libs")
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="discs")
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="of each piece of work, in turn")

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numba import prange
 
-from bench.timing import median_seconds
+from benchmarks.timing import median_seconds
 
 LANES, ROUNDS = 256, 200_000
 

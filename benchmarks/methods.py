@@ -9,8 +9,8 @@ from contextlib import contextmanager
 import numba
 import torch
 
-from bench.scene import bench_camera, bench_scene, glossy_scene
-from bench.timing import Work, interleaved_seconds, median_seconds, paired_ratio
+from benchmarks.scene import bench_camera, bench_scene, glossy_scene
+from benchmarks.timing import Work, interleaved_seconds, median_seconds, paired_ratio
 from glassplat.captures.view import View
 from glassplat.files.writing import Table
 from glassplat.kernels.composite import composite

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from bench.kernels import MULTIPLY_ADDS
+from benchmarks.kernels import MULTIPLY_ADDS
 from glassplat.kernels.composite.cuda_tile import BUCKET, PIXELS
 
 GEOMETRY_BYTES = 28

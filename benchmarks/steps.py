@@ -1,4 +1,4 @@
-"""Whole steps of training: python -m bench.steps [--data CAPTURE] [--run RUN].
+"""Whole steps of training: python -m benchmarks.steps [--data CAPTURE] [--run RUN].
 
 That is everything between two photographs: the frame, its losses and gradients, Adam, and what densification collects.
 """
@@ -13,8 +13,8 @@ from typing import Any
 
 import numba
 
-from bench.methods import doublings, thread_count
-from bench.timing import clocks_of
+from benchmarks.methods import doublings, thread_count
+from benchmarks.timing import clocks_of
 from glassplat.captures.dataset import Dataset, load_dataset
 from glassplat.cli.demo import SCENE
 from glassplat.cli.runs import open_run
@@ -88,7 +88,7 @@ def step_clocks(messages: Iterator[Message], rounds: int) -> dict[int, list[tupl
 
 def main() -> None:
     """Measures and prints."""
-    parser = argparse.ArgumentParser(prog="python -m bench.steps", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.steps", description=__doc__)
     parser.add_argument(
         "--data", type=Path, action="append", default=[], help="capture whose points `splat` begins with"
     )

@@ -1,7 +1,7 @@
-"""How soon a command says its first word: python -m bench.start [--run RUN].
+"""How soon a command says its first word: python -m benchmarks.start [--run RUN].
 
-That is the clock's time from the start of the process to its first line, when it has refused or begun: `train`, `bench`
-and `info` say it when they have read what the capture's folder holds, `demo` when it has begun to train, what renders
+That is the clock's time from the start of the process to its first line, when it has refused or begun: `train` and
+`info` say it when they have read what the capture's folder holds, `demo` when it has begun to train, what renders
 when it has read the run's records. All of that comes before PyTorch, of whose import a terminal shows a line.
 """
 
@@ -33,8 +33,6 @@ COMMANDS = (
     ("train", "splat", "--data", str(SCENE), "--output", OUTPUT),
     ("train", "planar", "--data", str(SCENE), "--output", OUTPUT),
     ("demo", "--output", OUTPUT),
-    ("bench", "--help"),
-    ("bench", "scenes", "--data", str(SCENE), "--output", OUTPUT),
     ("info", str(SCENE / "images")),
     ("info", str(SCENE)),
 )

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numba import cuda
 
-from bench.gpu_roofline import Peaks
+from benchmarks.gpu_roofline import Peaks
 from glassplat.kernels.backend.cuda import Kernel, kernel
 
 THREADS, CHAINS, ROUNDS = 256, 8, 4096

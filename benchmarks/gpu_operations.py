@@ -9,13 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bench.gpu_frames import HEIGHT, REPEATS, WIDTH, milliseconds, timed
-from bench.gpu_peaks import measured_peaks
-from bench.gpu_roofline import Peaks, backward_demand, counts_of, forward_demand
-from bench.kernels import backward, batch_of, raw_of, visited_pixels
-from bench.rays import operation_works
-from bench.scene import bench_camera, bench_scene
-from bench.timing import Work, interleaved_seconds
+from benchmarks.gpu_frames import HEIGHT, REPEATS, WIDTH, milliseconds, timed
+from benchmarks.gpu_peaks import measured_peaks
+from benchmarks.gpu_roofline import Peaks, backward_demand, counts_of, forward_demand
+from benchmarks.kernels import backward, batch_of, raw_of, visited_pixels
+from benchmarks.rays import operation_works
+from benchmarks.scene import bench_camera, bench_scene
+from benchmarks.timing import Work, interleaved_seconds
 from glassplat.files.writing import Table
 from glassplat.kernels.backend.devices import kernels_for
 from glassplat.kernels.composite import composite

@@ -1,4 +1,4 @@
-"""How soon the viewer answers a move of the camera: python -m bench.looking."""
+"""How soon the viewer answers a move of the camera: python -m benchmarks.looking."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import numba
 import numpy as np
 from PIL import Image
 
-from bench.methods import doublings, thread_count
-from bench.scene import bench_camera, bench_scene
+from benchmarks.methods import doublings, thread_count
+from benchmarks.scene import bench_camera, bench_scene
 from glassplat.files.writing import Table
 from glassplat.render.planar import Planar
 from glassplat.viewer.drawing import Wish, drawn
@@ -148,7 +148,7 @@ def slow(times: Sequence[float]) -> float:
 
 def main() -> None:
     """Measures and prints."""
-    parser = argparse.ArgumentParser(prog="python -m bench.looking", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.looking", description=__doc__)
     parser.add_argument("--moves", type=int, default=40)
     print(looking_times(parser.parse_args().moves).markdown())
 

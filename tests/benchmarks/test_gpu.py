@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 import torch
 
-from bench import gpu
-from bench.gpu_roofline import Counts, Peaks, backward_demand, forward_demand
-from bench.gpu_training import beside_the_cpu
+from benchmarks import gpu
+from benchmarks.gpu_roofline import Counts, Peaks, backward_demand, forward_demand
+from benchmarks.gpu_training import beside_the_cpu
 from glassplat.kernels.backend.devices import SIMULATED
 
 ROOT = Path(__file__).parents[2]
 WITHOUT_NUMBA_CUDA = """
 import sys
 sys.modules["numba_cuda"] = None
-sys.argv = ["bench.gpu"]
-from bench.gpu import main
+sys.argv = ["benchmarks.gpu"]
+from benchmarks.gpu import main
 sys.exit(main())
 """
 
@@ -77,7 +77,7 @@ def test_another_run_is_not_compared() -> None:
 @pytest.mark.filterwarnings("ignore::numba.core.errors.NumbaPerformanceWarning")
 def test_the_peak_is_measured_with_multiply_adds() -> None:
     pytest.importorskip("numba_cuda", reason="numba-cuda is not installed; `make setup` installs it")
-    from bench.gpu_peaks import CHAINS, multiply_adds
+    from benchmarks.gpu_peaks import CHAINS, multiply_adds
     from tools.compile_kernels import ptx_of
 
     (text,) = ptx_of(multiply_adds(np.float32), [(9, 0)])
@@ -100,7 +100,7 @@ def test_a_part_that_fails_or_hangs_leaves_the_others(
     monkeypatch.setattr(gpu.subprocess, "run", run)
     monkeypatch.setattr(gpu, "cuda_problem", lambda: None)
     monkeypatch.setattr(gpu.torch.cuda, "get_device_name", lambda: "A GPU")
-    monkeypatch.setattr(sys, "argv", ["bench.gpu", "--count", "1000"])
+    monkeypatch.setattr(sys, "argv", ["benchmarks.gpu", "--count", "1000"])
     assert gpu.main() == 1
     assert [command[4] for command in ran] == ["launch", "parity", "frames", "operations", "training"]
     assert all(command[-2:] == ["--count", "1000"] for command in ran)
@@ -119,7 +119,7 @@ ONLY_PYTORCH = """
 import sys
 for name in ("pycolmap", "OpenEXR", "tyro", "rich", "numba_cuda"):
     sys.modules[name] = None
-import bench.gpu
+import benchmarks.gpu
 """
 
 

@@ -1,4 +1,4 @@
-"""`python -m bench.parts METHOD [--data CAPTURE] [--iterations N]`: where a run's time goes, stage by stage.
+"""`python -m benchmarks.parts METHOD [--data CAPTURE] [--iterations N]`: where a run's time goes, stage by stage.
 
 Trains, and times every launch of a kernel; what is left of a step is Python and PyTorch between them. Processor time
 on one thread, so that other programs hardly matter.
@@ -98,7 +98,7 @@ def parts_table(costs: Mapping[str, Mapping[str, float]], title: str) -> Table:
 
 def main() -> None:
     """Trains, measures and prints."""
-    parser = argparse.ArgumentParser(prog="python -m bench.parts", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.parts", description=__doc__)
     parser.add_argument("method", choices=list(RECIPES))
     parser.add_argument("--data", type=Path, default=SCENE, help="capture; the bundled showcase unless given")
     parser.add_argument("--iterations", type=int, default=3000, help="length of the run")

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numba
 
-from bench.methods import doublings
-from bench.steps import step_clocks
+from benchmarks.methods import doublings
+from benchmarks.steps import step_clocks
 from glassplat.training.messages import ActionDone, Message, StepDone
 
 

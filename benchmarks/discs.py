@@ -1,4 +1,4 @@
-"""`python -m bench.discs`: what discs cost beside ellipsoids of the same places and two of their three sizes.
+"""`python -m benchmarks.discs`: what discs cost beside ellipsoids of the same places and two of their three sizes.
 
 Processor time, the least of several rounds in which both take turns, so that other programs hardly matter.
 """
@@ -13,9 +13,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bench.kernels import HEIGHT, WIDTH
-from bench.scene import bench_camera, room
-from bench.timing import Work
+from benchmarks.kernels import HEIGHT, WIDTH
+from benchmarks.scene import bench_camera, room
+from benchmarks.timing import Work
 from glassplat.files.writing import Table
 from glassplat.kernels.composite import composite
 from glassplat.kernels.records import Splats
