@@ -184,7 +184,9 @@ def in_photograph(view: View, labels: Labels) -> Labels:
     if lens is None:
         column, row = x * camera.width / width, y * camera.height / height
     else:
-        rays = np.asarray(lens.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1))).reshape(height, width, 2)
+        rays = np.asarray(lens.as_colmap().cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1))).reshape(
+            height, width, 2
+        )
         column, row = camera.fx * rays[..., 0] + camera.cx, camera.fy * rays[..., 1] + camera.cy
     inside = (column >= 0) & (column < labels.shape[1]) & (row >= 0) & (row < labels.shape[0])
     found = np.zeros((height, width), dtype=np.uint8)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,43 @@ def _nearest_rotation(linear: NDArray[np.float64], name: str) -> NDArray[np.floa
 
 Interpolation = Literal["BILINEAR", "NEAREST_NEIGHBOR"]
 
+
+class ParameterCounts(NamedTuple):
+    """How many parameters of each kind a camera model has; two for the principal point lie between them."""
+
+    focal: int
+    extra: int
+    middle: int = 2
+
+    @property
+    def total(self) -> int:
+        """All of them."""
+        return self.focal + self.middle + self.extra
+
+
+PARAMETER_COUNTS = {
+    "SIMPLE_PINHOLE": ParameterCounts(1, 0),
+    "PINHOLE": ParameterCounts(2, 0),
+    "SIMPLE_RADIAL": ParameterCounts(1, 1),
+    "RADIAL": ParameterCounts(1, 2),
+    "OPENCV": ParameterCounts(2, 4),
+    "OPENCV_FISHEYE": ParameterCounts(2, 4),
+    "FULL_OPENCV": ParameterCounts(2, 8),
+    "FOV": ParameterCounts(2, 1),
+    "SIMPLE_RADIAL_FISHEYE": ParameterCounts(1, 1),
+    "RADIAL_FISHEYE": ParameterCounts(1, 2),
+    "THIN_PRISM_FISHEYE": ParameterCounts(2, 8),
+    "RAD_TAN_THIN_PRISM_FISHEYE": ParameterCounts(2, 12),
+    "SIMPLE_DIVISION": ParameterCounts(1, 1),
+    "DIVISION": ParameterCounts(2, 1),
+    "SIMPLE_FISHEYE": ParameterCounts(1, 0),
+    "FISHEYE": ParameterCounts(2, 0),
+    "EUCM": ParameterCounts(2, 2),
+    "EQUIRECTANGULAR": ParameterCounts(0, 2, middle=0),
+}
+"""COLMAP's camera models, in the order of their numbers in binary files."""
+MODEL_OF_ID = dict(enumerate(PARAMETER_COUNTS))
+
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 PERSPECTIVE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Models that are a pinhole when all their distortion coefficients are zero; a fisheye never is."""
@@ -91,28 +128,65 @@ class Pinhole:
 
 
 @dataclass(frozen=True)
+class Lens:
+    """A camera model with its parameters, in COLMAP's names and order, and the image size in pixels."""
+
+    model: str
+    parameters: tuple[float, ...]
+    width: int
+    height: int
+
+    def focal_lengths(self) -> tuple[float, float]:
+        """Along x and y, pixels; of a panorama there are none."""
+        return self.parameters[0], self.parameters[PARAMETER_COUNTS[self.model].focal - 1]
+
+    def rescaled(self, width: int, height: int) -> Lens:
+        """The lens of the same photograph at another size."""
+        scale_x, scale_y = width / self.width, height / self.height
+        counts, scaled = PARAMETER_COUNTS[self.model], list(self.parameters)
+        if counts.focal == 1:
+            scaled[0] *= (scale_x + scale_y) / 2
+        elif counts.focal == 2:
+            scaled[:2] = scaled[0] * scale_x, scaled[1] * scale_y
+        if counts.middle:
+            middle = slice(counts.focal, counts.focal + 2)
+            scaled[middle] = scaled[middle][0] * scale_x, scaled[middle][1] * scale_y
+        return Lens(self.model, tuple(scaled), width, height)
+
+    def as_colmap(self) -> Any:
+        """The `pycolmap.Camera`.
+
+        Raises:
+            InputError: pycolmap is not installed.
+        """
+        return library.pycolmap.Camera(
+            model=self.model, width=self.width, height=self.height, params=list(self.parameters)
+        )
+
+
+@dataclass(frozen=True)
 class PixelMap:
     """Turns a photograph, or its mask, into the pixel grid of its pinhole camera: undistorts, then reduces.
 
     Attributes:
-        lens: `pycolmap.Camera` of the photograph, at the photograph's size; None when it is a pinhole already.
+        lens: that of the photograph, at the photograph's size; None when it is a pinhole already.
         width, height: size of the result.
     """
 
-    lens: Any
+    lens: Lens | None
     width: int
     height: int
 
     def photo(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """[H, W, 3] of the file to [height, width, 3]; bilinear undistortion, area-averaging reduction."""
         if self.lens is not None:
-            pixels = _undistort(pixels, self.lens, "BILINEAR")
+            pixels = undistorted(pixels, self.lens.as_colmap())
         return area_resize(pixels, self.width, self.height)
 
     def labels(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """[H, W] of the photograph's size to [height, width]; the nearest pixel's label, no label in between."""
         if self.lens is not None:
-            labels = _undistort(labels, self.lens, "NEAREST_NEIGHBOR")
+            labels = _undistort(labels, self.lens.as_colmap(), "NEAREST_NEIGHBOR")
         return nearest_resize(labels, self.width, self.height)
 
 
@@ -134,8 +208,8 @@ def nearest_resize(labels: NDArray[np.uint8], width: int, height: int) -> NDArra
     return np.ascontiguousarray(labels[rows[:, None], columns[None, :]])
 
 
-def make_lens(model: str, parameters: list[float], size: tuple[int, int]) -> Any:
-    """A checked `pycolmap.Camera`.
+def make_lens(model: str, parameters: list[float], size: tuple[int, int]) -> Lens:
+    """A checked lens.
 
     Args:
         model: COLMAP's name of the camera model.
@@ -145,32 +219,32 @@ def make_lens(model: str, parameters: list[float], size: tuple[int, int]) -> Any
     Raises:
         InputError: unknown model, wrong number of parameters, or a size or a parameter that no lens has.
     """
-    if model not in library.pycolmap.CameraModelId.__members__ or model == "INVALID":
-        known = ", ".join(name for name in library.pycolmap.CameraModelId.__members__ if name != "INVALID")
-        raise InputError(f"unknown camera model {model!r}; expected one of {known}")
+    if model not in PARAMETER_COUNTS:
+        raise InputError(f"unknown camera model {model!r}; expected one of {', '.join(PARAMETER_COUNTS)}")
     if not all(1 <= side <= LARGEST_SIDE for side in size):
         raise InputError(f"the camera is {_size_text(size)} pixels large; expected sides from 1 to {LARGEST_SIDE}")
-    lens = library.pycolmap.Camera.create_from_model_id(0, getattr(library.pycolmap.CameraModelId, model), 1.0, *size)
-    if len(parameters) != len(lens.params):
-        raise InputError(f"camera model {model} takes {len(lens.params)} parameters, got {len(parameters)}")
-    _check_parameters(lens, parameters, size)
-    lens.params = parameters
+    total = PARAMETER_COUNTS[model].total
+    if len(parameters) != total:
+        raise InputError(f"camera model {model} takes {total} parameters, got {len(parameters)}")
+    lens = Lens(model, tuple(parameters), *size)
+    _check_parameters(lens)
     return lens
 
 
-def _check_parameters(lens: Any, parameters: list[float], size: tuple[int, int]) -> None:
+def _check_parameters(lens: Lens) -> None:
     """Refuse what no lens has; comparisons with NaN are false."""
-    longer = max(size)
-    bounds: list[tuple[float, float]] = [(-LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)] * len(parameters)
-    for index in lens.focal_length_idxs():
-        bounds[index] = SHORTEST_FOCAL * longer, LONGEST_FOCAL * longer
-    for index in lens.principal_point_idxs():
-        bounds[index] = -FARTHEST_CENTER * longer, FARTHEST_CENTER * longer
-    for value, (least, most) in zip(parameters, bounds, strict=True):
+    size = lens.width, lens.height
+    longer, counts = max(size), PARAMETER_COUNTS[lens.model]
+    bounds = [
+        *[(SHORTEST_FOCAL * longer, LONGEST_FOCAL * longer)] * counts.focal,
+        *[(-FARTHEST_CENTER * longer, FARTHEST_CENTER * longer)] * counts.middle,
+        *[(-LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)] * counts.extra,
+    ]
+    for value, (least, most) in zip(lens.parameters, bounds, strict=True):
         if not least <= value <= most:
-            found = ", ".join(f"{one:g}" for one in parameters)
+            found = ", ".join(f"{one:g}" for one in lens.parameters)
             raise InputError(
-                f"camera model {lens.model_name} of {_size_text(size)} pixels has the parameters {found}; expected a "
+                f"camera model {lens.model} of {_size_text(size)} pixels has the parameters {found}; expected a "
                 f"finite number from {least:g} to {most:g} instead of {value:g}"
             )
 
@@ -180,7 +254,7 @@ def _size_text(size: tuple[int, int]) -> str:
     return "x".join(str(side) if abs(side) < 10**9 else "huge" for side in size)
 
 
-def lens_for_image(lens: Any, size: tuple[int, int], name: str) -> Any:
+def lens_for_image(lens: Lens, size: tuple[int, int], name: str) -> Lens:
     """The lens at the size of the image file; images reduced after calibration rescale it.
 
     Raises:
@@ -201,9 +275,7 @@ def lens_for_image(lens: Any, size: tuple[int, int], name: str) -> Any:
             f"{name} is {width}x{height} pixels large, but its camera {lens.width}x{lens.height}; expected the "
             "same size or a scaled copy; photographs rotated or cropped after calibration cannot be used"
         )
-    rescaled = library.pycolmap.Camera(lens.todict())
-    rescaled.rescale(width, height)
-    return rescaled
+    return lens.rescaled(width, height)
 
 
 def _skew(expected: float, side: int, rounding: float) -> float:
@@ -212,52 +284,44 @@ def _skew(expected: float, side: int, rounding: float) -> float:
     return math.inf if deviation > rounding else deviation / side
 
 
-def pinhole_of(lens: Any) -> tuple[Pinhole, bool]:
+@lru_cache(maxsize=1024)
+def pinhole_of(lens: Lens) -> tuple[Pinhole, bool]:
     """The pinhole camera that replaces a lens, and whether photographs have to be undistorted for it.
 
     Raises:
-        InputError: the lens cannot be undistorted, such as a panorama.
+        InputError: the lens cannot be undistorted, such as a panorama, or needs pycolmap for it, which is not there.
     """
-    key = (lens.model_name, tuple(float(value) for value in lens.params), lens.width, lens.height)
-    return _pinhole(*key)
-
-
-@lru_cache(maxsize=1024)
-def _pinhole(model: str, parameters: tuple[float, ...], width: int, height: int) -> tuple[Pinhole, bool]:
-    if _is_pinhole(model, parameters):
-        lens = make_lens(model, list(parameters), (width, height))
-        return _intrinsics(lens), False
-    lens = make_lens(model, list(parameters), (width, height))
+    if _is_pinhole(lens.model, lens.parameters):
+        first = PARAMETER_COUNTS[lens.model].focal
+        cx, cy = lens.parameters[first : first + 2]
+        return Pinhole(*lens.focal_lengths(), cx, cy, lens.width, lens.height), False
     try:
-        undistorted = library.pycolmap.undistort_camera(library.pycolmap.UndistortCameraOptions(), lens)
+        found = library.pycolmap.undistort_camera(library.pycolmap.UndistortCameraOptions(), lens.as_colmap())
+    except InputError:
+        raise
     except (ValueError, RuntimeError) as error:
         raise InputError(
-            f"camera model {model} with parameters {parameters} cannot be undistorted ({error})"
+            f"camera model {lens.model} with parameters {lens.parameters} cannot be undistorted ({error})"
         ) from error
-    return _intrinsics(undistorted), True
+    fx, fy, cx, cy = (float(value) for value in found.params)
+    return Pinhole(fx, fy, cx, cy, found.width, found.height), True
 
 
 def _is_pinhole(model: str, parameters: tuple[float, ...]) -> bool:
     if model in PINHOLES:
         return True
-    first_extra = 3 if model in ("SIMPLE_RADIAL", "RADIAL") else 4
-    return model in PERSPECTIVE and not any(parameters[first_extra:])
+    counts = PARAMETER_COUNTS[model]
+    return model in PERSPECTIVE and not any(parameters[counts.focal + counts.middle :])
 
 
 def undistorted(pixels: NDArray[np.uint8], lens: Any) -> NDArray[np.uint8]:
-    """[H, W, 3] as the pinhole camera of `pycolmap.undistort_camera` shows it, which may have another size."""
+    """[H, W, 3] as the pinhole camera of `pycolmap.undistort_camera` shows it, which may have another size.
+
+    Args:
+        pixels: the photograph.
+        lens: its `pycolmap.Camera`.
+    """
     return _undistort(pixels, lens, "BILINEAR")
-
-
-def _intrinsics(lens: Any) -> Pinhole:
-    return Pinhole(
-        fx=float(lens.focal_length_x),
-        fy=float(lens.focal_length_y),
-        cx=float(lens.principal_point_x),
-        cy=float(lens.principal_point_y),
-        width=lens.width,
-        height=lens.height,
-    )
 
 
 def _undistort(pixels: NDArray[np.uint8], lens: Any, interpolation: Interpolation) -> NDArray[np.uint8]:

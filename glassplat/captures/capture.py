@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from glassplat.captures.cameras import Lens
 from glassplat.errors import InputError
 
 HIGHEST_COLOR = 255
@@ -55,13 +56,13 @@ class Shot:
     Attributes:
         name: unique name with suffix, `/` between folders.
         image_path: the file.
-        lens: a `pycolmap.Camera` of any model.
+        lens: of any model.
         cam_from_world: [4, 4] float64, OpenCV axes.
     """
 
     name: str
     image_path: Path
-    lens: Any
+    lens: Lens
     cam_from_world: NDArray[np.float64]
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from glassplat.captures.cameras import make_lens
+from glassplat.captures.cameras import MODEL_OF_ID, PARAMETER_COUNTS, Lens, make_lens
 from glassplat.captures.capture import Capture, RawPoints, Shot
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.records import reading
@@ -44,9 +44,9 @@ class ModelImage:
 
 @dataclass(frozen=True)
 class Model:
-    """A sparse reconstruction; `lenses` maps camera ids to `pycolmap.Camera`."""
+    """A sparse reconstruction; `lenses` belong to camera ids."""
 
-    lenses: dict[int, Any]
+    lenses: dict[int, Lens]
     images: tuple[ModelImage, ...]
     points: RawPoints
 
@@ -88,11 +88,13 @@ def pose_matrix(image: ModelImage) -> NDArray[np.float64]:
     if not abs(math.hypot(*image.quat) - 1) < UNIT_TOLERANCE:
         quat = list(image.quat)
         raise InputError(f"the rotation of {image.name} is {quat}; expected a finite unit quaternion (w, x, y, z)")
-    from glassplat.captures.colmap_library import pycolmap
-
     w, x, y, z = np.array(image.quat) / math.hypot(*image.quat)
     pose = np.eye(4)
-    pose[:3, :3] = pycolmap.Rotation3d(np.array([x, y, z, w])).matrix()
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
     pose[:3, 3] = image.translation
     return pose
 
@@ -146,17 +148,15 @@ class _Bytes:
         return self.data[start:end].decode()
 
 
-def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, Any]]:
-    from glassplat.captures.colmap_library import pycolmap
-
+def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, Lens]]:
     (count,) = data.take("Q")
     for _ in range(count):
         camera_id, model_id, width, height = data.take("IiQQ")
-        model = pycolmap.CameraModelId(model_id).name
-        parameter_count = len(
-            pycolmap.Camera.create_from_model_id(0, pycolmap.CameraModelId(model_id), 1.0, 1, 1).params
-        )
-        yield camera_id, make_lens(model, list(data.take(f"{parameter_count}d")), (width, height))
+        model = MODEL_OF_ID.get(model_id)
+        if model is None:
+            raise ValueError(f"it has a camera model of number {model_id}; expected 0 to {max(MODEL_OF_ID)}")
+        parameters = data.take(f"{PARAMETER_COUNTS[model].total}d")
+        yield camera_id, make_lens(model, list(parameters), (width, height))
 
 
 def _binary_images(data: _Bytes) -> Iterator[ModelImage]:
@@ -195,7 +195,7 @@ def _at_least(count: int, fields: list[str]) -> list[str]:
     return fields
 
 
-def _text_cameras(stream: Iterator[str]) -> Iterator[tuple[int, Any]]:
+def _text_cameras(stream: Iterator[str]) -> Iterator[tuple[int, Lens]]:
     for line in _records(stream):
         camera_id, model, width, height, *parameters = _at_least(4, line.split())
         yield int(camera_id), make_lens(model, [float(value) for value in parameters], (int(width), int(height)))

@@ -1,5 +1,7 @@
 """pycolmap, when it is first asked for, and without what importing it does to the process.
 
+Only finding out where photographs were taken, and taking the distortion of a lens out of them, need it: it is an extra.
+
 It installs a handler that answers SIGTERM, with which job schedulers and shut-downs end a process, like a crash: with a
 stack of its C++ functions. Whatever answered before does so again.
 """
@@ -10,13 +12,28 @@ import signal
 import threading
 from typing import Any
 
+from glassplat.errors import InputError
+
+MISSING = (
+    "pycolmap, which finds out where photographs were taken and undistorts them, is not installed; run "
+    "pip install 'glassplat[prepare]'. There is none for Linux on ARM: prepare the capture on another machine; what "
+    "`glassplat prepare` writes needs it no more"
+)
+
 
 def __getattr__(name: str) -> Any:
-    """`pycolmap`, which takes a tenth of a second to import."""
+    """`pycolmap`, which takes a tenth of a second to import.
+
+    Raises:
+        InputError: it is not installed.
+    """
     if name != "pycolmap":
         raise AttributeError(f"module {__name__} has no attribute {name}")
     before = signal.getsignal(signal.SIGTERM)
-    import pycolmap
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise InputError(MISSING) from error
 
     # Only the main thread may say how signals are answered; None stands for what Python cannot restore.
     if before is not None and threading.current_thread() is threading.main_thread():
@@ -26,6 +43,10 @@ def __getattr__(name: str) -> Any:
 
 
 def quiet_pycolmap() -> None:
-    """Keeps pycolmap from printing; what matters of it is said in this package's own words."""
+    """Keeps pycolmap from printing; what matters of it is said in this package's own words.
+
+    Raises:
+        InputError: it is not installed.
+    """
     logging = __getattr__("pycolmap").logging
     logging.minloglevel = int(logging.FATAL)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from glassplat.captures.cameras import LARGEST_SIDE, make_lens, rigid_pose
+from glassplat.captures.cameras import LARGEST_SIDE, Lens, make_lens, rigid_pose
 from glassplat.captures.capture import Capture, RawPoints, Shot
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.images import IMAGE_SUFFIXES, image_size
@@ -83,7 +83,7 @@ LENS: dict[str, Field] = {
 }
 
 
-def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str) -> Any:
+def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str) -> Lens:
     """The `pycolmap.Camera` of one frame.
 
     Focal length: `fl_x`, `fl_y`, or the opening angles `camera_angle_x`, `camera_angle_y` in radians. Principal
@@ -105,7 +105,7 @@ def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str)
         raise InputError(f"the lens of {name}: {error}") from error
 
 
-def _lens(model: str, pinhole: list[float], coefficients: list[float], size: tuple[int, int]) -> Any:
+def _lens(model: str, pinhole: list[float], coefficients: list[float], size: tuple[int, int]) -> Lens:
     """The simplest of COLMAP's models that has all coefficients that are not zero."""
     k1, k2, k3, k4, k5, k6, p1, p2 = coefficients
     if model == FISHEYE:

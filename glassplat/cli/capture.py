@@ -9,11 +9,12 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from glassplat.captures.colmap_library import quiet_pycolmap
 from glassplat.cli.console import import_now, say, warn
 from glassplat.cli.progress import WorkProgress
 from glassplat.files.writing import check_capture_folder
 from glassplat.options import Range, Share
-from glassplat.prepare.colmap import Lens, Mapper
+from glassplat.prepare.colmap import LensName, Mapper
 from glassplat.prepare.preparation import Preparation, check_places, prepare
 from glassplat.prepare.reconstruction import Settings
 from glassplat.prepare.workplace import Workplace
@@ -39,15 +40,16 @@ class Prepare:
     output: Path
     max_size: Annotated[int, Range(320, 16384)] = 1600
     frames: Annotated[int, Range(8, 2000)] = 150
-    lens: Lens = "simple_radial"
+    lens: LensName = "simple_radial"
     mapper: Mapper = "incremental"
     least_registered: Share = 0.8
     resume: bool = False
     force: bool = False
 
     def ready(self) -> None:
-        """Refuses an input that is no photographs, and an output among them."""
+        """Refuses an input that is no photographs, an output among them, and to begin without pycolmap."""
         check_places(self._task())
+        quiet_pycolmap()
 
     def _task(self) -> Preparation:
         settings = Settings(lens=self.lens, mapper=self.mapper)

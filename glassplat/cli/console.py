@@ -6,6 +6,7 @@ as a picture, and break it at 80 columns where the output goes to a file; a cont
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import gc
 import importlib
@@ -304,11 +305,7 @@ def quoted(error: BaseException) -> str:
 def saved_traceback(error: BaseException) -> str:
     """Writes the traceback to a file among the temporary ones; says where, or where the error was if it cannot."""
     trace = "".join(traceback.format_exception(error))
-    head = (
-        f"glassplat {__version__}, Python {platform.python_version()}, PyTorch {_version('torch')}, "
-        f"Numba {_version('numba')}, {platform.system()} {platform.release()} {platform.machine()}\n"
-        f"{time.strftime('%Y-%m-%d %H:%M:%S %z')}\n{sys.argv}\n\n"
-    )
+    head = f"{versions()}\n{time.strftime('%Y-%m-%d %H:%M:%S %z')}\n{sys.argv}\n\n"
     try:
         with tempfile.NamedTemporaryFile(
             "w", prefix="glassplat-", suffix=".log", delete=False, encoding="utf-8", errors="backslashreplace"
@@ -320,11 +317,32 @@ def saved_traceback(error: BaseException) -> str:
     return f"the traceback is in {file.name}. Please report it, with what you did"
 
 
+def versions() -> str:
+    """The versions of what runs here, the system and its GPU, in a line, without importing any of it."""
+    return (
+        f"glassplat {__version__}, Python {platform.python_version()}, PyTorch {_version('torch')}, "
+        f"Numba {_version('numba')}, {platform.system()} {platform.release()} {platform.machine()}, "
+        f"{os.cpu_count()} CPU cores, {_gpu()}"
+    )
+
+
 def _version(package: str) -> str:
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return "missing"
+
+
+def _gpu() -> str:
+    """The NVIDIA GPU that the driver names first."""
+    try:
+        driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return "no NVIDIA driver"
+    name, version = ctypes.create_string_buffer(256), ctypes.c_int()
+    if driver.cuInit(0) or driver.cuDeviceGetName(name, 256, 0) or driver.cuDriverGetVersion(ctypes.byref(version)):
+        return "an NVIDIA driver without a GPU"
+    return f"{name.value.decode(errors='replace')} (CUDA {version.value // 1000}.{version.value % 1000 // 10})"
 
 
 def check_arguments(arguments: Sequence[str]) -> None:

@@ -14,8 +14,6 @@ from contextlib import nullcontext, suppress
 from dataclasses import field, make_dataclass
 from typing import Annotated, Any, NamedTuple, Union
 
-from glassplat import __version__
-
 FAILURE_CODE, USAGE_CODE, INTERRUPTED_CODE, UNREAD_CODE = 1, 2, 130, 141
 """The last two as shells report a process that Ctrl-C or a closed pipe ended."""
 DESCRIPTION = "Gaussian splatting for scenes with window panes, showcases and mirrors."
@@ -142,11 +140,11 @@ def parsed(arguments: list[str]) -> Any:
     """
     import tyro
 
-    from glassplat.cli.console import check_arguments
+    from glassplat.cli.console import check_arguments, versions
     from glassplat.options import check_options
 
     if arguments[:1] == ["--version"]:
-        print(f"glassplat {__version__}")
+        print(versions())
         raise SystemExit(0)
     config = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes)
     name = arguments[0] if arguments else ""
@@ -188,7 +186,7 @@ def overview(kinds: Mapping[str, type]) -> type:
     import tyro
 
     commands: Any = Union[tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in kinds.items())]  # noqa: UP007
-    version = tyro.conf.arg(help="show the version and exit", help_behavior_hint="")
+    version = tyro.conf.arg(help="show the versions of what runs here and exit", help_behavior_hint="")
     return make_dataclass(
         "Glassplat",
         [

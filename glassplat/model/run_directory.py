@@ -6,6 +6,7 @@ Where it must not be written, or holds no run, is found out without PyTorch.
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 import logging
 import os
@@ -16,6 +17,8 @@ from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
+
+from filelock import FileLock, Timeout
 
 from glassplat.captures.masks import Polarity
 from glassplat.errors import InputError, first_names, input_checked
@@ -32,6 +35,8 @@ log = logging.getLogger("glassplat.training")
 
 NAME = "train.lock"
 """The file stays behind, empty; the lock on it ends with the process, however that ends."""
+WITHOUT_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
+"""What file systems answer that know no locks."""
 
 
 @contextmanager
@@ -41,12 +46,22 @@ def run_lock(folder: Path) -> Iterator[None]:
     Raises:
         InputError: another training writes into it.
     """
-    descriptor = os.open(folder / NAME, os.O_RDWR | os.O_CREAT, 0o666)
+    lock = FileLock(folder / NAME, blocking=False, mode=0o666, thread_local=False)
     try:
-        _lock(descriptor, folder)
+        lock.acquire()
+    except Timeout as error:
+        raise InputError(
+            f"another training is writing into {folder}; expected a folder for each. Wait until it has ended, or "
+            "choose another --output"
+        ) from error
+    except OSError as error:
+        if error.errno not in WITHOUT_LOCKS:
+            raise
+        log.warning("%s cannot be locked (%s); see that no second training writes into it", folder, error.strerror)
+    try:
         yield
     finally:
-        os.close(descriptor)
+        lock.release()
 
 
 def check_unlocked(folder: Path) -> None:
@@ -58,22 +73,6 @@ def check_unlocked(folder: Path) -> None:
     if (folder / NAME).is_file():
         with run_lock(folder):
             pass
-
-
-def _lock(descriptor: int, folder: Path) -> None:
-    try:
-        import fcntl
-    except ImportError:  # Windows, where nothing holds a second training off.
-        return
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise InputError(
-            f"another training is writing into {folder}; expected a folder for each. Wait until it has ended, or "
-            "choose another --output"
-        ) from error
-    except OSError as error:
-        log.warning("%s cannot be locked (%s); see that no second training writes into it", folder, error.strerror)
 
 
 CHECKPOINT_SECONDS = 120.0

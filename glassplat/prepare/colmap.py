@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from glassplat.captures.colmap_library import pycolmap
+from glassplat.captures import colmap_library as library
 from glassplat.files.writing import atomic_write
 from glassplat.prepare.photographs import Listener, Photograph, Progress, read_photograph
 
@@ -38,7 +38,7 @@ def interruptible(work: Callable[[Any], Result], meanwhile: Callable[[], None] =
         Exception: what the work raised.
         KeyboardInterrupt: somebody asked for the end, and the work has ended.
     """
-    token = pycolmap.CancellationToken()
+    token = library.pycolmap.CancellationToken()
     results: list[Result] = []
     errors: list[BaseException] = []
 
@@ -64,7 +64,7 @@ def interruptible(work: Callable[[Any], Result], meanwhile: Callable[[], None] =
 
 
 Item = TypeVar("Item")
-Lens = Literal["simple_pinhole", "simple_radial", "radial", "opencv", "opencv_fisheye"]
+LensName = Literal["simple_pinhole", "simple_radial", "radial", "opencv", "opencv_fisheye"]
 """COLMAP's camera models, the simplest first: two fish-eyes aside, each next one bends lines in more ways."""
 
 USUAL_FOCAL = 1.2
@@ -107,9 +107,9 @@ class FeatureDatabase:
         """What a photograph is called in the database."""
         return f"{index:06d}.png"
 
-    def create(self, lens: Lens) -> None:
+    def create(self, lens: LensName) -> None:
         """Writes cameras and photographs, if they are not there yet."""
-        with closing(pycolmap.Database.open(self.path)) as database:
+        with closing(library.pycolmap.Database.open(self.path)) as database:
             if database.num_images() == len(self.photographs):
                 return
             database.clear_all_tables()
@@ -131,21 +131,21 @@ class FeatureDatabase:
 
     def extract(self, features: Features, listen: Listener, threads: int) -> None:
         """Finds the features of the photographs that have none yet."""
-        options = pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False)
+        options = library.pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False)
         options.sift.max_num_features = features.most
         options.sift.peak_threshold = features.least_contrast
         options.sift.first_octave = -1 if features.from_enlarged else 0
 
         def work(token: Any) -> None:
-            pycolmap.extract_features(
+            library.pycolmap.extract_features(
                 self.path,
                 self.pictures,
                 extraction_options=options,
-                device=pycolmap.Device.cpu,
+                device=library.pycolmap.Device.cpu,
                 cancellation_token=token,
             )
 
-        with closing(pycolmap.Database.open(self.path)) as database:
+        with closing(library.pycolmap.Database.open(self.path)) as database:
             watched = _Watched("looking for features", _image_ids(database), database.exists_keypoints, listen)
             interruptible(work, watched.look)
 
@@ -154,22 +154,22 @@ class FeatureDatabase:
         listed = self.path.with_suffix(".pairs.txt")
         names = [(self.picture_name(one), self.picture_name(other)) for one, other in pairs]
         listed.write_text("".join(f"{one} {other}\n" for one, other in names), encoding="utf-8")
-        matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
+        matching = library.pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
         matching.guided_matching = features.guided
-        verification = pycolmap.TwoViewGeometryOptions()
+        verification = library.pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = SEED
 
         def work(token: Any) -> None:
-            pycolmap.match_image_pairs(
+            library.pycolmap.match_image_pairs(
                 self.path,
                 matching_options=matching,
-                pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed),
+                pairing_options=library.pycolmap.ImportedPairingOptions(match_list_path=listed),
                 verification_options=verification,
-                device=pycolmap.Device.cpu,
+                device=library.pycolmap.Device.cpu,
                 cancellation_token=token,
             )
 
-        with closing(pycolmap.Database.open(self.path)) as database:
+        with closing(library.pycolmap.Database.open(self.path)) as database:
             ids = _image_ids(database)
             items = [(ids[one], ids[other]) for one, other in pairs]
             watched = _Watched(
@@ -179,20 +179,20 @@ class FeatureDatabase:
 
     def feature_counts(self) -> NDArray[np.int64]:
         """[P] features of each photograph."""
-        with closing(pycolmap.Database.open(self.path)) as database:
+        with closing(library.pycolmap.Database.open(self.path)) as database:
             return np.array([database.num_keypoints_for_image(one) for one in _image_ids(database)], dtype=np.int64)
 
     def descriptors(self) -> list[NDArray[np.uint8]]:
         """[F, 128] of each photograph, the order of the features as found."""
-        with closing(pycolmap.Database.open(self.path)) as database:
+        with closing(library.pycolmap.Database.open(self.path)) as database:
             return [np.asarray(database.read_descriptors(one).data) for one in _image_ids(database)]
 
     def inliers(self) -> dict[tuple[int, int], int]:
         """How many matches of each pair of photographs, by number, agree on how the camera moved; pairs with any."""
-        with closing(pycolmap.Database.open(self.path)) as database:
+        with closing(library.pycolmap.Database.open(self.path)) as database:
             numbers = {image.image_id: int(Path(image.name).stem) for image in database.read_all_images()}
             keys, counts = database.read_two_view_geometry_num_inliers()
-        pairs = ((pycolmap.pair_id_to_image_pair(key), count) for key, count in zip(keys, counts, strict=True))
+        pairs = ((library.pycolmap.pair_id_to_image_pair(key), count) for key, count in zip(keys, counts, strict=True))
         return {
             (min(a, b), max(a, b)): int(count)
             for (a, b), count in (((numbers[one], numbers[other]), count) for (one, other), count in pairs)
@@ -231,22 +231,24 @@ def _camera_key(photograph: Photograph) -> tuple[str, int, int]:
     return photograph.device, photograph.width, photograph.height
 
 
-def _new_rig(database: Any, lens: Lens, key: tuple[str, int, int], focal: float | None) -> tuple[int, int]:
+def _new_rig(database: Any, lens: LensName, key: tuple[str, int, int], focal: float | None) -> tuple[int, int]:
     """Adds the camera of a device, alone on its rig; the ids of both."""
     _, width, height = key
-    model = getattr(pycolmap.CameraModelId, lens.upper())
-    camera = pycolmap.Camera.create_from_model_id(0, model, focal or USUAL_FOCAL * max(width, height), width, height)
+    model = getattr(library.pycolmap.CameraModelId, lens.upper())
+    camera = library.pycolmap.Camera.create_from_model_id(
+        0, model, focal or USUAL_FOCAL * max(width, height), width, height
+    )
     camera.has_prior_focal_length = focal is not None
     camera.camera_id = database.write_camera(camera)
-    rig = pycolmap.Rig()
+    rig = library.pycolmap.Rig()
     rig.add_ref_sensor(camera.sensor_id)
     return camera.camera_id, database.write_rig(rig)
 
 
 def _add_image(database: Any, name: str, camera_id: int, rig_id: int) -> None:
-    image = pycolmap.Image(name=name, camera_id=camera_id)
+    image = library.pycolmap.Image(name=name, camera_id=camera_id)
     image.image_id = database.write_image(image)
-    frame = pycolmap.Frame()
+    frame = library.pycolmap.Frame()
     frame.rig_id = rig_id
     frame.add_data_id(image.data_id)
     database.write_frame(frame)
@@ -375,7 +377,7 @@ def _incremental(database: Path, output: Path, options: Any, count: int, listen:
         listen(Progress("placing the photographs", placed_now, count))
 
     def work(token: Any) -> dict:
-        return pycolmap.incremental_mapping(
+        return library.pycolmap.incremental_mapping(
             database,
             output,
             output,
@@ -389,16 +391,16 @@ def _incremental(database: Path, output: Path, options: Any, count: int, listen:
 
 
 def _global(database: Path, output: Path, threads: int) -> Callable[[Any], dict]:
-    options = pycolmap.GlobalPipelineOptions(num_threads=threads, random_seed=SEED)
+    options = library.pycolmap.GlobalPipelineOptions(num_threads=threads, random_seed=SEED)
 
     def work(token: Any) -> dict:
-        return pycolmap.global_mapping(database, output, output, options=options)
+        return library.pycolmap.global_mapping(database, output, output, options=options)
 
     return work
 
 
 def _incremental_options(options: Mapping, threads: int) -> Any:
-    chosen = pycolmap.IncrementalPipelineOptions(
+    chosen = library.pycolmap.IncrementalPipelineOptions(
         num_threads=threads, random_seed=SEED, min_model_size=3, extract_colors=False
     )
     chosen.mapper.init_min_tri_angle = options.first_angle

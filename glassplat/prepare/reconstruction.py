@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from glassplat.captures import colmap_library as library
 from glassplat.captures.cameras import undistorted
-from glassplat.captures.colmap_library import pycolmap
 from glassplat.errors import InputError, first_names
-from glassplat.prepare.colmap import FeatureDatabase, Features, Lens, Mapper, Mapping, chosen_pairs, placed
+from glassplat.prepare.colmap import FeatureDatabase, Features, LensName, Mapper, Mapping, chosen_pairs, placed
 from glassplat.prepare.photographs import Listener, Note, Photograph, Progress, read_photograph
 
 FEWEST_FEATURES = 50
@@ -83,7 +83,7 @@ class Settings:
         threads: to use.
     """
 
-    lens: Lens = "simple_radial"
+    lens: LensName = "simple_radial"
     mapper: Mapper = "incremental"
     threads: int = -1
 
@@ -156,7 +156,7 @@ def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
         InputError: a photograph can no longer be read.
     """
     model = solution.models[0]
-    lenses = {key: pycolmap.Camera(camera.todict()) for key, camera in model.cameras.items()}
+    lenses = {key: library.pycolmap.Camera(camera.todict()) for key, camera in model.cameras.items()}
     _straighten(model)
     colors = PointColors(model)
     images = image_numbers(model)
@@ -177,8 +177,8 @@ def write_capture(solution: Solution, folder: Path, listen: Listener) -> None:
 
 def _straighten(model: Any) -> None:
     """Gives a model pinhole cameras, and its observations the places that these show them at."""
-    options = pycolmap.UndistortCameraOptions()
-    pinholes = {key: pycolmap.undistort_camera(options, camera) for key, camera in model.cameras.items()}
+    options = library.pycolmap.UndistortCameraOptions()
+    pinholes = {key: library.pycolmap.undistort_camera(options, camera) for key, camera in model.cameras.items()}
     for image in image_numbers(model).values():
         pixels = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
         rays = np.asarray(model.cameras[image.camera_id].cam_from_img(pixels)).reshape(-1, 2)

@@ -1,29 +1,76 @@
-"""Photographs reduced to the pixel grid of their camera."""
+"""Lenses without pycolmap, held against it; and what is said where it is missing."""
 
 from __future__ import annotations
 
-import tracemalloc
+import sys
 
 import numpy as np
 import pytest
 
-from glassplat.captures.cameras import area_resize
-
-PIXELS = np.random.default_rng(0).integers(0, 256, (60, 48, 3), dtype=np.uint8)
-
-
-@pytest.mark.parametrize("factor", [1, 2, 3, 12])
-def test_a_pixel_is_the_mean_of_those_that_it_replaces(factor: int) -> None:
-    reduced = area_resize(PIXELS, 48 // factor, 60 // factor)
-    means = PIXELS.reshape(60 // factor, factor, 48 // factor, factor, 3).mean(axis=(1, 3))
-    assert reduced.dtype == np.uint8
-    np.testing.assert_allclose(reduced, means, atol=0.5 + 1e-4)
+from glassplat.captures import colmap_library
+from glassplat.captures.cameras import MODEL_OF_ID, PARAMETER_COUNTS, PERSPECTIVE, Lens, pinhole_of
+from glassplat.captures.colmap import ModelImage, pose_matrix
+from glassplat.captures.dataset import load_dataset
+from glassplat.errors import InputError
 
 
-def test_reduction_of_a_large_photograph_takes_little_more_memory_than_the_photograph() -> None:
-    pixels = np.zeros((4000, 4000, 3), dtype=np.uint8)
-    tracemalloc.start()
-    area_resize(pixels, 1000, 1000)
-    _, most = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert most < 2 * pixels.nbytes  # One channel as floats takes 1.3 times as much; all three would take 4.
+@pytest.fixture
+def without_pycolmap(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    monkeypatch.delattr(colmap_library, "pycolmap", raising=False)
+    pinhole_of.cache_clear()
+
+
+def example(model: str) -> Lens:
+    counts = PARAMETER_COUNTS[model]
+    parameters = [30.0, 31.0][: counts.focal] + [16.0, 13.0][: counts.middle] + [0.01] * counts.extra
+    return Lens(model, tuple(parameters), 32, 24)
+
+
+def test_the_table_of_models_is_colmaps() -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    members = {name: int(found) for name, found in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
+    assert members == {name: number for number, name in MODEL_OF_ID.items()}
+    for model, counts in PARAMETER_COUNTS.items():
+        camera = pycolmap.Camera(model=model, width=32, height=24, params=[1.0] * counts.total)
+        found = [camera.focal_length_idxs(), camera.principal_point_idxs(), camera.extra_params_idxs()]
+        if model == "EQUIRECTANGULAR":  # Its parameters are its size, of no kind.
+            continue
+        assert [len(list(indices)) for indices in found] == [counts.focal, counts.middle, counts.extra]
+
+
+@pytest.mark.parametrize("model", [name for name, counts in PARAMETER_COUNTS.items() if counts.focal])
+def test_a_lens_is_rescaled_as_colmap_does_it(model: str) -> None:
+    pytest.importorskip("pycolmap")
+    lens = example(model)
+    camera = lens.as_colmap()
+    camera.rescale(65, 50)
+    assert lens.rescaled(65, 50).parameters == pytest.approx(tuple(camera.params), rel=1e-12)
+
+
+@pytest.mark.parametrize("quat", [(1.0, 0.0, 0.0, 0.0), (0.1, -0.7, 0.5, 0.5), (0.0, 0.6, 0.0, -0.8)])
+def test_a_quaternion_is_the_rotation_that_colmap_means(quat: tuple[float, ...]) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    found = pose_matrix(ModelImage("0000.jpg", 1, quat, (1.0, 2.0, 3.0)))
+    w, x, y, z = quat
+    np.testing.assert_allclose(found[:3, :3], pycolmap.Rotation3d(np.array([x, y, z, w])).matrix(), atol=1e-12)
+    assert found[:3, 3].tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_a_capture_of_pinholes_needs_no_pycolmap(capture, binary: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture.lenses = [("SIMPLE_PINHOLE", [40.0, 15.5, 12.5]), ("OPENCV", [30.0, 31.0, 16.0, 12.0, 0, 0, 0, 0])]
+    capture.write_colmap(binary=binary)
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    monkeypatch.delattr(colmap_library, "pycolmap", raising=False)
+    dataset = load_dataset(capture.root)
+    lenses = {(view.camera.fx, view.camera.fy) for view in (*dataset.train, *dataset.test)}
+    assert lenses == {(40, 40), (30, 31)}
+
+
+@pytest.mark.usefixtures("without_pycolmap")
+@pytest.mark.parametrize("model", [name for name in PARAMETER_COUNTS if "PINHOLE" not in name])
+def test_a_lens_that_bends_names_the_extra_that_straightens_it(model: str) -> None:
+    assert model not in PERSPECTIVE or example(model).parameters[-1]
+    with pytest.raises(InputError, match=r"pip install 'glassplat\[prepare\]'"):
+        pinhole_of(example(model))

@@ -64,7 +64,7 @@ def test_same_cameras_as_colmap_in_either_axes(capture, axes: str) -> None:
     assert found.test_shots is not None
     for mine, other in zip((*found.shots, *found.test_shots), [*expected.shots[:7], *expected.shots[8:]], strict=True):
         np.testing.assert_allclose(mine.cam_from_world, other.cam_from_world, atol=1e-9)
-        assert list(mine.lens.params) == list(other.lens.params)
+        assert mine.lens.parameters == other.lens.parameters
     assert any("OpenCV axes" in warning for warning in found.warnings) == (axes == "opencv")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import pycolmap
+from scipy.spatial.transform import Rotation
 
 from glassplat.captures.dataset import load_dataset
 from glassplat.files.images import write_image
@@ -21,7 +21,7 @@ def write_colmap_capture(root: Path, names: Sequence[str]) -> list[Path]:
     lines, files = [], []
     for index, (name, view) in enumerate(zip(names, tiny_capture().train, strict=False), start=1):
         pose = view.camera.cam_from_world.double().numpy()
-        x, y, z, w = pycolmap.Rotation3d(pose[:3, :3]).quat
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
         translation = " ".join(map(str, pose[:3, 3]))
         lines.append(f"{index} {w} {x} {y} {z} {translation} 1 {name}\n\n")
         files.append(root / "images" / name)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import platform
 import shutil
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -54,6 +56,14 @@ def test_the_list_of_commands_needs_none_of_the_libraries(arguments: list[str], 
     assert not {f"glassplat.cli.{listed.module}" for listed in COMMANDS.values()} & set(commands)
     assert "Traceback" not in done.stderr
     assert all(name in done.stdout + done.stderr for name in COMMANDS) or arguments == ["--version"]
+
+
+def test_the_version_tells_what_a_report_of_a_bug_needs() -> None:
+    done = subprocess.run([sys.executable, "-m", "glassplat", "--version"], capture_output=True, text=True, check=True)
+    for name, version in (("glassplat", glassplat.__version__), ("PyTorch", metadata.version("torch"))):
+        assert f"{name} {version}, " in done.stdout
+    assert f"Python {platform.python_version()}, " in done.stdout
+    assert "NVIDIA driver" in done.stdout or "CUDA" in done.stdout
 
 
 @pytest.mark.parametrize("name", ["prepare", "annotate", "train", "eval", "export", "view", "video", "import", "info"])
