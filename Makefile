@@ -1,25 +1,37 @@
 # Every target sets itself up in .venv; nothing but Python 3.11 (or newer) and make has to be there.
 # Another interpreter: make test PYTHON=/path/to/python
+# The newest versions in place of the pinned ones: make test CONSTRAINTS=
 
-PYTHON ?= $(shell command -v python3.11 || command -v python3)
+PYTHON ?= $(shell command -v python3.11 || command -v python3 || command -v python)
+CONSTRAINTS ?= constraints.txt
 VENV := .venv
-BIN := $(VENV)/bin
+IN_VENV := $(if $(filter Windows_NT,$(OS)),Scripts,bin)
+BIN := $(VENV)/$(IN_VENV)
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check --no-input
 
-.PHONY: help setup browser demo test lint format docs bench clean
+# Tests of what differs between systems and versions; they need neither a browser nor a compiled kernel.
+PORTABLE_TESTS := tests/files tests/captures tests/scene tests/model/test_run_lock.py tests/cli/test_start.py
+# What releases are made with, and the lowest versions tried in.
+RELEASE := build/release
+LOWEST := build/lowest
+
+.PHONY: help setup browser demo test portable lowest dist lint format docs bench clean
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make demo    train both methods on the bundled showcase and say where the pictures are"
-	@echo "make test    style, types and tests, as the continuous integration runs them"
-	@echo "make lint    style and types only"
-	@echo "make format  rewrite the sources in the project's format"
-	@echo "make docs    the documentation of the Python interface, in build/docs"
-	@echo "make bench   measure the kernels and the methods"
-	@echo "make setup   only create .venv"
-	@echo "make browser install Chromium for the tests of pages, from Debian's packages (asks for sudo where needed)"
-	@echo "make clean   remove .venv and every cache"
+	@echo "make demo     train both methods on the bundled showcase and say where the pictures are"
+	@echo "make test     style, types and tests, as the continuous integration runs them"
+	@echo "make portable only the tests of what differs between systems: files, captures, scenes, commands"
+	@echo "make lowest   the same with the lowest version of every dependency"
+	@echo "make dist     wheel and source distribution, checked, installed and tried"
+	@echo "make lint     style and types only"
+	@echo "make format   rewrite the sources in the project's format"
+	@echo "make docs     the documentation of the Python interface, in build/docs"
+	@echo "make bench    measure the kernels and the methods"
+	@echo "make setup    only create .venv"
+	@echo "make browser  install Chromium for the tests of pages, from Debian's packages (asks for sudo where needed)"
+	@echo "make clean    remove .venv and every cache"
 
 setup: $(STAMP)
 
@@ -29,7 +41,7 @@ $(STAMP): pyproject.toml constraints.txt
 		{ echo "glassplat needs Python 3.11 or newer; '$(PYTHON)' is not. Try: make PYTHON=/path/to/python3.11" >&2; exit 1; }
 	@echo "Setting up $(VENV) (downloads PyTorch, takes a few minutes the first time) ..."
 	@"$(PYTHON)" -m venv --clear $(VENV)
-	@$(PIP) install --constraint constraints.txt --editable '.[dev]'
+	@$(PIP) install $(addprefix --constraint ,$(CONSTRAINTS)) --editable '.[dev]'
 	@touch $@
 
 # Tests of pages are skipped, and said to be, where there is no Chromium.
@@ -48,6 +60,27 @@ lint: $(STAMP)
 
 test: lint
 	$(BIN)/python -m pytest --numprocesses=2 --dist=worksteal --durations=15
+
+portable: $(STAMP)
+	$(BIN)/python -m pytest $(PORTABLE_TESTS)
+
+# uv, because pip has no way to ask for the lowest version.
+lowest:
+	"$(PYTHON)" -m venv --clear $(LOWEST)
+	$(LOWEST)/$(IN_VENV)/python -m pip --quiet install uv
+	$(LOWEST)/$(IN_VENV)/uv pip install --quiet --python $(LOWEST) --resolution lowest-direct \
+		--editable '.[prepare,view,video]' 'pytest>=8.3' 'hypothesis>=6.100'
+	$(LOWEST)/$(IN_VENV)/python -m pytest $(PORTABLE_TESTS)
+
+dist:
+	rm -rf dist $(RELEASE)
+	"$(PYTHON)" -m venv $(RELEASE)
+	$(RELEASE)/$(IN_VENV)/python -m pip --quiet install build twine
+	$(RELEASE)/$(IN_VENV)/python -m build
+	$(RELEASE)/$(IN_VENV)/python -m twine check --strict dist/*
+	$(RELEASE)/$(IN_VENV)/python -m pip --quiet install dist/*.whl
+	cd $(RELEASE) && $(IN_VENV)/glassplat --version && $(IN_VENV)/glassplat --help >/dev/null
+	cd $(RELEASE) && $(IN_VENV)/python -c 'import glassplat; glassplat.load'
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
