@@ -17,6 +17,10 @@ PAGES = sorted(
 )
 MOST_README_LINES = 60
 
+REPOSITORY = re.compile(
+    r"https://(?:github\.com/glassplat/glassplat/blob|raw\.githubusercontent\.com/glassplat/glassplat)/main/"
+)
+"""What PyPI needs before the links of the README, which it shows elsewhere."""
 LINK = re.compile(r"\]\(([^)#\s]+)[^)]*\)")
 SHELL_BLOCK = re.compile(r"```sh\n(.*?)```", re.DOTALL)
 
@@ -40,9 +44,16 @@ def test_the_readme_fits_on_one_screen() -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_to_files_that_exist(page: Path) -> None:
-    targets = [target for target in LINK.findall(page.read_text()) if "://" not in target]
-    missing = [target for target in targets if not (page.parent / target).exists()]
+    targets = LINK.findall(page.read_text())
+    absolute = [REPOSITORY.sub("", target) for target in targets if REPOSITORY.match(target)]
+    relative = [target for target in targets if "://" not in target]
+    missing = [target for target in absolute if not (ROOT / target).exists()]
+    missing += [target for target in relative if not (page.parent / target).exists()]
     assert not missing, f"{page.relative_to(ROOT)} links to {missing}, which do not exist"
+
+
+def test_the_readme_can_be_read_elsewhere() -> None:
+    assert not [target for target in LINK.findall(README.read_text()) if "://" not in target]
 
 
 def test_the_readme_shows_how_to_start() -> None:
