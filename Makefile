@@ -25,9 +25,9 @@ help:
 	@echo "make portable only the tests of what differs between systems: files, captures, scenes, commands"
 	@echo "make lowest   the same with the lowest version of every dependency"
 	@echo "make dist     wheel and source distribution, checked, installed and tried"
-	@echo "make lint     style and types only"
+	@echo "make lint     style, types and prose only"
 	@echo "make format   rewrite the sources in the project's format"
-	@echo "make docs     the documentation of the Python interface, in build/docs"
+	@echo "make docs     the documentation as a site, in build/docs"
 	@echo "make bench    measure the kernels and the methods"
 	@echo "make setup    only create .venv"
 	@echo "make browser  install Chromium for the tests of pages, from Debian's packages (asks for sudo where needed)"
@@ -57,6 +57,7 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/python -m tools.check_prose
 
 test: lint
 	$(BIN)/python -m pytest --numprocesses=2 --dist=worksteal --durations=15

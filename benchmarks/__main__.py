@@ -15,6 +15,8 @@ from benchmarks.looking import looking_times
 from benchmarks.methods import deferred_costs, method_costs, scaling
 from benchmarks.steps import step_costs
 
+WRITTEN = (kernel_times, method_costs)
+"""The measurements whose tables the page shows."""
 PAGE = Path(__file__).parent.parent / "docs" / "performance.md"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 
@@ -40,8 +42,9 @@ def main() -> None:
     parts = [f"Machine: {machine()}.\n"]
     print(parts[0])
     for measure in (kernel_times, twin_ratios, step_costs, method_costs, deferred_costs, scaling, looking_times):
-        parts.append(measure().markdown())
-        print(parts[-1], flush=True)
+        table = measure().markdown()
+        parts += [table] if measure in WRITTEN else []
+        print(table, flush=True)
     if arguments.write:
         page = PAGE.read_text()
         before, _, rest = page.partition(BEGIN)

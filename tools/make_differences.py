@@ -1,0 +1,173 @@
+"""Write the tables "What differs from the paper" of the pages of the methods, from the presets themselves.
+
+    python -m tools.make_differences
+
+A row is an option whose value in `--preset paper` is another one. Here are only the reasons; a test holds that the
+pages are up to date, and that no difference is without a reason.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from glassplat.methods.recipe import RECIPES, recipe_of
+
+DOCS = Path(__file__).parent.parent / "docs"
+BEGIN, END = "<!-- differences: begin -->", "<!-- differences: end -->"
+COMMON = "splat"
+"""Differences that every method shares stand on the page of this one."""
+
+ALL = {
+    "rates.short_run_power": "Runs of n < 30,000 iterations learn (30,000 / n)^0.5 times as fast.",
+    "rhythm.averaged_passes": "The mean over the last pass is better than the last step.",
+    "densify.split_by": "Gradients of single pixels (AbsGS) find what a large Gaussian smears.",
+    "densify.whole_passes": "Every Gaussian is seen before it is judged.",
+    "densify.adapt_to_size": "Small photographs grow more Gaussians than they have pixels otherwise.",
+    "densify.prune_large_start": "Walls and sky are large and stay.",
+    "densify.per_pixel": "Photographs that contradict each other never stop asking for more.",
+    "densify.least_contribution": "A sixth of the Gaussians does nothing.",
+    "mcmc.noise_units": "The units of the capture do not matter.",
+    "mcmc.reach": "Gaussians that few views show fade and wander otherwise.",
+    "mcmc.initial_spread": "Gaps take a thousand steps to close otherwise.",
+}
+GLOSSY = {
+    "search.begin_found": "Mirrors are found that stay painted otherwise.",
+    "search.estimated_normals": "Estimated normals say which way a mirror faces.",
+    "find_region": "Few views make anything look reflective.",
+    "strength_weight": "Matte things learn to reflect a little otherwise.",
+    "consistency_weight": "Normals follow the slope of the depths over a coarse grid, and are nearly right at once.",
+    "monocular_weight": "Estimated normals help little at the published weight.",
+    "propagation.sabotage": "A round number.",
+    "schedule.end": "Propagation ends when reflections stop growing.",
+    "schedule.stop": "A bound only.",
+    "schedule.pause": "Runs are shorter.",
+    "schedule.last_reset": "Raised opacities that only stand in the way sink again.",
+    "least_iterations": "Shorter runs train as `splat`, which is better then.",
+    "hurry_matte": "Without mirrors there are no normals to spoil.",
+    "hurry_found": "Matte parts lose half a decibel otherwise.",
+    "bootstrap": "Mirrors are recognised by how they look without reflection.",
+    "rates.decay": "Positions slow down until the end of the run.",
+    "reflection_rates.strength": "Runs are shorter.",
+    "rhythm.beat": "Mirrors lose their strength if propagation waits.",
+    "rhythm.reset_stop": "As 3DGS.",
+    "rhythm.sh": "As 3DGS.",
+    "densify.start": "As 3DGS.",
+    "densify.stop": "As 3DGS.",
+    "densify.prune_large_start": ALL["densify.prune_large_start"],
+    "densify.prune_opacity": "As 3DGS.",
+}
+REASONS: dict[str, dict[str, str]] = {
+    "splat": ALL,
+    "planar": {
+        "view_dependence_weight": "Mirrored views see Gaussians from where no photograph does.",
+        "fresnel": "A pane has two surfaces; Schlick's curve is a third too low at 70°.",
+        "blend": "Light adds up linearly.",
+        "panes": "Panes behind panes held half of the error of a glass case.",
+        "detect_mirrors": "Nobody has to name the mirrors.",
+        "fixed_mirrors": "R0 falls, and the mirror becomes a window.",
+        "seed_reflections": "Captures from the front show the room in the glass only.",
+        "weights.intensity": "R0 and a(u) are nearly one factor.",
+        "moving_mean": "The mean depth follows the photographs.",
+        "perturbation.stop": "What was perturbed has time to settle.",
+        "perturbation.bounds": "Opacities that were lowered by mistake can recover.",
+        "early_growth": "Early Gaussians build the reflected room behind the pane (MCMC).",
+        "early_resets": "Planes are fitted to transparent Gaussians otherwise: -1.1 dB.",
+        "densify_by": "Things are small in a mirror and need no splitting.",
+    },
+    "deferred": GLOSSY
+    | {
+        "texels": "Runs are shorter.",
+        "first_texels": "Coarse texels give wrong normals a gradient.",
+        "propagation_interval": "Runs are shorter.",
+    },
+    "traced": GLOSSY
+    | {
+        "primitive": "Discs cost more; not compared yet.",
+        "sh_degree": "As 3DGS.",
+        "harmonics_from_start": "View-dependent colours explain what reflects.",
+        "mirrors": "A cube map finds the sky sooner, and normals with it.",
+        "least_strength": "Most pixels reflect nothing: 0.00 dB.",
+        "surroundings.start.source": "The scene holds what is mirrored already; a third of the time.",
+        "surroundings.start.cells": "Of the box.",
+        "surroundings.sh_degree": "Mirrored things are matte, as a rule.",
+        "surroundings.rates.decay": "Runs are shorter.",
+        "surroundings.rates.short_run_power": "Runs are shorter.",
+        "surroundings.densify.interval": "As the scene.",
+        "surroundings.densify.whole_passes": "As the scene.",
+        "surroundings.densify.adapt_to_size": "As the scene.",
+        "surroundings.densify.start": "As the scene.",
+        "surroundings.densify.stop": "Runs are shorter.",
+        "surroundings.densify.gradient_threshold": "As the scene.",
+        "surroundings.densify.prune_opacity": "As the scene.",
+        "surroundings.densify.prune_large_start": "As the scene.",
+        "surroundings.densify.cap": "As the scene.",
+        "surroundings.densify.per_pixel": "As the scene.",
+        "surroundings.densify.least_contribution": "What no reflection shows late in the run goes.",
+        "surroundings.reset": "Copies begin where they belong.",
+        "normals_throughout": "Depths are too noisy later: -0.25 to -1 dB.",
+    },
+}
+"""Why an option differs, by method and dotted name."""
+
+
+def leaves(options: Any, name: str = "") -> dict[str, Any]:
+    """Every single value of nested options, by its dotted name."""
+    if not dataclasses.is_dataclass(options):
+        return {name: options}
+    parts = [
+        leaves(getattr(options, field.name), f"{name}.{field.name}".lstrip("."))
+        for field in dataclasses.fields(options)
+    ]
+    return {key: value for part in parts for key, value in part.items()}
+
+
+def differences(method: str) -> dict[str, tuple[Any, Any]]:
+    """The default and the published value of every option in which the two differ."""
+    ours, published = leaves(recipe_of(method)), leaves(recipe_of(method, "paper"))
+    return {name: (value, published[name]) for name, value in ours.items() if value != published[name]}
+
+
+def written(value: Any) -> str:
+    """A value as it stands in a table."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, tuple):
+        return ", ".join(written(part) for part in value)
+    return str(value)
+
+
+def own_differences(method: str) -> dict[str, tuple[Any, Any]]:
+    """The differences of a method without those that all methods share."""
+    shared = differences(COMMON) if method != COMMON else {}
+    return {name: values for name, values in differences(method).items() if shared.get(name) != values}
+
+
+def table_of(method: str) -> str:
+    """The table of a method, without the rows that all methods share."""
+    rows = [
+        f"| `{name}` | {written(ours)} | {written(published)} | {REASONS[method][name]} |"
+        for name, (ours, published) in own_differences(method).items()
+    ]
+    return "\n".join(["| option | here | paper | why |", "|---|---|---|---|", *rows])
+
+
+def with_table(page: str, method: str) -> str:
+    """A page whose table is that of the presets."""
+    before, begin, rest = page.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(f"docs/{method}.md has no place for the table: {BEGIN} and {END}")
+    return f"{before}{BEGIN}\n{table_of(method)}\n{END}{after}"
+
+
+def main() -> None:
+    """Write the tables of all methods."""
+    for method in RECIPES:
+        page = DOCS / f"{method}.md"
+        page.write_text(with_table(page.read_text(encoding="utf-8"), method), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
