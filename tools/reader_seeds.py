@@ -8,7 +8,7 @@ import json
 import shutil
 import struct
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,8 @@ import torch
 from PIL import Image
 
 from glassplat.annotate.document import FILE, read_document
-from glassplat.captures.colmap import read_model
+from glassplat.captures import colmap_library as library
+from glassplat.captures.colmap import pose_matrix, read_model
 from glassplat.captures.masks import read_mask_values
 from glassplat.captures.transforms import load_transforms
 from glassplat.captures.view import View, estimated_normals
@@ -42,6 +43,8 @@ from glassplat.files.sidecars import (
 from glassplat.files.spz import HEADER, MAGIC, write_spz
 from glassplat.methods.recipe import RECIPES, recipe_to_json
 from glassplat.model.run_directory import RunDirectory, RunSettings, lines_until
+from glassplat.prepare.colmap import FeatureDatabase
+from glassplat.prepare.photographs import Photograph
 from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import Exposures
 from glassplat.scene.gaussians import Gaussians
@@ -160,6 +163,56 @@ def _colmap(path: Path) -> None:
     read_model(path.parent)
 
 
+TEXT_PARTS = ("cameras.txt", "images.txt", "points3D.txt")
+BETWEEN = b"#--\n"
+"""Between the three files of a model in text, which are damaged as one."""
+
+
+def _text_seeds(folder: Path) -> None:
+    parts = (
+        "# a comment\n1 PINHOLE 64 48 50 50 32 24\n2 SIMPLE_RADIAL 64 48 50 32 24 0.01\n",
+        "1 1 0 0 0 0 0 1 1 a.png\n1 2 3\n2 0.6 0.8 0 0 0 0 1 2 b c.png\n\n",
+        "3 0 0 1 9 9 9 0.5 1 0\n",
+    )
+    (folder / "a.txt").write_bytes(BETWEEN.join(part.encode() for part in parts))
+
+
+def _colmap_text(path: Path) -> None:
+    """Three files in one."""
+    for name, data in zip(TEXT_PARTS, path.read_bytes().split(BETWEEN, 2), strict=False):
+        (path.parent / name).write_bytes(data)
+    for image in read_model(path.parent).images:
+        pose_matrix(image)
+
+
+def _features(path: Path) -> FeatureDatabase:
+    photographs = [Photograph(Path(f"{index}.png"), f"{index}.png", 64, 48, "", None) for index in range(3)]
+    return FeatureDatabase(path, path.parent, photographs)
+
+
+def _database_seeds(folder: Path) -> None:
+    features = _features(folder / "a.db")
+    features.create("opencv")
+    with closing(library.pycolmap.Database.open(features.path)) as database:
+        for image in database.read_all_images():
+            database.write_keypoints(image.image_id, np.ones((4, 4), np.float32))
+            found = library.pycolmap.FeatureDescriptors(
+                library.pycolmap.FeatureExtractorType.SIFT, np.ones((4, 128), np.uint8)
+            )
+            database.write_descriptors(image.image_id, found)
+
+
+def _database(path: Path) -> None:
+    """What an interrupted preparation goes on from."""
+    for suffix in ("-wal", "-shm", "-journal"):
+        path.with_name(path.name + suffix).unlink(missing_ok=True)
+    features = _features(path)
+    features.create("opencv")
+    features.feature_counts()
+    features.descriptors()
+    features.inliers()
+
+
 def _environment(path: Path) -> None:
     read_environment(path)
 
@@ -263,6 +316,8 @@ READERS: dict[str, Reader] = {
     "scene": Reader("scene.json", lambda path: read_scene(path.parent), _scene_seeds),
     "transforms": Reader("transforms.json", _transforms, _transforms_seeds),
     "colmap": Reader("model.bin", _colmap, _colmap_seeds),
+    "colmap text": Reader("model.txt", _colmap_text, _text_seeds),
+    "features": Reader("features.db", _database, _database_seeds, longest=200_000),
     "checkpoint": Reader("checkpoint.safetensors", load_checkpoint, _checkpoint_seeds, longest=16_384),
     "recipe": Reader("recipe.json", lambda path: RunDirectory(path.parent).recipe(), _recipe_seeds, longest=16_384),
     "settings": Reader("settings.json", lambda path: RunDirectory(path.parent).settings(), _settings_seeds),

@@ -1,6 +1,6 @@
 """Many clients that click at random look at a scene for long: does memory stay flat, does everybody get pictures?
 
-    python -m tools.soak_viewer RUN --clients 50 --minutes 120
+    python -m tools.soak_viewer RUN --clients 50 --minutes 120 [--pause 0.25]
 
 Starts `glassplat view` in a process of its own and speaks viser's protocol, as browsers do: cameras that move, every
 control that the page has, panes that are dragged, connections that are cut. At the end all clients rest, and each has
@@ -20,6 +20,7 @@ import tempfile
 import time
 from collections import Counter
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -30,8 +31,6 @@ from tests.viewer.free_port import free_port
 from tools.viewer_client import ViewerClient
 
 SIZES = ((640, 480), (1280, 720), (390, 844))
-PAUSE = 0.25
-"""Mean seconds between two actions of a client."""
 LEAVES = 0.01
 """Of the actions, how many cut the connection."""
 BETWEEN_SAMPLES = 5.0
@@ -54,8 +53,8 @@ class Count:
 class Looker:
     """One client that does what people do, and some things that they do not."""
 
-    def __init__(self, address: str, seed: int, count: Count) -> None:
-        self._address, self._random, self._count = address, random.Random(seed), count
+    def __init__(self, address: str, seed: int, pause: float, count: Count) -> None:
+        self._address, self._random, self._pause, self._count = address, random.Random(seed), pause, count
         self._angle, self._size = self._random.uniform(0, 6.28), self._random.choice(SIZES)
         self.rests, self.pictures = False, 0
 
@@ -81,7 +80,7 @@ class Looker:
         """Acts until it leaves; while it rests, it only listens."""
         before: int | None = None
         while True:
-            await asyncio.sleep(self._random.expovariate(1 / PAUSE))
+            await asyncio.sleep(self._random.expovariate(1 / self._pause))
             if self.rests:
                 if before is None:
                     before = client.pictures
@@ -160,7 +159,7 @@ def resident_mib(pid: int) -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-async def soak(run: Path, clients: int, minutes: float, say: Any = print) -> Soaked:
+async def soak(run: Path, clients: int, minutes: float, *, pause: float = 0.25, say: Any = print) -> Soaked:
     """Starts a viewer and its clients, waits, and ends them all."""
     port, count = free_port(), Count()
     with tempfile.TemporaryDirectory() as kept, tempfile.TemporaryFile("w+") as log:
@@ -168,13 +167,13 @@ async def soak(run: Path, clients: int, minutes: float, say: Any = print) -> Soa
         viewer = await asyncio.create_subprocess_exec(sys.executable, *command, stdout=log, stderr=log)
         try:
             address = await printed_address(log, viewer)
-            browsers = [Looker(address, seed, count) for seed in range(clients)]
+            browsers = [Looker(address, seed, pause, count) for seed in range(clients)]
             tasks = [asyncio.create_task(browser.live()) for browser in browsers]
             samples = await sampled(viewer.pid, 60 * minutes, count, say)
             for browser in browsers:
                 browser.rests = True
             begun = time.monotonic()
-            await asyncio.sleep(4 * PAUSE)
+            await asyncio.sleep(4 * pause)
             while any(not one.pictures for one in browsers) and time.monotonic() - begun < LAST_PICTURE:
                 await asyncio.sleep(0.5)
             seconds = time.monotonic() - begun
@@ -221,8 +220,11 @@ def main() -> int:
     parser.add_argument("run", type=Path)
     parser.add_argument("--clients", type=int, default=50)
     parser.add_argument("--minutes", type=float, default=120)
+    parser.add_argument("--pause", type=float, default=0.25, help="mean seconds between two actions of a client")
     options = parser.parse_args()
-    found = asyncio.run(soak(options.run, options.clients, options.minutes, lambda line: print(line, flush=True)))
+    found = asyncio.run(
+        soak(options.run, options.clients, options.minutes, pause=options.pause, say=partial(print, flush=True))
+    )
     first, last = found.samples[len(found.samples) // 2][1], found.samples[-1][1]
     print(
         f"{found.count.connections} connections, {found.count.actions} actions, {found.count.pictures} pictures; "

@@ -6,9 +6,11 @@ interrupted goes on.
 
 from __future__ import annotations
 
+import errno
+import os
 import threading
-from collections.abc import Callable, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
@@ -18,7 +20,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from glassplat.captures import colmap_library as library
+from glassplat.errors import InputError
 from glassplat.files.writing import atomic_write
+from glassplat.options import shown
 from glassplat.prepare.photographs import Listener, Photograph, Progress, read_photograph
 
 Result = TypeVar("Result")
@@ -70,6 +74,8 @@ LensName = Literal["simple_pinhole", "simple_radial", "radial", "opencv", "openc
 USUAL_FOCAL = 1.2
 """Focal length in longer image sides, where a photograph does not tell: roughly a telephone's main lens."""
 SEED = 0
+OF_DATABASE = ("SQLite", "database")
+"""In what COLMAP says where its database fails."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +115,7 @@ class FeatureDatabase:
 
     def create(self, lens: LensName) -> None:
         """Writes cameras and photographs, if they are not there yet."""
-        with closing(library.pycolmap.Database.open(self.path)) as database:
+        with self._opened() as database:
             if database.num_images() == len(self.photographs):
                 return
             database.clear_all_tables()
@@ -145,7 +151,7 @@ class FeatureDatabase:
                 cancellation_token=token,
             )
 
-        with closing(library.pycolmap.Database.open(self.path)) as database:
+        with self._opened() as database:
             watched = _Watched("looking for features", _image_ids(database), database.exists_keypoints, listen)
             interruptible(work, watched.look)
 
@@ -169,7 +175,7 @@ class FeatureDatabase:
                 cancellation_token=token,
             )
 
-        with closing(library.pycolmap.Database.open(self.path)) as database:
+        with self._opened() as database:
             ids = _image_ids(database)
             items = [(ids[one], ids[other]) for one, other in pairs]
             watched = _Watched(
@@ -179,30 +185,61 @@ class FeatureDatabase:
 
     def feature_counts(self) -> NDArray[np.int64]:
         """[P] features of each photograph."""
-        with closing(library.pycolmap.Database.open(self.path)) as database:
+        with self._opened() as database:
             return np.array([database.num_keypoints_for_image(one) for one in _image_ids(database)], dtype=np.int64)
 
     def descriptors(self) -> list[NDArray[np.uint8]]:
         """[F, 128] of each photograph, the order of the features as found."""
-        with closing(library.pycolmap.Database.open(self.path)) as database:
+        with self._opened() as database:
             return [np.asarray(database.read_descriptors(one).data) for one in _image_ids(database)]
 
     def inliers(self) -> dict[tuple[int, int], int]:
         """How many matches of each pair of photographs, by number, agree on how the camera moved; pairs with any."""
-        with closing(library.pycolmap.Database.open(self.path)) as database:
+        with self._opened() as database:
             numbers = {image.image_id: int(Path(image.name).stem) for image in database.read_all_images()}
             keys, counts = database.read_two_view_geometry_num_inliers()
-        pairs = ((library.pycolmap.pair_id_to_image_pair(key), count) for key, count in zip(keys, counts, strict=True))
-        return {
-            (min(a, b), max(a, b)): int(count)
-            for (a, b), count in (((numbers[one], numbers[other]), count) for (one, other), count in pairs)
-            if count
-        }
+            pairs = (
+                (library.pycolmap.pair_id_to_image_pair(key), count) for key, count in zip(keys, counts, strict=True)
+            )
+            return {
+                (min(a, b), max(a, b)): int(count)
+                for (a, b), count in (((numbers[one], numbers[other]), count) for (one, other), count in pairs)
+                if count
+            }
+
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
+        """The file as COLMAP's database."""
+        with sound(self.path), closing(library.pycolmap.Database.open(self.path)) as database:
+            yield database
 
     def _focal(self, key: tuple[str, int, int]) -> float | None:
         """What the photographs of one camera say of its focal length, the middle one; None where none does."""
         told = [one.focal for one in self.photographs if _camera_key(one) == key and one.focal is not None]
         return float(np.median(told)) if told else None
+
+
+@contextmanager
+def sound(path: Path) -> Iterator[None]:
+    """Says in words what is wrong with a database that COLMAP cannot work with.
+
+    Raises:
+        InputError: it is damaged.
+        OSError: the disk is full.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except (RuntimeError, LookupError, ValueError) as error:
+        reason = str(error)
+        if isinstance(error, RuntimeError) and not any(word in reason for word in OF_DATABASE):
+            raise
+        if "disk is full" in reason:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
+        raise InputError(
+            f"{path} is damaged, or cannot be written ({shown(reason)}); begin the preparation again with --force"
+        ) from error
 
 
 class _Watched(Generic[Item]):
@@ -351,6 +388,9 @@ def placed(
         count: of the photographs, for the progress.
         listen: is told how far it is.
         threads: to use.
+
+    Raises:
+        InputError: the database is damaged.
     """
     output = database.with_suffix(".models")
     output.mkdir(exist_ok=True)
@@ -359,7 +399,8 @@ def placed(
         work = _incremental(database, output, _incremental_options(options, threads), count, listen)
     else:
         work = _global(database, output, threads)
-    found = interruptible(work)
+    with sound(database):
+        found = interruptible(work)
     return sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 

@@ -1,0 +1,46 @@
+"""A database of features that is damaged: an interrupted preparation that goes on from it says so."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from glassplat.captures import colmap_library as library
+from glassplat.errors import InputError
+from glassplat.prepare.colmap import FeatureDatabase, sound
+from glassplat.prepare.photographs import Photograph
+
+
+def features(folder: Path) -> FeatureDatabase:
+    photographs = [Photograph(Path(f"{index}.png"), f"{index}.png", 64, 48, "", None) for index in range(3)]
+    found = FeatureDatabase(folder / "features.db", folder, photographs)
+    found.create("opencv")
+    return found
+
+
+@pytest.mark.parametrize("kept", [0.5, 0.1])
+def test_a_database_that_is_cut_off_is_named(tmp_path: Path, kept: float) -> None:
+    database = features(tmp_path)
+    data = database.path.read_bytes()
+    database.path.write_bytes(data[: int(kept * len(data))])
+    with pytest.raises(InputError, match=r"features\.db is damaged, .* --force"):
+        database.feature_counts()
+
+
+def test_photographs_that_are_not_ours_are_damage_too(tmp_path: Path) -> None:
+    database = features(tmp_path)
+    with closing(library.pycolmap.Database.open(database.path)) as opened:
+        image = opened.read_all_images()[0]
+        image.name = "portrait.png"
+        opened.update_image(image)
+    with pytest.raises(InputError, match="damaged"):
+        database.inliers()
+
+
+def test_a_full_disk_and_errors_of_others_stay_what_they_are(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="No space left"), sound(tmp_path):
+        raise RuntimeError("SQLite error: database or disk is full")
+    with pytest.raises(RuntimeError, match="of another kind"), sound(tmp_path):
+        raise RuntimeError("of another kind")
