@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -155,6 +157,23 @@ def read_document(folder: Path) -> Any:
 def version_of(value: Any) -> str:
     """What tells a document from others: a digest of all that is in it."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:24]
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Keeps other programs from saving marks of a capture meanwhile, where its file system has locks."""
+    try:
+        import fcntl
+    except ImportError:  # Windows.
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def write_document(folder: Path, value: Any) -> None:

@@ -19,6 +19,7 @@ from glassplat.annotate.document import (
     PLACE,
     MarkedPane,
     filled,
+    held,
     parsed_document,
     read_document,
     seen_outline,
@@ -259,7 +260,7 @@ class Session:
         fields = checked(asked, {"version": Text()}, "what the page saves")
         document = asked.get("document")
         panes = parsed_document(document, "the document of the page")
-        with self._lock:
+        with self._lock, held(self.root):
             there = read_document(self.root)
             if version_of(there) != fields["version"]:
                 base = self._versions.get(fields["version"], {"version": 1, "panes": []})

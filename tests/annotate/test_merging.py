@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import Any
+
 import pytest
 
-from glassplat.annotate.document import MOST_PANES
-from glassplat.annotate.session import merged
+from glassplat.annotate import session
+from glassplat.annotate.document import MOST_PANES, read_document
+from glassplat.annotate.session import ChangedElsewhereError, merged, opened_session
+from tests.annotate.conftest import marked_document, saved
 
 
 def document(**panes: str) -> dict:
@@ -39,3 +45,22 @@ def test_more_panes_than_fit_are_refused() -> None:
     ours = {"version": 1, "panes": [{"label": 1, "marks": "2"}]}
     with pytest.raises(ValueError, match="all 64 labels are in use"):
         merged(document(), full, ours)
+
+
+def test_two_programs_that_save_at_the_same_moment_drop_nothing(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    one, other = opened_session(room), opened_session(room)
+    second: list[Future[Any]] = []
+    write = session.write_document
+
+    def write_late(folder: Path, document: Any) -> None:
+        if not second:
+            second.append(pool.submit(saved, other, marked_document(label=2)))
+            wait(second, timeout=0.5)
+        write(folder, document)
+
+    with ThreadPoolExecutor(1) as pool:
+        monkeypatch.setattr(session, "write_document", write_late)
+        saved(one, marked_document())
+        with pytest.raises(ChangedElsewhereError):
+            second[0].result(30)
+    assert [pane["label"] for pane in read_document(room)["panes"]] == [1]
