@@ -32,6 +32,7 @@ def is_compressed(table: PlyTable) -> bool:
     return set(PACKED) <= table.columns.keys()
 
 
+@np.errstate(over="ignore", invalid="ignore")  # What is out of range is told by the caller; here it must not warn.
 def read_compressed(path: Path, table: PlyTable) -> Gaussians:
     """The Gaussians of a compressed PLY, whose `vertex` table has been read.
 
@@ -77,9 +78,7 @@ def _bounds(path: Path, count: int) -> dict[str, Floats]:
 
 def _between(shares: Floats, bounds: dict[str, Floats], names: tuple[str, ...]) -> Floats:
     low, high = (np.stack([bounds[f"{end}_{name}"] for name in names], axis=1) for end in ("min", "max"))
-    # What is out of range is told by the caller; here it must not warn.
-    with np.errstate(over="ignore", invalid="ignore"):
-        between: Floats = low * (1 - shares) + high * shares
+    between: Floats = low * (1 - shares) + high * shares
     return between
 
 

@@ -12,7 +12,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from glassplat.files.ply import BOUNDS, write_gaussians
+from glassplat.files.ply import BOUNDS, COLOR_BOUNDS, write_gaussians
 from glassplat.files.scene_folder import SPLAT_ROW, drawable, read_splats
 from glassplat.files.spz import write_spz
 from glassplat.kernels.project.reference import rotations
@@ -106,6 +106,16 @@ def test_files_that_lie_get_a_message(name: str, data: bytes, words: str, tmp_pa
     (tmp_path / name).write_bytes(data)
     with pytest.raises(ValueError, match=words):
         read_splats(tmp_path / name)
+
+
+@pytest.mark.parametrize("largest", [3e38, 1e300])
+def test_a_compressed_file_with_bounds_out_of_range_does_not_warn(largest: float, tmp_path: Path) -> None:
+    header = compressed_header(1, 1).decode().replace("property float", "property double")
+    colors = "".join(f"property double {name}\n" for name in COLOR_BOUNDS)
+    header = header.replace("element vertex", f"{colors}element vertex")
+    bounds = np.full(len(BOUNDS) + len(COLOR_BOUNDS), largest)
+    (tmp_path / "a.ply").write_bytes(header.encode() + bounds.tobytes() + bytes(16))
+    assert not read_splats(tmp_path / "a.ply").sh.isfinite().all()
 
 
 @given(st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 255)), min_size=1, max_size=6))
