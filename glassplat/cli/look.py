@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 
 from glassplat.cli.console import import_now
-from glassplat.cli.places import SceneEdits, Split, check_claim, check_file, check_scene, say_scene
+from glassplat.cli.places import SceneEdits, SplatFile, Split, check_claim, check_file, check_scene, say_scene
 from glassplat.errors import InputError, input_checked
 from glassplat.files.writing import check_folder
 from glassplat.kernels.backend.devices import DeviceName
@@ -67,11 +67,12 @@ class View:
     """Look at a scene in the browser, layer by layer, with its panes as they are or edited.
 
     Attributes:
-        scene: a run's directory, an imported scene, or a splat file.
+        scene: a run's directory, or a splat file of any program (.ply, .spz, .glb, .splat).
         port: where the browser finds it.
         host: who may look with the link; 127.0.0.1 is this machine alone, 0.0.0.0 everybody who can reach it.
         output: folder for edited scenes and keyframes that are saved in the browser; the one that holds the scene if
             not given. Where others may look, too, nothing can be saved unless it is given.
+        file: what a splat file does not say of itself.
         edits: changes to the panes.
         device: where to render; auto takes an NVIDIA GPU where one can be used.
     """
@@ -80,12 +81,14 @@ class View:
     port: Annotated[int, Range(1, 65535)] = 8080
     host: str = LOCAL
     output: Path | None = None
+    file: Annotated[SplatFile, tyro.conf.arg(name="")] = field(default_factory=SplatFile)
     edits: Annotated[SceneEdits, tyro.conf.arg(name="")] = field(default_factory=SceneEdits)
     device: DeviceName = "auto"
 
     def ready(self) -> None:
         """Refuses what is no scene, an output that cannot be written, and a port that is taken; imports the viewer."""
         check_scene(self.scene)
+        self.file.check()
         if self.output is not None:
             check_folder(self.output)
         check_port(self.host, self.port)
@@ -108,7 +111,7 @@ class Video:
     """Film a scene along a path: one layer, several side by side, or one wiped over another.
 
     Attributes:
-        scene: a run's directory, an imported scene, or a splat file.
+        scene: a run's directory, or a splat file of any program (.ply, .spz, .glb, .splat).
         output: the film: .mp4 (VP9, plays in browsers; needs glassplat[video]), .webp or .gif.
         path: once around, or in a loop before what was photographed from one side; through the photographs' cameras;
             or through those of --keyframes.
@@ -119,6 +122,7 @@ class Video:
         fps: pictures per second.
         width: of one layer's picture, pixels.
         force: replace a film of that name.
+        file: what a splat file does not say of itself.
         edits: changes to the panes.
         device: where to render; auto takes an NVIDIA GPU where one can be used.
     """
@@ -133,6 +137,7 @@ class Video:
     fps: Annotated[int, Range(1, 120)] = 30
     width: Annotated[int, Range(16, 8192)] = 960
     force: bool = False
+    file: Annotated[SplatFile, tyro.conf.arg(name="")] = field(default_factory=SplatFile)
     edits: Annotated[SceneEdits, tyro.conf.arg(name="")] = field(default_factory=SceneEdits)
     device: DeviceName = "auto"
 
@@ -152,6 +157,7 @@ class Video:
         if (self.path == "keyframes") != (self.keyframes is not None):
             raise InputError("--path keyframes and --keyframes FILE belong together; give both or neither")
         check_scene(self.scene)
+        self.file.check()
         if self.keyframes is not None:
             check_file(self.keyframes)
         say_scene(self.scene)

@@ -52,11 +52,6 @@ COMMANDS = {
         "Video",
         "Film a scene along a path: one layer, several side by side, or one wiped over another.",
     ),
-    "import": Listed(
-        "publish",
-        "Import",
-        "Read a splat file (PLY, SPZ, GLB, .splat) of any program as a scene to look at, film and export.",
-    ),
     "export": Listed(
         "publish",
         "Export",

@@ -13,12 +13,14 @@ from glassplat.cli.console import message_console, say
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.records import read_json, reading
 from glassplat.files.writing import check_folder, make_folder, real_path
+from glassplat.kernels.backend.devices import DeviceName
 from glassplat.model.run_directory import RunDirectory, write_text
-from glassplat.options import Finite, PaneLabel, Share
+from glassplat.options import Finite, PaneLabel, Share, Up
 
 if TYPE_CHECKING:
     from glassplat.captures.dataset import Dataset
     from glassplat.captures.view import View
+    from glassplat.model.model import Model
     from glassplat.scene.scene import Scene
 
 RECORD = "glassplat.json"
@@ -115,7 +117,7 @@ def _in_words(path: Path) -> str:
         return f"a splat file of {path.stat().st_size / 1e6:.1f} MB"
     directory = RunDirectory(path)
     if directory.imported.is_file():
-        return "an imported scene"
+        return "a scene without a capture"
     recipe, settings = directory.recipe(), directory.settings()
     return f"a {recipe.method} run of {settings.iterations} iterations on {settings.data}"
 
@@ -129,6 +131,31 @@ def check_file(path: Path) -> None:
     """
     with input_checked(), reading(path), path.open("rb"):
         pass
+
+
+@dataclass(frozen=True)
+class SplatFile:
+    """What a splat file does not say of itself; a run knows all of it.
+
+    Attributes:
+        planes: panes of a splat file: planes.json, written by hand or by `export`; the one beside it if not given.
+        up: which way is up in a splat file, for the cameras that look at it; y points down in most. A cameras.json
+            beside the file, as `export` writes it, is taken instead.
+    """
+
+    planes: Path | None = None
+    up: Up = "-y"
+
+    def check(self) -> None:
+        """Refuses panes that cannot be read."""
+        if self.planes is not None:
+            check_file(self.planes)
+
+    def opened(self, path: Path, device: DeviceName) -> Model:
+        """The run or the splat file at a path."""
+        from glassplat.model.loading import load
+
+        return load(path, device=device, planes=self.planes, up=self.up)
 
 
 @dataclass(frozen=True)

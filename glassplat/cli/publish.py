@@ -1,23 +1,25 @@
-"""`glassplat export`, `import` and `dereflect`: scenes in other formats, and photographs without reflections."""
+"""`glassplat export` and `dereflect`: scenes in other formats, and photographs without reflections."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
 
-from glassplat.cli.console import import_now, say, warn
-from glassplat.cli.places import SceneEdits, Split, check_claim, check_file, check_scene, say_scene
-from glassplat.errors import InputError, input_checked
-from glassplat.files.writing import check_folder
+from glassplat.cli.console import import_now
+from glassplat.cli.places import SceneEdits, SplatFile, Split, check_claim, check_scene, say_scene
+from glassplat.errors import InputError
+from glassplat.files.writing import WRITTEN
 from glassplat.kernels.backend.devices import DeviceName
 from glassplat.model.run_directory import RunDirectory
-from glassplat.options import Up
 
-Format = Literal["ply", "spz", "glb", "html"]
+if TYPE_CHECKING:
+    Format = str
+else:
+    Format = Literal[WRITTEN]
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,7 @@ class Export:
     """Write a scene as others read it: PLY, SPZ, GLB, a web page with live panes, and the panes beside them.
 
     Attributes:
-        run_directory: the run's directory.
+        scene: a run's directory, or a splat file of any program (.ply, .spz, .glb, .splat).
         output: where the files go; a new folder, or one that this command wrote.
         formats: which files; glb is glTF with KHR_gaussian_splatting, html a page that shows the scene in any browser,
             by itself and without a server.
@@ -33,26 +35,29 @@ class Export:
             without its panes and what they reflect.
         title: of the page; the run's name if not given.
         spz_version: 3, which every reader knows, or 4.
+        file: what a splat file does not say of itself.
         edits: changes to the panes.
         device: where to render what has to be rendered; auto takes an NVIDIA GPU where one can be used.
     """
 
-    run_directory: tyro.conf.Positional[Path]
+    scene: tyro.conf.Positional[Path]
     output: Path
     formats: tuple[Format, ...] = ("ply", "spz", "html")
     layer: Literal["all", "transmission"] = "all"
     title: str | None = None
     spz_version: Literal[3, 4] = 3
+    file: Annotated[SplatFile, tyro.conf.arg(name="")] = field(default_factory=SplatFile)
     edits: Annotated[SceneEdits, tyro.conf.arg(name="")] = field(default_factory=SceneEdits)
     device: DeviceName = "auto"
 
     def ready(self) -> None:
         """Refuses what contradicts itself, what is no scene, and an output that holds something else."""
         if not self.formats:
-            raise InputError("nothing to write without --formats; expected ply, spz, glb or html")
-        check_scene(self.run_directory)
+            raise InputError(f"nothing to write without --formats; expected some of {', '.join(WRITTEN)}")
+        check_scene(self.scene)
+        self.file.check()
         check_claim(self.output, "export")
-        say_scene(self.run_directory)
+        say_scene(self.scene)
         import_now("glassplat.cli.writing")
 
     def run(self, console: Console) -> None:
@@ -64,55 +69,6 @@ class Export:
     def left_behind(self) -> str:
         """What an interrupt leaves, and how to go on."""
         return f"files already written to {self.output} are whole: repeat the command for all of them"
-
-
-@dataclass(frozen=True)
-class Import:
-    """Read a splat file (PLY, SPZ, GLB, .splat) of any program as a scene to look at, film and export.
-
-    Attributes:
-        file: a .ply as 3DGS and gsplat write it or as SuperSplat compresses it, a .spz of versions
-            1 to 4, a .glb with KHR_gaussian_splatting, or a .splat.
-        output: where the scene goes; a new folder. It can be used like a run, but for what needs photographs.
-        planes: planes.json of the panes, written by hand or by `export`; the one beside the file if not given.
-        up: which way is up, for the cameras that look at it; y points down in most files. A cameras.json beside the
-            file, as `export` writes it, is taken instead.
-    """
-
-    file: tyro.conf.Positional[Path]
-    output: Path
-    planes: Path | None = None
-    up: Up = "-y"
-
-    def ready(self) -> None:
-        """Refuses files that cannot be read, and an output that is not empty; imports what reads and writes."""
-        check_folder(self.output)
-        if self.output.exists() and any(self.output.iterdir()):
-            raise InputError(f"{self.output} is not empty; nothing was written. Choose a new folder for --output")
-        for file in (self.file, *([] if self.planes is None else [self.planes])):
-            check_file(file)
-        import_now("glassplat.model.model")
-
-    def run(self, console: Console) -> None:
-        """Reads and writes."""
-        from glassplat.methods.planar_recipe import PlanarRecipe
-        from glassplat.model.loading import imported_scene
-        from glassplat.model.model import Model, by_name, write_as_run
-        from glassplat.options import BLACK
-
-        with input_checked():
-            scene, cameras, lost = imported_scene(self.file, self.planes, self.up)
-        if lost:
-            warn(console, f"{lost} Gaussians were left out: values that are no numbers or too large to draw")
-        model = Model(scene, PlanarRecipe(background=BLACK), by_name(cameras))
-        write_as_run(self.output, model, self.file)
-        panes = f", {len(scene.planes)} panes" if len(scene.planes) else ""
-        say(console, f"{len(scene.primary)} Gaussians of degree {scene.primary.max_sh_degree}{panes} -> {self.output}")
-        say(console, f"next: glassplat view {self.output}")
-
-    def left_behind(self) -> str:
-        """What an interrupt leaves, and how to go on."""
-        return f"{self.output} may hold a part of the scene: delete it and repeat the command"
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ def open_run(path: Path, device: DeviceName = "auto", data: Path | None = None) 
 
 
 def capture_of(directory: RunDirectory, recipe: Any, moved: Path | None = None) -> Dataset:
-    """The capture of a run, where it was or where it is said to be now; of an imported scene its cameras alone.
+    """The capture of a run, where it was or where it is said to be now; of a scene without one its cameras alone.
 
     Raises:
         InputError: it cannot be read, or is another one.
@@ -102,12 +102,12 @@ def capture_of(directory: RunDirectory, recipe: Any, moved: Path | None = None) 
 
 
 def _without_photographs(directory: RunDirectory) -> Dataset:
-    """The cameras of a scene that was imported, as views that have no photographs."""
+    """The cameras of a scene that has no capture, as views that have no photographs."""
     with input_checked():
         cameras = sorted(read_cameras(directory.path / "cameras.json"), key=lambda named: named[0])
 
     def no_photograph() -> Tensor:
-        raise InputError(f"{directory.path} was imported and has no photographs; this command needs those it shows")
+        raise InputError(f"{directory.path} has no photographs; this command needs those it shows")
 
     views = tuple(View(name, camera, directory.path / name, no_photograph) for name, camera in cameras)
     points = PointCloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))

@@ -19,7 +19,6 @@ from glassplat.annotate.session import opened_session
 from glassplat.cli.console import say
 from glassplat.cli.runs import announce, capture_of
 from glassplat.errors import InputError
-from glassplat.model.loading import load
 from glassplat.model.model import Model
 from glassplat.model.run_directory import RunDirectory
 from glassplat.model.watching import KeptBeside, shown_of
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 
 def serve_viewer(command: View, console: Console) -> None:
     """Serves until it is interrupted."""
-    model = load(command.scene, device=command.device)
+    model = command.file.opened(command.scene, command.device)
     model = model.with_scene(command.edits.applied(model.scene))
     viewer = Viewer(shown_of(model, photographs_of(command.scene), keeper(command, model)), command.host, command.port)
     viewer.start()

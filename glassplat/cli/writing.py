@@ -22,15 +22,11 @@ from glassplat.cli.runs import StoredRun, open_run, photographs_of, pictures_of
 from glassplat.errors import InputError, input_checked
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.evaluate.metrics import quantized
-from glassplat.files.glb import write_glb
 from glassplat.files.images import write_image
-from glassplat.files.ply import write_gaussians
 from glassplat.files.sidecars import read_cameras, write_cameras
-from glassplat.files.spz import write_spz
-from glassplat.files.writing import atomic_write
+from glassplat.files.writing import SPLAT_WRITERS, atomic_write, splat_writer
 from glassplat.model.layers import check_layers
-from glassplat.model.loading import load
-from glassplat.model.model import ENVIRONMENT, GLASS, PLANES, Model, save_page, write_beside
+from glassplat.model.model import CAMERAS, ENVIRONMENT, GLASS, PLANES, Model, save_page, write_beside
 from glassplat.prepare.photographs import Progress as Step
 from glassplat.publish.camera_paths import interpolated, keyframes_of, widened
 from glassplat.publish.film import side_by_side, wiped, write_film
@@ -38,7 +34,6 @@ from glassplat.publish.web_page import can_show
 from glassplat.render.layers import layer_image, renderer_with
 from glassplat.render.planar import Planar, dereflected_photo
 from glassplat.scene.camera import Camera
-from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene, without_glass
 
 if TYPE_CHECKING:
@@ -125,7 +120,7 @@ WIPE_SPAN = 0.9
 
 def film(command: Video, console: Console) -> None:
     """Renders the pictures and encodes them one by one."""
-    model = load(command.scene, device=command.device)
+    model = command.file.opened(command.scene, command.device)
     check_layers(command.layers, model.recipe)
     model = model.with_scene(command.edits.applied(model.scene))
     cameras = _cameras(command, model)
@@ -181,26 +176,20 @@ def followed(
 
 def write_files(command: Export, console: Console) -> None:
     """Writes the files."""
-    model = load(command.run_directory, device=command.device)
+    model = command.file.opened(command.scene, command.device)
     model = model.with_scene(_chosen(command, command.edits.applied(model.scene)))
-    targets = [
-        command.output / name
-        for name in (
-            "index.html",
-            "scene.ply",
-            "scene.spz",
-            "scene.glb",
-            "glass.ply",
-            "planes.json",
-            "cameras.json",
-        )
-    ]
-    check_targets(command.output, targets, [])
-    if claim_folder(command.output, "export", command.run_directory):
+    splats = {kind: command.output / f"scene.{kind}" for kind in SPLAT_WRITERS}
+    beside = [command.output / name for name in ("index.html", GLASS, PLANES, CAMERAS)]
+    check_targets(command.output, [*beside, *splats.values()], [])
+    if claim_folder(command.output, "export", command.scene):
         say(console, f"replacing the files of an earlier run of this command in {command.output}")
     _write_beside(command, model.scene, console)
-    write_cameras(command.output / "cameras.json", model.cameras.items())
-    _write_gaussians(command, model.scene.primary, console)
+    write_cameras(command.output / CAMERAS, model.cameras.items())
+    for kind in (kind for kind in splats if kind in command.formats):
+        options = {"version": command.spz_version} if kind == "spz" else {}
+        with input_checked():
+            splat_writer(kind)(splats[kind], model.scene.primary, **options)
+        say(console, f"{splats[kind].stat().st_size / 1e6:.2f} MB -> {splats[kind]}")
     if "html" in command.formats:
         _write_page(command, model, console)
 
@@ -210,21 +199,6 @@ def _chosen(command: Export, scene: Scene) -> Scene:
         return scene
     bare = without_glass(scene)
     return replace(bare, primary=replace(bare.primary, channels={}))
-
-
-def _write_gaussians(command: Export, gaussians: Gaussians, console: Console) -> None:
-    if "ply" in command.formats:
-        write_gaussians(command.output / "scene.ply", gaussians)
-        say(console, f"{len(gaussians)} Gaussians -> {command.output / 'scene.ply'}")
-    if "spz" in command.formats:
-        path = command.output / "scene.spz"
-        write_spz(path, gaussians, command.spz_version)
-        say(console, f"{path.stat().st_size / 1e6:.2f} MB, version {command.spz_version} -> {path}")
-    if "glb" in command.formats:
-        path = command.output / "scene.glb"
-        with input_checked():
-            write_glb(path, gaussians)
-        say(console, f"{path.stat().st_size / 1e6:.2f} MB -> {path}")
 
 
 def _write_page(command: Export, model: Model, console: Console) -> None:

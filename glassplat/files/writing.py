@@ -3,14 +3,31 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from uuid import uuid4
 
 SPLAT_SUFFIXES = (".ply", ".spz", ".glb", ".splat")
+"""Of files of Gaussians that are read."""
+SPLAT_WRITERS = {
+    "ply": "glassplat.files.ply:write_gaussians",
+    "spz": "glassplat.files.spz:write_spz",
+    "glb": "glassplat.files.glb:write_glb",
+}
+"""Formats that Gaussians are written in, by suffix: the function `(path, gaussians)` of each, imported when needed."""
+WRITTEN = (*SPLAT_WRITERS, "html")
+"""All formats of `export` and `Model.save`; the page is written of a whole model."""
+
+
+def splat_writer(kind: str) -> Callable[..., None]:
+    """The function that writes Gaussians in a format of `SPLAT_WRITERS`."""
+    module, _, name = SPLAT_WRITERS[kind].partition(":")
+    writer: Callable[..., None] = getattr(importlib.import_module(module), name)
+    return writer
 
 
 @contextmanager

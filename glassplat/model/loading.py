@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,6 +32,7 @@ AXES: dict[str, tuple[int, int, int]] = {
     "x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1),
 }  # fmt: skip
 EXTENT_MARGIN = 1.1
+log = logging.getLogger(__name__)
 
 
 class ImportedScene(NamedTuple):
@@ -96,24 +98,34 @@ def _cameras(file: Path, gaussians: Gaussians, up: Up) -> NamedCameras:
     return tuple(cameras or cameras_around(gaussians, torch.tensor(AXES[up], dtype=torch.float64)))
 
 
-def load(path: str | os.PathLike[str], *, device: DeviceName = "auto") -> Model:
-    """Opens a trained run, an imported scene, or a splat file of any program.
+def load(
+    path: str | os.PathLike[str],
+    *,
+    device: DeviceName = "auto",
+    planes: str | os.PathLike[str] | None = None,
+    up: Up = "-y",
+) -> Model:
+    """Opens a trained run, a model that was saved as one, or a splat file of any program.
 
     Beside a splat file, `planes.json`, `glass.ply` and `cameras.json` are read if they are there, as `Model.save` and
     `glassplat export` write them.
 
     Args:
-        path: a run's directory, the folder of `glassplat import`, or a .ply, .spz, .splat or .glb.
+        path: a run's directory, a folder of `Model.save`, or a .ply, .spz, .splat or .glb.
         device: where the scene's tensors go; `auto` takes an NVIDIA GPU where one can be used.
+        planes: panes of a splat file, a planes.json written by hand or by `export`; the one beside it if not given.
+        up: which way is up in a splat file, for the cameras that look at it, if no cameras.json is beside it.
 
     Raises:
         CudaUnavailableError: the GPU was asked for and cannot be used.
-        InputError: nothing that can be looked at is there, or it cannot be read.
+        InputError: nothing that can be looked at is there, it cannot be read, or panes are given to a run.
         FileNotFoundError: nothing is there.
     """
     path = Path(path)
-    if path.is_file() or path.suffix:
-        return _from_file(path, device) if not path.is_dir() else _from_run(path, device)
+    if not path.is_dir() and (path.is_file() or path.suffix):
+        return _from_file(path, device, None if planes is None else Path(planes), up)
+    if planes is not None:
+        raise InputError(f"{path} is no splat file, and has panes of its own or none; {planes} is for splat files")
     return _from_run(path, device)
 
 
@@ -129,8 +141,10 @@ def _from_run(path: Path, device: DeviceName) -> Model:
     return Model(scene.to(chosen_device(device)), recipe, by_name(cameras), path.resolve().name, path)
 
 
-def _from_file(path: Path, device: DeviceName) -> Model:
+def _from_file(path: Path, device: DeviceName, planes: Path | None, up: Up) -> Model:
     """A scene that was not trained here, over black."""
     with input_checked():
-        scene, cameras, _ = imported_scene(path)
+        scene, cameras, lost = imported_scene(path, planes, up)
+    if lost:
+        log.warning("%d Gaussians of %s are left out: values that are no numbers or too large to draw", lost, path)
     return Model(scene.to(chosen_device(device)), PlanarRecipe(background=BLACK), by_name(cameras), path.stem, path)

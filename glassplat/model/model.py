@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,12 +14,10 @@ from torch import Tensor
 
 from glassplat.captures.dataset import Dataset, with_corrected_cameras
 from glassplat.errors import InputError, first_names, input_checked
-from glassplat.files.glb import write_glb
 from glassplat.files.ply import write_gaussians
 from glassplat.files.records import read_text
 from glassplat.files.sidecars import write_cameras, write_equirect, write_planes
-from glassplat.files.spz import write_spz
-from glassplat.files.writing import atomic_write, make_folder
+from glassplat.files.writing import SPLAT_WRITERS, WRITTEN, atomic_write, make_folder, splat_writer
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.recipe import recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
@@ -258,7 +256,6 @@ def by_name(cameras: Iterable[tuple[str, Camera]]) -> dict[str, Camera]:
     return named
 
 
-WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {".ply": write_gaussians, ".spz": write_spz, ".glb": write_glb}
 PLANES, GLASS, CAMERAS = "planes.json", "glass.ply", "cameras.json"
 SETTINGS = "settings.json"
 PANORAMA, ENVIRONMENT = "environment.png", "environment.json"
@@ -295,23 +292,24 @@ def save_model(model: Savable, path: Path, *, overwrite: bool) -> Path:
         FileExistsError: something is there; nothing was written.
         InputError: the format is not known, or cannot hold this model.
     """
-    kind = path.suffix.lower()
+    kind = path.suffix.lower().removeprefix(".")
     if not kind:
         return save_folder(model, path)
-    if kind not in (*WRITERS, ".html"):
-        raise InputError(f"{path}: expected a name that ends in {', '.join((*WRITERS, '.html'))}, or a folder's")
-    beside = [] if kind == ".html" else [path.with_name(name) for name in (PLANES, GLASS, CAMERAS)]
+    if kind not in WRITTEN:
+        endings = ", ".join(f".{known}" for known in WRITTEN)
+        raise InputError(f"{path}: expected a name that ends in {endings}, or a folder's")
+    beside = [path.with_name(name) for name in (PLANES, GLASS, CAMERAS)] if kind in SPLAT_WRITERS else []
     found = [str(target) for target in (path, *beside) if target.exists()]
     if found and not overwrite:
         raise FileExistsError(
             f"{first_names(found)} is already there; nothing was written. Choose another folder, or overwrite=True"
         )
     make_folder(path.parent)
-    if kind == ".html":
+    if kind not in SPLAT_WRITERS:
         save_page(model, path, model.name or path.stem)
         return path
     with input_checked():
-        WRITERS[kind](path, model.scene.primary)
+        splat_writer(kind)(path, model.scene.primary)
     write_beside(path.parent, model.scene)
     if not len(model.scene.planes) and (path.parent / PLANES).exists():
         write_planes(path.parent / PLANES, model.scene.planes)  # Panes of what was there must not be taken for its own.

@@ -151,7 +151,7 @@ class RunDirectory:
 
     @property
     def imported(self) -> Path:
-        """Where the source of a scene is recorded that has no capture: it was imported, or made in a program."""
+        """Where the source of a scene is recorded that has no capture: it was made in a program."""
         return self.path / "imported.json"
 
     @property

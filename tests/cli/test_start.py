@@ -66,7 +66,7 @@ def test_the_version_tells_what_a_report_of_a_bug_needs() -> None:
     assert "NVIDIA driver" in done.stdout or "CUDA" in done.stdout
 
 
-@pytest.mark.parametrize("name", ["prepare", "annotate", "train", "eval", "export", "view", "video", "import", "info"])
+@pytest.mark.parametrize("name", ["prepare", "annotate", "train", "eval", "export", "view", "video", "info"])
 def test_a_command_does_not_wait_for_what_it_may_never_need(name: str) -> None:
     late = ["scipy.spatial", "scipy.ndimage", "scipy.interpolate", "scipy.optimize", "viser", "cv2", "OpenEXR"]
     late += [] if name in ("prepare", "annotate") else ["pycolmap"]
@@ -101,8 +101,8 @@ REFUSED = {
     "video begun --output film.gif --path keyframes --keyframes none.json": "no file none.json",
     "export none --output new": "none is not a run directory",
     "export begun --output capture": "capture is not empty",
-    "import none.ply --output new": "no file none.ply",
-    "import splats.ply --output capture": "capture is not empty",
+    "export none.ply --output new": "no file none.ply",
+    "view splats.ply --planes none.json": "no file none.json",
     "info none": "there is nothing at none",
     "info splats.txt": "splats.txt is no file that is known",
     "demo --output splats.ply": "splats.ply is a file",

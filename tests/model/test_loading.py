@@ -1,0 +1,93 @@
+"""Splat files of other programs, which every command takes that needs no photographs."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from glassplat import InputError, load
+from glassplat.cli.main import main
+from glassplat.files.ply import write_gaussians
+from glassplat.files.sidecars import write_planes
+from glassplat.files.writing import SPLAT_SUFFIXES, SPLAT_WRITERS, splat_writer
+from tests.cli.tiny_run import write_run
+from tests.files.test_spz import typical
+from tests.training.tiny_capture import true_scene
+
+
+def test_what_was_exported_comes_back(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    assert main(["export", str(run), "--output", str(tmp_path / "out"), "--formats", "ply", "spz"]) == 0
+    for kind, precision in (("ply", 0.0), ("spz", 2**-18)):
+        again = load(tmp_path / "out" / f"scene.{kind}", device="cpu")
+        before = load(run, device="cpu")
+        torch.testing.assert_close(again.scene.primary.means, before.scene.primary.means, rtol=0, atol=precision)
+        assert torch.equal(again.scene.planes.centers, before.scene.planes.centers)
+        assert torch.equal(again.scene.glass.means, before.scene.glass.means)
+        assert list(again.cameras) == list(before.cameras)
+
+
+def given_by_hand(path: Path) -> Path:
+    write_planes(path, true_scene().planes)
+    entries = json.loads(path.read_text())
+    for entry in entries:
+        del entry["raw_normal"], entry["logit_reflectance"]
+    path.write_text(json.dumps(entries))
+    return path
+
+
+def test_panes_can_be_given_by_hand(tmp_path: Path) -> None:
+    write_gaussians(tmp_path / "a.ply", typical().with_tensors({"means": typical().means + 50}))
+    model = load(tmp_path / "a.ply", device="cpu", planes=given_by_hand(tmp_path / "mine.json"))
+    camera = next(iter(model.cameras.values()))
+    pose = torch.eye(4)
+    pose[:3, 3] = -model.scene.planes.centers[0] + torch.tensor([0.0, 0.0, 2.0])
+    with torch.no_grad():
+        strength = model.render(replace(camera, cam_from_world=pose), layers=("strength",)).layers["strength"]
+    assert float(strength.max()) > 0.1
+
+
+def test_a_file_goes_through_export_with_its_panes_and_its_up(tmp_path: Path) -> None:
+    write_gaussians(tmp_path / "a.ply", typical())
+    command = ["export", str(tmp_path / "a.ply"), "--formats", "ply", "--device", "cpu"]
+    panes = ["--planes", str(given_by_hand(tmp_path / "mine.json"))]
+    assert main([*command, "--output", str(tmp_path / "down"), *panes]) == 0
+    assert main([*command, "--output", str(tmp_path / "up"), "--up", "z"]) == 0
+    assert (tmp_path / "down" / "planes.json").is_file() and not (tmp_path / "up" / "planes.json").exists()
+    cameras = [(tmp_path / name / "cameras.json").read_text() for name in ("down", "up")]
+    assert cameras[0] != cameras[1]
+
+
+def test_panes_are_for_splat_files(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is for splat files"):
+        load(write_run(tmp_path / "run"), device="cpu", planes=tmp_path / "mine.json")
+
+
+def test_what_cannot_be_drawn_is_left_out_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    means = typical().means.clone()
+    means[1] = float("nan")
+    write_gaussians(tmp_path / "a.ply", typical().with_tensors({"means": means}))
+    with caplog.at_level(logging.WARNING, "glassplat"):
+        assert len(load(tmp_path / "a.ply", device="cpu").scene.primary) == len(means) - 1
+    assert "1 Gaussians of" in caplog.text and "are left out" in caplog.text
+
+
+@pytest.mark.parametrize("suffix", SPLAT_SUFFIXES)
+def test_hostile_files_get_one_message(suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / f"a{suffix}"
+    file.write_bytes(b"\x00" * 31)
+    assert main(["export", str(file), "--output", str(tmp_path / "scene")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("error:") == 1 and "Traceback" not in error
+    assert not (tmp_path / "scene").exists()
+
+
+@pytest.mark.parametrize("kind", SPLAT_WRITERS)
+def test_every_format_that_is_written_is_read(kind: str, tmp_path: Path) -> None:
+    splat_writer(kind)(tmp_path / f"a.{kind}", typical())
+    assert len(load(tmp_path / f"a.{kind}", device="cpu").scene.primary) == len(typical())
