@@ -15,7 +15,6 @@ from glassplat.cli.places import SceneEdits, SplatFile, Split, check_claim, chec
 from glassplat.errors import InputError, input_checked
 from glassplat.files.writing import check_folder
 from glassplat.kernels.backend.devices import DeviceName
-from glassplat.model.layers import Layer
 from glassplat.model.run_directory import RunDirectory
 from glassplat.options import Range
 from glassplat.publish.film import check_encoder
@@ -29,7 +28,8 @@ class Render:
     Attributes:
         run_directory: the run's directory.
         output: where the images go, one folder per layer; a new folder, or one that this command wrote.
-        layers: which layers.
+        layers: rgb, normal, depth, alpha and those of the method, such as transmission and reflection; a layer
+            that it does not render is refused with the list of those that it does.
         split: which cameras.
         edits: changes to the panes.
         device: where to render; auto takes an NVIDIA GPU where one can be used.
@@ -38,7 +38,7 @@ class Render:
 
     run_directory: tyro.conf.Positional[Path]
     output: Path
-    layers: tuple[Layer, ...] = ("rgb",)
+    layers: tuple[str, ...] = ("rgb",)
     split: Split = "test"
     edits: Annotated[SceneEdits, tyro.conf.arg(name="")] = field(default_factory=SceneEdits)
     device: DeviceName = "auto"
@@ -131,7 +131,7 @@ class Video:
     output: Path
     path: Literal["orbit", "interpolate", "keyframes"] = "orbit"
     keyframes: Path | None = None
-    layers: tuple[Layer, ...] = ("rgb",)
+    layers: tuple[str, ...] = ("rgb",)
     layout: Literal["side-by-side", "wipe"] = "side-by-side"
     seconds: Annotated[float, Range(0.1, 3600)] = 8.0
     fps: Annotated[int, Range(1, 120)] = 30

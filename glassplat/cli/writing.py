@@ -25,13 +25,12 @@ from glassplat.evaluate.metrics import quantized
 from glassplat.files.images import write_image
 from glassplat.files.sidecars import read_cameras, write_cameras
 from glassplat.files.writing import SPLAT_WRITERS, atomic_write, splat_writer
-from glassplat.model.layers import check_layers
 from glassplat.model.model import CAMERAS, ENVIRONMENT, GLASS, PLANES, Model, save_page, write_beside
 from glassplat.prepare.photographs import Progress as Step
 from glassplat.publish.camera_paths import interpolated, keyframes_of, widened
 from glassplat.publish.film import side_by_side, wiped, write_film
-from glassplat.publish.web_page import can_show
-from glassplat.render.layers import layer_image, renderer_with
+from glassplat.render.frame import check_layers
+from glassplat.render.layers import layer_image
 from glassplat.render.planar import Planar, dereflected_photo
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene, without_glass
@@ -44,9 +43,9 @@ if TYPE_CHECKING:
 def write_layers(command: Render, console: Console) -> None:
     """Renders every layer of every view into its file."""
     stored = open_run(command.run_directory, command.device, command.data)
-    check_layers(command.layers, stored.recipe)
+    check_layers(stored.renderer, stored.scene, command.layers, stored.recipe.method)
     scene = command.edits.applied(stored.scene)
-    renderer = renderer_with(stored.renderer, command.layers)
+    renderer = stored.renderer.with_layers(command.layers)
     views = chosen_views(stored.dataset, command.split)
     paths = pictures_of(stored.dataset)
     targets = [command.output / layer / paths[view.name] for layer in command.layers for view in views]
@@ -121,7 +120,7 @@ WIPE_SPAN = 0.9
 def film(command: Video, console: Console) -> None:
     """Renders the pictures and encodes them one by one."""
     model = command.file.opened(command.scene, command.device)
-    check_layers(command.layers, model.recipe)
+    check_layers(model.renderer, model.scene, command.layers, model.recipe.method)
     model = model.with_scene(command.edits.applied(model.scene))
     cameras = _cameras(command, model)
     with WorkProgress(console) as progress, atomic_write(command.output) as temporary:
@@ -144,7 +143,7 @@ def _cameras(command: Video, model: Model) -> list[Camera]:
 
 def _pictures(command: Video, model: Model, cameras: Sequence[Camera]) -> Iterator[NDArray[np.uint8]]:
     """One picture per camera; rendered when it is asked for."""
-    renderer = renderer_with(model.renderer, command.layers)
+    renderer = model.renderer.with_layers(command.layers)
     for index, camera in enumerate(cameras):
         with torch.no_grad():
             frame = renderer(model.scene, camera)
@@ -203,7 +202,7 @@ def _chosen(command: Export, scene: Scene) -> Scene:
 
 def _write_page(command: Export, model: Model, console: Console) -> None:
     path = command.output / "index.html"
-    if not can_show(model.renderer):
+    if model.renderer.page_settings() is None:
         warn(console, f"no page was written: it does not show {model.recipe.method} runs of this kind")
         return
     save_page(model, path, command.title or model.name)

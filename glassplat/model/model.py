@@ -21,17 +21,15 @@ from glassplat.files.writing import SPLAT_WRITERS, WRITTEN, atomic_write, make_f
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.recipe import recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
-from glassplat.model.layers import Layer, check_layers, layers_of
 from glassplat.model.run_directory import RunDirectory, write_text
 from glassplat.panes.material import with_pane
 from glassplat.publish.camera_paths import orbit
-from glassplat.publish.web_page import can_show, write_page
+from glassplat.publish.web_page import write_page
 from glassplat.render.environment import equirect_from_environment
-from glassplat.render.frame import Frame, Renderer
-from glassplat.render.layers import layer_image, renderer_with
+from glassplat.render.frame import Frame, Renderer, check_layers
+from glassplat.render.layers import layer_image
 from glassplat.scene import scene
 from glassplat.scene.camera import Camera
-from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
 
@@ -70,9 +68,9 @@ class Model:
         return renderer
 
     @property
-    def layers(self) -> tuple[Layer, ...]:
+    def layers(self) -> tuple[str, ...]:
         """Names of the layers that are worth looking at, `rgb` the first."""
-        return layers_of(self.recipe)
+        return self.renderer.layers(self.scene)
 
     @property
     def panes(self) -> tuple[int, ...]:
@@ -93,9 +91,9 @@ class Model:
             InputError: the method renders no such layer; says which it does.
             KeyError: no camera has that name.
         """
-        check_layers(layers, self.recipe)
+        check_layers(self.renderer, self.scene, layers, self.recipe.method)
         chosen = self.cameras[camera] if isinstance(camera, str) else camera
-        return renderer_with(self.renderer, layers)(self.scene, chosen)
+        return self.renderer.with_layers(layers)(self.scene, chosen)
 
     @torch.no_grad()
     def image(self, camera: Camera | str, layer: str = "rgb") -> Tensor:
@@ -323,7 +321,7 @@ def save_page(model: Savable, path: Path, title: str) -> None:
     Raises:
         InputError: it shows only what `planar` and `splat` render of ellipsoids.
     """
-    if not can_show(model.renderer):
+    if model.renderer.page_settings() is None:
         raise InputError(f"the page shows planar and splat scenes, not {model.recipe.method} ones of this kind")
     with input_checked():
         write_page(path, model.scene, model.renderer, tuple(model.cameras.items()), title)

@@ -18,7 +18,6 @@ from glassplat.files.writing import make_folder
 from glassplat.model.model import Model, save_folder
 from glassplat.model.training import Training
 from glassplat.render.frame import Renderer
-from glassplat.render.layers import PHOTOGRAPHED
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
@@ -104,8 +103,6 @@ def shown_of(model: Model, photographs: Mapping[str, Callable[[], Tensor]], keep
         keeper: writes what is made in the browser; None where nothing may be written.
     """
     layers: list[str] = [layer for layer in model.layers if layer not in HIDDEN_LAYERS]
-    if len(model.scene.photographer):
-        layers.append(PHOTOGRAPHED)
     if photographs:
         layers.append(ERROR)
     return Shown(model.name, model.scene, model.renderer, layers, tuple(model.cameras.items()), photographs, keeper)

@@ -12,11 +12,11 @@ import html
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -27,8 +27,6 @@ from glassplat.files.spz import FLIP, spz_bytes
 from glassplat.files.writing import atomic_write
 from glassplat.render.frame import NEAR_PER_EXTENT, Renderer
 from glassplat.render.panes import glass_owners, nearest_hits, panes_in_camera
-from glassplat.render.planar import Planar
-from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
@@ -187,7 +185,8 @@ def write_page(
 @torch.no_grad()
 def page_text(scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Camera]], title: str) -> str:
     """What `write_page` writes."""
-    if not can_show(renderer):
+    settings = renderer.page_settings()
+    if settings is None:
         raise ValueError(f"a page cannot show what {type(renderer).__name__} renders; expected a planar or a splat run")
     if not cameras or len(scene.planes) > MOST_PANES:
         raise ValueError(
@@ -198,7 +197,7 @@ def page_text(scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Cam
     poster = jpeg(renderer(scene, poster_camera(cameras[poster_view][1])).rgb)
     scene = replace(scene, primary=drawn(scene.primary), glass=drawn(scene.glass)).to("cpu")
     channel, channel_range = channel_bytes(scene)
-    description = described(scene, renderer, cameras, poster_view)
+    description = described(scene, settings, cameras, poster_view)
     count = len(scene.planes)
     subtitle = f"{len(scene.primary):,} Gaussians" + (f" · {count} pane{'s' if count > 1 else ''}" if count else "")
     # Glass has no colour; a constant one makes an SPZ file of it.
@@ -218,11 +217,6 @@ def page_text(scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Cam
             "script": "\n".join(asset(name) for name in SCRIPTS),
         },
     )
-
-
-def can_show(renderer: Renderer) -> TypeGuard[Planar | Splat]:
-    """Whether a page can draw what a renderer draws."""
-    return isinstance(renderer, Splat | Planar)
 
 
 def asset(name: str) -> str:
@@ -282,16 +276,13 @@ def channel_bytes(scene: Scene) -> tuple[bytes, list[float]]:
 
 
 def described(
-    scene: Scene, renderer: Planar | Splat, cameras: Sequence[tuple[str, Camera]], first: int
+    scene: Scene, settings: Mapping[str, Any], cameras: Sequence[tuple[str, Camera]], first: int
 ) -> dict[str, Any]:
     """What the page has to know beside the Gaussians."""
     survey = surveyed([camera for _, camera in cameras], scene.extent)
     kept = sorted({*range(0, len(cameras), -(-len(cameras) // MOST_VIEWS)), first})
     return {
-        "background": list(renderer.background),
-        "fresnel": renderer.fresnel if isinstance(renderer, Planar) else "none",
-        "blend": renderer.blend if isinstance(renderer, Planar) else "srgb",
-        "intensity": isinstance(renderer, Planar) and renderer.intensity,
+        **settings,
         "near": NEAR_PER_EXTENT * scene.extent,
         "panes": [described_pane(scene.planes, index) for index in range(len(scene.planes))],
         "views": [described_view(*cameras[index]) for index in kept],

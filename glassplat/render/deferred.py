@@ -4,8 +4,8 @@ shade.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -259,6 +259,17 @@ class Deferred:
         check_colored(scene.primary)
         check_ellipsoids(scene.primary)
         check_reflective(scene)
+
+    def layers(self, scene: Scene) -> tuple[str, ...]:
+        """Names of the layers that are worth looking at."""
+        return ("rgb", "base", "reflection", "strength", "normal", "environment", "depth", "alpha")
+
+    def with_layers(self, layers: Sequence[str]) -> Deferred:
+        """The renderer, also of `environment` where that is among the layers."""
+        return replace(self, environment=self.environment or "environment" in layers)
+
+    def page_settings(self) -> None:
+        """None: the web page knows no environment."""
 
     def _channels_of(self, gaussians: Gaussians, camera: Camera, projected: Projected) -> Tensor:
         """[N, D] what each Gaussian adds to the image: as `shade_environment` reads it, then depth, if asked for."""

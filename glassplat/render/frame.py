@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from glassplat.errors import InputError
 from glassplat.kernels.project import GradientSum, project
 from glassplat.kernels.records import CameraBatch, Projected, ProjectedDiscs, RawGaussians, Splats
 from glassplat.scene.camera import Camera, constant
@@ -109,6 +110,35 @@ class Renderer(Protocol):
             ValueError: it lacks something; says what.
         """
         ...
+
+    def layers(self, scene: Scene) -> tuple[str, ...]:
+        """Names of the layers of a scene that are worth looking at, `rgb` the first; frames hold more for losses."""
+        ...
+
+    def with_layers(self, layers: Sequence[str]) -> Renderer:
+        """The renderer, also of those of these layers that it renders only when asked."""
+        ...
+
+    def page_settings(self) -> Mapping[str, Any] | None:
+        """What the web page has to know to draw the same; None where it cannot."""
+        ...
+
+
+MEDIAN_DEPTH = "median_depth"
+"""A layer that any renderer has of discs."""
+
+
+def check_layers(renderer: Renderer, scene: Scene, layers: Sequence[str], method: str) -> None:
+    """Refuses layers that a method does not render of a scene, before anything is rendered.
+
+    Raises:
+        InputError: there are such, or none is asked for.
+    """
+    known = renderer.layers(scene)
+    foreign = [layer for layer in layers if layer not in known]
+    if foreign or not layers:
+        asked = f"renders no layer {', '.join(foreign)}" if foreign else "renders nothing without --layers"
+        raise InputError(f"{method} {asked}; expected --layers out of {', '.join(known)}")
 
 
 NEAR_PER_EXTENT = 0.01

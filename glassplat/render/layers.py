@@ -1,10 +1,8 @@
-"""Layers on request, as pictures in false colours, and what each Gaussian adds to a view."""
+"""Layers as pictures in false colours, and what each Gaussian adds to a view."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
 
 import torch
 from torch import Tensor
@@ -12,12 +10,10 @@ from torch import Tensor
 from glassplat.kernels.composite import composite
 from glassplat.kernels.records import Projected
 from glassplat.kernels.tiles import bin_tiles
-from glassplat.render.deferred import Deferred
-from glassplat.render.frame import NEAR_PER_EXTENT, Frame, Renderer, joined_splats, project_gaussians
+from glassplat.render.frame import NEAR_PER_EXTENT, Frame, joined_splats, project_gaussians
 from glassplat.render.panes import nearest_hits, panes_in_camera, project_mirrored, seen_panes
-from glassplat.render.planar import Planar, detached, with_photographer
-from glassplat.render.splat import Splat, WithNormals, blended_discs, projected_discs
-from glassplat.render.traced import Traced
+from glassplat.render.planar import detached
+from glassplat.render.splat import blended_discs, projected_discs
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
@@ -115,20 +111,6 @@ def layer_image(frame: Frame, layer: str) -> Tensor:
     if layer in ("depth", "median_depth"):
         return depth_colors(image, frame.layers["alpha"])
     return image.clamp(0, 1)
-
-
-PHOTOGRAPHED: Final = "photographed"
-"""The image with whom the panes of a photograph show, of runs that looked for somebody."""
-
-
-def renderer_with(renderer: Renderer, layers: Sequence[str]) -> Renderer:
-    """The renderer, also of those of the layers that it renders only when asked."""
-    if isinstance(renderer, Deferred):
-        return replace(renderer, environment=renderer.environment or "environment" in layers)
-    if isinstance(renderer, Traced):
-        return replace(renderer, surroundings=renderer.surroundings or "surroundings" in layers)
-    renderer = with_photographer(renderer, "beside") if PHOTOGRAPHED in layers else renderer
-    return WithNormals(renderer) if "normal" in layers and isinstance(renderer, Planar | Splat) else renderer
 
 
 def contributions(scene: Scene, camera: Camera) -> Tensor:

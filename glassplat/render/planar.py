@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -44,6 +44,7 @@ from glassplat.render.panes import (
     seen_panes,
     visibilities,
 )
+from glassplat.render.splat import WithNormals
 from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import Exposures
 from glassplat.scene.gaussians import Gaussians
@@ -51,6 +52,8 @@ from glassplat.scene.scene import Scene
 
 DEPTH_CHANNEL = 3
 """Of the first pass, after the colours."""
+PHOTOGRAPHED = "photographed"
+"""The layer that shows the photographer in the panes, beside an image without."""
 Shown = Literal["absent", "present", "beside"]
 """Whether panes show who took a photograph."""
 
@@ -169,6 +172,26 @@ class Planar:
             )
         if "logit_mark" not in scene.glass.channels:
             raise ValueError(f"the glass has the channels {sorted(scene.glass.channels)}; expected logit_mark")
+
+    def layers(self, scene: Scene) -> tuple[str, ...]:
+        """Names of the layers that are worth looking at; with `photographed` where a photographer is known."""
+        known = (PHOTOGRAPHED,) if len(scene.photographer) else ()
+        panes = ("transmission", "without_panes", "reflection", "strength", "mask")
+        return ("rgb", *panes, "normal", "depth", "alpha", *known)
+
+    def with_layers(self, layers: Sequence[str]) -> Renderer:
+        """The renderer, also of `photographed` and `normal` where they are among the layers."""
+        renderer = replace(self, photographer="beside") if PHOTOGRAPHED in layers else self
+        return WithNormals(renderer) if "normal" in layers else renderer
+
+    def page_settings(self) -> Mapping[str, Any]:
+        """What the web page has to know to lay panes before the image."""
+        return {
+            "background": self.background,
+            "fresnel": self.fresnel,
+            "blend": self.blend,
+            "intensity": self.intensity,
+        }
 
     def _first_pass(self, scene: Scene, camera: Camera, rectangles: Panes, probed: bool) -> FirstPass:
         near, total = NEAR_PER_EXTENT * scene.extent, GradientSum()

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,6 +15,7 @@ from glassplat.kernels.project import project_discs
 from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, Discs, ProjectedDiscs
 from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.frame import (
+    MEDIAN_DEPTH,
     NEAR_PER_EXTENT,
     Frame,
     Renderer,
@@ -109,6 +111,18 @@ class WithNormals:
         """As the renderer does."""
         self.renderer.check(scene)
 
+    def layers(self, scene: Scene) -> tuple[str, ...]:
+        """As the renderer does."""
+        return self.renderer.layers(scene)
+
+    def with_layers(self, layers: Sequence[str]) -> Renderer:
+        """The renderer with these layers."""
+        return self.renderer.with_layers(layers)
+
+    def page_settings(self) -> Mapping[str, Any] | None:
+        """As the renderer does."""
+        return self.renderer.page_settings()
+
 
 def ellipsoid_normals(scene: Scene, camera: Camera) -> Tensor:
     """[H, W, 3] blended normals of the primary Gaussians, world axes, towards the camera, at most of unit length."""
@@ -190,3 +204,15 @@ class Splat:
     def check(self, scene: Scene) -> None:
         """Raises ValueError where the Gaussians have no colours."""
         check_colored(scene.primary)
+
+    def layers(self, scene: Scene) -> tuple[str, ...]:
+        """Names of the layers that are worth looking at."""
+        return ("rgb", "normal", "depth", "alpha", *((MEDIAN_DEPTH,) if scene.primary.are_discs else ()))
+
+    def with_layers(self, layers: Sequence[str]) -> Renderer:
+        """The renderer, also of `normal` where that is among the layers."""
+        return WithNormals(self) if "normal" in layers else self
+
+    def page_settings(self) -> Mapping[str, Any]:
+        """What the web page has to know: there are no panes."""
+        return {"background": self.background, "fresnel": "none", "blend": "srgb", "intensity": False}

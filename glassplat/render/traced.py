@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,7 +14,7 @@ from glassplat.kernels.records import FLAT, RawGaussians, Rays
 from glassplat.kernels.records import Traced as Found
 from glassplat.kernels.trace import build_bvh, shapes_of, trace
 from glassplat.render.deferred import INVISIBLE, Surface, reflected_rays, seen_surface, view_directions
-from glassplat.render.frame import NEAR_PER_EXTENT, Frame, SpacePass, check_colored, over_background
+from glassplat.render.frame import MEDIAN_DEPTH, NEAR_PER_EXTENT, Frame, SpacePass, check_colored, over_background
 from glassplat.scene.activations import SH_ZERO
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
@@ -109,6 +110,18 @@ class Traced:
         """Raises ValueError where a scene lacks colours, or what reflection needs."""
         check_colored(scene.primary)
         check_mirrored(scene)
+
+    def layers(self, scene: Scene) -> tuple[str, ...]:
+        """Names of the layers that are worth looking at."""
+        discs = (MEDIAN_DEPTH,) if scene.primary.are_discs else ()
+        return ("rgb", "base", "reflection", "strength", "normal", "surroundings", "depth", "alpha", *discs)
+
+    def with_layers(self, layers: Sequence[str]) -> Traced:
+        """The renderer, also of `surroundings` where that is among the layers."""
+        return replace(self, surroundings=self.surroundings or "surroundings" in layers)
+
+    def page_settings(self) -> None:
+        """None: the web page knows no surroundings."""
 
     def _elsewhere(self, scene: Scene, camera: Camera, surface: Surface, chosen: Tensor) -> tuple[Tensor, Tensor]:
         """[H, W, 3] what pixels mirror where no ray is traced, and [H, W] which ones mirror anything."""

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.render.frame import Frame, Renderer
-from glassplat.render.layers import PHOTOGRAPHED, error_colors, layer_image, renderer_with
+from glassplat.render.layers import error_colors, layer_image
+from glassplat.render.planar import PHOTOGRAPHED
 from glassplat.scene.camera import Camera, rotation_from_quat
 from glassplat.scene.scene import Scene, as_mirrors, moved, with_reflectance, without_glass
 
@@ -158,7 +159,7 @@ def edited(scene: Scene, wish: Wish) -> Scene:
 @torch.no_grad()
 def drawn(scene: Scene, renderer: Renderer, wish: Wish, height: int) -> NDArray[np.uint8]:
     """The picture [H, W, 3] of a wish; a layer that the scene does not have shows as the image itself."""
-    frame = renderer_with(renderer, [wish.layer])(edited(scene, wish), wish.camera(height))
+    frame = renderer.with_layers([wish.layer])(edited(scene, wish), wish.camera(height))
     return _picture(layer_image(frame, wish.layer if _has(frame, wish.layer) else "rgb"))
 
 
@@ -181,7 +182,7 @@ def error_drawn(
     """
     rows = min(height, photo.shape[0])
     columns = max(1, round(rows * camera.width / camera.height))
-    frame = renderer_with(renderer, [PHOTOGRAPHED])(edited(scene, wish), camera.resized(columns, rows))
+    frame = renderer.with_layers([PHOTOGRAPHED])(edited(scene, wish), camera.resized(columns, rows))
     small = torch.nn.functional.interpolate(
         photo.to(frame.rgb).movedim(-1, 0)[None], (rows, columns), mode="bilinear", antialias=True
     )[0].movedim(0, -1)

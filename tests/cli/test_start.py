@@ -230,7 +230,7 @@ def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[
         ["eval"],
         ["eval", "run", "--device", "tpu"],
         ["render", "run"],
-        ["render", "run", "--output", "x", "--layers", "hit"],
+        ["render", "run", "--output", "x", "--split", "most"],
         ["dereflect", "run", "--output", "x", "--source", "[bold]"],
         ["demo", "--iterations", "many"],
     ],

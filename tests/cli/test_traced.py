@@ -11,11 +11,10 @@ import torch
 
 from glassplat.cli.main import main
 from glassplat.cli.runs import open_run
-from glassplat.model import layers
 from glassplat.training.checkpoint import load_checkpoint
 from tests.training.object_capture import few_steps, write_object_capture
 
-LAYERS = layers.LAYERS["traced"]
+LAYERS = ("rgb", "base", "reflection", "strength", "normal", "surroundings", "depth", "alpha")
 
 
 @pytest.fixture
@@ -44,7 +43,8 @@ def test_discs_have_a_median_depth_beside_all_other_layers(tmp_path: Path) -> No
     capture, run, output = write_object_capture(tmp_path / "ball"), tmp_path / "run", tmp_path / "layers"
     options = [*few_steps(capture, run), "--surroundings.start.cells", "3", "--primitive", "disc"]
     assert main(["train", "traced", *options]) == 0
-    listed = layers.layers_of(open_run(run, "cpu").recipe)
+    stored = open_run(run, "cpu")
+    listed = stored.renderer.layers(stored.scene)
     assert set(listed) == {*LAYERS, "median_depth"}
     assert main(["render", str(run), "--layers", *listed, "--output", str(output)]) == 0
     assert all(len(list((output / layer).rglob("*.png"))) == 2 for layer in listed)

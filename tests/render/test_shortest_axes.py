@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from glassplat.render.frame import Renderer
-from glassplat.render.layers import renderer_with
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat, WithNormals
 from glassplat.scene.camera import rotation_from_quat
@@ -53,7 +52,7 @@ def test_a_frame_has_normals_only_where_they_are_asked_for(renderer: Renderer) -
     glass = random_gaussians(20, (0.0, 0.0, 2.0), seed=2, glass=True)
     scene = replace(wall(1.0), planes=pane(2.0), glass=glass)
     camera = camera_at(0, 0, 0)
-    plain, whole = renderer_with(renderer, ["rgb"])(scene, camera), renderer_with(renderer, ["normal"])(scene, camera)
+    plain, whole = (renderer.with_layers([layer])(scene, camera) for layer in ("rgb", "normal"))
     assert set(whole.layers) - set(plain.layers) == {"normal"} and torch.equal(plain.rgb, whole.rgb)
     assert all(torch.equal(whole.layers[name], image) for name, image in plain.layers.items())
     middle = whole.layers["normal"][14, 20]
@@ -65,11 +64,9 @@ def test_discs_keep_their_own_normals() -> None:
     flat = replace(scene, primary=scene.primary.with_tensors({"log_scales": scene.primary.log_scales[:, :2].clone()}))
     camera = camera_at(0, 0, 0)
     expected = Splat()(flat, camera).layers["normal"]
-    assert torch.equal(renderer_with(Splat(), ["normal"])(flat, camera).layers["normal"], expected)
+    assert torch.equal(Splat().with_layers(["normal"])(flat, camera).layers["normal"], expected)
 
 
 def test_what_the_renderer_needs_is_still_looked_for() -> None:
     with pytest.raises(ValueError, match="logit_mark"):
-        renderer_with(Planar(), ["normal"]).check(
-            replace(wall(1.0), glass=random_gaussians(3, (0.0, 0.0, 2.0), seed=2))
-        )
+        Planar().with_layers(["normal"]).check(replace(wall(1.0), glass=random_gaussians(3, (0.0, 0.0, 2.0), seed=2)))
