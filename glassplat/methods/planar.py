@@ -13,7 +13,14 @@ from glassplat.captures.dataset import Dataset
 from glassplat.methods.splat import image_terms
 from glassplat.options import BLACK
 from glassplat.panes.fit import fit_planes, with_mirrors
-from glassplat.panes.material import glass_gaussians, mirrored_coverage, mirrors_among, pane_pixels, virtual_points
+from glassplat.panes.material import (
+    JudgedPane,
+    glass_gaussians,
+    judged_pane,
+    mirrored_coverage,
+    photographs_of,
+    virtual_points,
+)
 from glassplat.panes.options import PlaneFit, PlaneFitError
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
@@ -82,7 +89,7 @@ class PaneSetup:
         planes = fitted_planes(dataset, state.scene.primary.means, self.fit)
         glass = glass_gaussians(planes, count=self.glass_count, seed=self.seed)
         scene = replace(state.scene, planes=planes, glass=glass)
-        if self.detect_mirrors and not self.fit.mirror_labels:
+        if self.detect_mirrors or self.fit.mirror_labels:
             planes = yield from self._with_mirrors_found(scene, dataset)
         if not self.fixed_mirrors:
             planes = replace(planes, mirrors=())
@@ -96,15 +103,27 @@ class PaneSetup:
         return True
 
     def _with_mirrors_found(self, scene: Scene, dataset: Dataset) -> Generator[Working, None, Planes]:
-        """The scene's planes, with those as mirrors that look like it; of given ones the capture says what they are."""
+        """The scene's planes, with those as mirrors that look like it, each where the photographs show it.
+
+        What `fit` names is a mirror, and nothing else then; of planes that the capture gives it says what they are.
+        """
         given = Planes.empty() if dataset.planes is None else dataset.planes
-        told = [label for label in scene.planes.labels if label in given.labels]
-        if len(told) == len(scene.planes):
-            return scene.planes
-        found = yield from mirrors_found(scene, dataset)
-        mirrors = tuple(label for label in found if label not in told)
+        untold = [label for label in scene.planes.labels if label not in given.labels]
+        judged = yield from judged_panes(scene, dataset, untold)
+        alike = [label for label, found in judged.items() if found.is_mirror]
+        mirrors = tuple(dict.fromkeys((*given.mirrors, *(self.fit.mirror_labels or alike))))
         log.info("mirrors among the panes: %s", ", ".join(map(str, mirrors)) or "none")
-        return with_mirrors(scene.planes, (*given.mirrors, *mirrors), self.fit.mirror_reflectance)
+        aligned = [judged[label].pane for label in alike if label in mirrors]
+        return with_mirrors(with_poses_of(scene.planes, aligned), mirrors, self.fit.mirror_reflectance)
+
+
+def with_poses_of(planes: Planes, panes: Sequence[Planes]) -> Planes:
+    """The planes with centre and normal of some of them, by label, as in `panes` of one plane each."""
+    centers, normals = planes.centers.clone(), planes.raw_normals.clone()
+    for pane in panes:
+        row = planes.labels.index(pane.labels[0])
+        centers[row], normals[row] = pane.centers[0], pane.raw_normals[0]
+    return replace(planes, centers=centers, raw_normals=normals)
 
 
 def glass_only_darkens(state: TrainState, clock: Clock, visible: Tensor | None) -> None:
@@ -150,14 +169,16 @@ def _as_given(planes: Planes, fit: PlaneFit) -> Planes:
     return with_mirrors(replace(planes, half_sizes=fit.margin * planes.half_sizes), mirrors, fit.mirror_reflectance)
 
 
-def mirrors_found(scene: Scene, dataset: Dataset) -> Generator[Working, None, tuple[int, ...]]:
-    """Labels of the panes that look like mirrors in the annotated views."""
-    annotated = [view for view in dataset.train if view.is_annotated]
-    pairs = []
-    for done, view in enumerate(annotated):
-        yield Working("telling mirrors from glass", done, len(annotated))
-        pairs.append(pane_pixels(scene, view))
-    return mirrors_among(scene.planes.labels, pairs)
+def judged_panes(
+    scene: Scene, dataset: Dataset, labels: Sequence[int]
+) -> Generator[Working, None, dict[int, JudgedPane]]:
+    """How like a mirror each pane is, by label."""
+    photographs = photographs_of(scene, dataset.train) if labels else []
+    judged = {}
+    for done, label in enumerate(labels):
+        yield Working("telling mirrors from glass", done, len(labels))
+        judged[label] = judged_pane(scene, label, photographs)
+    return judged
 
 
 def surfaces(planes: Planes, *, mirrors: bool) -> list[Planes]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -13,13 +14,16 @@ from glassplat.captures.view import View
 from glassplat.panes.material import (
     FEWEST_PIXELS,
     LEAST_SHARE,
+    REDUCED_WIDTH,
     WINDOW,
     about_local_mean,
+    degrees_between,
     glass_gaussians,
+    judged_pane,
     likeness,
     mirror_labels,
-    mirrors_among,
-    pane_pixels,
+    photographs_of,
+    reduced_photograph,
     window_sums,
 )
 from glassplat.render.planar import Planar
@@ -76,18 +80,44 @@ def test_an_exposure_does_not_turn_a_mirror_into_glass() -> None:
 def test_a_pane_of_which_hardly_anything_is_known_stays_glass() -> None:
     """Of a glass front that mirrors what no photograph shows, some spots may well agree with it."""
     scene = scene_with(0.2)
-    known = [pane_pixels(scene, view) for view in photographs(scene_with(0.995))]
-    assert mirrors_among((1,), known) == (1,)
-    count = sum(len(view[1].mirrored) for view in known)
-    assert count >= FEWEST_PIXELS
-    larger = round(1.05 * count / LEAST_SHARE / len(known))
-    assert mirrors_among((1,), [{1: view[1]._replace(shown=larger)} for view in known]) == ()
+    found = judged_pane(scene, 1, photographs_of(scene, photographs(scene_with(0.995))))
+    assert found.is_mirror and FEWEST_PIXELS <= found.compared <= found.shown
+    assert not found._replace(shown=round(1.05 * found.compared / LEAST_SHARE)).is_mirror
+    assert not found._replace(compared=FEWEST_PIXELS - 1).is_mirror
 
 
-def test_views_without_masks_say_nothing() -> None:
-    scene = scene_with(0.995)
-    bare = [replace(view, read_pane_labels=None) for view in photographs(scene)]
-    assert mirror_labels(scene, [*bare, *photographs(scene)]) == (1,)
+def test_a_mirror_is_found_and_put_right_where_its_fitted_plane_is_tilted() -> None:
+    """A plane that is tilted by two degrees mirrors what lies four degrees beside what the photograph shows."""
+    true, unknown = scene_with(0.995), scene_with(0.2)
+    tilt = torch.tensor([[math.tan(math.radians(2.0)), 0.0, 0.0]])
+    tilted = replace(unknown, planes=replace(unknown.planes, raw_normals=unknown.planes.normals + tilt))
+    before = degrees_between(tilted.planes.normals[0], true.planes.normals[0])
+    found = judged_pane(tilted, 1, photographs_of(tilted, photographs(true)))
+    assert before == pytest.approx(2.0, abs=0.01)
+    assert found.is_mirror
+    assert degrees_between(found.pane.normals[0], true.planes.normals[0]) < 0.5
+    torch.testing.assert_close(found.pane.half_sizes, tilted.planes.half_sizes)
+
+
+def test_photographs_are_reduced_with_all_that_belongs_to_them() -> None:
+    scene = scene_with(0.2)
+    camera = replace(camera_at(0.0, 0.0, -0.3), width=4 * REDUCED_WIDTH, height=3 * REDUCED_WIDTH)
+    photo = torch.full((camera.height, camera.width, 3), 51, dtype=torch.uint8)
+    labels = torch.zeros(camera.height, camera.width, dtype=torch.uint8)
+    labels[:, : 2 * REDUCED_WIDTH] = 1
+    view = View.in_memory("x", camera, photo=photo, pane_labels=labels)
+    ignoring = replace(view, read_ignored=lambda: (torch.arange(camera.height) < 6)[:, None].expand_as(labels).float())
+    found = reduced_photograph(scene, ignoring)
+    assert (found.camera.width, found.camera.height) == (REDUCED_WIDTH, 3 * REDUCED_WIDTH // 4)
+    assert found.camera.fx == pytest.approx(camera.fx / 4)
+    torch.testing.assert_close(found.pixels, torch.full((150, 200, 3), 0.2))
+    assert found.labels is not None and (found.labels[:, :100] == 1).all() and (found.labels[:, 100:] == 0).all()
+    assert not found.told[:2].any() and found.told[2:].all()
+
+
+def test_a_view_without_a_mask_tells_as_well() -> None:
+    views = [replace(view, read_pane_labels=None) for view in photographs(scene_with(0.995))]
+    assert mirror_labels(scene_with(0.2), views) == (1,)
 
 
 def test_likeness_is_slope_and_correlation() -> None:
