@@ -88,7 +88,7 @@ class Run:
 
     @property
     def title(self) -> str:
-        """What messages call it."""
+        """Name in messages."""
         return f"{self.scene}, {self.name}, seed {self.seed}"
 
     def results(self) -> dict[str, Any] | None:
@@ -249,7 +249,7 @@ def mean(values: Iterable[float | None]) -> float | None:
 
 
 def compared(measured: Measured, name: str, baseline: str) -> dict[str, list[Values]]:
-    """What `name` has more than `baseline`, or how many times as much, by scene, seed against equal seed."""
+    """Gains of `name` over `baseline`, as differences or ratios, by scene, seed against equal seed."""
     found: dict[str, list[Values]] = {}
     for (scene, other, seed), values in measured.items():
         if other == name and (scene, baseline, seed) in measured:
@@ -284,7 +284,7 @@ def tables(measured: Measured) -> str:
 
 
 def value_table(measured: Measured) -> list[str]:
-    """What each run reached: means over seeds, with their standard deviation."""
+    """Means over seeds for each run, with their standard deviation."""
     rows = {
         key: [v for (s, n, _), v in measured.items() if (s, n) == key] for key in dict.fromkeys(k[:2] for k in measured)
     }

@@ -49,7 +49,7 @@ def main() -> int:
 
 
 def parsed() -> argparse.Namespace:
-    """What the command line says."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.gpu", description=__doc__)
     parser.add_argument("--count", type=int, default=COUNT, help="Gaussians of the timings")
     parser.add_argument("--data", type=Path, default=DATA, help="capture to train on; the bundled showcase by default")

@@ -71,7 +71,7 @@ def kernel_times(count: int) -> Table:
 
 
 def least_seconds(splats: Splats, channels: Tensor, bins: TileBins, evaluations: int) -> dict[str, Bound]:
-    """What bounds both passes of `composite`, from what a forward pass counted."""
+    """Least seconds of both passes of `composite`, from the counts of a forward pass."""
     forward = kernels_for("composite", channels.device).composite
     marks, count = channels.new_zeros(1, 0), channels.shape[1]
     options: dict[str, Any] = {"marks": marks, "num_primary": count, "deviation": None, "needs_gradients": True}

@@ -1,4 +1,4 @@
-"""What the compositing kernels would take at a GPU's peaks, from counted multiply-adds and bytes."""
+"""Least times of the compositing kernels at a GPU's peaks, from counted multiply-adds and bytes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Peaks(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """What a traversal of all tiles met.
+    """Counts of a traversal of all tiles.
 
     pairs: (tile, splat) pairs that any pixel looked at. evaluations: of a splat at a pixel. buckets: that were stored.
     pixels: of the image. channels: of a splat.

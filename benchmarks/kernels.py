@@ -137,7 +137,7 @@ def at_threads(work: Work, threads: int) -> float:
 
 
 def twin_ratios() -> Table:
-    """How much faster the kernels are than their twins, at a size the twins can bear."""
+    """Speed of the kernels relative to their twins, at a size the twins can bear."""
     camera = bench_camera(64, 48)
     gaussians = room(1000)
     raw, batch = raw_of(gaussians), batch_of(camera)

@@ -1,4 +1,4 @@
-"""How soon the viewer answers a move of the camera: python -m benchmarks.looking."""
+"""Latency of the viewer after a move of the camera: python -m benchmarks.looking."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class Looker:
 
 
 def answers(moves: int, count: int, *, moving: bool) -> list[Answer]:
-    """What a number of moves got, after some to warm up."""
+    """Latencies of a number of moves, after some to warm up."""
     looker = Looker(count)
     try:
         return [looker.answer(place, moving=moving) for place in range(WARM_UP + moves)][WARM_UP:]
@@ -142,7 +142,7 @@ def looking_times(moves: int = 40, count: int = COUNT) -> Table:
 
 
 def slow(times: Sequence[float]) -> float:
-    """What one in twenty exceeds."""
+    """95th percentile."""
     return float(np.quantile(times, 0.95))
 
 

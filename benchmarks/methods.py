@@ -1,4 +1,4 @@
-"""What the reflections cost: `planar` and `deferred` against `splat`, frame and training step, in one run."""
+"""Cost of the reflections: `planar` and `deferred` against `splat`, frame and training step, in one run."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def frame_work(scene: Scene, renderer: Renderer, camera: Camera) -> Work:
 
 
 def bare_work(scene: Scene, camera: Camera) -> Work:
-    """What no `planar` frame can save: the `splat` frame, and the mirrored one in the tiles of the panes."""
+    """Least work of a `planar` frame: the `splat` frame, and the mirrored one in the tiles of the panes."""
     splat, planes = Splat(depth=False), scene.planes
     hits = nearest_hits(panes_in_camera(planes, camera), camera)
     poses = camera.cam_from_world @ mirror_matrices(planes.centers, planes.normals)

@@ -53,7 +53,7 @@ def timed_kernels(seconds: Seconds) -> Iterator[None]:
 
 
 def costs_of(messages: Iterator[Message]) -> Costs:
-    """What the stages of a run cost; steps are told from what a stage does before its first one."""
+    """Costs of the stages of a run; the preparation of a stage counts apart from its steps."""
     costs: Costs = {}
     seconds: Seconds = defaultdict(float)
     with timed_kernels(seconds):

@@ -62,7 +62,7 @@ def surrounding_discs(count: int) -> RawGaussians:
 
 
 def mirrored_rays(width: int) -> Rays:
-    """What a mirror ball at the origin throws back of a camera's rays, row by row of those that meet it."""
+    """Rays of a camera after a mirror ball at the origin has reflected them, row by row of those that meet it."""
     across = (torch.arange(width) + 0.5) / width * 2 - 1
     y, x = torch.meshgrid(across, across, indexing="ij")
     eye = torch.tensor([0.0, 0.0, -0.9])

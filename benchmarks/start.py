@@ -1,4 +1,4 @@
-"""How soon a command says its first word: python -m benchmarks.start [--run RUN].
+"""Seconds to the first line of a command: python -m benchmarks.start [--run RUN].
 
 That is the clock's time from the start of the process to its first line, when it has refused or begun: `train` and
 `info` say it when they have read what the capture's folder holds, `demo` when it has begun to train, what renders
@@ -48,7 +48,7 @@ OF_RUNS = (
 
 
 class FirstLine(NamedTuple):
-    """What a process said first, and how many seconds after its start."""
+    """First line of a process, and the seconds after its start."""
 
     text: str
     seconds: float

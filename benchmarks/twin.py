@@ -47,7 +47,7 @@ Array = NDArray[Any]
 
 
 class Blending(NamedTuple):
-    """What goes into both passes, flat, with what the first leaves for the second.
+    """Flat inputs of both passes, with the results of the first that the second needs.
 
     Attributes:
         splats: means [S, 2], conics [S, 3], opacities [S] and channels [S, 4].

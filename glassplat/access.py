@@ -1,4 +1,4 @@
-"""Who may talk to a server of ours: whoever was given its link, from its own page.
+"""Access to our servers: for whoever was given the link, from its own page.
 
 A browser sends requests for any page that it shows, those of strangers included. Three checks tell them apart:
 
@@ -99,7 +99,7 @@ class Access:
 
 
 def is_local(host: str) -> bool:
-    """Whether an address to listen on can be reached from this computer only."""
+    """Return whether an address to listen on can be reached from this computer only."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

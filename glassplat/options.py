@@ -25,15 +25,15 @@ MOST = 1_000_000_000
 
 @runtime_checkable
 class Requirement(Protocol):
-    """What the annotation of a field may say of its values; `allows` is asked about values of the annotated type."""
+    """Requirement in the annotation of a field; `allows` is asked about values of the annotated type."""
 
     def allows(self, value: Any) -> bool:
-        """Whether the value will do."""
+        """Return whether the value will do."""
         ...
 
     @property
     def expected(self) -> str:
-        """What is expected, as the end of a message."""
+        """Expectation, as the end of a message."""
         ...
 
 
@@ -54,7 +54,7 @@ class Range:
     below: float | None = None
 
     def allows(self, value: float) -> bool:
-        """Whether the number is within the bounds; NaN never is."""
+        """Return whether the number is within the bounds; NaN never is."""
         return (
             value == value
             and (self.low is None or value >= self.low)
@@ -77,7 +77,7 @@ class Ascending:
     """Numbers that get no smaller."""
 
     def allows(self, value: Sequence[float]) -> bool:
-        """Whether they are in order."""
+        """Return whether they are in order."""
         return list(value) == sorted(value)
 
     @property
@@ -190,7 +190,7 @@ def unwrapped(hint: Any) -> tuple[Any, tuple[Requirement, ...]]:
 
 
 def expectation(hint: Any, requirements: tuple[Requirement, ...] = ()) -> str:
-    """What a value of this annotation has to be, in words."""
+    """Expected value of this annotation, in words."""
     bounds = " and ".join(requirement.expected for requirement in requirements)
     return f"{PLAIN[hint]} {bounds}".rstrip() if hint in PLAIN else ", ".join(filter(None, (_structure(hint), bounds)))
 
@@ -228,7 +228,7 @@ def _in_type(hint: Any, value: Any, name: str, requirements: tuple[Requirement, 
 
 
 def _is_of(hint: Any, value: Any) -> bool:
-    """Whether a single value is of a type; a whole number is a number too, but True is not, nor is infinity."""
+    """Return whether a single value is of a type; a whole number is a number too, but True is not, nor is infinity."""
     if hint is float:
         return isinstance(value, (int, float)) and not isinstance(value, bool) and _is_finite(value)
     if hint is int:

@@ -126,7 +126,7 @@ class Browser:
         return wait_until(lambda: self.evaluate(expression), what)
 
     def screenshot(self) -> bytes:
-        """What the window shows, as PNG."""
+        """Picture of the window, as PNG."""
         return base64.b64decode(self._ask("Page.captureScreenshot", format="png")["data"])
 
     def picture(self) -> np.ndarray:
@@ -184,7 +184,7 @@ class Browser:
         return [params["request"]["url"] for params in sent]
 
     def complaints(self) -> list[str]:
-        """What the page reported as an error."""
+        """Errors that the page reported."""
         found = []
         for event in self.events:
             if event.get("method") == "Runtime.exceptionThrown":
@@ -227,6 +227,6 @@ class Browser:
 
 
 def _key(key: str, held: int) -> dict[str, Any]:
-    """What tells Chromium which key it is."""
+    """Codes by which Chromium knows a key."""
     code = CODES.get(key, ord(key.upper()) if len(key) == 1 else 0)
     return {"key": key, "modifiers": held, "windowsVirtualKeyCode": code}

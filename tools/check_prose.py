@@ -111,7 +111,7 @@ def mean_words(prose: Prose) -> float:
 
 
 def size_complaints(readme: str, pages: dict[str, str]) -> Iterator[str]:
-    """Whether README and docs are too long, and their sentences on the mean."""
+    """Return whether README and docs are too long, and their sentences on the mean."""
     lines = sum(len(text.splitlines()) for text in pages.values())
     words = sum(len(text.split()) for text in pages.values())
     if lines > MOST_DOCS_LINES or words > MOST_DOCS_WORDS:
@@ -141,6 +141,8 @@ def main() -> None:
     complaints = list(size_complaints(readme, pages))
     for name, text in {"README.md": readme, **pages}.items():
         complaints += page_complaints(name, text)
+    files = sorted(path for folder in CODE_FOLDERS for path in (ROOT / folder).rglob("*.py"))
+    complaints += [complaint for path in files for complaint in riddles(path)]
     sentences = Prose([s for text in (readme, *pages.values()) for s in prose_of(text).sentences], [])
     lines, words = (sum(len(split(text)) for text in pages.values()) for split in (str.splitlines, str.split))
     print(f"docs/: {lines} lines, {words} words; README.md: {len(readme.splitlines())} lines")

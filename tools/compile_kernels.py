@@ -29,7 +29,7 @@ COSTS = ("shared bytes", "local bytes")
 
 
 class Resources(NamedTuple):
-    """What a thread or block of a kernel takes: registers, bytes spilled to memory and back, bytes shared, and bytes of
+    """Resources of a thread or block of a kernel: registers, bytes spilled and fetched back, bytes shared, and bytes of
     a thread's own memory, which is where its arrays are that do not fit into registers.
     """
 
@@ -64,7 +64,7 @@ def kernels_of(factory: Callable[..., Any], real: type) -> list[Any]:
 
 
 def first_parameter(factory: Callable[..., Any]) -> str | None:
-    """What a factory of kernels takes first: `real` or, of kernels without floating-point numbers, `key`."""
+    """First argument of a factory of kernels: `real` or, of kernels without floating-point numbers, `key`."""
     return next(iter(inspect.signature(factory).parameters), None)
 
 

@@ -1,4 +1,4 @@
-"""How much of a run's error is blur and how much a wrong layer: fine and coarse errors, over the panes and elsewhere.
+"""Split of a run's error into blur and wrong layers: fine and coarse errors, over the panes and elsewhere.
 
 python -m tools.error_bands RUN [RUN ...] [--sigma 4]
 

@@ -20,7 +20,7 @@ BLUR = 1 / 100
 
 
 def estimated_normals(normals: Array, coverage: Array, error_deg: float, random: np.random.Generator) -> Array:
-    """What an estimator would say of one photograph.
+    """Normals that an estimator would give for one photograph.
 
     Args:
         normals: [S, S, 3] true unit normals in the camera's axes; zero where nothing is.

@@ -103,7 +103,7 @@ class Studio:
     size: int
 
     def shows_mirror(self, hits: Any) -> Array:
-        """Which of the hits [R] lie on something reflective, as 0 and 1."""
+        """Mask of the hits [R] that lie on something reflective, as 0 and 1."""
         # A scene may copy shapes while it is built, so that they are found again by their place.
         shapes = self.scene.shapes()[: self.mirrors]
         return sum((np.array(hits.shape == shape, dtype=np.float64) for shape in shapes), np.zeros(1))
@@ -259,7 +259,7 @@ def photograph(studio: Studio, pose: Array, samples: int, seed: int) -> NDArray[
 
 
 def visible_surfaces(studio: Studio, pose: Array) -> tuple[Array, Array]:
-    """What one camera sees, from rays through a regular grid in every pixel.
+    """Surfaces that one camera sees, from rays through a regular grid in every pixel.
 
     Returns:
         Unit world normal averaged over what is covered, and coverage, [S, S, 4]; and the share [S, S] of the pixel

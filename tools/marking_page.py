@@ -109,7 +109,7 @@ class MarkingPage:
         return str(self.window.run("return document.getElementById('status').textContent"))
 
     def said(self) -> str:
-        """What stands beside the panes."""
+        """Text next to the panes."""
         return str(self.window.run("return document.getElementById('panes').innerText"))
 
 

@@ -1,4 +1,4 @@
-"""How like the web page of a run is to its render, and how often and how soon the page shows a picture without a GPU.
+"""Likeness of a run's web page to its render, and how soon and how often the page draws without a GPU.
 
 python -m tools.page_likeness runs/showcase out/index.html
 """
@@ -40,12 +40,12 @@ def wanted(camera: Camera, layer: str) -> str:
 
 
 def picture(browser: Browser, camera: Camera, layer: str = "rgb") -> torch.Tensor:
-    """What the page shows of a layer, [H, W, 3] uint8."""
+    """Picture of a layer in the page, [H, W, 3] uint8."""
     return pixels_of(browser.evaluate(wanted(camera, layer)), camera.width, camera.height)
 
 
 def pixels_of(text: str, width: int, height: int) -> torch.Tensor:
-    """What the page's script returns for a picture, as [H, W, 3] uint8."""
+    """Picture that the page's script returns, as [H, W, 3] uint8."""
     pixels = np.frombuffer(base64.b64decode(text), dtype=np.uint8)
     return torch.from_numpy(pixels.reshape(height, width, 4)[::-1, :, :3].copy())
 
@@ -63,7 +63,7 @@ def likenesses(browser: Browser, model: Model) -> list[float]:
 
 @dataclass(frozen=True)
 class Walk:
-    """What a page showed while it was dragged and when it was let go."""
+    """Record of a page while it is dragged and after it is let go."""
 
     moving: list[dict[str, float]]
     """Pictures while dragged: `time` in milliseconds, `scale` of its resolution, `splats` that it drew."""

@@ -111,7 +111,7 @@ def draw_place(seed: int, views: int) -> DrawnPlace:
 
 
 def is_shown(drawn: DrawnPlace) -> bool:
-    """Whether photographs show enough of each pane, and lamps."""
+    """Return whether photographs show enough of each pane, and lamps."""
     seen = [drawn.place.view(pose, *PREVIEW) for pose in drawn.poses]
     labels = np.stack([view.label for view in seen])
     shares = np.stack([(labels == pane.label).mean(axis=(1, 2, 3)) for pane in drawn.place.panes])
@@ -442,7 +442,7 @@ def _distance_to_pane(pane: Pane, where: Array) -> float:
 
 
 def _touch(pane: Pane, other: Pane) -> bool:
-    """Whether two panes stand nearer to each other than a step, on the floor plan."""
+    """Return whether two panes stand nearer to each other than a step, on the floor plan."""
     steps = np.linspace(-1, 1, 9)[:, None] * pane.half_sizes[0] * pane.tangent[:2]
     return min(_distance_to_pane(other, pane.center[:2] + step) for step in steps) < 0.3
 
@@ -513,7 +513,7 @@ def _draw_position(
 
 
 def is_clear(place: Place, position: Array) -> bool:
-    """Whether nothing is nearer to a position [3] than `CLEARANCE`, panes included, and no thing is around it."""
+    """Return whether nothing, panes included, is nearer to a position [3] than `CLEARANCE`, or around it."""
     z = np.linspace(-1, 1, 64)
     turn = GOLDEN_ANGLE_RAD * np.arange(64)
     flat = np.sqrt(1 - z**2)
@@ -524,7 +524,7 @@ def is_clear(place: Place, position: Array) -> bool:
 
 
 def _holds(thing: Thing, position: Array) -> bool:
-    """Whether a place lies in the span of a thing, or outside of a room."""
+    """Return whether a place lies in the span of a thing, or outside of a room."""
     room = isinstance(thing, Box) and thing.room
     if isinstance(thing, Carried):
         position, thing = (np.linalg.inv(thing.world_from_thing) @ [*position, 1.0])[:3], thing.thing

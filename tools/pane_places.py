@@ -164,7 +164,7 @@ def case_poses(count: int, seed: int) -> list[Array]:
 
 
 def photographer(world_from_cam: Array) -> tuple[Thing, ...]:
-    """Who took a photograph of a room with the floor at z = 0.
+    """Person who takes photographs of a room with the floor at z = 0.
 
     The body is as high as the camera needs it and turns with it, but stands upright however the camera is tilted.
 

@@ -1,4 +1,4 @@
-"""What the ray tracer of panes can show: things, panes of glass, mirrors, silver, lamps, and places of them."""
+"""Contents of rooms for the ray tracer of panes: things, panes of glass, mirrors, silver, lamps, and places of them."""
 
 from __future__ import annotations
 
@@ -266,13 +266,13 @@ class Place:
     silver: Sequence[Silver] = ()
 
     def seen(self, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> Seen:
-        """What rays [N, 3] with unit directions [N, 3] see, with the panes' labels."""
+        """Colours that rays [N, 3] with unit directions [N, 3] see, with the panes' labels."""
         seen = trace(self.tables, origins, directions, reflections)
         labels = np.array([0, *(pane.label for pane in self.panes)], dtype=np.uint8)
         return seen._replace(label=labels[seen.label])
 
     def view(self, pose: Array, width: int, height: int) -> Seen:
-        """What the rays of an image see, `SUBPIXELS` squared for each pixel: [H, W, S, ...] each.
+        """Colours of the rays of an image, `SUBPIXELS` squared for each pixel: [H, W, S, ...] each.
 
         Args:
             pose: [4, 4] camera-to-world: x right, y down, z forward.

@@ -87,7 +87,7 @@ class Tables(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What rays see.
+    """Results of tracing rays.
 
     Attributes:
         radiance: [N, 3] linear, with all panes: (1 - strength) transmission + strength reflection.
@@ -111,7 +111,7 @@ class Seen(NamedTuple):
 
 
 def trace(tables: Tables, origins: Array, directions: Array, reflections: int = REFLECTIONS) -> Seen:
-    """What rays [N, 3] with unit directions [N, 3] see; panes that light meets after `reflections` are not there."""
+    """Trace rays [N, 3] with unit directions [N, 3]; panes that light meets after `reflections` are not there."""
     count = len(directions)
     colors, scalars, labels = np.zeros((count, 4, 3)), np.zeros((count, 3)), np.zeros(count, dtype=np.uint8)
     rays = np.ascontiguousarray(origins, dtype=float), np.ascontiguousarray(directions, dtype=float)
@@ -268,7 +268,7 @@ def _in_frame(frame, point, w):
 
 @njit(cache=True)
 def distance_to(thing, origin, direction):
-    """How far a ray goes until it meets a thing; infinite where it does not."""
+    """Distance along a ray to a thing; infinite if it meets none."""
     if thing.turned:
         origin, direction = _in_frame(thing.frame, origin, 1.0), _in_frame(thing.frame, direction, 0.0)
     low, high = vector(thing.low), vector(thing.high)
@@ -290,7 +290,7 @@ def distance_to(thing, origin, direction):
 
 @njit(cache=True)
 def _through_slab(low, high, origin, direction):
-    """Where a ray enters and leaves what lies between two parallel planes."""
+    """Distances at which a ray enters and leaves what lies between two parallel planes."""
     if direction == 0:
         return (-np.inf, np.inf) if low <= origin <= high else (np.inf, -np.inf)
     to_low, to_high = (low - origin) / direction, (high - origin) / direction
@@ -299,7 +299,7 @@ def _through_slab(low, high, origin, direction):
 
 @njit(cache=True)
 def _through_ellipsoid(low, high, axes, ray):
-    """Where a ray enters and leaves the ellipsoid that fills a span; with two axes an endless upright cylinder."""
+    """Distances at which a ray enters and leaves an ellipsoid; with two axes an endless upright cylinder."""
     square, middle, rest = 0.0, 0.0, -1.0
     for axis in range(axes):
         scale = 2.0 / (high[axis] - low[axis])
@@ -348,7 +348,7 @@ def _next_pane(tables, origin, direction, between):
 
 @njit(cache=True)
 def _meeting(pane, which, ray):
-    """Where a ray meets a pane or its second pane, where it goes on to, and the share of the light that does.
+    """Meeting of a ray with a pane or its second pane: the place, where it goes on, and the share of light that does.
 
     Light that goes to and fro between the two panes of double glazing is left out.
     """

@@ -1,4 +1,4 @@
-"""How far fitted planes are from the true ones, over many choices of a few masks.
+"""Errors of fitted planes against the true ones, over many choices of a few masks.
 
 python -m tools.plane_errors --data SCENE [SCENE ...] --masks 3
 
@@ -50,7 +50,7 @@ class Fit:
 
     @property
     def good(self) -> bool:
-        """Whether the plane is within the limits."""
+        """Return whether the plane is within the limits."""
         return self.errors is not None and self.errors[0] <= LIMITS[0] and self.errors[1] <= LIMITS[1]
 
 

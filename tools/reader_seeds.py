@@ -1,4 +1,4 @@
-"""What readers of files are tried with, once it is damaged: small files of every kind, as we and others write them."""
+"""Inputs for readers of files, before they are damaged: small files of every kind, as we and others write them."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ def _database_seeds(folder: Path) -> None:
 
 
 def _database(path: Path) -> None:
-    """What an interrupted preparation goes on from."""
+    """State from which an interrupted preparation goes on."""
     for suffix in ("-wal", "-shm", "-journal"):
         path.with_name(path.name + suffix).unlink(missing_ok=True)
     features = _features(path)

@@ -77,7 +77,7 @@ SIGNS = (
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What an environment shows; the defaults are those of the scenes with names.
+    """Contents of an environment; the defaults are those of the scenes with names.
 
     Attributes:
         zenith, horizon: colours of the sky, linear radiance.
@@ -160,7 +160,7 @@ def _offsets(panel: Panel, azimuth_deg: Array, elevation_deg: Array) -> tuple[Ar
 
 
 def _inside(panel: Panel, azimuth_deg: Array, elevation_deg: Array) -> NDArray[np.bool_]:
-    """Which pixels a panel covers."""
+    """Mask of the pixels that a panel covers."""
     across, up = _offsets(panel, azimuth_deg, elevation_deg)
     return (np.abs(across) <= panel.size_deg[0] / 2) & (np.abs(up) <= panel.size_deg[1] / 2)
 

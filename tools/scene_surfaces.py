@@ -78,7 +78,7 @@ def torus(major: float, minor: float, tilt_deg: float, rings: int = 320, segment
 
 
 def torus_depth(major: float, minor: float, tilt_deg: float) -> float:
-    """How far the lowest point of `torus` lies below the origin, world units."""
+    """Depth of the lowest point of `torus` below the origin, world units."""
     return major * float(np.sin(np.radians(tilt_deg))) + minor
 
 

@@ -42,7 +42,7 @@ COMPLAINTS = ("Traceback", "Error", "could not be drawn")
 
 @dataclass
 class Count:
-    """What happened."""
+    """Counts of events."""
 
     pictures: int = 0
     actions: int = 0
@@ -138,7 +138,7 @@ class Looker:
 
 @dataclass
 class Soaked:
-    """What a soak found: seconds and MiB of samples, counts, and lines in which the viewer complained."""
+    """Result of a soak: seconds and MiB of samples, counts, and lines in which the viewer complained."""
 
     samples: list[tuple[float, float]]
     count: Count
@@ -191,7 +191,7 @@ async def soak(run: Path, clients: int, minutes: float, *, pause: float = 0.25, 
 
 
 async def printed_address(log: IO[str], viewer: asyncio.subprocess.Process) -> str:
-    """What the viewer says where it is to be looked at; raises RuntimeError if it ends before."""
+    """Address that the viewer prints; raises RuntimeError if it ends before."""
     while viewer.returncode is None:
         found = re.search(r"look at (http\S+)", os.pread(log.fileno(), 1_000_000, 0).decode())
         if found:

@@ -29,7 +29,7 @@ CLASSES = ("crashes", "readers", "servers", "numbers", "machines")
 
 
 class Case(NamedTuple):
-    """What was tried, and what is wrong with how it ended; nothing if that is empty."""
+    """Case that was tried, and the fault of its end; none if that is empty."""
 
     what: str
     fault: str = ""
@@ -50,7 +50,7 @@ def trial_of(name: str) -> Trial:
 
 
 def tried(name: str, seed: int, cases: int, minutes: float) -> tuple[int, list[Case]]:
-    """How many cases there was time for, and those that are faults; says these at once."""
+    """Try as many cases as there is time for; returns their number and the faults, which are printed at once."""
     end, count, faults = time.monotonic() + 60 * minutes, 0, list[Case]()
     with tempfile.TemporaryDirectory(prefix="trial-", ignore_cleanup_errors=True) as place:
         for case in trial_of(name)(seed, cases, Path(place)):

@@ -70,7 +70,7 @@ def digest_of(folder: Path) -> str:
 
 
 def tried(kind: str, draw: random.Random, asked: tuple[str, Path, Path], whole: tuple[str, float, Path]) -> str:
-    """What is wrong with how one command ended and what it left."""
+    """Fault of a command's end and of what it left."""
     method, data, folder = asked
     digest, seconds, done = whole
     moment = draw.uniform(0.2, 1.0) * seconds
@@ -93,7 +93,7 @@ def tried(kind: str, draw: random.Random, asked: tuple[str, Path, Path], whole: 
 
 
 def resumed(method: str, data: Path, folder: Path, digest: str) -> str:
-    """What is wrong with a run that goes on; one that has nothing to go on from begins again."""
+    """Fault of a run that goes on; one that has nothing to go on from begins again."""
     if folder.exists():
         fault = run(["info", folder]).fault()
         if fault:

@@ -44,7 +44,7 @@ def pictures(folder: Path) -> dict[str, bytes]:
 
 
 def machine(kind: str, draw: random.Random, folder: Path, scene: Path) -> tuple[str, Mapping[str, str], Path]:
-    """What is odd about it, its environment, and the run that it renders."""
+    """Odd environment, with its description and the run that it renders."""
     known = dict(os.environ)
     kernels = folder / "kernels"
     if kind == "home":
@@ -104,7 +104,7 @@ def damaged_cache(what: str, draw: random.Random, kernels: Path) -> None:
 
 
 def tried(environment: Mapping[str, str], scene: Path, folder: Path, truth: dict[str, bytes], *, twice: bool) -> str:
-    """What is wrong with renders in an environment, one or two at once."""
+    """Fault of renders in an environment, one or two at once."""
     outputs = [folder / "one", folder / "other"][: 2 if twice else 1]
 
     def rendered(output: Path) -> str:

@@ -45,7 +45,7 @@ def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
 
 
 def fault_of(work: Callable[[], Any]) -> str:
-    """What is wrong with how it ends; nothing if it does, or raises an error with a text."""
+    """Fault of an end; none if it ends well, or raises an error with a text."""
     begun = time.process_time()
     try:
         work()

@@ -21,14 +21,14 @@ COMPLAINTS = ("Traceback (most recent call last)", "did not foresee", "Fatal Pyt
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended; `code` is None where it was killed, here or for its time."""
+    """End of a command; `code` is None where it was killed, here or for its time."""
 
     code: int | None
     output: str
     is_late: bool = False
 
     def fault(self) -> str:
-        """What is wrong with such an end; nothing if it was asked for, or gave one readable message."""
+        """Fault of such an end; none if it was asked for, or gave one readable message."""
         if self.is_late:
             return f"it did not end in {MOST_SECONDS} s: {self.output[-300:]!r}"
         if any(word in self.output for word in COMPLAINTS):

@@ -68,7 +68,7 @@ def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
 
 
 def names_fault(place: Path) -> str:
-    """What is wrong with pages about a photograph that is called HTML."""
+    """Fault of pages about a photograph that is called HTML."""
     data = write_tiny_capture(place / "capture")
     for folder in ("images", "masks"):
         (data / folder / "0.png").rename(data / folder / HTML)
@@ -280,7 +280,7 @@ def request(draw: random.Random, port: int, cookie: str) -> bytes:
 
 
 def answered_well(port: int, sent: bytes, *, let_in: bool = False) -> str:
-    """What is wrong with the answer to bytes: it is one for those who have the key, or an error of ours."""
+    """Fault of the answer to bytes: it is one for those who have the key, or an error of ours."""
     with socket.create_connection(("127.0.0.1", port), timeout=20) as connection, suppress(ConnectionError):
         connection.sendall(sent)
         connection.shutdown(socket.SHUT_WR)

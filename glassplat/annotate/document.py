@@ -155,7 +155,7 @@ def read_document(folder: Path) -> Any:
 
 
 def version_of(value: Any) -> str:
-    """What tells a document from others: a digest of all that is in it."""
+    """Digest of all that is in a document."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:24]
 
 

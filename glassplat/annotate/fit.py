@@ -1,4 +1,4 @@
-"""Where a pane is, from what was marked of its outline in several photographs, and how sure that is."""
+"""Fit of a pane's plane to marks of its outline in several photographs, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RECTANGLE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
 class PaneShape(Protocol):
-    """What is fitted to marks: corners in one plane, moved by steps of a few numbers."""
+    """Corners in one plane, moved by steps of a few numbers, which are fitted to marks."""
 
     @property
     def frame(self) -> Array:
@@ -27,7 +27,7 @@ class PaneShape(Protocol):
 
     @property
     def freedom(self) -> int:
-        """How many numbers move it; the first two tilt its plane, in radians."""
+        """Number of parameters; the first two tilt the plane, in radians."""
         ...
 
     def corners(self) -> Array:
@@ -156,7 +156,7 @@ class TooFewMarksError(ValueError):
 
 @dataclass(frozen=True)
 class Marks:
-    """What was marked of one pane; views are numbered.
+    """Marks of one pane; views are numbered.
 
     Attributes:
         corners: for each corner, in order round the outline, its pixel (x, y) in every view that shows it.
@@ -225,7 +225,7 @@ def fitted_pane(marks: Marks, eyes: Sequence[NumpyCamera], shape: Shape) -> Pane
 
 
 def _fitted(marks: Marks, eyes: Sequence[NumpyCamera], begun: PaneShape) -> tuple[float, PaneShape]:
-    """What marks leave unexplained, and the shape that is nearest to them from where it begins."""
+    """Fit a shape to marks from where it begins; also return the residuals."""
     from scipy.optimize import least_squares
 
     def residuals(step: Array) -> Array:
@@ -328,7 +328,7 @@ def _cut_at(corners: Array, edge: int, line: tuple[Array, Array] | None) -> Arra
 def _line_on_plane(
     places: Mapping[int, Array], eyes: Sequence[NumpyCamera], pane: PaneShape
 ) -> tuple[Array, Array] | None:
-    """Where the two sight lines of an edge that one view shows meet a pane's plane; None if they run away from it."""
+    """Intersections of an edge's two sight lines, seen in one view, with a pane's plane; None if they diverge."""
     ((view, ends),) = places.items()
     rays, normal, center = eyes[view].rays(np.asarray(ends)), pane.frame[2], eyes[view].center
     heights, slopes = (pane.corners().mean(axis=0) - center) @ normal, rays @ normal

@@ -60,7 +60,7 @@ class AnnotationServer(ThreadingHTTPServer):
 
     @property
     def address(self) -> str:
-        """What to open in the browser."""
+        """Address to open in the browser."""
         return f"http://{LOCAL}:{self.server_address[1]}/?key={self.access.key}"
 
     def finish(self) -> None:

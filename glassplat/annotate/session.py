@@ -211,7 +211,7 @@ class Session:
 
     @property
     def document(self) -> Any:
-        """What was marked, as JSON."""
+        """Marks as JSON."""
         return self._document
 
     def described(self) -> dict[str, Any]:
@@ -277,7 +277,7 @@ class Session:
             return {"document": self._document, "version": version_of(self._document)}
 
     def _remember(self, document: Any) -> None:
-        """What is on disk now."""
+        """Remember the state on disk."""
         self._document = self._versions[version_of(document)] = document
         self._versions.move_to_end(version_of(document))
         while len(self._versions) > KNOWN_VERSIONS:
@@ -323,7 +323,7 @@ class Session:
         return {"masks": written, "planes": [pane.label for pane, _ in solved]}
 
     def _answer(self, solved: SolvedPane) -> dict[str, Any]:
-        """What the page shows of a pane."""
+        """Record of a pane for the page."""
         pane, fit = solved.pane, solved.fit
         marks = pane.marks(self._numbers)
         if fit is None:
@@ -395,7 +395,7 @@ class Session:
         return np.round(eye.project(ends[[0, -1]]), 1).tolist()
 
     def _reach(self) -> float:
-        """How far things are from the cameras, roughly."""
+        """Rough distance of the scene from the cameras."""
         centers = np.stack([eye.center for eye in self.eyes])
         things = self._points if len(self._points) else centers
         return max(float(np.median(np.linalg.norm(things - centers.mean(axis=0), axis=1))), 1e-6)

@@ -26,7 +26,7 @@ BOX_MARGIN = 0.5
 
 @dataclass(frozen=True)
 class AxesEvidence:
-    """What the data says about the direction in which the cameras look.
+    """Evidence in the data for the direction in which the cameras look.
 
     Attributes:
         as_read: share of the points that some camera sees, or of the masks that contain the middle of their pane.
@@ -40,12 +40,12 @@ class AxesEvidence:
 
     @property
     def contradicts(self) -> bool:
-        """Whether the axes are wrong and the other ones right."""
+        """Return whether the axes are wrong and the other ones right."""
         return self.as_read < LEAST_SEEN and self.flipped > MOST_SEEN
 
     @property
     def fits_neither(self) -> bool:
-        """Whether the poses make no sense with either axes."""
+        """Return whether the poses make no sense with either axes."""
         return self.as_read < LEAST_SEEN and self.flipped < LEAST_SEEN
 
 

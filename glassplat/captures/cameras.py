@@ -63,7 +63,7 @@ Interpolation = Literal["BILINEAR", "NEAREST_NEIGHBOR"]
 
 
 class ParameterCounts(NamedTuple):
-    """How many parameters of each kind a camera model has; two for the principal point lie between them."""
+    """Numbers of parameters of each kind in a camera model; two for the principal point lie between them."""
 
     focal: int
     extra: int

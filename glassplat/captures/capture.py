@@ -1,4 +1,4 @@
-"""What a loader reads from a data set, before photographs, masks and splits are looked at."""
+"""Result of a loader, before photographs, masks and splits are looked at."""
 
 from __future__ import annotations
 

@@ -211,7 +211,7 @@ def _text_images(stream: Iterator[str]) -> Iterator[ModelImage]:
 
 
 def _check_observations(line: str, name: str) -> None:
-    """What follows an image is its list of x, y and point; the line is empty, but there, where it has none.
+    """Check that a line of x, y and point follows an image; it is empty where the image has none.
 
     Without it the next image would pass for the list, and be lost.
     """

@@ -151,7 +151,7 @@ def check_downscale(downscale: float) -> None:
 
 
 def dataset_of(files: CaptureFiles, *, downscale: float = 1.0, background: Rgb = WHITE) -> Dataset:
-    """What `load_dataset` returns, of a capture whose folder was read.
+    """Make a `Dataset`, as `load_dataset` does, of a capture whose folder was read.
 
     Raises:
         InputError: as `load_dataset`.
@@ -207,7 +207,7 @@ def _check_axes(train: tuple[View, ...], points: PointCloud | None, format_name:
 
 
 def _any_transparent(shots: Sequence[Shot]) -> bool:
-    """Whether a photograph has transparent pixels."""
+    """Return whether a photograph has transparent pixels."""
     with input_checked():
         return any(is_transparent(shot.image_path) for shot in shots)
 
@@ -268,7 +268,7 @@ def _points(capture: Capture, train: tuple[View, ...]) -> tuple[PointCloud, list
 
 
 def _view_warnings(prepared: list[PreparedView], background: Rgb | None) -> list[str]:
-    """What was assumed about photographs, once for all of them."""
+    """Assumptions about photographs, once for all of them."""
     warnings = []
     rescaled = [p.view.name for p in prepared if p.rescaled]
     if rescaled:

@@ -42,7 +42,7 @@ class CaptureFiles:
     mask_polarity: Polarity
 
     def __str__(self) -> str:
-        """What was found, in a line."""
+        """One line about the capture."""
         points = "no" if self.capture.points is None else len(self.capture.points)
         masks = len(self.masks.masks)
         return (

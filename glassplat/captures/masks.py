@@ -103,7 +103,7 @@ def _in_eight_bits(values: NDArray[np.integer], path: Path) -> NDArray[np.uint8]
 
 
 def _is_black_and_white(image: Image.Image) -> bool:
-    """Whether a palette shows nothing but black and white, so that its colours count and not its indices."""
+    """Return whether a palette shows nothing but black and white, so that its colours count and not its indices."""
     colours = {colour for _, colour in image.convert("RGB").getcolors(image.width * image.height) or []}
     return colours <= {(0, 0, 0), (WHITE, WHITE, WHITE)}
 
@@ -310,7 +310,7 @@ def _beside(photograph: Path) -> list[Path]:
 
 
 def _names_by_key(names: Iterable[str]) -> dict[str, list[str]]:
-    """What a mask may be called, with and without folder and suffix, and the photographs that go by that name."""
+    """Photographs by the names that their masks may have, with and without folder and suffix."""
     found: dict[str, list[str]] = defaultdict(list)
     for name in names:
         path = PurePosixPath(name)
@@ -336,7 +336,7 @@ def _check_same_kind(values: Mapping[str, MaskValues], paths: Mapping[str, Path]
 
 
 def _decide_polarity(values: list[MaskValues], polarity: Polarity) -> tuple[bool, list[str]]:
-    """Whether dark pixels are the pane, and a warning where that was guessed."""
+    """Return whether dark pixels are the pane, and a warning where that was guessed."""
     binary = [v for v in values if v.kind == "binary"]
     if polarity != "auto" or not binary:
         return polarity == "dark" and bool(binary), []

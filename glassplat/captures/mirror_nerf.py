@@ -161,14 +161,14 @@ def _masks(root: Path, shots: tuple[Shot, ...]) -> dict[str, Path]:
 
 
 def _mask_names(photograph: Path) -> list[str]:
-    """What the mask of a photograph may be called, the most explicit first."""
+    """Possible names of a photograph's mask, the most explicit first."""
     number = photograph.stem.rpartition("_")[2]
     stems = (photograph.stem, f"{SYNTHETIC_MASK}{number}")
     return [photograph.name, *(stem + suffix for stem in stems for suffix in IMAGE_SUFFIXES)]
 
 
 def _evidence(shots: tuple[Shot, ...], masks: Mapping[str, Path], points: RawPoints | None) -> AxesEvidence | None:
-    """What some of the masks, or else the points, say about the axes of the poses."""
+    """Evidence of some masks, or else the points, for the axes of the poses."""
     from glassplat.captures.axes import axes_evidence  # Takes PyTorch, which no other format needs to be read.
     from glassplat.captures.view import PointCloud
 

@@ -84,7 +84,7 @@ class View:
 
     @property
     def is_annotated(self) -> bool:
-        """Whether there is a mask; does not read it."""
+        """Return whether there is a mask; does not read it."""
         return self.read_pane_labels is not None
 
     def with_camera(self, camera: Camera) -> View:
@@ -101,7 +101,7 @@ class View:
 
 @dataclass(frozen=True)
 class PhotoFile:
-    """How to read the pixels of one view from its file; `background` is seen through transparent pixels."""
+    """Recipe for reading the pixels of one view; `background` is seen through transparent pixels."""
 
     path: Path
     pixel_map: PixelMap
@@ -116,7 +116,7 @@ class PhotoFile:
 
 @dataclass(frozen=True)
 class MaskFile:
-    """How to read the pane labels of one view; `size` is the photograph's, before undistortion."""
+    """Recipe for reading the pane labels of one view; `size` is the photograph's, before undistortion."""
 
     mask: PaneMask
     size: tuple[int, int]
@@ -129,7 +129,7 @@ class MaskFile:
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """How photographs become views.
+    """Options for making views of photographs.
 
     Attributes:
         downscale: width and height are divided by it and rounded.
@@ -204,7 +204,7 @@ def _mask_file(mask: PaneMask, size: tuple[int, int], pixel_map: PixelMap) -> Ma
 
 
 def _is_multiple(large: tuple[int, int], small: tuple[int, int]) -> bool:
-    """Whether one size is an integer multiple of the other, up to the rounding of the smaller one."""
+    """Return whether one size is an integer multiple of the other, up to the rounding of the smaller one."""
     factor = round(large[0] / small[0])
     return factor >= 1 and all(
         abs(a / factor - b) < min(1, MOST_SKEW * b) and (factor > 1 or a == b)

@@ -70,7 +70,7 @@ class Prepare:
         say(console, f"next: glassplat annotate {self.output}")
 
     def left_behind(self) -> str:
-        """What an interrupt leaves, and how to go on."""
+        """Text after an interrupt: the state on disk, and how to go on."""
         if Workplace(self.output).folder.exists():
             return f"repeat the command with --resume to go on; what is done so far lies in {self.output}.partial"
         return "nothing was written: repeat the command to begin again"
@@ -102,5 +102,5 @@ class Annotate:
         serve_marking(self, console)
 
     def left_behind(self) -> str:
-        """What an interrupt leaves, and how to go on."""
+        """Text after an interrupt: the state on disk, and how to go on."""
         return f"what was marked is saved in {self.capture}: repeat the command to go on"

@@ -240,7 +240,7 @@ REMEDY = "photographs made smaller (train with a larger --downscale) or fewer Ga
 
 
 class Ending(NamedTuple):
-    """What is said and returned at the end of a command: `error` for wrong input, `stopped` for a failure."""
+    """Text and exit code of a command's end: `error` for wrong input, `stopped` for a failure."""
 
     label: Literal["error", "stopped"]
     text: str
@@ -259,7 +259,7 @@ def ending(error: BaseException) -> Ending:
 
 
 def is_one_of(error: BaseException, names: tuple[str, ...]) -> bool:
-    """Whether an error is of a class given by name; one whose module is not loaded cannot have been raised."""
+    """Return whether an error is of a class given by name; one whose module is not loaded cannot have been raised."""
     for module, _, name in (full.rpartition(".") for full in names):
         kind = getattr(sys.modules.get(module), name, None)
         if kind is not None and isinstance(error, kind):
@@ -288,7 +288,7 @@ def _failure(error: BaseException) -> str:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether the CPU's memory ran out, or that is what made a library fail; many say so in words only."""
+    """Return whether the CPU's memory ran out, or that is what made a library fail; many say so in words only."""
     if isinstance(error, MemoryError):
         return True
     if isinstance(error, RuntimeError | ImportError | OSError) and any(text in str(error) for text in OUT_OF_MEMORY):

@@ -68,5 +68,5 @@ class Demo:
         say(console, f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
 
     def left_behind(self) -> str:
-        """What an interrupt leaves, and how to go on."""
+        """Text after an interrupt: the state on disk, and how to go on."""
         return f"what is finished stays in {self.output}: repeat the command to go on"

@@ -27,7 +27,7 @@ FEW_POINTS, FEW_MASKS = 500, 3
 
 
 def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
-    """What there is to say of a capture beside what its files say.
+    """Parts about a capture that its files alone do not give.
 
     Raises:
         InputError: it cannot be used.
@@ -64,7 +64,7 @@ def write_capture_page(path: Path, target: Path) -> None:
 
 
 def _marked(path: Path, dataset: Dataset) -> Finding:
-    """Which panes are marked, and how well."""
+    """Marked panes, and the quality of the marks."""
     finding = Finding()
     if ignoring := sum(view.read_ignored is not None for view in (*dataset.train, *dataset.test)):
         finding.facts["ignored"] = f"parts of {ignoring} photographs, marked in ignore/"
@@ -87,7 +87,7 @@ def _marked(path: Path, dataset: Dataset) -> Finding:
 
 
 def _behind(path: Path, dataset: Dataset) -> Finding:
-    """Whether planes can be fitted to the panes that are marked, and what lies behind them; takes seconds."""
+    """Return whether planes can be fitted to the panes that are marked, and what lies behind them; takes seconds."""
     finding = Finding()
     if not dataset.pane_labels and dataset.planes is None:
         return finding
@@ -111,7 +111,7 @@ FAINT = 0.01
 
 
 def splats_part(path: Path) -> Finding:
-    """What a file of Gaussians holds.
+    """Part about a file of Gaussians.
 
     Raises:
         InputError: it cannot be read.
@@ -126,7 +126,7 @@ def splats_part(path: Path) -> Finding:
 
 
 def trained_part(directory: RunDirectory) -> Finding:
-    """What a training has led to so far."""
+    """Part about the state of a training."""
     finding = Finding()
     try:
         scene, step = directory.latest_scene()
@@ -142,7 +142,7 @@ def trained_part(directory: RunDirectory) -> Finding:
 
 
 def scene_part(path: Path) -> Finding:
-    """What the scene in a folder consists of.
+    """Part about the scene in a folder.
 
     Raises:
         InputError: it cannot be read.

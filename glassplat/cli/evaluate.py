@@ -58,5 +58,5 @@ class Evaluate:
         say(console, f"pictures: {stored.directory.path / 'index.html'}")
 
     def left_behind(self) -> str:
-        """What an interrupt leaves, and how to go on."""
+        """Text after an interrupt: the state on disk, and how to go on."""
         return f"{self.run_directory} itself is as it was: repeat the command to evaluate it"

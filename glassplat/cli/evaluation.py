@@ -109,7 +109,7 @@ def evaluate_run(stored: StoredRun, panes: PaneSource = "auto", *, align: Align 
 
 
 def cameras_of_test_views(stored: StoredRun, aligned: bool) -> str:
-    """Where the cameras of test views are taken to be, in words."""
+    """Description of the cameras of test views."""
     if aligned:
         return "aligned with their photographs"
     return "moved as the neighbouring photographs', in the order of names" if len(stored.scene.poses) else UNMOVED
@@ -155,7 +155,7 @@ def plane_text(plane: dict) -> str:
 
 
 def notes(*results: dict) -> list[str]:
-    """Why metrics have no value, a line for each reason."""
+    """One line for each reason why metrics have no value."""
     heads = [f"{result['method']}: " if len(results) > 1 else "" for result in results]
     return [
         f"{head}no {', '.join(names)}: {reason}"

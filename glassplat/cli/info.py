@@ -31,7 +31,7 @@ FEW_VIEWS = 20
 
 @dataclass
 class Finding:
-    """What something is, how it is, and what can be done with it.
+    """Kind and state of something, with the commands that fit it.
 
     What takes long to find out comes in parts: finders yield them, and each adds to those before.
 
@@ -91,7 +91,7 @@ def _first_part(files: CaptureFiles) -> Finding:
 
 
 def _prepared(path: Path, finding: Finding) -> None:
-    """What `glassplat prepare` reported, where it made the capture."""
+    """Report of `glassplat prepare` in the capture."""
     try:
         report = read_json(path / RECORD)["report"]
         finding.facts["prepared"] = (
@@ -242,12 +242,12 @@ class Info:
             say(console, f"  {name}: {fact}")
 
     def left_behind(self) -> str:
-        """What an interrupt leaves: everything."""
+        """Text after an interrupt: nothing has changed."""
         return "nothing was changed"
 
 
 def finder_of(path: Path) -> Finder:
-    """What finds out about a path.
+    """Function that examines a path.
 
     Raises:
         FileNotFoundError: nothing is there.

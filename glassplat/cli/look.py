@@ -58,7 +58,7 @@ class Render:
         write_layers(self, console)
 
     def left_behind(self) -> str:
-        """What an interrupt leaves, and how to go on."""
+        """Text after an interrupt: the state on disk, and how to go on."""
         return f"images already written to {self.output} are whole: repeat the command for all of them"
 
 
@@ -102,7 +102,7 @@ class View:
         serve_viewer(self, console)
 
     def left_behind(self) -> str:
-        """What an interrupt leaves, and how to go on."""
+        """Text after an interrupt: the state on disk, and how to go on."""
         return "what was saved in the browser stays"
 
 
@@ -170,5 +170,5 @@ class Video:
         film(self, console)
 
     def left_behind(self) -> str:
-        """What an interrupt leaves, and how to go on."""
+        """Text after an interrupt: the state on disk, and how to go on."""
         return "nothing was written: repeat the command"

@@ -157,7 +157,7 @@ def parsed(arguments: list[str]) -> Any:
 
 
 def command_line(name: str, options: list[str]) -> tuple[Any, list[str]]:
-    """What tyro should make of a command's options, and how it should see them; that of `train` depends on them."""
+    """Type and settings for tyro of a command line; that of `train` depends on its options."""
     if name == "train":
         from glassplat.cli.train import train_command
 
@@ -172,12 +172,12 @@ def command_class(name: str) -> type:
 
 
 def stub(name: str) -> type:
-    """What the list of commands shows of a command whose module is not imported."""
+    """Entry in the list of commands for one whose module is not imported."""
     return make_dataclass(COMMANDS[name].kind, [], namespace={"__doc__": COMMANDS[name].summary})
 
 
 def overview(kinds: Mapping[str, type]) -> type:
-    """What can be asked of `glassplat` itself: one of the commands, or the version."""
+    """Options of `glassplat` itself: one of the commands, or the version."""
     import tyro
 
     commands: Any = Union[tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in kinds.items())]  # noqa: UP007

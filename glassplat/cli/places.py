@@ -82,7 +82,7 @@ def check_targets(folder: Path, targets: Sequence[Path], photographs: Sequence[P
 
 
 def _recorded_command(record: Path) -> str | None:
-    """Who wrote the folder; None where nobody says."""
+    """Command that wrote the folder; None if it is not recorded."""
     try:
         content = read_json(record)
     except (OSError, ValueError):
@@ -135,7 +135,7 @@ def check_file(path: Path) -> None:
 
 @dataclass(frozen=True)
 class SplatFile:
-    """What a splat file does not say of itself; a run knows all of it.
+    """Facts that a splat file leaves out and a run records.
 
     Attributes:
         planes: panes of a splat file: planes.json, written by hand or by `export`; the one beside it if not given.

@@ -47,7 +47,7 @@ FREQUENT = ("densify", "grow")
 
 @dataclass
 class Standing:
-    """Where a training stands; `loss` is smoothed, `saved` the step of the last checkpoint."""
+    """Progress of a training; `loss` is smoothed, `saved` the step of the last checkpoint."""
 
     iterations: int
     step: int = 0
@@ -58,7 +58,7 @@ class Standing:
 
 
 class Display(Protocol):
-    """What shows the standing between the lines that both kinds print."""
+    """Display of the progress between the lines that are printed."""
 
     def step(self, standing: Standing) -> None:
         """Shows a step."""

@@ -67,7 +67,7 @@ class Export:
         write_files(self, console)
 
     def left_behind(self) -> str:
-        """What an interrupt leaves, and how to go on."""
+        """Text after an interrupt: the state on disk, and how to go on."""
         return f"files already written to {self.output} are whole: repeat the command for all of them"
 
 
@@ -106,5 +106,5 @@ class Dereflect:
         write_dereflected(self, console)
 
     def left_behind(self) -> str:
-        """What an interrupt leaves, and how to go on."""
+        """Text after an interrupt: the state on disk, and how to go on."""
         return f"images already written to {self.output} are whole: repeat the command for all of them"

@@ -174,7 +174,7 @@ def train(asked: Train[Any], console: Console) -> None:
 
 @contextmanager
 def _watched(asked: Train[Any], training: Training, dataset: Dataset, console: Console) -> Iterator[Listener]:
-    """What else listens: the viewer, where it is asked for."""
+    """Further listeners: the viewer, if asked for."""
     if not asked.view:
         yield lambda message: None
         return

@@ -45,7 +45,7 @@ def serve_viewer(command: View, console: Console) -> None:
 
 
 def keeper(command: View, model: Model) -> KeptBeside | None:
-    """Who may look from elsewhere must not write here unless that was asked for."""
+    """Keeper of edited scenes; viewers from other machines may write only if asked for."""
     if command.output is None and not is_local(command.host):
         return None
     return KeptBeside(model, command.output or Path(os.path.abspath(command.scene)).parent)
@@ -78,7 +78,7 @@ def serve_marking(command: Annotate, console: Console) -> None:
 
 
 def has_screen() -> bool:
-    """Whether a browser that is opened here is seen by whoever typed the command."""
+    """Return whether a browser that is opened here is seen by whoever typed the command."""
     if "SSH_CONNECTION" in os.environ:
         return False
     return sys.platform in ("darwin", "win32") or bool({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ))

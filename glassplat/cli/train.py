@@ -68,7 +68,7 @@ class Train(Generic[RecipeKind]):
 
     @cached_property
     def files(self) -> CaptureFiles:
-        """What the capture's folder holds; read when it is first asked for, without PyTorch."""
+        """Contents of the capture's folder, read at first use and without PyTorch."""
         return read_capture(self.data, mask_polarity=self.mask_polarity)
 
     def run(self, console: Console) -> None:
@@ -78,13 +78,13 @@ class Train(Generic[RecipeKind]):
         train(self, console)
 
     def left_behind(self) -> str:
-        """What an interrupt leaves, and how to go on."""
+        """Text after an interrupt: the state on disk, and how to go on."""
         if RunDirectory(self.output).checkpoint.is_file():
             return f"{self.output} holds a checkpoint: repeat the command with --resume to go on from it"
         return "no checkpoint was written yet: repeat the command to begin again"
 
     def settings(self) -> RunSettings:
-        """What the run's directory records beside the recipe."""
+        """Record of the run's settings apart from the recipe."""
         device = str(chosen_device(self.device))
         data = str(self.data.resolve())  # The run may be looked at from another folder than it was started in.
         return RunSettings(data, self.iterations, self.downscale, self.seed, device, self.mask_polarity)
@@ -99,7 +99,7 @@ POINTER = f"These are the options that most runs need; {FULL_HELP} in place of -
 
 
 def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
-    """What tyro should make of a command line that may be one of `train`.
+    """Type and settings for tyro of a command line of `train`.
 
     Returns:
         `Train`, with the recipes of the preset that the arguments name as defaults and, where they ask for help, with
@@ -147,10 +147,10 @@ def in_brief(options: Any) -> Any:
 
 
 def has_essentials(kind: type) -> bool:
-    """Whether one of a dataclass's options is essential."""
+    """Return whether one of a dataclass's options is essential."""
     return any(is_essential(hint) for hint in typing.get_type_hints(kind, include_extras=True).values())
 
 
 def is_essential(hint: Any) -> bool:
-    """Whether an annotation marks an option as one that many runs need."""
+    """Return whether an annotation marks an option as one that many runs need."""
     return any(isinstance(data, Essential) for data in typing.get_args(hint)[1:])

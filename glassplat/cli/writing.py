@@ -105,7 +105,7 @@ def planar_renderer(stored: StoredRun) -> Planar:
 
 
 def mirror_warnings(stored: StoredRun) -> list[str]:
-    """What to expect of panes that transmit nothing."""
+    """Warnings about panes that transmit nothing."""
     return [
         f"pane {label} is a mirror, and nothing is seen through it; without its reflection it shows what the scene "
         "happens to hold behind it"

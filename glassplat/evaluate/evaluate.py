@@ -49,7 +49,7 @@ class PaneRegions(Protocol):
 
     @property
     def source(self) -> str:
-        """What the region is, for whoever reads the metrics."""
+        """Description of the region for readers of the metrics."""
         ...
 
     def of(self, view: View, frame: Frame, truth: TrueView | None) -> Tensor | str:
@@ -59,7 +59,7 @@ class PaneRegions(Protocol):
 
 @dataclass(frozen=True)
 class TrueRegions:
-    """What the ground truth says."""
+    """Pane regions from the ground truth."""
 
     source: str = "ground-truth pane labels"
 
@@ -88,7 +88,7 @@ class MarkedRegions:
 
 @dataclass(frozen=True)
 class RenderedRegions:
-    """Where the method itself draws a pane, so that methods may be scored over different pixels."""
+    """Pane regions as the method itself renders them, so that methods may be scored over different pixels."""
 
     source: str = "rendered mask > 0.5"
 
@@ -226,7 +226,7 @@ def _nobody(evaluated: EvaluatedView) -> None:
 
 @dataclass(frozen=True)
 class _Measurement:
-    """What one view contributes; `reflection` holds rendered and true pane pixels until the gain is known."""
+    """Contribution of one view; `reflection` holds rendered and true pane pixels until the gain is known."""
 
     metrics: dict[str, Outcome]
     seconds: float
@@ -429,7 +429,7 @@ def _means(per_view: list[dict[str, Outcome]]) -> dict[str, Outcome]:
 
 
 def _description(scene: Scene, dataset: Dataset) -> dict[str, Any]:
-    """What was measured."""
+    """Description of the measurement."""
     sizes = dict.fromkeys(f"{view.camera.width}x{view.camera.height}" for view in dataset.test)
     return {
         "resolution": ", ".join(sizes),
@@ -445,7 +445,7 @@ def _description(scene: Scene, dataset: Dataset) -> dict[str, Any]:
 def _footnotes(
     results: Mapping[str, Any], lpips: Lpips | str, regions: PaneRegions, gain: float | None
 ) -> dict[str, Any]:
-    """What the reader of the metrics must know: backbone, region, gain."""
+    """Footnotes of the metrics: backbone, region, gain."""
     if isinstance(lpips, str):
         backbone = json_values({"lpips": lpips, "lpips_backbone": lpips})
     else:

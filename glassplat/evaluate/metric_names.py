@@ -25,7 +25,7 @@ def json_values(outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
 
 
 class Metric(NamedTuple):
-    """How a metric is shown: its label, its value as a pattern with its unit, and a sentence on what it is."""
+    """Presentation of a metric: label, pattern with its unit, and a sentence about it."""
 
     label: str
     pattern: str
@@ -117,7 +117,7 @@ def shown_metrics(results: Mapping[str, Any]) -> dict[str, Metric]:
 
 
 def missing_reasons(results: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Why metrics that are shown have no value: the reasons, each with the names of those it holds for."""
+    """Reasons why shown metrics have no value, each with the names of the metrics."""
     reasons: dict[str, list[str]] = {}
     for name in shown_metrics(results):
         if results[name] is None:

@@ -126,7 +126,7 @@ def _cards(results: Mapping[str, Any]) -> str:
 
 
 def _missing(results: Mapping[str, Any]) -> str:
-    """Why some metrics are dashes."""
+    """Reasons for the dashes among the metrics."""
     metrics = shown_metrics(results)
     lines = [
         f"<p>Not measured: <b>{_escaped('; '.join(metrics[name].label for name in names))}</b>: {_escaped(reason)}</p>"
@@ -136,7 +136,7 @@ def _missing(results: Mapping[str, Any]) -> str:
 
 
 def _meanings(results: Mapping[str, Any]) -> str:
-    """What the numbers are, at the end of the page."""
+    """Meanings of the numbers, at the end of the page."""
     planes = PLANE_COLUMNS if results.get("planes") else {}
     parts = [f"<dl>{_defined(shown_metrics(results))}</dl>"]
     if planes:

@@ -104,7 +104,7 @@ def _image_row(frame: Frame, photo: Tensor) -> list[Panel]:
 
 
 def _layer_rows(frame: Frame, truth: TrueView | None, surface: TrueSurface) -> tuple[Row, Row]:
-    """What was rendered, and what it should be below it."""
+    """Rendered layers, with the true ones below."""
     maps = [frame.layers.get("strength"), surface.strength, None if truth is None else truth.strength]
     scale = _strength_scale([strength for strength in maps if strength is not None])
     rendered, true = _rendered_panels(frame, scale), _true_panels(truth, surface, scale)

@@ -169,7 +169,7 @@ NEARLY_UNIT = 0.25
 
 @dataclass(frozen=True)
 class TrueSurface:
-    """What one view really shows.
+    """True surface of one view.
 
     Attributes:
         covered: [H, W] bool, where there is a surface.

@@ -191,7 +191,7 @@ class GltfReader:
         return entry
 
     def count(self, index: int) -> int:
-        """How many rows an accessor has."""
+        """Number of rows of an accessor."""
         return int(self.entry("accessors", index, ACCESSOR)["count"])
 
     def array(self, index: int, width: int) -> NDArray[np.float32]:
@@ -275,12 +275,12 @@ class Placement:
 
     @property
     def is_identity(self) -> bool:
-        """Whether it moves nothing."""
+        """Return whether it moves nothing."""
         return self.scale == 1 and not bool(self.shift.any()) and not bool(self.quat[1:].any())
 
 
 def placement_of(node: Mapping[str, Any], outer: Placement, where: str) -> Placement:
-    """Where a node places what hangs on it, within the placement of what it hangs on itself.
+    """Placement of a node, within the placement of its parent.
 
     Raises:
         ValueError: its transform is skewed, mirrored, of different scales, or of a scale that is none.

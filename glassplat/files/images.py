@@ -60,7 +60,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def is_transparent(path: Path) -> bool:
-    """Whether any pixel lets through what is behind it; decodes only images that store transparency.
+    """Return whether any pixel lets through what is behind it; decodes only images that store transparency.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -258,10 +258,10 @@ def _candidates(parts: Parts, *, clash: bool) -> Iterator[PurePosixPath]:
 
 
 def _is_free(path: PurePosixPath, taken: set[str]) -> bool:
-    """Whether the path is neither a file yet nor a folder of one."""
+    """Return whether the path is neither a file yet nor a folder of one."""
     return not {_key(path), f"{_key(path)}/"} & taken
 
 
 def _key(path: PurePosixPath) -> str:
-    """What file systems that ignore case take a path for."""
+    """Name that file systems without case take a path for."""
     return unicodedata.normalize("NFC", str(path)).casefold()

@@ -28,7 +28,7 @@ Floats = NDArray[np.float32]
 
 
 def is_compressed(table: PlyTable) -> bool:
-    """Whether a PLY is of this kind."""
+    """Return whether a PLY is of this kind."""
     return set(PACKED) <= table.columns.keys()
 
 
@@ -137,7 +137,7 @@ SH_COEFFICIENTS = (1, 4, 9, 16)
 
 
 def is_channel(name: str) -> bool:
-    """Whether a property is a channel: not one of a foreign program, nor the name of what all Gaussians have."""
+    """Return whether a property is a channel: not one of a foreign program, nor the name of what all Gaussians have."""
     return name.startswith(CHANNEL_PREFIXES) and name not in PER_GAUSSIAN
 
 

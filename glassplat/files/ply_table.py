@@ -35,7 +35,7 @@ class PlyElement:
 
     @property
     def has_lists(self) -> bool:
-        """Whether rows differ in length, so that the table cannot be skipped or read at once."""
+        """Return whether rows differ in length, so that the table cannot be skipped or read at once."""
         return any(kind is None for _, kind in self.properties)
 
     def row_type(self, byte_order: str) -> np.dtype:

@@ -144,7 +144,7 @@ LARGEST_COORDINATE = 1e12
 
 
 class Field(Protocol):
-    """What one value has to be."""
+    """Requirements of one value."""
 
     @property
     def expected(self) -> str:

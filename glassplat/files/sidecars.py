@@ -135,7 +135,7 @@ def _pane_entry(planes: Planes, index: int) -> dict[str, Any]:
 
 
 def _glass(planes: Planes) -> dict[str, Tensor]:
-    """What panes have if their glass may be tinted, a row for each."""
+    """Further values of panes whose glass may be tinted, a row for each."""
     glass = {}
     if planes.transmittances is not None and planes.log_transmittances is not None:
         glass["transmittance"] = planes.transmittances.clamp(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE)

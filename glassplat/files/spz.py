@@ -42,7 +42,7 @@ QUAT_STEPS = 511
 
 
 class Layout(NamedTuple):
-    """What the header says about the sections.
+    """Sections of the file as the header describes them.
 
     Attributes:
         version: of the format; 1 stores half-precision positions, 3 and later four bytes per rotation.
@@ -214,7 +214,7 @@ def write_spz(path: Path | str, gaussians: Gaussians, version: int = 3) -> None:
 
 
 def spz_bytes(gaussians: Gaussians, version: int = 3) -> bytes:
-    """What `write_spz` writes."""
+    """Bytes of an SPZ file."""
     if version not in (3, 4):
         raise ValueError(f"SPZ of version {version} cannot be written; expected 3 or 4")
     if gaussians.max_sh_degree < 0:
@@ -328,7 +328,7 @@ def _unpacked_stream(packed: bytes, size: int, index: int, path: Path) -> Bytes:
 
 
 def _layout(header: bytes, file_size: int, path: Path) -> Layout:
-    """What the header says, as far as it can be true."""
+    """Layout in the header, checked for plausibility."""
     if len(header) < HEADER.size:
         raise ValueError(f"{path} ends within its header; the file is cut off: copy or export it again")
     magic, version, count, degree, bits, *_ = HEADER.unpack(header)

@@ -140,7 +140,7 @@ def remove_empty(folders: Sequence[Path]) -> None:
 
 
 def real_path(path: Path) -> Path:
-    """Where a path leads through links; one that goes round in circles stays what it is, unlike in `Path.resolve`."""
+    """Path after following links; one that goes round in circles stays as it is, unlike in `Path.resolve`."""
     return Path(os.path.realpath(path))
 
 

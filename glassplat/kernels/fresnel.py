@@ -1,4 +1,4 @@
-"""How much panes reflect, by name."""
+"""Laws of reflection, by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much colours change with the direction of view.
+"""Energy of the view-dependent colours.
 
 On the CPU squares of harmonics are added up in one pass; PyTorch writes them all down before it adds them up.
 """

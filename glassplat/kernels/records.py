@@ -84,7 +84,7 @@ class Projected(NamedTuple):
 
 
 class Splats(NamedTuple):
-    """What rasterisation needs of each splat; fields as in `Projected`, [C, G, ...]."""
+    """Inputs of rasterisation for each splat; fields as in `Projected`, [C, G, ...]."""
 
     means2d: Tensor
     conics: Tensor
@@ -173,12 +173,12 @@ class ProjectedDiscs(NamedTuple):
 
     @property
     def outlines(self) -> Splats:
-        """What `bin_tiles` takes for these discs."""
+        """Splats of these discs for `bin_tiles`."""
         return Splats(self.outline_centers, self.outline_conics, self.opacities, self.depths, self.radii)
 
 
 class Discs(NamedTuple):
-    """What blending needs of each disc; fields as in `ProjectedDiscs`, [C, N, ...]."""
+    """Inputs of blending for each disc; fields as in `ProjectedDiscs`, [C, N, ...]."""
 
     means2d: Tensor
     maps: Tensor
@@ -200,7 +200,7 @@ class Panes(NamedTuple):
 
 
 class PaneHits(NamedTuple):
-    """Which pane each pixel shows.
+    """Pane that each pixel shows.
 
     pane [H, W] int32: the nearest pane that the pixel's ray meets, -1 where there is none.
     depth [H, W]: where it does, infinite where there is none.
@@ -271,7 +271,7 @@ class Bvh(NamedTuple):
 
 
 class Traced(NamedTuple):
-    """What rays meet.
+    """Results of tracing rays.
 
     colors [R, 3]: blended front to back (EnvGS, Eq. 2), over black.
     alphas [R]: share of the light that Gaussians take.

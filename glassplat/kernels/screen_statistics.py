@@ -1,4 +1,4 @@
-"""What the views of a step saw of each Gaussian, added up for densification."""
+"""Statistics of the views of a step for each Gaussian, added up for densification."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CHUNK = 1024
 
 
 class Sums(NamedTuple):
-    """What is added up for each of N Gaussians, in two rows: over all views, and over those that see it directly.
+    """Sums for each of N Gaussians, in two rows: over all views, and over those that see it directly.
 
     gradient_sum [2, N]: norms of the gradient of the centre; pull_sum [2, N]: of the probe's; view_count [2, N]: how
     many views; max_radius [N]: largest radius, as a share of the longer image side.

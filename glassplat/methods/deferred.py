@@ -140,18 +140,18 @@ def _rates_of_splat(recipe: DeferredRecipe) -> GaussianRates:
 
 
 def _regular(recipe: DeferredRecipe, population: Population) -> tuple[Action, ...]:
-    """What happens in the bootstrap as in `splat`: a scene has to look right for mirrors to be told from it."""
+    """Actions of the bootstrap, as in `splat`: a scene has to look right before mirrors can be recognised."""
     return (GrowSh(Every(recipe.rhythm.sh)), *population.resets) if recipe.search.begin_found else ()
 
 
 def first_reflections(recipe: DeferredRecipe) -> BeginReflections:
-    """How things begin to reflect."""
+    """Begin reflections."""
     seen_by = Splat(recipe.background or BLACK, depth=False)
     return BeginReflections(_environment(recipe), None, recipe.search, seen_by, harmonics_wait=True)
 
 
 def _environment(recipe: DeferredRecipe) -> AddEnvironment:
-    """What is mirrored."""
+    """Environment to mirror."""
     return AddEnvironment(min(recipe.first_texels, recipe.texels), recipe.region, recipe.find_region)
 
 
@@ -161,7 +161,7 @@ def _doublings(recipe: DeferredRecipe) -> tuple[float, ...]:
 
 
 def _edits(recipe: DeferredRecipe, population: Population) -> tuple[Action, ...]:
-    """What changes the number of Gaussians once they reflect."""
+    """Actions that change the number of Gaussians once they reflect."""
     if recipe.propagation_interval is None or recipe.strategy == "mcmc":
         return population.edits
     slow = replace(recipe.densify, interval=recipe.propagation_interval)
@@ -189,7 +189,7 @@ def _propagate(recipe: DeferredRecipe, beat: Every, renderer: Deferred) -> Propa
 
 
 def _matte_rates(recipe: DeferredRecipe) -> dict[str, Rate]:
-    """What brings the learning rates to those of `splat`, where nothing reflects that higher ones would spoil."""
+    """Factors that bring the learning rates to those of `splat`, where no normals can be spoiled."""
     if not recipe.hurry_matte:
         return {}
     missing = GaussianRates().short_run_power - recipe.rates.short_run_power

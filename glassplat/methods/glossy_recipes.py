@@ -173,7 +173,7 @@ class DeferredRecipe:
         )
 
     def contradiction(self) -> str | None:
-        """What is wrong with the options together, if anything."""
+        """Contradiction between the options, if any."""
         if self.schedule.stop <= self.bootstrap:
             return (
                 f"--schedule.stop is {self.schedule.stop} and --bootstrap {self.bootstrap}; normals spread in between, "
@@ -359,7 +359,7 @@ class TracedRecipe:
         )
 
     def contradiction(self) -> str | None:
-        """What is wrong with the options together, if anything."""
+        """Contradiction between the options, if any."""
         return self.distant().contradiction()
 
     def distant(self) -> DeferredRecipe:

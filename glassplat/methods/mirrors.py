@@ -41,7 +41,7 @@ LEAST_SHOWN = 0.1
 
 @dataclass(frozen=True)
 class Search:
-    """How to tell what reflects, by what the views show of the region in which anything may.
+    """Search for what reflects, by what the views show of the region in which anything may.
 
     A Gaussian's residual in a view is the mean difference between photograph and render over its pixels, by its
     blending weights. Detail that is not resolved yet is the same in all views; a reflection is another in each. So it
@@ -359,7 +359,7 @@ class Propagate:
     name: str = "propagate normals"
 
     def due(self, clock: Clock) -> bool:
-        """Whether to act after this step."""
+        """Return whether to act after this step."""
         return self._beats.due(clock) or clock.step == self._last(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
@@ -402,7 +402,7 @@ class Propagate:
         return round(self.schedule.stop * clock.iterations)
 
     def _settles(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Whether what reflects has not grown for long enough; keeps the records."""
+        """Return whether what reflects has not grown for long enough; keeps the records."""
         if self.schedule.end == "fixed":
             return False
         share = self.search.reflective(state.scene, dataset.train)
@@ -412,7 +412,7 @@ class Propagate:
         return waited >= self.schedule.patience or self._looks_matte(state, dataset, clock)
 
     def _looks_matte(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
-        """Whether nothing reflects nor turns with the view; keeps the record.
+        """Return whether nothing reflects nor turns with the view; keeps the record.
 
         That is asked before opacities are raised for the first time, and at the beats after a reset. At others,
         whatever stands in the way turns with the view.
@@ -496,7 +496,7 @@ class DensifyWhilePropagating(Densify):
     regular: Densify = field(kw_only=True)
 
     def due(self, clock: Clock) -> bool:
-        """Whether to act after this step, before or after the end."""
+        """Return whether to act after this step, before or after the end."""
         return super().due(clock) or self.regular.due(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
@@ -522,7 +522,7 @@ class RefineEnvironment:
     name: str = "refine environment"
 
     def due(self, clock: Clock) -> bool:
-        """Whether to act after this step."""
+        """Return whether to act after this step."""
         return clock.is_at(self.moments)
 
     @torch.no_grad()
@@ -538,5 +538,5 @@ class RefineEnvironment:
 
 
 def has_ended(state: TrainState) -> bool:
-    """Whether normal propagation is over."""
+    """Return whether normal propagation is over."""
     return ENDED in state.records

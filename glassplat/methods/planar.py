@@ -172,7 +172,7 @@ def _as_given(planes: Planes, fit: PlaneFit) -> Planes:
 def judged_panes(
     scene: Scene, dataset: Dataset, labels: Sequence[int]
 ) -> Generator[Working, None, dict[int, JudgedPane]]:
-    """How like a mirror each pane is, by label."""
+    """Likeness of each pane to a mirror, by label."""
     photographs = photographs_of(scene, dataset.train) if labels else []
     judged = {}
     for done, label in enumerate(labels):
@@ -191,13 +191,13 @@ def surfaces(planes: Planes, *, mirrors: bool) -> list[Planes]:
 
 
 def named(panes: Planes, kind: str) -> str:
-    """What messages call panes: "pane 2", "panes 2, 3"."""
+    """Name of panes in messages: "pane 2", "panes 2, 3"."""
     labels = ", ".join(map(str, sorted(panes.labels)))
     return f"{kind}s {labels}" if len(panes) > 1 else f"{kind} {labels}"
 
 
 def reflects_little(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Work:
-    """Whether Gaussians cover hardly anything of what panes could mirror; False where no view shows any."""
+    """Return whether Gaussians cover hardly anything of what panes could mirror; False where no view shows any."""
     covered, whole = 0.0, 0
     for done, camera in enumerate(cameras):
         yield Working(f"looking for what {named(panes, 'pane')} can mirror", done, len(cameras))
@@ -361,7 +361,7 @@ def _joint(recipe: PlanarRecipe, share: float) -> Stage:
 
 
 def _glass_post_steps(recipe: PlanarRecipe) -> tuple[PostStep, ...]:
-    """What keeps transmittances possible; before the means of the last passes are taken."""
+    """Steps that keep transmittances possible; before the means of the last passes are taken."""
     return (glass_only_darkens,) if recipe.tint else ()
 
 
@@ -372,7 +372,7 @@ def _joint_terms(recipe: PlanarRecipe, population: Population) -> tuple[LossTerm
 
 
 def planar_population(recipe: PlanarRecipe) -> Population:
-    """What the strategy adds to every stage; under `mcmc` the set grows late unless the recipe says otherwise."""
+    """Contribution of the strategy to every stage; under `mcmc` the set grows late unless the recipe says otherwise."""
     means_rate = recipe.rates.of("primary")["primary.means"]
     start = recipe.mcmc.start if recipe.early_growth else max(recipe.mcmc.start, _joint_start(recipe))
     mcmc = replace(recipe.mcmc, start=start)

@@ -59,7 +59,7 @@ class ReflectionWeights:
 
 @dataclass(frozen=True)
 class Perturbation:
-    """When and how much the opacity of what lies behind a pane is perturbed (Section III-C3).
+    """Perturbation of the opacity of what lies behind a pane: times and amount (Section III-C3).
 
     It happens at the beats of `Rhythm` that do not reset the opacities.
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Recipe(Protocol):
-    """How a method trains: data, an initialiser and stages."""
+    """Recipe of a method: data, an initialiser and stages."""
 
     @property
     def method(self) -> str:
@@ -84,7 +84,7 @@ def recipe_from_json(text: str, where: str = "the recipe") -> Any:
 
 
 def photo_background(recipe: Any) -> Rgb:
-    """What to lay transparent photographs over: the recipe's background, or white, as results are published over."""
+    """Colour behind transparent photographs: the recipe's background, or white, as results are published over."""
     return WHITE if recipe.background is None else recipe.background
 
 

@@ -28,7 +28,7 @@ Primitive = Literal["ellipsoid", "disc"]
 
 @dataclass(frozen=True)
 class DiscTerms:
-    """What keeps discs on one surface (2DGS, Section 4.2); ellipsoids know none of it.
+    """Terms that keep discs on one surface (2DGS, Section 4.2); ellipsoids have none.
 
     Attributes:
         distortion_weight: of how far apart along a ray lies what a pixel shows; 2DGS takes 1000 for bounded scenes.

@@ -95,7 +95,7 @@ def _rendered(recipe: TracedRecipe, stage: Stage) -> Stage:
 
 
 def _surroundings_actions(recipe: TracedRecipe) -> list[Action]:
-    """What changes the surroundings, but for learning."""
+    """Actions that change the surroundings, apart from learning."""
     options = recipe.surroundings
     reset = ResetOpacity(Every(options.reset, stop=options.densify.stop), part="surroundings")
     return [

@@ -1,1 +1,1 @@
-"""What `import glassplat` offers."""
+"""Names that `import glassplat` offers."""

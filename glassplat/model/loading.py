@@ -68,7 +68,7 @@ def imported_scene(file: Path, planes_file: Path | None = None, up: Up = "-y") -
 
 
 def extent_of(gaussians: Gaussians, cameras: NamedCameras) -> float:
-    """What training would call the scene's extent; of a single camera that of the scene."""
+    """Extent of the scene as training defines it; of a single camera that of the scene."""
     centers = torch.stack([camera.center for _, camera in cameras])
     radius = float((centers - centers.mean(0)).norm(dim=1).max())
     return EXTENT_MARGIN * (radius or bounding_ball(gaussians)[1])

@@ -63,7 +63,7 @@ class Model:
 
     @property
     def renderer(self) -> Renderer:
-        """What turns the scene and a camera into a frame: a function `(scene, camera) -> Frame`."""
+        """Renderer of the scene: a function `(scene, camera) -> Frame`."""
         renderer: Renderer = self.recipe.renderer()
         return renderer
 
@@ -260,7 +260,7 @@ PANORAMA, ENVIRONMENT = "environment.png", "environment.json"
 
 
 class Savable(Protocol):
-    """What of a model is written."""
+    """Parts of a model that are written."""
 
     @property
     def scene(self) -> Scene:
@@ -268,7 +268,7 @@ class Savable(Protocol):
 
     @property
     def recipe(self) -> Any:
-        """How it is rendered."""
+        """Recipe that renders it."""
 
     @property
     def renderer(self) -> Renderer:
@@ -280,7 +280,7 @@ class Savable(Protocol):
 
     @property
     def name(self) -> str:
-        """What to call it."""
+        """Name of the model."""
 
 
 def save_model(model: Savable, path: Path, *, overwrite: bool) -> Path:

@@ -81,7 +81,7 @@ CHECKPOINT_SECONDS = 120.0
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What was asked for, beside the recipe.
+    """Settings of a run apart from the recipe.
 
     Attributes:
         data: directory of the capture, from the root of the file system.
@@ -136,32 +136,32 @@ class RunDirectory:
 
     @property
     def checkpoint(self) -> Path:
-        """Where the newest checkpoint is."""
+        """Path of the newest checkpoint."""
         return self.path / "checkpoint.safetensors"
 
     @property
     def log(self) -> Path:
-        """Where the training log is."""
+        """Path of the training log."""
         return self.path / "log.jsonl"
 
     @property
     def results(self) -> Path:
-        """Where the metrics are."""
+        """Path of the metrics."""
         return self.path / "results.json"
 
     @property
     def imported(self) -> Path:
-        """Where the source of a scene is recorded that has no capture: it was made in a program."""
+        """Path of the record of a scene's source if it has no capture: it was made in a program."""
         return self.path / "imported.json"
 
     @property
     def is_saved(self) -> bool:
-        """Whether there is something in it that took training to make."""
+        """Return whether there is something in it that took training to make."""
         return any((self.path / name).exists() for name in (self.checkpoint.name, self.results.name, "point_cloud"))
 
     @property
     def is_begun(self) -> bool:
-        """Whether a run was begun here, whatever has become of it."""
+        """Return whether a run was begun here, whatever has become of it."""
         try:
             self.recipe()
         except InputError:
@@ -243,7 +243,7 @@ class RunDirectory:
         return recipe_from_json(self._read("recipe.json"), str(self.path / "recipe.json"))
 
     def was_begun_with(self, recipe: Any) -> bool:
-        """Whether `begin` recorded just this recipe.
+        """Return whether `begin` recorded just this recipe.
 
         Compared as written: `recipe()` gives options that an earlier version did not have their present defaults,
         with which the run was not made.
@@ -310,7 +310,7 @@ class RunDirectory:
 
 
 def check_output(directory: RunDirectory, *, resume: bool) -> None:
-    """What can be told about a run's directory before the photographs are read; writes nothing.
+    """Check a run's directory before the photographs are read; writes nothing.
 
     Raises:
         InputError: a fresh run would overwrite something, there is nothing to go on from, or another training writes

@@ -52,7 +52,7 @@ class StopRequest:
 
     @property
     def requested(self) -> bool:
-        """Whether the run is to stop."""
+        """Return whether the run is to stop."""
         return self.number is not None
 
     def end(self) -> NoReturn:
@@ -195,7 +195,7 @@ class Run:
 
     @property
     def is_stopping(self) -> bool:
-        """Whether the user has asked the run to end; it does after the step."""
+        """Return whether the user has asked the run to end; it does after the step."""
         return self._session is not None and self._session.is_stopping
 
     def save(self) -> None:
@@ -281,7 +281,7 @@ class TrainingSession:
 
     @property
     def is_stopping(self) -> bool:
-        """Whether a signal asked for the end."""
+        """Return whether a signal asked for the end."""
         return self._stop.requested
 
     def save(self) -> None:
@@ -412,7 +412,7 @@ class Training:
 
     @property
     def is_stopping(self) -> bool:
-        """Whether the user has asked the run to end, as with Ctrl-C; it does after the step."""
+        """Return whether the user has asked the run to end, as with Ctrl-C; it does after the step."""
         return self._run is not None and self._run.is_stopping
 
     @property

@@ -156,7 +156,7 @@ EDGE_SMOOTHING = 0.005
 
 @dataclass(frozen=True)
 class PaneView:
-    """Where one pane is, and is not, in one annotated view.
+    """Region of one pane, and of what is certainly no pane, in one annotated view.
 
     Attributes:
         cam_from_world: [4, 4] rigid transform, world to camera.

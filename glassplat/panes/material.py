@@ -132,7 +132,7 @@ FEWEST_IN_VIEW = 100
 
 
 class Likeness(NamedTuple):
-    """How the photographs of a pane depend on what the plane would mirror there.
+    """Dependence of a pane's photographs on what the plane would mirror there.
 
     slope: change of the photograph per change of the mirrored image; 1 for a mirror, R0 for glass.
     correlation: of the two, over pixels and channels.
@@ -143,7 +143,7 @@ class Likeness(NamedTuple):
 
     @property
     def is_mirror(self) -> bool:
-        """Whether the photograph shows the mirrored scene itself."""
+        """Return whether the photograph shows the mirrored scene itself."""
         return self.slope > MIRROR_SLOPE and self.correlation > MIRROR_CORRELATION
 
 
@@ -161,7 +161,7 @@ class JudgedPane(NamedTuple):
 
     @property
     def is_mirror(self) -> bool:
-        """Whether it is one, as far as enough is known of what it would mirror."""
+        """Return whether it is one, as far as enough is known of what it would mirror."""
         is_known = self.compared >= FEWEST_PIXELS and self.compared >= LEAST_SHARE * self.shown
         return is_known and self.like.is_mirror
 
@@ -210,7 +210,7 @@ def mirror_labels(scene: Scene, views: Sequence[View]) -> tuple[int, ...]:
 
 
 def judged_pane(scene: Scene, label: int, photographs: Sequence[Photograph]) -> JudgedPane:
-    """How like a mirror a pane is, where it would be most like one.
+    """Likeness of a pane to a mirror, where it is most like one.
 
     Nothing is transmitted by a mirror, so its photograph is the mirrored scene; through glass it is mostly what
     stands behind, which has nothing to do with the mirrored scene. A rough first scene is enough to tell, if the plane
@@ -341,7 +341,7 @@ def agreement(scene: Scene, photograph: Photograph, region: Tensor) -> Tensor:
 
 
 class MirroredImage(NamedTuple):
-    """What the panes would mirror at full strength.
+    """Image that the panes would mirror at full strength.
 
     color [H, W, 3]; coverage [H, W], how much of it is covered by Gaussians; seen [H, W] bool, where there is a pane.
     """
@@ -362,7 +362,7 @@ def mirrored_image(scene: Scene, camera: Camera) -> MirroredImage:
 
 @torch.no_grad()
 def mirrored_coverage(scene: Scene, pane: Planes, camera: Camera) -> tuple[float, int]:
-    """How much of what a pane could mirror in a view is covered by Gaussians, and how much it is; pixels."""
+    """Pixels of a view in which a pane could mirror, and how many of them Gaussians cover."""
     mirrored = mirrored_image(replace(scene, planes=pane), camera)
     return float(mirrored.coverage.sum()), int(mirrored.seen.sum())
 

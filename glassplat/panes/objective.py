@@ -131,7 +131,7 @@ def _edges_on(
 
 
 def _pixel_and_frame(planes: PlaneEquations, view: PaneView, points: Array, outward: Array) -> tuple[Array, Array]:
-    """What a pixel of a view covers of the plane across an edge, and what a frame of height one hides; [H, P] each."""
+    """Size on the plane of a pixel across an edge, and of what a frame of height one hides; [H, P] each."""
     height = np.abs(planes.normals @ view.center - planes.offsets)[:, None]
     height = np.maximum(height, np.finfo(np.float64).tiny)
     beyond = np.einsum("hpd,hpd->hp", view.center - points, outward)

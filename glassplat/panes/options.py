@@ -14,7 +14,7 @@ class PlaneFitError(ValueError):
 
 @dataclass(frozen=True)
 class PlaneFit:
-    """How planes are found from masks.
+    """Options for finding planes from masks.
 
     Attributes:
         mirror_labels: panes that are mirrors; they get a base reflectance near one, and keep it.

@@ -259,7 +259,7 @@ class Fit(NamedTuple):
 
 
 def score(plane: FramedPlanes, evidence: Objective) -> float:
-    """How well masks and points support a plane: 1 where all outlines meet and all points lie on it, free of scale."""
+    """Support of masks and points for a plane: 1 where all outlines meet and all points lie on it, free of scale."""
     return 1 - float(contradiction(plane, evidence)[0])
 
 

@@ -80,7 +80,7 @@ OF_DATABASE = ("SQLite", "database")
 
 @dataclass(frozen=True)
 class Features:
-    """How places are recognised in photographs.
+    """Options for finding and matching features.
 
     Attributes:
         most: features of one photograph.
@@ -110,7 +110,7 @@ class FeatureDatabase:
     photographs: Sequence[Photograph]
 
     def picture_name(self, index: int) -> str:
-        """What a photograph is called in the database."""
+        """Name of a photograph in the database."""
         return f"{index:06d}.png"
 
     def create(self, lens: LensName) -> None:
@@ -194,7 +194,7 @@ class FeatureDatabase:
             return [np.asarray(database.read_descriptors(one).data) for one in _image_ids(database)]
 
     def inliers(self) -> dict[tuple[int, int], int]:
-        """How many matches of each pair of photographs, by number, agree on how the camera moved; pairs with any."""
+        """Number of matches that agree on the camera's motion, by pair of photographs; pairs with any."""
         with self._opened() as database:
             numbers = {image.image_id: int(Path(image.name).stem) for image in database.read_all_images()}
             keys, counts = database.read_two_view_geometry_num_inliers()
@@ -214,7 +214,7 @@ class FeatureDatabase:
             yield database
 
     def _focal(self, key: tuple[str, int, int]) -> float | None:
-        """What the photographs of one camera say of its focal length, the middle one; None where none does."""
+        """Median focal length in the photographs of one camera; None if none has one."""
         told = [one.focal for one in self.photographs if _camera_key(one) == key and one.focal is not None]
         return float(np.median(told)) if told else None
 
@@ -365,7 +365,7 @@ Mapper = Literal["incremental", "global"]
 
 @dataclass(frozen=True)
 class Mapping:
-    """How photographs are placed.
+    """Options for placing photographs.
 
     Attributes:
         first_angle: degrees between the sight lines of the first two photographs.

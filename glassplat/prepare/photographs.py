@@ -21,7 +21,7 @@ from glassplat.files.records import reading
 
 @dataclass(frozen=True)
 class Progress:
-    """How far one part of the work is; `done` counts from 0 to `total`."""
+    """Progress of one part of the work; `done` counts from 0 to `total`."""
 
     what: str
     done: int
@@ -104,7 +104,7 @@ def photographs_in(folder: Path, max_size: int, listen: Listener) -> list[Photog
 
 
 def _refusal(broken: Mapping[str, InputError], count: int) -> InputError:
-    """What is wrong with some of so many photographs, by their names."""
+    """Reason for refusing some of so many photographs, by their names."""
     first = next(iter(broken.values()))
     if len(broken) == 1:
         return first
@@ -126,7 +126,7 @@ def broken_photographs(paths: Sequence[Path]) -> list[str]:
 
 
 def capture_names(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
-    """What each photograph is called in the capture: its own name below the folder, as a JPEG.
+    """Name of each photograph in the capture: its own name below the folder, as a JPEG.
 
     All differ without suffix, too, as masks need it. Names that are no text, or have line breaks, are made readable.
     """
@@ -196,7 +196,7 @@ def _photograph_paths(folder: Path) -> list[Path]:
 
 
 def _unreadable_kind(path: Path) -> str | None:
-    """What a photograph is that Pillow cannot read, by its name or by its first bytes; None for all others."""
+    """Kind of a photograph that Pillow cannot read, by its name or first bytes; None for all others."""
     suffix = path.suffix.lower()
     if suffix in UNREADABLE:
         return suffix[1:].upper()

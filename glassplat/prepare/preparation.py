@@ -19,7 +19,7 @@ from glassplat.prepare.workplace import Workplace
 
 @dataclass(frozen=True)
 class Preparation:
-    """What to make of which photographs.
+    """Options of a preparation, and its photographs.
 
     Attributes:
         source: folder of photographs, or a video.
@@ -38,7 +38,7 @@ class Preparation:
     settings: Settings = field(default_factory=Settings)
 
     def record(self) -> dict[str, Any]:
-        """What the work depends on: an interrupted one goes on with the same only."""
+        """Inputs on which the work depends: an interrupted one goes on with the same only."""
         placing = {"lens": self.settings.lens, "mapper": self.settings.mapper}
         return {
             "input": str(real_path(self.source)),
@@ -81,7 +81,7 @@ def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force:
 
 
 def is_video(source: Path) -> bool:
-    """Whether an input is read as a video."""
+    """Return whether an input is read as a video."""
     return source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES
 
 

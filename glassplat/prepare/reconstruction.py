@@ -75,7 +75,7 @@ class Solution:
 
 @dataclass(frozen=True)
 class Settings:
-    """How photographs are placed.
+    """Options for placing photographs.
 
     Attributes:
         lens: COLMAP's camera model.

@@ -1,4 +1,4 @@
-"""What became of the photographs: figures, and advice where something could be better."""
+"""Report on the photographs: figures, and advice where something could be better."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def report_of(solution: Solution) -> Report:
 
 
 def _groups(solution: Solution) -> tuple[int, ...]:
-    """How many photographs each model adds to the larger ones; a part of a group may be placed a second time."""
+    """Number of photographs that each model adds to the larger ones; part of a group may be placed twice."""
     known: set[int] = set()
     sizes = []
     for model in solution.models:

@@ -150,7 +150,7 @@ svg { background: #0c0d0f; border-radius: 8px }
 
 @dataclass(frozen=True)
 class Shown:
-    """What one photograph has in the model.
+    """Record of one photograph in the model.
 
     Attributes:
         view: the photograph.

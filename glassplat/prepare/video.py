@@ -30,7 +30,7 @@ FEWEST_CORNERS = 10
 
 @dataclass(frozen=True)
 class Footage:
-    """What a first look at a video measured, for each frame.
+    """Measurements of a first look at a video, for each frame.
 
     Attributes:
         travelled: [F] how far the picture has moved since the first frame, in image sides.
@@ -87,7 +87,7 @@ class NoOpenCVError(InputError):
 
 @dataclass(frozen=True)
 class VideoFacts:
-    """What a video says of itself: the number of its frames, and their width and height in pixels."""
+    """Facts of a video: the number of its frames, and their width and height in pixels."""
 
     frames: int
     width: int
@@ -95,7 +95,7 @@ class VideoFacts:
 
 
 def video_facts(video: Path) -> VideoFacts | None:
-    """What a video says of itself; None where OpenCV can read no picture of it.
+    """Facts of a video; None if OpenCV can read no picture of it.
 
     Raises:
         NoOpenCVError: OpenCV is not installed.

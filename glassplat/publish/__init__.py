@@ -1,1 +1,1 @@
-"""What leaves the house: pages and films of a scene."""
+"""Publishing: pages and films of a scene."""

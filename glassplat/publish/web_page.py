@@ -141,7 +141,7 @@ def best_view(planes: Planes, cameras: Sequence[Camera]) -> int:
 
 
 def _composition(planes: Planes, camera: Camera) -> float:
-    """How far a picture is from one that shows panes well: by their share of it, and by how far off its middle."""
+    """Distance of a picture from one that shows panes well: by their share of it, and by how far off its middle."""
     small = camera.resized(64, max(1, round(64 * camera.height / camera.width)))
     rows, columns = (nearest_hits(panes_in_camera(planes, small), small).pane >= 0).nonzero(as_tuple=True)
     if not len(rows):
@@ -184,7 +184,7 @@ def write_page(
 
 @torch.no_grad()
 def page_text(scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Camera]], title: str) -> str:
-    """What `write_page` writes."""
+    """Text of the page."""
     settings = renderer.page_settings()
     if settings is None:
         raise ValueError(f"a page cannot show what {type(renderer).__name__} renders; expected a planar or a splat run")
@@ -278,7 +278,7 @@ def channel_bytes(scene: Scene) -> tuple[bytes, list[float]]:
 def described(
     scene: Scene, settings: Mapping[str, Any], cameras: Sequence[tuple[str, Camera]], first: int
 ) -> dict[str, Any]:
-    """What the page has to know beside the Gaussians."""
+    """Description of the scene for the page, without the Gaussians."""
     survey = surveyed([camera for _, camera in cameras], scene.extent)
     kept = sorted({*range(0, len(cameras), -(-len(cameras) // MOST_VIEWS)), first})
     return {

@@ -20,7 +20,7 @@ from glassplat.scene.scene import Scene
 
 @dataclass(frozen=True)
 class ScreenPass:
-    """Where the Gaussians of one scene part landed on screen, in one rasterisation pass.
+    """Screen positions of the Gaussians of one scene part, in one rasterisation pass.
 
     The gradients of a loss with respect to `means2d` and `probe` are the statistics that densification collects;
     ask for them with `torch.autograd.grad`.
@@ -45,7 +45,7 @@ class ScreenPass:
 
 @dataclass(frozen=True)
 class SpacePass:
-    """How far away the Gaussians of one scene part were met that rays found in space, where there is no screen.
+    """Distances at which rays met the Gaussians of one scene part, where there is no screen.
 
     The gradient of a loss with respect to their centres, times half of that distance, is what on a screen would be the
     gradient in normalised device coordinates (EnvGS, Section 5.1).
@@ -120,7 +120,7 @@ class Renderer(Protocol):
         ...
 
     def page_settings(self) -> Mapping[str, Any] | None:
-        """What the web page has to know to draw the same; None where it cannot."""
+        """Settings with which the web page draws the same; None if it cannot."""
         ...
 
 

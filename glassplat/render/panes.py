@@ -97,7 +97,7 @@ def seen_panes(
 
 
 def _shown(hits: PaneHits) -> list[bool]:
-    """Which panes some tile shows. The one thing that the program asks of a GPU here, and waits for."""
+    """Panes that some tile shows. The one thing that the program asks of a GPU here, and waits for."""
     found: list[bool] = hits.tiles.flatten(1).any(dim=1).tolist()
     return found
 

@@ -74,7 +74,7 @@ class FirstPass(NamedTuple):
 
 
 class SecondPass(NamedTuple):
-    """What the panes mirror: colours and intensity minus 1 [K, H, W, 4] of each."""
+    """Images in the panes: colours and intensity minus 1 [K, H, W, 4] of each."""
 
     reflections: Tensor
     mirrored: Tensor
@@ -185,7 +185,7 @@ class Planar:
         return WithNormals(renderer) if "normal" in layers else renderer
 
     def page_settings(self) -> Mapping[str, Any]:
-        """What the web page has to know to lay panes before the image."""
+        """Settings with which the web page lays panes before the image."""
         return {
             "background": self.background,
             "fresnel": self.fresnel,
@@ -389,7 +389,7 @@ def as_mirror_image(frame: Frame, blend: Blend) -> Tensor:
 
 
 def _trust(photographed: Tensor, light: Tensor, reflected: Tensor, strength: Tensor) -> Tensor:
-    """How far [H, W] the photograph is believed over the rendered transmission, in [0, 1]."""
+    """Trust [H, W] in the photograph over the rendered transmission, in [0, 1]."""
     overwhelmed = _smooth_step(strength, TRUSTED_STRENGTH, DISTRUSTED_STRENGTH)
     clipped = _smooth_step(photographed.amax(-1), CLIPPING_BEGINS, 1.0)
     visible = _smooth_step(reflected.amax(-1), FAINT_LIGHT, PLAIN_LIGHT)

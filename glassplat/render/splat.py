@@ -214,5 +214,5 @@ class Splat:
         return WithNormals(self) if "normal" in layers else self
 
     def page_settings(self) -> Mapping[str, Any]:
-        """What the web page has to know: there are no panes."""
+        """Settings for the web page: there are no panes."""
         return {"background": self.background, "fresnel": "none", "blend": "srgb", "intensity": False}

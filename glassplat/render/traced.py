@@ -155,7 +155,7 @@ def traced_colors(
 
 
 def traced_surroundings(part: Gaussians, origins: Tensor, directions: Tensor, near: float) -> Found:
-    """What rays [R, 3] meet of a set of Gaussians."""
+    """Trace rays [R, 3] through a set of Gaussians."""
     raw = RawGaussians(part.means, part.quats, part.log_scales, part.logit_opacities, part.sh)
     bvh = build_bvh(shapes_of(raw), flat=part.log_scales.shape[1] == FLAT)
     return trace(raw, Rays(origins, directions), bvh, sh_degree=part.active_sh_degree, near=near)

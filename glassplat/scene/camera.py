@@ -17,7 +17,7 @@ from torch import Tensor
 
 
 def waits(device: torch.device) -> bool:
-    """Whether the program has to wait before it can look at what this device computes, as for a GPU."""
+    """Return whether the program has to wait before it can look at what this device computes, as for a GPU."""
     return device.type == "cuda"
 
 

@@ -30,7 +30,7 @@ def neighbours(name: str, names: Sequence[str]) -> list[int]:
 
 
 def _in_order(name: str) -> tuple[list[tuple[int, str]], str]:
-    """What names are sorted by: their parts without suffix, numbers by value, so that `a.jpg` comes before `a1.jpg`."""
+    """Sort key of names: their parts without suffix, numbers by value, so that `a.jpg` comes before `a1.jpg`."""
     parts = re.findall(r"\d+|\D+", str(PurePosixPath(name).with_suffix("")))
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts], name
 

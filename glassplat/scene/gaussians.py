@@ -59,7 +59,7 @@ class Gaussians:
 
     @property
     def are_discs(self) -> bool:
-        """Whether they are flat, with two scales each (2DGS)."""
+        """Return whether they are flat, with two scales each (2DGS)."""
         return self.log_scales.shape[1] == DISC_SCALES
 
     @property

@@ -177,7 +177,7 @@ LARGEST_OFFSET = 0.02
 
 @torch.no_grad()
 def coplanar_groups(planes: Planes, rows: Sequence[int]) -> list[list[int]]:
-    """Which of some panes lie in one plane with others, directly or by way of third ones; the largest of each first.
+    """Groups of panes that lie in one plane, directly or by way of third ones; the largest of each first.
 
     Args:
         planes: the panes.

@@ -48,7 +48,7 @@ class Environment:
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is no environment at all."""
+        """Return whether there is no environment at all."""
         return self.size == 0
 
     def tensors(self) -> dict[str, Tensor]:

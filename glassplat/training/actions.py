@@ -53,7 +53,7 @@ class GrowSh:
     name: str = "grow SH"
 
     def due(self, clock: Clock) -> bool:
-        """Whether to act after this step."""
+        """Return whether to act after this step."""
         return self.when.due(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
@@ -67,7 +67,7 @@ class GrowSh:
 
 
 def threshold_factor(dataset: Dataset) -> float:
-    """How much higher the densification threshold is on small photographs; 1 from a megapixel on.
+    """Factor on the densification threshold for small photographs; 1 from a megapixel on.
 
     The published threshold was found on photographs of about a megapixel. The loss is a mean over pixels, so a
     Gaussian a few pixels wide has a larger gradient in a smaller image, and a quarter-megapixel capture would grow
@@ -93,11 +93,11 @@ class Densify:
 
     @property
     def name(self) -> str:
-        """What the log calls it."""
+        """Name in the log."""
         return f"densify {self.part}"
 
     def due(self, clock: Clock) -> bool:
-        """Whether to act after this step."""
+        """Return whether to act after this step."""
         least = self.densifier.interval
         if self.densifier.whole_passes:
             least = max(least, min(clock.views, 2 * least))
@@ -148,11 +148,11 @@ class PruneIdle:
 
     @property
     def name(self) -> str:
-        """What the log calls it."""
+        """Name in the log."""
         return f"prune idle {self.part}"
 
     def due(self, clock: Clock) -> bool:
-        """Whether to act after this step."""
+        """Return whether to act after this step."""
         return self.densifier.least_contribution > 0 and clock.is_at(self.densifier.contribution_moments)
 
     @torch.no_grad()
@@ -205,7 +205,7 @@ class Relocate:
     name: str = "densify primary"
 
     def due(self, clock: Clock) -> bool:
-        """Whether to act after this step."""
+        """Return whether to act after this step."""
         return Every(0.0, self.densifier.start, self.densifier.stop, self.densifier.interval).due(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
@@ -259,7 +259,7 @@ class ResetOpacity:
     name: str = "reset opacity"
 
     def due(self, clock: Clock) -> bool:
-        """Whether to act after this step."""
+        """Return whether to act after this step."""
         return self.when.due(clock)
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
@@ -282,7 +282,7 @@ class PerturbOpacity:
     name: str = "perturb opacity"
 
     def due(self, clock: Clock) -> bool:
-        """Whether to act after this step."""
+        """Return whether to act after this step."""
         return self.amplitude > 0 and self.when.due(clock)
 
     @torch.no_grad()
@@ -310,7 +310,7 @@ class PerturbOpacity:
 
 @dataclass(frozen=True)
 class Population:
-    """What a strategy contributes to every stage of a recipe.
+    """Contribution of a strategy to every stage of a recipe.
 
     Attributes:
         opacity: of the first Gaussians.
@@ -338,7 +338,7 @@ class Population:
 def population_of(
     strategy: Strategy, *, default: DefaultDensify, mcmc: McmcDensify, rhythm: Rhythm, means_rate: Rate
 ) -> Population:
-    """What the strategy of this name contributes; the options of the other one are not looked at.
+    """Contribution of the strategy of this name; the options of the other one are not looked at.
 
     Args:
         strategy: name on the command line.

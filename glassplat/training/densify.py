@@ -29,7 +29,7 @@ Moments = Mapping[str, tuple[Tensor, Tensor]]
 
 @dataclass(frozen=True)
 class Edit:
-    """How a new set of M Gaussians is made from an old one.
+    """Recipe for making a new set of M Gaussians from an old one.
 
     Attributes:
         source: [M] int64 row of the old set that each new row copies.
@@ -177,7 +177,7 @@ def forget(moments: Moments, names: Collection[str], rows: Tensor | None = None)
 
 @dataclass(frozen=True)
 class ScreenStatistics:
-    """What the views since the last densification saw of each Gaussian.
+    """Statistics of each Gaussian over the views since the last densification.
 
     Gradients are in normalised device coordinates, in which the image spans [-1, 1] both ways: thresholds do not
     depend on its resolution. Sums and counts have two rows, over all views and over those that see the Gaussian

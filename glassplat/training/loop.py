@@ -128,7 +128,7 @@ def check_population(state: TrainState) -> None:
 
 
 class VisibilityCheck:
-    """Whether the views show anything at all.
+    """Check that the views show anything at all.
 
     One view that shows no Gaussian learns nothing, and the run goes on; a whole pass of them is a broken capture. That
     is asked once a pass, so that no step has to wait for a GPU's answer.
@@ -241,7 +241,7 @@ def collect_in_space(state: TrainState, result: Differentiated) -> None:
 
 
 def statistics_of(state: TrainState, part: str, count: int, device: torch.device) -> ScreenStatistics:
-    """What the state has collected of a part of the scene; of so many Gaussians, where that begins."""
+    """Statistics of a part of the scene; empty ones for so many Gaussians where none exist."""
     if part not in state.statistics:
         state.statistics[part] = ScreenStatistics.zeros(count, device=device)
     return state.statistics[part]

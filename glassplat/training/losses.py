@@ -109,7 +109,7 @@ def depth_deviation_loss(frame: Frame, view: View, scene: Scene) -> Tensor:
 
 
 def normal_consistency(frame: Frame, view: View, scene: Scene) -> Tensor:
-    """How far the blended normals are from those of the surface that the depths describe (after 2DGS, Eq. 14).
+    """Difference of the blended normals from those of the surface that the depths describe (after 2DGS, Eq. 14).
 
     The mean of 1 - n . n_d over the cells of a coarse grid: n is the mean layer `normal`, made unit, n_d the normal of
     the mean depths. Both have a gradient: where depths are right they turn the normals, and where reflections have

@@ -154,7 +154,7 @@ Strategy = Literal["default", "mcmc"]
 
 @dataclass(frozen=True)
 class Rhythm:
-    """When opacities are disturbed, when the SH degree grows, and how a run ends.
+    """Schedule of the perturbation of opacities, of the SH degree, and of the end of a run.
 
     Times are shares of the run (3DGS: of 30,000 iterations).
 
@@ -179,7 +179,7 @@ class Rhythm:
 
 @dataclass(frozen=True)
 class DefaultDensify:
-    """When and how 3DGS adds and removes Gaussians, with the criterion of AbsGS (arXiv 2404.10484) for splits.
+    """Options for adding and removing Gaussians as in 3DGS, with the criterion of AbsGS (arXiv 2404.10484) for splits.
 
     A small Gaussian whose mean screen gradient exceeds a threshold is cloned; a large one at which single pixels pull
     more than another threshold is split in two. Where a large Gaussian smears detail, pixels pull it to all sides;
@@ -248,7 +248,7 @@ class DefaultDensify:
 
 @dataclass(frozen=True)
 class McmcDensify:
-    """When and how Gaussians are relocated, added and moved (Kheradmand et al. 2024).
+    """Options for relocating, adding and moving Gaussians (Kheradmand et al. 2024).
 
     Attributes:
         cap: largest number of Gaussians to grow to; None takes half as many as a photograph has pixels, for what
@@ -296,7 +296,7 @@ class McmcDensify:
 
 @dataclass(frozen=True)
 class MirrorSearch:
-    """What is taken for a mirror when reflections begin, and as which.
+    """Options for recognising mirrors when reflections begin.
 
     Attributes:
         begin_found: whether anything is; without, every strength grows from `first_strength` (the papers).
@@ -320,7 +320,7 @@ class MirrorSearch:
 
 @dataclass(frozen=True)
 class NormalPropagation:
-    """How reflective Gaussians grow over their neighbours, and how the colours of the others are disturbed.
+    """Options for growing reflective Gaussians over their neighbours and disturbing the colours of the others.
 
     A reflective Gaussian has a nearly correct normal. Where it overlaps another one, the blended normal is nearly
     correct too, so that the other receives a gradient that means something.
@@ -373,7 +373,7 @@ class PoseRefinement:
 
 @dataclass(frozen=True)
 class Photographer:
-    """Whether the panes show who took the photographs: Gaussians that the camera carries along.
+    """Options for the photographer in the panes: Gaussians that the camera carries along.
 
     Attributes:
         learn: look for one.
@@ -395,7 +395,7 @@ Texels = Annotated[int, Range(1, 2048)]
 
 @dataclass(frozen=True)
 class PropagationSchedule:
-    """When normals are propagated: at the beats of `Rhythm`, but for those that reset opacities.
+    """Schedule of propagation: at the intervals of `Rhythm`, but for those that reset opacities.
 
     Attributes:
         end: `settled` ends it when what reflects has stopped growing (the paper's criterion), `fixed` at `stop`.
@@ -416,7 +416,7 @@ class PropagationSchedule:
 
 @dataclass(frozen=True)
 class SurroundingsStart:
-    """What the first surroundings are.
+    """Options for the first surroundings.
 
     Attributes:
         source: Gaussians all over the box of the scene (the paper's), or copies of what stands in the scene and does
@@ -436,7 +436,7 @@ class SurroundingsStart:
 
 @dataclass(frozen=True)
 class SurroundingsOptions:
-    """How the surroundings learn.
+    """Options for learning the surroundings.
 
     Attributes:
         start: what they are at first.

@@ -55,7 +55,7 @@ class Optimizer:
         return Update(parameter, gradient, *moments, lr=rate * self.hurried.get(name, 1.0), step=self.updates[name])
 
     def _waits(self, name: str) -> bool:
-        """Whether a parameter is paused; counts the step."""
+        """Return whether a parameter is paused; counts the step."""
         left = self.paused.get(name, 0)
         if left:
             self.paused[name] = left - 1
@@ -132,7 +132,7 @@ class TrainState:
 
 @dataclass(frozen=True)
 class Clock:
-    """Where a run stands.
+    """Position in a run.
 
     Attributes:
         step: iterations done so far, counting the current one.
@@ -150,7 +150,7 @@ class Clock:
         return self.step / self.iterations
 
     def is_at(self, shares: Iterable[float]) -> bool:
-        """Whether this step is one of those that lie at these shares of the run."""
+        """Return whether this step is one of those that lie at these shares of the run."""
         return self.step in {round(share * self.iterations) for share in shares}
 
 
@@ -178,7 +178,7 @@ class Every:
         return max(round(self.share * clock.iterations), self.least, 1)
 
     def due(self, clock: Clock) -> bool:
-        """Whether the moment is now."""
+        """Return whether the moment is now."""
         count, remainder = divmod(clock.step, self.interval(clock))
         if remainder or not self.start * clock.iterations < clock.step <= self.stop * clock.iterations:
             return False
@@ -204,11 +204,11 @@ class Action(Protocol):
 
     @property
     def name(self) -> str:
-        """What the log calls it."""
+        """Name in the log."""
         ...
 
     def due(self, clock: Clock) -> bool:
-        """Whether to act after this step."""
+        """Return whether to act after this step."""
         ...
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work | bool:

@@ -90,7 +90,7 @@ class PaneGizmo:
         self._handle.remove()
 
     def move(self) -> PaneMove | None:
-        """How it was moved; None if it was not."""
+        """Movement of the pane; None if it was not moved."""
         wxyz, position = np.asarray(self._handle.wxyz), np.asarray(self._handle.position)
         if np.array_equal(wxyz, self._start) and np.array_equal(position, self._center):
             return None

@@ -50,7 +50,7 @@ class Keeper(Protocol):
 
 @dataclass(frozen=True)
 class Shown:
-    """What there is to look at.
+    """Scene on show, with its cameras.
 
     Attributes:
         title: of the page.
@@ -99,7 +99,7 @@ ERROR = "error"
 
 
 class PaneMove(NamedTuple):
-    """Where a pane is taken: turned by a quaternion [4], `wxyz`, about its middle, then shifted by [3] world units."""
+    """New place of a pane: turned by a quaternion [4], `wxyz`, about its middle, then shifted by [3] world units."""
 
     label: int
     turn: tuple[float, ...]
@@ -167,7 +167,7 @@ def drawn(scene: Scene, renderer: Renderer, wish: Wish, height: int) -> NDArray[
 def error_drawn(
     scene: Scene, renderer: Renderer, wish: Wish, height: int, camera: Camera, photo: Tensor
 ) -> NDArray[np.uint8]:
-    """How far the edited scene is from a photograph, seen from its camera: [H, W, 3], W by the wish's aspect.
+    """Error of the edited scene against a photograph, from its camera: [H, W, 3], W by the wish's aspect.
 
     The photograph fills the height, is black beside its edges and cut off where the picture is narrower. Both are
     compared pixel by pixel, so that the picture has no more rows than the photograph.

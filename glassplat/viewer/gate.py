@@ -1,4 +1,4 @@
-"""What stands between viser and whoever connects to it.
+"""Gate between viser and whoever connects to it.
 
 viser accepts any websocket connection and believes every message. It makes its server by
 `websockets.asyncio.server.serve(handler, host, port, ...)`; while it does, that name stands for one that adds three
@@ -54,7 +54,7 @@ class ShortText:
 
 
 class ControlValue:
-    """What a control may be set to."""
+    """Possible value of a control."""
 
     expected = "a number, true, false or a short text"
 
@@ -191,5 +191,5 @@ def guarded_server(access: Access, *, host: str, port: int, title: str) -> viser
 
 
 def _noted(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """What goes wrong with one message is noted, not printed with a traceback."""
+    """Note an error of one message in place of printing its traceback."""
     logger.debug("a message of a browser was not followed: %s", context.get("exception") or context.get("message"))

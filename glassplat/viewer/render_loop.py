@@ -154,7 +154,7 @@ class RenderLoop(Generic[Wanted]):
                 self._changed.wait(seconds)
 
     def expected_seconds(self) -> float | None:
-        """What the next picture is likely to take, what is called for nothing; None where nobody waits."""
+        """Expected seconds of the next picture, which is called for nothing; None if nobody waits."""
         with self._changed:
             if self._calls:
                 return 0.0

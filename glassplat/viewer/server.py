@@ -39,7 +39,7 @@ WAITING = ("Drawing", "The first picture may take a minute or two: kernels are c
 
 
 class Host(Protocol):
-    """What a client needs of the viewer."""
+    """Requirements of a client on the viewer."""
 
     shown: Shown
     viewpoints: Viewpoints
@@ -104,7 +104,7 @@ class Client:
         self._viewer.loop.ask(self._handle.client_id, wish, (max(1, round(wish.aspect * rows)), rows))
 
     def wish(self) -> Wish | None:
-        """What the controls and the camera say; None before the browser has said where it stands."""
+        """Wish of the controls and the camera; None before the browser has reported its camera."""
         camera = self._handle.camera
         try:
             wxyz, position = np.asarray(camera.wxyz), np.asarray(camera.position)
@@ -117,7 +117,7 @@ class Client:
         return wish if self._panes is None else self._panes.applied(wish)
 
     def camera(self) -> Camera | None:
-        """Where the browser stands, with as many rows as its window has."""
+        """Camera of the browser, with as many rows as its window has."""
         wish = self.wish()
         return None if wish is None else wish.camera(max(1, int(self._handle.camera.image_height)))
 
@@ -258,19 +258,19 @@ class Viewer:
 
     @property
     def port(self) -> int:
-        """Where it is served; another one than was asked for if that was taken."""
+        """Port of the server; another one than was asked for if that was taken."""
         return int(self._server.get_port())
 
     @property
     def address(self) -> str:
-        """What to open in the browser: with the key, without which there is no answer."""
+        """Address to open in the browser: with the key, without which there is no answer."""
         everywhere = self.host in ("0.0.0.0", "::")
         name = "localhost" if is_local(self.host) else socket.gethostname() if everywhere else self.host
         return f"http://{name}:{self.port}/?key={self.access.key}"
 
     @property
     def is_watched(self) -> bool:
-        """Whether a browser is connected."""
+        """Return whether a browser is connected."""
         return bool(self._clients)
 
     def start(self) -> None:

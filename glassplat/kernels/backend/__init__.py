@@ -1,1 +1,1 @@
-"""How kernels are compiled, kept and launched, on which threads and on which device."""
+"""Compilation, caching and launching of kernels, on threads and devices."""

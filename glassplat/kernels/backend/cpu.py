@@ -1,4 +1,4 @@
-"""How CPU kernels are compiled and run: the compiler's flags, the threads, the memory between steps.
+"""Compilation and running of CPU kernels: the compiler's flags, the threads, the memory between steps.
 
 Threads are OpenMP's where there are some, else those of Numba's own work queue. Left alone, Numba takes TBB wherever it
 finds one. TBB's waiting threads take the cores from PyTorch's pool, which makes training about twice as long, and when
@@ -126,7 +126,7 @@ class Kernel:
 
     @property
     def compilations(self) -> int:
-        """How often this process had to compile it, once for each combination of argument types."""
+        """Number of compilations in this process, one for each combination of argument types."""
         return int(self.dispatcher._cache.compilations)
 
 

@@ -83,7 +83,7 @@ class Nowhere(InTreeCacheLocator):
 
 
 class KernelFiles(CompileResultCacheImpl):
-    """How compiled kernels become files, and where: in the first folder that can be written."""
+    """Files of compiled kernels, in the first folder that can be written."""
 
     _locator_classes = (UserProvidedCacheLocator, InTreeCacheLocator, UserFolder, TemporaryFolder, Nowhere)
 
@@ -219,7 +219,7 @@ def _globals_read(code: CodeType) -> set[str]:
 
 @cache
 def loading_context() -> CPUContext:
-    """Where kernels are loaded that this process has compiled itself: apart from what the compiler left."""
+    """Context for loading kernels that this process compiled, apart from the compiler's own."""
     return CPUContext(cpu_target.typing_context, "cpu")
 
 

@@ -59,7 +59,7 @@ class MaskType(types.Type):
 
 
 def llvm_type(kind: VectorType) -> ir.VectorType:
-    """What such vectors are to LLVM."""
+    """LLVM type of such vectors."""
     return ir.VectorType(ir.DoubleType() if kind.element == types.float64 else ir.FloatType(), kind.lanes)
 
 
@@ -76,7 +76,7 @@ class _MaskModel(models.PrimitiveModel):
 
 
 class VectorKind(NamedTuple):
-    """What makes vectors of one element type and number of lanes.
+    """Operations on vectors of one element type and number of lanes.
 
     Attributes:
         full: a scalar in every lane.
@@ -187,7 +187,7 @@ exp = _called("exp")
 
 @intrinsic
 def fraction(typing, value):
-    """What is left of numbers when they are cut towards 0; undefined from 2^31 on."""
+    """Fractional parts of numbers; undefined from 2^31 on."""
 
     def build(builder, x):
         whole = builder.fptosi(x, ir.VectorType(ir.IntType(32), value.lanes))
@@ -218,7 +218,7 @@ def bits_of(typing, mask):
 
 @intrinsic
 def lowest_bit(typing, bits):
-    """Which is the lowest bit that is set in an int64; undefined for 0."""
+    """Index of the lowest bit that is set in an int64; undefined for 0."""
     if bits == types.int64:
         return plain(types.intp, (bits,), lambda builder, x: builder.cttz(x, ir.Constant(ir.IntType(1), 1)))
 
@@ -263,7 +263,7 @@ def _times_power_of_2(builder: Any, x: Any, exponent: Any, kind: VectorType) -> 
 
 
 def plain(result: Any, arguments: tuple[Any, ...], build: Callable[..., Any]) -> tuple[Any, Callable[..., Any]]:
-    """What an intrinsic returns that needs nothing but the values of its arguments."""
+    """Result of an intrinsic that needs only the values of its arguments."""
     return result(*arguments), lambda context, builder, sig, values: build(builder, *values)
 
 

@@ -1,4 +1,4 @@
-"""How CUDA kernels are declared, compiled and launched: one place for the flags and for what torch and Numba share.
+"""Declaration, compilation and launch of CUDA kernels: one place for the flags and for what torch and Numba share.
 
 Memory, sorting and scans belong to torch; a kernel gets views of its tensors and runs on its current stream. Numba's
 own launch looks at each array for microseconds; here the arguments are written out as its calling convention wants.
@@ -89,7 +89,7 @@ def current_gpu(index: int) -> Any:
 
 
 def checked(what: str, answer: tuple[Any, ...]) -> Any:
-    """What the driver answered.
+    """Result of a call to the driver; raises if it failed.
 
     Raises:
         RuntimeError: the driver refused; the message names the call and the driver's error.
@@ -185,7 +185,7 @@ def _array_layout(shape: tuple[int, ...], size: int) -> tuple[int, tuple[int, ..
 
 
 class Expected:
-    """What a kernel takes in one place, and how it is handed over.
+    """Expected argument of a kernel, and how it is handed over.
 
     Attributes:
         type: the Numba type.
@@ -219,7 +219,7 @@ class Expected:
         values += (0, 0, count, self._size, argument.data_ptr(), *after)
 
     def simulated(self, argument: Any) -> Any:
-        """What stands for an argument in the simulator."""
+        """Stand-in for an argument in the simulator."""
         if not self._is_array:
             return bool(argument) if self._is_bool else np.dtype(str(self.type)).type(argument)
         if argument is None:

@@ -73,7 +73,7 @@ def compiled(
 
 @cache
 def compiler_versions() -> str:
-    """What a compiled kernel depends on beside its own code."""
+    """Versions of the compilers that a compiled kernel depends on."""
     return " ".join([*(f"{name} {_version(name)}" for name in COMPILERS), f"linker {_linker_version()}"])
 
 

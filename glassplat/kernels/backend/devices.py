@@ -23,17 +23,17 @@ EXTRAS = {12: "glassplat[cuda12]", 13: "glassplat[cuda]"}
 
 
 def has_numba_cuda() -> bool:
-    """Whether the package is there that all CUDA kernels need."""
+    """Return whether the package is there that all CUDA kernels need."""
     return importlib.util.find_spec("numba_cuda") is not None
 
 
 def install_hint() -> str:
-    """What to say where numba-cuda is missing."""
+    """Hint how to install numba-cuda."""
     return "the CUDA kernels need numba-cuda; run `pip install 'glassplat[cuda]'` or use --device cpu"
 
 
 def toolchain_problem() -> str | None:
-    """Why kernels could not be compiled or loaded, with the remedy; None where nothing is known to be in the way."""
+    """Reason why kernels cannot be compiled or loaded, with the remedy; None if none is known."""
     if not has_numba_cuda():
         return install_hint()
     major = bindings_major()
@@ -69,7 +69,7 @@ def driver_version() -> int:
 
 
 def has_library(name: str) -> bool:
-    """Whether a library of the CUDA toolkit can be loaded."""
+    """Return whether a library of the CUDA toolkit can be loaded."""
     from cuda import pathfinder
 
     try:
@@ -138,7 +138,7 @@ def chosen_device(name: DeviceName) -> torch.device:
 
 
 def cuda_problem() -> str | None:
-    """Why no GPU can be used, with the remedy; None where one can."""
+    """Reason why no GPU can be used, with the remedy; None if one can."""
     import torch
 
     if torch.version.cuda is None:

@@ -21,7 +21,7 @@ __all__ = ["composite", "composite_discs", "composite_discs_gradients", "composi
 
 
 class Saved(NamedTuple):
-    """What the backward pass needs from the forward pass, flat.
+    """Flat results of the forward pass for the backward pass.
 
     Packed splats, what each pair reaches (`cpu_tile.GLASS`), each active tile's final state, and where a deviation was
     asked for, each active tile's mean of the channel and its lean: the weight of what lies above the mean minus that of

@@ -369,7 +369,7 @@ def _value_of(real: type) -> Scalar:
 
     @inlined
     def value_of(planes, i, batch, splat, groups):
-        """What a disc's channels are worth to a block."""
+        """Contribution of a disc's channels to a block."""
         dot = load(planes, V_IMAGE + i) * item(batch, splat + VALUES)
         for d in range(1, 4 * groups):
             dot = dot + load(planes, V_IMAGE + d * PIXELS + i) * item(batch, splat + VALUES + d)
@@ -546,7 +546,7 @@ def composite_discs_backward(real: type) -> Kernel:
 
 
 class Saved(NamedTuple):
-    """What the backward pass needs from the forward pass, flat: packed discs, the blocks that each pair reaches, and
+    """Flat results of the forward pass for the backward pass: packed discs, the blocks that each pair reaches, and
     each active tile's final state.
     """
 

@@ -226,7 +226,7 @@ def _reached(real: type) -> Scalar:
 
 @inlined
 def lane_of(x, y):
-    """Where a plane holds the pixel in column x and row y of the tile."""
+    """Index in a plane of the pixel in column x and row y of the tile."""
     return (y // BLOCK * ACROSS + x // BLOCK) * LANES + y % BLOCK * BLOCK + x % BLOCK
 
 

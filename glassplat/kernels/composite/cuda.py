@@ -34,7 +34,7 @@ __all__ = ["composite", "composite_discs", "composite_discs_gradients", "composi
 
 
 class Saved(NamedTuple):
-    """What the backward pass needs from the forward pass.
+    """Results of the forward pass for the backward pass.
 
     final [A, 2, 256]: both transmittances of each pixel of the active tiles.
     last [A, 2, 256] int32: the last pair, counted from the tile's first, that each pixel blended, -1 for none.

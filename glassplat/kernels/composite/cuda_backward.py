@@ -121,7 +121,7 @@ def _write(num_channels: int, probed: bool) -> Scalar:
 
 
 def _planes(num_channels: int) -> tuple[int, ...]:
-    """Where the planes of a tile's pulls beyond those of its channels begin."""
+    """Offset of the planes for a tile's gradients beyond those of its channels."""
     return tuple(PIXELS * (num_channels + i) for i in range(PULLS))
 
 

@@ -318,7 +318,7 @@ SUM_THREADS = 256
 
 
 class Saved(NamedTuple):
-    """What the backward pass needs from the forward pass.
+    """Results of the forward pass for the backward pass.
 
     finals [A, 4, 256], orders [A, 2, 256] int32: of each pixel of the active tiles, the planes that `cuda_tile` names;
     orders count from the tile's first pair, -1 for none. looked_at [A] int32: how many pairs of each tile any pixel
@@ -403,7 +403,7 @@ def _sharpness(low_pass: float) -> float:
 
 
 def _geometry(discs: Discs) -> tuple[Tensor, ...]:
-    """What stands for the discs of all cameras: centres, maps, opacities, depths, outlines' centres and conics."""
+    """Geometry of the discs of all cameras: centres, maps, opacities, depths, outlines' centres and conics."""
     outlines = discs.outlines
     return (
         discs.means2d.view(-1, 2),

@@ -176,7 +176,7 @@ def _camera(
 
 
 def _layer(discs: Discs, index: int, bins: TileBins, near: float, low_pass: float, probe: Tensor | None) -> _Layer:
-    """What a disc covers, and where; elsewhere the depth is that of its centre."""
+    """Coverage and depth of a disc; where it does not cover, the depth is that of its centre."""
     like = discs.means2d
     x = torch.arange(bins.width, dtype=like.dtype) + 0.5
     y = torch.arange(bins.height, dtype=like.dtype)[:, None] + 0.5

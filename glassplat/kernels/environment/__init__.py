@@ -89,7 +89,7 @@ class _SurfaceChannels(torch.autograd.Function):
 
 
 def cube_lookup(texels: Tensor, directions: Tensor) -> Tensor:
-    """What a cube map shows in directions, by a bilinear filter without seams.
+    """Look up a cube map in directions, by a bilinear filter without seams.
 
     Faces are +x, -x, +y, -y, +z, -z. On a face of axis a (x, y, z = 0, 1, 2), on either side, columns run along axis
     a + 1 and rows along a + 2, counted round:

@@ -258,7 +258,7 @@ def fold_faces(real: type) -> Kernel:
 
 
 def cube_lookup(texels: Tensor, directions: Tensor) -> Tensor:
-    """What texels [6, S, S, D] show in directions [P, 3], as [P, D]."""
+    """Look up texels [6, S, S, D] in directions [P, 3], as [P, D]."""
     found = texels.new_empty(directions.shape[0], texels.shape[3])
     cube_lookup_forward(REAL_OF[texels.dtype])(padded_faces(texels).numpy(), directions.numpy(), found.numpy())
     return found
@@ -382,7 +382,7 @@ def _place(real: type) -> Scalar:
 
     @inlined
     def place(run, whole, row, side, intrinsics, rotation):
-        """Where on the cube the pixels of a run are mirrored to."""
+        """Place on the cube that the pixels of a run mirror."""
         inverse_f, start = one / intrinsics[0], half - intrinsics[2]
         y = (real(np.int32(row)) + half - intrinsics[3]) / intrinsics[1]
         across_x, across_y, across_z = rotation[0, 0], rotation[1, 0], rotation[2, 0]

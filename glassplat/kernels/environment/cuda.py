@@ -196,7 +196,7 @@ def fold_faces(real: type) -> Kernel:
 
     @inlined
     def is_end(at, side, size):
-        """Whether a texel is the last of its row or column, for side = 0, or the first."""
+        """Return whether a texel is the last of its row or column, for side = 0, or the first."""
         return at == (1 - side) * (size - 1)
 
     @kernel("cube_fold_faces", real, "real4 real4")

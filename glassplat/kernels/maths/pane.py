@@ -97,7 +97,7 @@ def _two_surfaces(real: type) -> tuple[Scalar, Scalar]:
 
     @inlined
     def terms(base, cosine):  # type: ignore[no-untyped-def]
-        """What the a^2 + b^2 of both polarisations are proportional to; then w, 1 - w, c_t, and the clamped cosine."""
+        """Multiples of a^2 + b^2 for both polarisations; then w, 1 - w, c_t, and the clamped cosine."""
         cosine = cosine if cosine > least else least
         cosine = cosine if cosine < one else one
         through = one - base

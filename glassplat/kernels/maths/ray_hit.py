@@ -85,7 +85,7 @@ def _ellipsoid(real: type) -> RayHitMaths:
 
     @inlined
     def across(q, f, length):  # type: ignore[no-untyped-def]
-        """What of q is at right angles to the ray: all of it, but for rounding.
+        """Part of q at right angles to the ray: all of it, apart from rounding.
 
         Across a thin ellipsoid q is a difference of numbers as large as the inverse of its thickness, and gradients
         multiply what rounding leaves of it by as much again.

@@ -219,7 +219,7 @@ def layer_slopes(
 
 @torch.no_grad()
 def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> Tensor:
-    """What an image of slopes holds at the centres of splats, 1 where they lie before a surface. Not differentiable.
+    """Values of an image of slopes at the centres of splats, 1 where they lie before a surface. Not differentiable.
 
     Args:
         slopes: [H, W], by the transmission.

@@ -1,4 +1,4 @@
-"""How far an image is from a photograph: L1 and structural similarity (Wang et al. 2004), as 3DGS uses them."""
+"""Difference of an image from a photograph: L1 and structural similarity (Wang et al. 2004), as in 3DGS."""
 
 from __future__ import annotations
 

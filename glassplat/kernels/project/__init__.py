@@ -71,7 +71,7 @@ def _check(gaussians: RawGaussians, cameras: CameraBatch, scales: int) -> None:
 
 @dataclass
 class GradientSum:
-    """Where projections of the same Gaussians add up their gradients, instead of each filling tensors of its own.
+    """Common tensors in which projections of the same Gaussians add up their gradients.
 
     Most of a gradient is zeros, of what a camera does not see; filling and adding them costs more than the rest. Each
     projection hands the next one a token, so that autograd asks for their gradients from the last to the first, which

@@ -1,4 +1,4 @@
-"""What one camera sees of Gaussians, sixteen of them at once, and the gradients, in vectors.
+"""Projection of Gaussians for one camera, sixteen at once, and the gradients, in vectors.
 
 The same maths as for one of them (`steps`), which takes vectors as it takes numbers, but for roots and limits.
 """

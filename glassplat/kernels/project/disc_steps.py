@@ -1,4 +1,4 @@
-"""How one camera sees one disc: what the kernels of the projection share, on the CPU and on a GPU."""
+"""Projection of one disc for one camera, shared by the kernels of the CPU and of a GPU."""
 
 from __future__ import annotations
 

@@ -135,7 +135,7 @@ def sh_basis(directions: Tensor) -> Tensor:
 
 
 def _visible(projected: Projected, gaussians: RawGaussians, cameras: CameraBatch, near: float) -> Tensor:
-    """What is in front of the near plane, on the kept side of the clip plane and in the window [C, N]."""
+    """Mask [C, N] of what is in front of the near plane, on the kept side of the clip plane and in the window."""
     raw = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities[:, None])
     norm = gaussians.quats.square().sum(-1)
     usable = torch.cat(raw, dim=-1).isfinite().all(dim=-1) & norm.isfinite() & (norm > 0)
@@ -239,7 +239,7 @@ def _outlines(maps: Tensor, opacities: Tensor, whole: Tensor, width: int, height
 
 
 def _visible_discs(projected: ProjectedDiscs, gaussians: RawGaussians, cameras: CameraBatch, near: float) -> Tensor:
-    """What is in front of the near plane, not seen from its edge, on the kept side and in the window [C, N]."""
+    """Mask [C, N] of what is in front of the near plane, not seen from its edge, on the kept side and in the window."""
     raw = torch.cat([*gaussians[:3], gaussians.logit_opacities[:, None]], dim=-1)
     norm = gaussians.quats.square().sum(-1)
     usable = raw.isfinite().all(dim=-1) & norm.isfinite() & (norm > 0)
@@ -290,7 +290,7 @@ def _crossing_boxes(
 
 
 def _faces(gaussians: RawGaussians, cameras: CameraBatch) -> Tensor:
-    """Whether discs are seen from anywhere but their edge [C, N]."""
+    """Return whether discs are seen from anywhere but their edge [C, N]."""
     linear, offset = cameras.cam_from_world[:, :3, :3], cameras.cam_from_world[:, :3, 3]
     centers = gaussians.means @ linear.mT + offset[:, None]
     turned = rotations(gaussians.quats)

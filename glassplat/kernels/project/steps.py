@@ -1,4 +1,4 @@
-"""How one camera sees one Gaussian, and the gradients of that: what the kernels of the projection share."""
+"""Projection of one Gaussian for one camera, with its gradients, shared by the kernels."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
 
 def view_with(real: type, clamped: Callable[..., Any]) -> Callable[..., Any]:
-    """What a camera sees, of numbers or of vectors, with the function that holds them between two limits."""
+    """Make a record of a camera, of numbers or of vectors, with the function that clamps them."""
     along = vector_maths().along
     _, _, footprint, screen_covariance, *_ = screen_maths(real)
     one = real(1.0)
@@ -291,7 +291,7 @@ def view_gradients(real: type) -> Callable[..., Any]:
 
 
 class Footprint(NamedTuple):
-    """What a Gaussian is on a screen, an ellipsoid or a disc: the parts in which their projections differ.
+    """Parts in which the projections of ellipsoids and discs differ.
 
     Inputs are raw Gaussians, poses, intrinsics, clip planes and windows. Of outputs and cotangents the first five are
     centres, conics or maps, depths, opacities and colours; the last output are the radii.

@@ -106,7 +106,7 @@ def _spans(real: type) -> tuple[Scalar, Scalar, Scalar]:
 
     @inlined
     def shape_of(means2d, conics, s, rows):
-        """What `columns_of` needs of a splat."""
+        """Shape of a splat for `columns_of`."""
         x, y = np.float64(means2d[s, 0]), np.float64(means2d[s, 1])
         return x, y, rows[0], rows[1], outline(conics[s, 0], conics[s, 1], conics[s, 2], rows[2])
 
@@ -127,7 +127,7 @@ def _spans(real: type) -> tuple[Scalar, Scalar, Scalar]:
 def _active_between() -> Scalar:
     @inlined
     def active_between(active_tiles, camera, row, left, right):
-        """How many active tiles there are from one column to another, both included."""
+        """Number of active tiles from one column to another, both included."""
         found = right - left + 1
         if active_tiles.size > 0:
             for column in range(left, right + 1):

@@ -43,7 +43,7 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
 
 
 def _offsets(counts: Tensor) -> Tensor:
-    """Where each group begins [len + 1], from the sizes of the groups."""
+    """Starts of the groups [len + 1], from their sizes."""
     return torch.cat([counts.new_zeros(1), counts.cumsum(0)])
 
 

@@ -23,7 +23,7 @@ from glassplat.kernels.trace.steps import WIDTH
 
 
 def level_offsets(count: int) -> list[int]:
-    """Where the nodes of each level over `count` Gaussians begin, the lowest first, and where the last one ends."""
+    """Starts of the nodes of each level over `count` Gaussians, the lowest first, and the end of the last one."""
     offsets = [0]
     while count > 1 or (count == 1 and len(offsets) == 1):
         count = -(-count // WIDTH)

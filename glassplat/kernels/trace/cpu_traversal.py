@@ -162,7 +162,7 @@ def pack_leaves(real: type) -> Kernel:
 
 
 def packed_leaves(shapes: Sequence[Tensor], order: Tensor) -> NDArray[Any]:
-    """What the lowest nodes of a hierarchy hold, in one dimension."""
+    """Contents of the lowest nodes of a hierarchy, in one dimension."""
     means, frames, opacities = shapes[:3]
     leaves = means.new_empty(-(-order.shape[0] // WIDTH), 13, WIDTH)
     inputs = (tensor.numpy() for tensor in (means, frames, opacities, order, leaves))

@@ -142,7 +142,7 @@ def fit_level(real: type) -> Kernel:
 
 
 def _entry(real: type) -> Scalar:
-    """Where a ray enters one box and where it leaves it, between two bounds; it meets the box if that is in order."""
+    """Distances at which a ray enters and leaves a box, within two bounds; it meets the box if they are in order."""
     zero = real(0.0)
 
     @inlined
@@ -224,7 +224,7 @@ STRIDE = HARMONICS + 1
 
 
 class Hits(NamedTuple):
-    """What rays meet, ray by ray, from the nearest on.
+    """Hits of rays, ray by ray, from the nearest on.
 
     offsets [R + 1] int64: where each ray's hits begin.
     met, rays [H] int32: the Gaussian and the ray of a hit.

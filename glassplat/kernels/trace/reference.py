@@ -48,7 +48,7 @@ def trace(gaussians: RawGaussians, rays: Rays, bvh: Bvh | None, *, sh_degree: in
 
 
 def _meet(shapes: Shapes, origins: Tensor, directions: Tensor, flat: bool, near: float) -> _Hits:
-    """Where rays meet Gaussians, and how much these cover there."""
+    """Places where rays meet Gaussians, and their coverage there."""
     offsets = shapes.means - origins[:, None]
     local_offset = torch.einsum("nij,rnj->rni", shapes.frames, offsets)
     local_direction = torch.einsum("nij,rj->rni", shapes.frames, directions)
