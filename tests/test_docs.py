@@ -72,6 +72,29 @@ def test_make_has_every_target_shown(arguments: list[str]) -> None:
     assert set(arguments) <= targets
 
 
+MODULE = re.compile(r"python -m ((?:tools|benchmarks)(?:\.\w+)?)([^`\n|;]*)")
+
+
+def module_calls() -> list[tuple[str, str]]:
+    """Modules of this repository that the pages run, with the options shown; continued lines count as one."""
+    text = "\n".join(page.read_text(encoding="utf-8").replace("\\\n", " ") for page in PAGES)
+    return sorted({(module, option) for module, rest in MODULE.findall(text) for option in options_of(rest)})
+
+
+def options_of(arguments: str) -> list[str]:
+    """The options of a call, of which texts in quotes are none; one empty string where there are none."""
+    bare = re.sub(r"\"[^\"]*\"|\s#.*", "", arguments)
+    return re.findall(r"(?<=\s)--[a-z][a-z-]*", bare) or [""]
+
+
+@pytest.mark.parametrize(("module", "option"), module_calls(), ids=" ".join)
+def test_tools_and_benchmarks_take_every_option_shown(module: str, option: str) -> None:
+    path = ROOT / module.replace(".", "/")
+    path = path / "__main__.py" if path.is_dir() else path.with_suffix(".py")
+    source = path.read_text(encoding="utf-8")
+    assert option in source or option.removeprefix("--").replace("-", "_") in source
+
+
 LAB_BOOK = ROOT / "lab"
 MOST_LAB_BOOK_LINES = 800
 

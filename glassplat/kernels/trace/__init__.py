@@ -1,4 +1,18 @@
-"""Rays through Gaussians, front to back, with gradients to both, and the hierarchy of boxes that finds these."""
+"""Rays through Gaussians, front to back, with gradients to both, and the hierarchy of boxes that finds these.
+
+Meaning: a ray meets a disc where it crosses the disc's plane, and an ellipsoid where its density is largest along the
+ray. It covers opacity x exp(-r^2 / 2) there, r the distance from the centre in standard deviations; at most 0.99, and
+nothing below 1/255 or beyond 3 deviations. Hits blend in the order of their distance, equal ones in the order of the
+Gaussians. A ray ends before the Gaussian that would take its transmittance below 1e-4. Not met, and without a gradient,
+are discs seen from their edge (cosine below 1e-3), hits at or before `near`, and whatever is not finite.
+
+Search: Gaussians lie in the order of a Hilbert curve, with a box around each eight, and a node around each eight boxes.
+The tree needs no pointers; after small moves `order=bvh.order` fits the boxes again. A search keeps the nearest 16 hits
+beyond the last known one, and starts again from there while the ray still sees something.
+
+Gradients: the backward pass searches again, as the same code, and adds up the rows of each Gaussian in a fixed order:
+no atomics, the same bits for any number of threads. `reference.py` is the definition, every ray against every Gaussian.
+"""
 
 from __future__ import annotations
 
