@@ -1,12 +1,18 @@
 """The README's picture: one test view of a finished `planar` or `deferred` run, taken apart.
 
 python tools/make_readme_picture.py RUN --view 0016.jpg --output docs/images/showcase.png
+
+With `--output sway.json` it writes cameras that sway before that view instead, for the moving picture:
+
+glassplat video RUN --output wipe.webp --path keyframes --keyframes sway.json --layers rgb without_panes --layout wipe
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
+from typing import Any
 
 from glassplat.cli.runs import open_run
 from glassplat.evaluate.evaluate import timed_render
@@ -23,13 +29,29 @@ PARTS = {
 }
 
 
+SWAY = (-0.35, 0.0, 0.35, 0.0, -0.35)
+"""Places of the swaying camera along its horizontal axis, world units."""
+
+
+def swaying(camera: dict[str, Any]) -> list[dict[str, Any]]:
+    """Cameras to the left and right of one of a run's `cameras.json`, as keyframes of a film."""
+    right = [row[0] for row in camera["rotation"]]
+    places = [[p + shift * r for p, r in zip(camera["position"], right, strict=True)] for shift in SWAY]
+    return [{**camera, "id": k, "img_name": f"{k}.png", "position": place} for k, place in enumerate(places)]
+
+
 def main() -> None:
-    """Renders the view and writes the picture."""
+    """Renders the view and writes the picture, or the cameras."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--view", required=True, help="name of a test view")
     parser.add_argument("--output", type=Path, required=True)
     arguments = parser.parse_args()
+    if arguments.output.suffix == ".json":
+        cameras = json.loads((arguments.run / "cameras.json").read_text(encoding="utf-8"))
+        (camera,) = [camera for camera in cameras if camera["img_name"] == arguments.view]
+        arguments.output.write_text(json.dumps(swaying(camera)), encoding="utf-8")
+        return
     stored = open_run(arguments.run)
     view = next((v for v in stored.dataset.test if v.name == arguments.view), None)
     if view is None:
