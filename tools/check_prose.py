@@ -2,9 +2,9 @@
 
     python -m tools.check_prose
 
-Checked are README.md and the pages in docs/: their length, the mean and the longest sentence, and words that are
-private to this project or that send a reader in circles. Every Python file is checked too: no docstring may begin
-with a riddle such as "Whether ..." or "What ...".
+Checked are README.md, CONTRIBUTING.md, SECURITY.md and the pages in docs/: their length, the mean and the longest
+sentence, and words that are private to this project or that send a reader in circles. In Python files no docstring may
+begin with a riddle such as "Whether ..." or "What ...".
 """
 
 from __future__ import annotations
@@ -139,7 +139,8 @@ def main() -> None:
     paths = sorted((ROOT / "docs").glob("**/*.md"))
     pages = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in paths}
     complaints = list(size_complaints(readme, pages))
-    for name, text in {"README.md": readme, **pages}.items():
+    others = {name: (ROOT / name).read_text(encoding="utf-8") for name in ("CONTRIBUTING.md", "SECURITY.md")}
+    for name, text in {"README.md": readme, **others, **pages}.items():
         complaints += page_complaints(name, text)
     files = sorted(path for folder in CODE_FOLDERS for path in (ROOT / folder).rglob("*.py"))
     complaints += [complaint for path in files for complaint in riddles(path)]
