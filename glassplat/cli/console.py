@@ -47,6 +47,11 @@ def message_console(*, stderr: bool = False) -> Console:
     return console
 
 
+def counted(number: int, noun: str) -> str:
+    """A number of things, as in "1 pane" and "2 panes"."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
 def say(console: Console, text: object, *, label: str = "", style: str = "") -> None:
     """Prints a line as it is.
 

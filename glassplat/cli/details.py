@@ -69,7 +69,7 @@ def _marked(path: Path, dataset: Dataset) -> Finding:
     if ignoring := sum(view.read_ignored is not None for view in (*dataset.train, *dataset.test)):
         finding.facts["ignored"] = f"parts of {ignoring} photographs, marked in ignore/"
     if estimated := sum(normals_path(view.image_path) is not None for view in dataset.train):
-        finding.facts["normals"] = f"estimated for {estimated} training photographs; deferred and traced heed them"
+        finding.facts["normals"] = f"estimated for {estimated} training photographs; deferred and traced use them"
     annotated = sum(view.is_annotated for view in dataset.train)
     if not dataset.pane_labels and dataset.planes is None:
         finding.facts["panes"] = "none marked"

@@ -14,7 +14,7 @@ from torch import Tensor
 from glassplat.access import is_local
 from glassplat.captures.dataset import TEST_EVERY, Dataset, dataset_of, load_dataset, with_corrected_cameras
 from glassplat.captures.view import PointCloud, View
-from glassplat.cli.console import say, warn
+from glassplat.cli.console import counted, say, warn
 from glassplat.cli.places import chosen_views
 from glassplat.cli.progress import TrainingProgress
 from glassplat.errors import InputError, first_names, input_checked
@@ -167,7 +167,7 @@ def train(asked: Train[Any], console: Console) -> None:
     say(
         console,
         f"trained {asked.recipe.method} for {training.step} iterations in {training.seconds:.0f} s: "
-        f"{len(scene.primary)} Gaussians, {len(scene.planes)} panes -> {asked.output}",
+        f"{len(scene.primary)} Gaussians, {counted(len(scene.planes), 'pane')} -> {asked.output}",
     )
     say(console, f"next: glassplat eval {asked.output}")
 
@@ -197,8 +197,8 @@ def describe(dataset: Dataset, console: Console) -> None:
     say(
         console,
         f"{dataset.root}: {len(dataset.train)} training and {len(dataset.test)} test views, "
-        f"{len(dataset.points.positions)} points, {annotated} annotated views with {len(dataset.pane_labels)} panes"
-        f"{given}",
+        f"{len(dataset.points.positions)} points, {annotated} annotated views with "
+        f"{counted(len(dataset.pane_labels), 'pane')}{given}",
     )
     for warning in dataset.warnings:
         warn(console, warning)

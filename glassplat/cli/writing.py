@@ -15,7 +15,7 @@ from rich.progress import track
 from torch import Tensor
 
 from glassplat.captures.view import View
-from glassplat.cli.console import say, warn
+from glassplat.cli.console import counted, say, warn
 from glassplat.cli.places import check_targets, chosen_views, claim_folder
 from glassplat.cli.progress import WorkProgress
 from glassplat.cli.runs import StoredRun, open_run, photographs_of, pictures_of
@@ -213,6 +213,6 @@ def _write_beside(command: Export, scene: Scene, console: Console) -> None:
     """Planes, glass and environment, where there are any."""
     write_beside(command.output, scene)
     if len(scene.planes):
-        say(console, f"{len(scene.planes)} panes -> {command.output / PLANES}, their shape -> {GLASS}")
+        say(console, f"{counted(len(scene.planes), 'pane')} -> {command.output / PLANES}, their shape -> {GLASS}")
     if not scene.environment.is_empty:
         warn(console, f"other viewers show this scene without what it mirrors; that is in {ENVIRONMENT}")

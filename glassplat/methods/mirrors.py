@@ -323,7 +323,7 @@ NOTHING_FOUND = (
     "learns as fast as splat; %s"
 )
 MATTE = (
-    "no more than %.0f %% of what is seen looks different from different sides. Should something reflect all the same, "
+    "no more than %.0f %% of what is seen looks different from different sides. If something reflects anyway, "
     "--region X Y Z RADIUS names its place"
 )
 OVERLOOKED = (

@@ -167,7 +167,7 @@ log = logging.getLogger("glassplat.training")
 
 TOO_SHORT = (
     "%d iterations are too few for normals to spread: nothing will reflect, and the run trains like splat, which has "
-    "the better picture then. Reflections need %d --iterations; --least-iterations 1 looks for them all the same"
+    "the better picture then. Reflections need %d --iterations; --least-iterations 1 looks for them anyway"
 )
 
 

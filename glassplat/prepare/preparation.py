@@ -124,7 +124,7 @@ def _check_enough(report: Report, task: Preparation) -> None:
         return
     lines = "\n".join(report.lines())
     remedy = (
-        f"if that is enough all the same, repeat with --resume --least-registered {int(100 * report.share) / 100:g}"
+        f"if that is enough, repeat with --resume --least-registered {int(100 * report.share) / 100:g}"
         if report.registered >= 3
         else "nothing was written"
     )

@@ -189,7 +189,8 @@ def test_photographs_are_described_without_pytorch(places: Path) -> None:
 
 def test_the_package_runs_as_a_module() -> None:
     done = subprocess.run([sys.executable, "-m", "glassplat", "--version"], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (0, f"glassplat {glassplat.__version__}\n")
+    assert done.returncode == 0
+    assert done.stdout.startswith(f"glassplat {glassplat.__version__}, Python ")
 
 
 def test_a_command_imports_no_other(tmp_path: Path) -> None:
