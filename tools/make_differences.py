@@ -132,7 +132,7 @@ def differences(method: str) -> dict[str, tuple[Any, Any]]:
 def written(value: Any) -> str:
     """A value as it stands in a table."""
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return f"{value:.6g}"
     if isinstance(value, tuple):
         return ", ".join(written(part) for part in value)
     return str(value)
