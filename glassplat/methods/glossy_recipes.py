@@ -47,20 +47,17 @@ if TYPE_CHECKING:
     from glassplat.scene.scene import Scene
     from glassplat.training.stage import Stage
 
-DEFERRED_CODE_ITERATIONS = 61_000
-"""Length of the runs of the public code on synthetic scenes."""
-
 
 @dataclass(frozen=True)
-class DeferredRecipe:
-    """3DGS-DR: a strength and a normal for every Gaussian, one environment, and shading per pixel.
+class GlossyOptions:
+    """Options of `deferred` and `traced`: a strength and a normal for every Gaussian, and how both are learnt.
 
     Attributes:
-        sh_degree: highest degree of the view-dependent colour, which grows once propagation has ended.
+        sh_degree: highest degree of the view-dependent colour, which grows once propagation has ended unless a
+            method says otherwise.
         ssim_weight: lambda, share of D-SSIM in the photometric loss.
         view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
         background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
-        shading: per pixel (`deferred`), or per Gaussian (`forward`, ablation).
         bootstrap: share of the run without reflection (paper: a few thousand iterations); where mirrors are searched
             for afterwards it is a run of `splat`, else harmonics wait.
         texels: edge length of the environment's cube faces in the end.
@@ -78,7 +75,7 @@ class DeferredRecipe:
             thing would learn to reflect a little.
         consistency_weight: weight of the difference between normals and the slope of the depths, while normals spread.
         monocular_weight: of the difference between normals and those that lie in `normals/` beside the photographs;
-            nothing where there are none (not in the paper).
+            nothing where there are none (3DGS-DR: none; EnvGS: 0.01).
         propagation: how normals spread and colours are sabotaged.
         schedule: when they do.
         least_iterations: of the shortest run in which anything reflects. A shorter one would be over before the colours
@@ -99,13 +96,10 @@ class DeferredRecipe:
         poses: whether the camera of each photograph is corrected.
     """
 
-    method: ClassVar[str] = "deferred"
-
     sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
     ssim_weight: Share = 0.2
     view_dependence_weight: NotNegative = 0.0
     background: Annotated[Color | None, ESSENTIAL] = None
-    shading: Internal[Shading] = "deferred"
     bootstrap: Share = 0.06
     texels: Annotated[Texels, ESSENTIAL] = 64
     first_texels: Texels = 16
@@ -132,6 +126,32 @@ class DeferredRecipe:
     mcmc: McmcDensify = field(default_factory=McmcDensify)
     exposure: PhotoExposure = field(default_factory=PhotoExposure)
     poses: PoseRefinement = field(default_factory=PoseRefinement)
+
+    def contradiction(self) -> str | None:
+        """What is wrong with the options together, if anything."""
+        if self.schedule.stop <= self.bootstrap:
+            return (
+                f"--schedule.stop is {self.schedule.stop} and --bootstrap {self.bootstrap}; normals spread in between, "
+                "so expected --schedule.stop to be larger"
+            )
+        return None
+
+
+DEFERRED_CODE_ITERATIONS = 61_000
+"""Length of the runs of the public code on synthetic scenes."""
+
+
+@dataclass(frozen=True)
+class DeferredRecipe(GlossyOptions):
+    """3DGS-DR: a strength and a normal for every Gaussian, one environment, and shading per pixel.
+
+    Attributes:
+        shading: per pixel (`deferred`), or per Gaussian (`forward`, ablation).
+    """
+
+    method: ClassVar[str] = "deferred"
+
+    shading: Internal[Shading] = "deferred"
 
     @classmethod
     def paper(cls) -> DeferredRecipe:
@@ -172,30 +192,21 @@ class DeferredRecipe:
             mcmc=McmcDensify.published(),
         )
 
-    def contradiction(self) -> str | None:
-        """Contradiction between the options, if any."""
-        if self.schedule.stop <= self.bootstrap:
-            return (
-                f"--schedule.stop is {self.schedule.stop} and --bootstrap {self.bootstrap}; normals spread in between, "
-                "so expected --schedule.stop to be larger"
-            )
-        return None
-
     def initialise(self, dataset: Dataset) -> Scene:
         """The first scene: one Gaussian per point that hardly reflects, and no environment yet."""
-        from glassplat.methods.deferred import first_scene
+        from glassplat.methods.glossy import first_scene
 
         return first_scene(self, dataset)
 
     def renderer(self) -> Deferred:
         """The renderer of the finished scene, with all its layers."""
-        from glassplat.methods.deferred import finished_renderer
+        from glassplat.methods.glossy import finished_renderer
 
         return finished_renderer(self)
 
     def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
         """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has one stage."""
-        from glassplat.methods.deferred import stages_of
+        from glassplat.methods.glossy import stages_of
 
         return stages_of(self, seed, iterations)
 
@@ -206,96 +217,33 @@ Mirrors = Literal["both", "surroundings", "environment"]
 
 
 @dataclass(frozen=True)
-class TracedRecipe:
+class TracedRecipe(GlossyOptions):
     """EnvGS: a strength and a normal for every Gaussian, and a second set of Gaussians that reflections show.
 
     Attributes:
         primitive: what scene and surroundings are made of: ellipsoids, or discs (paper).
-        sh_degree: highest degree of the view-dependent colour.
         harmonics_from_start: let it grow from the first step on (its code), and not once propagation has ended.
-        ssim_weight: lambda, share of D-SSIM in the photometric loss.
-        view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
-        background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         mirrors: what is mirrored: `surroundings` (paper), an `environment` infinitely far away (ablation), or `both`,
             the environment behind the surroundings.
         joint: reflections also move the surfaces; without, they only teach the surroundings (ablation).
         least_strength: rays are traced where the strength is larger; elsewhere the environment alone is mirrored. Where
             there is none, training traces them everywhere.
-        least_iterations: of the shortest run in which anything reflects; a shorter one trains like `splat`.
-        bootstrap: share of the run without reflection, a run of `splat` if mirrors are searched for at its end.
         surroundings: how the Gaussians learn that reflections show.
-        texels: edge length of the environment's cube faces in the end.
-        first_texels: edge length at the start.
-        refinements: shares of the run at which the edge length doubles for the first and for the last time.
-        first_strength: reflection strength of every Gaussian at the start.
-        search: what is taken for a mirror at once when reflections begin.
-        region: only what lies in this sphere may reflect: centre and radius, world units. None leaves it to
-            `find_region`.
-        find_region: look for the place that the cameras stand around; if not, everything may reflect unless `region`
-            says otherwise, as in the paper.
-        outside_weight: weight of the mean strength outside of the region in the objective.
-        strength_weight: of the mean strength of all Gaussians in the objective, which the paper does not have.
-        consistency_weight: weight of the difference between normals and the slope of the depths.
         normals_throughout: keep that term after propagation, and where the Gaussians are discs, have it and that of
             estimated normals from the first step on (paper).
-        monocular_weight: of the difference between normals and those that lie in `normals/` beside the photographs;
-            nothing where there are none (paper: 0.01).
-        propagation: how normals spread and colours are sabotaged.
-        schedule: when they do.
-        hurry_matte: raise the learning rates to those of `splat` for the rest of a run in which nothing was found that
-            reflects.
-        hurry_found: so that `hurry_matte` counts after propagation where something reflects, too; before, high rates
-            would spoil its normals.
-        propagation_interval: steps between densifications while normals spread; None keeps `densify.interval`.
-        rates: learning rates of the Gaussians.
-        reflection_rates: learning rates of strength and environment.
-        rhythm: when opacities are reset and the SH degree grows.
-        strategy: what decides how many Gaussians the scene has and where; `densify` or `mcmc` holds its options.
-        densify: when and how Gaussians are added and pruned under `default`.
-        mcmc: when and how Gaussians are relocated and added under `mcmc`.
-        exposure: whether the exposure of each photograph is learned.
-        poses: whether the camera of each photograph is corrected.
     """
 
     method: ClassVar[str] = "traced"
 
     primitive: Annotated[Primitive, ESSENTIAL] = "ellipsoid"
-    sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
     harmonics_from_start: bool = False
-    ssim_weight: Share = 0.2
-    view_dependence_weight: NotNegative = 0.0
-    background: Annotated[Color | None, ESSENTIAL] = None
     mirrors: Annotated[Mirrors, ESSENTIAL] = "both"
     joint: Internal[bool] = True
     least_strength: Annotated[Share, ESSENTIAL] = 0.02
-    least_iterations: Several = 6000
-    bootstrap: Share = 0.25
     surroundings: SurroundingsOptions = field(default_factory=SurroundingsOptions)
-    texels: Annotated[Texels, ESSENTIAL] = 64
-    first_texels: Texels = 16
-    refinements: Internal[Annotated[tuple[Share, Share], Ascending()]] = (0.45, 0.65)
-    first_strength: Internal[InnerShare] = 1e-3
-    search: Internal[MirrorSearch] = field(default_factory=MirrorSearch)
-    region: Annotated[tuple[Finite, Finite, Finite, Positive] | None, ESSENTIAL] = None
-    find_region: Internal[bool] = True
-    outside_weight: NotNegative = 0.4
-    strength_weight: NotNegative = 0.005
-    consistency_weight: NotNegative = 0.3
     normals_throughout: Internal[bool] = False
-    monocular_weight: NotNegative = 0.5
-    propagation: Internal[NormalPropagation] = field(default_factory=NormalPropagation)
-    schedule: PropagationSchedule = field(default_factory=PropagationSchedule)
-    hurry_matte: Internal[bool] = True
-    hurry_found: Internal[bool] = True
-    propagation_interval: Internal[Several | None] = None
-    rates: GaussianRates = field(default_factory=partial(GaussianRates, short_run_power=0.0))
-    reflection_rates: Internal[ReflectionRates] = field(default_factory=ReflectionRates)
+    bootstrap: Share = 0.25
     rhythm: Rhythm = field(default_factory=lambda: Rhythm(beat=0.0214, least=150))
-    strategy: Annotated[Strategy, ESSENTIAL] = "default"
-    densify: DefaultDensify = field(default_factory=DefaultDensify)
-    mcmc: McmcDensify = field(default_factory=McmcDensify)
-    exposure: PhotoExposure = field(default_factory=PhotoExposure)
-    poses: PoseRefinement = field(default_factory=PoseRefinement)
 
     @classmethod
     def paper(cls) -> TracedRecipe:
@@ -358,32 +306,24 @@ class TracedRecipe:
             mcmc=McmcDensify.published(),
         )
 
-    def contradiction(self) -> str | None:
-        """Contradiction between the options, if any."""
-        return self.distant().contradiction()
-
     def distant(self) -> DeferredRecipe:
-        """The recipe of `deferred` with the options that both have."""
-        return DeferredRecipe(**{name: getattr(self, name) for name in SHARED})
+        """The recipe of `deferred` with the same options."""
+        return DeferredRecipe(**{shared.name: getattr(self, shared.name) for shared in fields(GlossyOptions)})
 
     def initialise(self, dataset: Dataset) -> Scene:
         """The first scene: one Gaussian per point that hardly reflects, and nothing to mirror yet."""
-        from glassplat.methods.traced import first_scene
+        from glassplat.methods.glossy import traced_first_scene
 
-        return first_scene(self, dataset)
+        return traced_first_scene(self, dataset)
 
     def renderer(self) -> Traced | Deferred:
         """The renderer of the finished scene, with all its layers."""
-        from glassplat.methods.traced import finished_renderer
+        from glassplat.methods.glossy import traced_finished_renderer
 
-        return finished_renderer(self)
+        return traced_finished_renderer(self)
 
     def stages(self, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
         """Bootstrap, reflections, everything without propagation; a short run has one stage."""
-        from glassplat.methods.traced import stages_of
+        from glassplat.methods.glossy import traced_stages_of
 
-        return stages_of(self, seed, iterations)
-
-
-SHARED = tuple({f.name for f in fields(DeferredRecipe)} & {f.name for f in fields(TracedRecipe)})
-"""The options of `deferred` that `traced` has too."""
+        return traced_stages_of(self, seed, iterations)
