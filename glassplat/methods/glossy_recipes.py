@@ -128,7 +128,7 @@ class GlossyOptions:
     poses: PoseRefinement = field(default_factory=PoseRefinement)
 
     def contradiction(self) -> str | None:
-        """What is wrong with the options together, if anything."""
+        """Contradiction between the options, if any."""
         if self.schedule.stop <= self.bootstrap:
             return (
                 f"--schedule.stop is {self.schedule.stop} and --bootstrap {self.bootstrap}; normals spread in between, "

@@ -122,7 +122,7 @@ def _advice(figures: Report, missing: Sequence[Photograph], solution: Solution) 
     if missing:
         advice.append(
             f"photograph once more around {first_names([one.path.name for one in missing], 3)}: steps of half a metre, "
-            "each picture sharing two thirds with the one before, and some that show what stands beside the glass"
+            "each picture sharing two thirds with the one before, and some that show what stands next to the glass"
         )
     if len(figures.groups) > 1:
         advice.append(
@@ -131,12 +131,13 @@ def _advice(figures: Report, missing: Sequence[Photograph], solution: Solution) 
         )
     if figures.features < FEW_FEATURES:
         advice.append(
-            f"a photograph has {figures.features} features only: more light, a steadier hand, or a larger --max-size"
+            f"photographs have only {figures.features} features on average: more light, a steadier hand, or a larger "
+            "--max-size"
         )
     if figures.points and figures.track_length < SHORT_TRACK:
         advice.append("points are seen in few photographs: take more, with smaller steps")
     if figures.reprojection_error > LARGE_ERROR:
-        advice.append("points are far off for a still scene: see that nothing large moves, or try --lens opencv")
+        advice.append("points have large errors for a still scene: see that nothing large moves, or try --lens opencv")
     model = solution.models[0] if solution.models else None
     if model is not None and any(not _usual(camera) for camera in model.cameras.values()):
         advice.append("a focal length is unusual, the lens was badly determined: photograph from different distances")

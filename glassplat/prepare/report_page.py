@@ -220,7 +220,7 @@ def _cards(report: Mapping[str, Any], behind: NDArray[np.bool_], planes: Planes 
         "photographs placed": f"{report['registered']} of {report['photographs']}",
         "points": f"{report['points']:,}",
         "pixels off, on average": f"{report['reprojection_error']:.2f}",
-        "photographs of a point": f"{report['track_length']:.1f}",
+        "photographs per point": f"{report['track_length']:.1f}",
         "features of a photograph": f"{report['features']:,}",
         "points behind panes": "no panes yet" if planes is None else f"{behind.sum():,} ({behind.mean():.0%})",
         "attempt": f"{report['attempt']} ({report['attempts']} made)",

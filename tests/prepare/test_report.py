@@ -91,7 +91,7 @@ def test_two_places_are_two_groups() -> None:
         ({"track": 2.2}, 3000, "with smaller steps"),
         ({"error": 2.0}, 3000, "nothing large moves"),
         ({"focal": 5000.0}, 3000, "focal length is unusual"),
-        ({}, 200, "200 features only"),
+        ({}, 200, "only 200 features"),
     ],
 )
 def test_what_is_poor_is_said(model: dict[str, float], features: int, expected: str) -> None:
