@@ -1,164 +1,311 @@
 """Commands that end at any moment: killed, interrupted, out of disk, or with their output taken away.
 
 What is left is never a half-written file that is taken for whole: `glassplat info` reads it without a traceback, and a
-training that is resumed ends with the same bits as one that nobody disturbed.
+training that is resumed ends with the same bits as one that nobody disturbed. Full and read-only disks are small file
+systems in memory, which only the administrator may mount.
 """
 
 from __future__ import annotations
 
 import hashlib
+import importlib
+import os
 import random
 import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from functools import cache
+from multiprocessing import get_context
 from pathlib import Path
+from typing import NamedTuple
 
+from glassplat.annotate.document import read_document
+from glassplat.annotate.session import ChangedElsewhereError, opened_session
+from tests.annotate.conftest import write_room
+from tests.prepare.conftest import copy_photographs
 from tests.training.tiny_capture import write_tiny_capture
 from tools.trial import Case
-from tools.trial_process import Ended, Sent, run
+from tools.trial_process import Ended, Sent, run, run_forked, small_disk
 
 METHODS = ("splat", "planar", "deferred", "traced")
-STEPS = 120
-KINDS = ("kill", "kill", "kill", "disk", "interrupt", "interrupt", "twice", "gone", "read-only", "write")
+STEPS = 60
+CHECKPOINT = "checkpoint.safetensors"
+MOST_LOST = 120.0
+"""Seconds of a training."""
+TIMES = """
+import random, time
+shift, truth = random.Random(0), (time.time, time.time_ns)
+time.time = lambda: truth[0]() + shift.uniform(-1e6, 1e6)
+time.time_ns = lambda: truth[1]() + shift.randint(-10**15, 10**15)
+"""
+"""A clock that jumps by days each time somebody looks."""
+
+
+class Whole(NamedTuple):
+    """A training that nobody disturbed."""
+
+    method: str
+    data: Path
+    folder: Path
+    digest: str
+    seconds: float
 
 
 def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
     """Mostly trainings; each method is trained undisturbed when it is first needed."""
-    data = write_tiny_capture(place / "capture")
-    whole: dict[str, tuple[str, float]] = {}
+    for module in ("runs", "evaluation", "writing", "details"):  # What takes long is imported before processes fork.
+        importlib.import_module(f"glassplat.cli.{module}")
+    data = place / "capture"
+    writer = get_context("fork").Process(target=write_tiny_capture, args=(data,))  # No kernel may run in this process.
+    writer.start()
+    writer.join()
+
+    @cache
+    def whole(method: str) -> Whole:
+        return undisturbed(method, data, place / method)
+
     for number in range(cases):
         draw = random.Random(f"{seed} {number}")
-        method, kind = METHODS[number % len(METHODS)], draw.choice(KINDS)
-        if method not in whole:
-            whole[method] = undisturbed(method, data, place / method)
+        method, kind = draw.choice(METHODS), KINDS[number % len(KINDS)]
         folder = place / str(number)
-        digest, seconds = whole[method]
-        yield Case(
-            f"{number} {method} {kind}", tried(kind, draw, (method, data, folder), (digest, seconds, place / method))
-        )
+        yield Case(f"{number} {method} {kind.__name__}", kind(draw, whole(method), folder))
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def training(method: str, data: Path, run_folder: Path, *more: str) -> Sequence[str | Path]:
-    """Options of a short training with many checkpoints."""
+def training(whole: Whole, folder: Path, *more: str) -> Sequence[str | Path]:
+    """Options of a short training with a checkpoint after every step."""
     return [
-        "train", method, "--data", data, "--output", run_folder, "--iterations", str(STEPS), "--device", "cpu",
-        "--checkpoint-every", "0.05", *more,
+        "train", whole.method, "--data", whole.data, "--output", folder, "--iterations", str(STEPS), "--device", "cpu",
+        "--checkpoint-every", "0.001", *more,
     ]  # fmt: skip
 
 
-def undisturbed(method: str, data: Path, folder: Path) -> tuple[str, float]:
-    """Digest of the scene of a training that ends by itself, and the seconds it takes."""
-    run(training(method, data, folder))  # Kernels are compiled.
-    shutil.rmtree(folder)
-    begun = time.monotonic()
-    ended = run(training(method, data, folder))
-    if ended.code != 0:
-        raise RuntimeError(f"{method} cannot be trained at all: {ended.output[-500:]}")
-    return digest_of(folder), time.monotonic() - begun
+def undisturbed(method: str, data: Path, folder: Path) -> Whole:
+    """A training that ends by itself; the first one compiles kernels."""
+    for _ in range(2):
+        shutil.rmtree(folder, ignore_errors=True)
+        begun = time.monotonic()
+        ended = run_forked(training(Whole(method, data, folder, "", 0), folder))
+        if ended.code != 0:
+            raise RuntimeError(f"{method} cannot be trained at all: {ended.output[-500:]}")
+    return Whole(method, data, folder, digest_of(folder), time.monotonic() - begun)
 
 
 def digest_of(folder: Path) -> str:
     """Digest of all files of a run's last scene."""
+    return digest_of_all(folder / "point_cloud" / f"iteration_{STEPS}")
+
+
+def digest_of_all(folder: Path) -> str:
+    """Digest of all files in a folder."""
     digest = hashlib.sha256()
-    for path in sorted((folder / "point_cloud" / f"iteration_{STEPS}").rglob("*")):
+    for path in sorted(folder.rglob("*")):
         if path.is_file():
             digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()
 
 
-def tried(kind: str, draw: random.Random, asked: tuple[str, Path, Path], whole: tuple[str, float, Path]) -> str:
-    """Fault of a command's end and of what it left."""
-    method, data, folder = asked
-    digest, seconds, done = whole
-    moment = draw.uniform(0.2, 1.0) * seconds
-    if kind == "write":
-        return written(draw, done, folder)
-    if kind == "gone":
-        return taken_away(draw, training(method, data, folder), folder, moment)
-    if kind == "twice":
-        return two_at_once(training(method, data, folder), folder, digest)
-    if kind == "read-only":
-        folder.write_text("a file")
-        return run(training(method, data, folder)).fault()
-    if kind == "disk":
-        ended = run(training(method, data, folder), largest_file=draw.choice((0, 100, 3000, 20_000, 60_000)))
-    else:
-        times = 1 if kind == "kill" else draw.randint(2, 4)
-        sent = Sent(signal.SIGKILL if kind == "kill" else signal.SIGINT, moment, times, 0.5 / times)
-        ended = run(training(method, data, folder), sent=sent)
-    return ended.fault() or resumed(method, data, folder, digest)
-
-
-def resumed(method: str, data: Path, folder: Path, digest: str) -> str:
+def resumed(whole: Whole, folder: Path) -> str:
     """Fault of a run that goes on; one that has nothing to go on from begins again."""
     if folder.exists():
-        fault = run(["info", folder]).fault()
+        fault = run_forked(["info", folder]).fault()
         if fault:
             return f"info: {fault}"
-    ended = run(training(method, data, folder, "--resume"))
+    ended = run_forked(training(whole, folder, *(["--resume"] if (folder / CHECKPOINT).exists() else [])))
     if ended.code != 0:
         return f"resumed: {ended.fault() or ended.output[-500:]}"
-    return "" if digest_of(folder) == digest else "resumed, it ended with other bits"
+    return "" if digest_of(folder) == whole.digest else "resumed, it ended with other bits"
 
 
-def written(draw: random.Random, done: Path, folder: Path) -> str:
-    """Something is made of a finished run, killed or out of disk on the way, and made again."""
-    shutil.copytree(done, folder / "run")
-    command: list[str | Path] = draw.choice(
-        (
-            ["eval", folder / "run"],
-            ["export", folder / "run", "--output", folder / "exported"],
-            ["render", folder / "run", "--output", folder / "pictures"],
-            [
-                "video",
-                folder / "run",
-                "--output",
-                folder / "film.webp",
-                "--seconds",
-                "0.5",
-                "--fps",
-                "8",
-                "--width",
-                "64",
-            ],
-        )
-    )
-    is_full = draw.random() < 0.5
-    first = run(
-        [*command, "--device", "cpu"],
-        sent=None if is_full else Sent(signal.SIGKILL, draw.uniform(1, 8)),
-        largest_file=draw.choice((0, 100, 1000)) if is_full else None,
-    )
-    if first.fault():
-        return f"{command[0]}: {first.fault()}"
-    if command[0] == "video":
-        command.append("--force")
-    again = run([*command, "--device", "cpu"])
-    return "" if again.code == 0 else f"{command[0]} again: {again.fault() or again.output[-400:]}"
+def wait_for_moment(draw: random.Random, whole: Whole, folder: Path) -> None:
+    """Any moment of a training; two thirds of them are after its first checkpoint."""
+    if draw.random() < 1 / 3:
+        time.sleep(draw.uniform(0, whole.seconds))
+        return
+    end = time.monotonic() + 5 * whole.seconds
+    while not (folder / CHECKPOINT).exists() and time.monotonic() < end:
+        time.sleep(0.005)
+    time.sleep(draw.uniform(0, 0.4 * whole.seconds))
 
 
-def taken_away(draw: random.Random, command: Sequence[str | Path], folder: Path, moment: float) -> str:
+def killed(draw: random.Random, whole: Whole, folder: Path) -> str:
+    """A training is killed, and loses little."""
+
+    def kill(pid: int) -> None:
+        wait_for_moment(draw, whole, folder)
+        os.kill(pid, signal.SIGKILL)
+
+    ended = run_forked(training(whole, folder), act=kill)
+    checkpoint = folder / CHECKPOINT
+    if checkpoint.exists() and time.time() - checkpoint.stat().st_mtime > MOST_LOST:
+        return "it lost more than two minutes"
+    return ended.fault() or resumed(whole, folder)
+
+
+def interrupted(draw: random.Random, whole: Whole, folder: Path) -> str:
+    """Somebody presses Ctrl-C one to four times within half a second."""
+    times = draw.randint(1, 4)
+    sent = Sent(signal.SIGINT, draw.uniform(0, 2 * whole.seconds + 3), times, 0.5 / times)
+    return run(training(whole, folder), sent=sent).fault() or resumed(whole, folder)
+
+
+def out_of_disk(draw: random.Random, whole: Whole, folder: Path) -> str:
+    """The disk is full at some write; later there is space."""
+    with small_disk(folder, draw.choice((0, 4, 8, 16, 40, 100, 200)) + draw.randrange(1, 40)) as change:
+        fault = run_forked(training(whole, folder / "run")).fault()
+        change("size=1g")
+        return fault or resumed(whole, folder / "run")
+
+
+def read_only(draw: random.Random, whole: Whole, folder: Path) -> str:
+    """The disk becomes read-only in the middle; later it can be written."""
+    with small_disk(folder, 1 << 20) as change:
+
+        def protect(pid: int) -> None:
+            wait_for_moment(draw, whole, folder / "run")
+            for _ in range(100):
+                with suppress(subprocess.CalledProcessError):  # While a file is open there.
+                    change("ro")
+                    return
+                time.sleep(0.005)
+
+        fault = run_forked(training(whole, folder / "run"), act=protect).fault()
+        change("rw,size=1g")
+        return fault or resumed(whole, folder / "run")
+
+
+def taken_away(draw: random.Random, whole: Whole, folder: Path) -> str:
     """The output is removed, or replaced by a file, while the command works."""
-    script = f"sleep {moment:.2f}; rm -rf '{folder}'" + ("" if draw.random() < 0.5 else f"; echo x > '{folder}'")
-    with subprocess.Popen(["sh", "-c", script]) as remover:
-        ended = run(command)
-        remover.wait()
-    folder.unlink() if folder.is_file() else None
+    replaced = draw.random() < 0.5
+
+    def take(pid: int) -> None:
+        wait_for_moment(draw, whole, folder)
+        shutil.rmtree(folder, ignore_errors=True)
+        if replaced:
+            with suppress(OSError):
+                folder.write_text("x")
+
+    ended = run_forked(training(whole, folder), act=take)
+    if folder.is_file():
+        folder.unlink()
     return ended.fault()
 
 
-def two_at_once(command: Sequence[str | Path], folder: Path, digest: str) -> str:
+def two_at_once(draw: random.Random, whole: Whole, folder: Path) -> str:
     """Two processes train into one folder: one does, the other one is refused."""
-    from concurrent.futures import ThreadPoolExecutor
-
     with ThreadPoolExecutor(2) as pool:
-        ended: list[Ended] = list(pool.map(lambda _: run(command), range(2)))
+        ended: list[Ended] = list(pool.map(lambda _: run(training(whole, folder)), range(2)))
     faults = "; ".join(fault for one in ended if (fault := one.fault()))
     if faults:
         return faults
     if 0 not in [one.code for one in ended]:
         return f"neither was done: {[one.output[-200:] for one in ended]}"
-    return "" if digest_of(folder) == digest else "together they ended with other bits"
+    return "" if digest_of(folder) == whole.digest else "together they ended with other bits"
+
+
+def clock_jumps(draw: random.Random, whole: Whole, folder: Path) -> str:
+    """The clock jumps to and fro by days."""
+    site = folder.with_name(f"{folder.name}-clock")
+    site.mkdir()
+    (site / "sitecustomize.py").write_text(TIMES)
+    ended = run(training(whole, folder), environment=dict(os.environ) | {"PYTHONPATH": str(site)})
+    shutil.rmtree(site)
+    if ended.code != 0:
+        return ended.fault() or ended.output[-300:]
+    return "" if digest_of(folder) == whole.digest else "it ended with other bits"
+
+
+def killer(seconds: float) -> Callable[[int], None]:
+    """What kills a process after so many seconds."""
+
+    def kill(pid: int) -> None:
+        time.sleep(seconds)
+        os.kill(pid, signal.SIGKILL)
+
+    return kill
+
+
+def written(draw: random.Random, whole: Whole, folder: Path) -> str:
+    """Something is made of a finished run, killed or out of disk on the way, and made again."""
+    made = folder / "made"
+    film = ["--seconds", "0.5", "--fps", "8", "--width", "64"]
+    name, *more = draw.choice((["eval"], ["export"], ["render"], ["video", *film]))
+    output = [] if name == "eval" else ["--output", made / "film.webp" if name == "video" else made]
+    command: list[str | Path] = [name, folder / "run", *output, *more, "--device", "cpu"]
+    size = sum(path.stat().st_size + 4096 for path in whole.folder.rglob("*")) // 1024
+
+    def again(fault: str) -> str:
+        ended = run_forked([*command, *(["--force"] if name == "video" else [])])
+        return fault or ("" if ended.code == 0 else f"{name} again: {ended.fault() or ended.output[-400:]}")
+
+    with small_disk(folder, 1 << 20) as change:
+        shutil.copytree(whole.folder, folder / "run")
+        if draw.random() < 0.5:
+            return again(run_forked(command, act=killer(draw.uniform(0, 4))).fault())
+        change(f"size={size + draw.choice((0, 4, 16, 60))}k")
+        fault = run_forked(command).fault()
+        change("size=1g")
+        return again(fault)
+
+
+def marked(draw: random.Random, whole: Whole, folder: Path) -> str:
+    """Two programs save marks of one capture, and are killed: what was saved is there."""
+    room, context = write_room(folder / "room"), get_context("fork")
+    logs = [folder / "1", folder / "2"]
+    savers = [context.Process(target=save_marks, args=(room, log)) for log in logs]
+    for saver in savers:
+        saver.start()
+    savers[0].join(draw.uniform(0, 3))
+    for saver in savers[: draw.randint(1, 2)]:
+        saver.kill()
+    for saver in savers:
+        saver.join()
+    document = read_document(room)
+    there = {next(iter(pane["corners"][0].values()))[0] for pane in document["panes"]}
+    told = {float(line) for log in logs if log.exists() for line in log.read_text().splitlines()}
+    return f"{sorted(told - there)} were saved and are gone" if told - there else ""
+
+
+def save_marks(room: Path, log: Path) -> None:
+    """Adds pane after pane, each with a corner that no other has, and writes a line for each that is saved."""
+    session = opened_session(room)
+    with log.open("w") as lines:
+        for number in range(20):
+            place = float(100 * int(log.name) + number)
+            known = session.described()
+            label = next(
+                label for label in range(1, 65) if label not in [p["label"] for p in known["document"]["panes"]]
+            )
+            pane = {"label": label, "material": "glass", "shape": "rectangle", "edges": [{}] * 4, "strokes": {}}
+            panes = [*known["document"]["panes"], pane | {"corners": [{"0.png": [place, 1.0]}, {}, {}, {}]}]
+            asked = {"document": {"version": 1, "panes": panes}, "version": known["version"]}
+            while True:
+                try:
+                    session.save(asked)
+                    break
+                except ChangedElsewhereError as changed:
+                    asked = {name: changed.answer[name] for name in ("document", "version")}
+            print(place, file=lines, flush=True)
+
+
+def prepared(draw: random.Random, whole: Whole, folder: Path) -> str:
+    """A preparation is killed, and goes on."""
+    photographs = copy_photographs(folder / "photographs")
+    command: list[str | Path] = ["prepare", photographs, "--output", folder / "capture", "--max-size", "320"]
+    ended = run_forked(command, act=killer(draw.uniform(0.5, 15)))
+    if ended.code is not None:
+        return ended.fault()
+    if (folder / "capture").exists() and not (folder / "capture.partial").exists():
+        return run_forked(["info", folder / "capture"]).fault()
+    last = run_forked([*command, "--resume"])
+    return "" if last.code == 0 else f"prepare --resume: {last.fault() or last.output[-400:]}"
+
+
+KINDS: tuple[Callable[[random.Random, Whole, Path], str], ...] = (
+    killed, out_of_disk, interrupted, marked, killed, written, read_only, taken_away, killed, two_at_once, out_of_disk,
+    killed, written, clock_jumps, killed, interrupted, marked, out_of_disk, killed, prepared,
+)  # fmt: skip

@@ -9,13 +9,15 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 MOST_BYTES, MOST_SECONDS = 8 << 30, 600
-GOOD_CODES = (0, 1, 2, 129, 130, 141, 143)
+GOOD_CODES = (0, 1, 2, 129, 130, 141, 143, -signal.SIGINT)  # The last where Ctrl-C comes while Python ends.
 COMPLAINTS = ("Traceback (most recent call last)", "did not foresee", "Fatal Python error", "terminate called")
 
 
@@ -60,17 +62,18 @@ def run(
     Args:
         options: of the command line.
         sent: signals that it gets on the way.
-        environment: in place of ours; PYTHONPATH is added.
+        environment: in place of ours; this tree is put before its PYTHONPATH.
         largest_file: bytes after which a write fails, as on a full disk.
     """
 
     def bound() -> None:
-        resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES))
+        bound_memory()
         if largest_file is not None:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
             resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
 
-    known = dict(os.environ if environment is None else environment) | {"PYTHONPATH": str(ROOT)}
+    known = dict(os.environ if environment is None else environment)
+    known["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), known.get("PYTHONPATH"))))
     with tempfile.TemporaryFile() as log:
         process = subprocess.Popen(
             [sys.executable, "-m", "glassplat", *map(str, options)],
@@ -93,6 +96,66 @@ def run(
         output = (piped + log.read()).decode(errors="replace")
     code = process.returncode
     return Ended(None if is_late or code == -signal.SIGKILL else code, output, is_late)
+
+
+def bound_memory() -> None:
+    """This process gets no more than `MOST_BYTES`."""
+    resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES))
+
+
+def run_forked(options: Sequence[str | Path], act: Callable[[int], None] = lambda pid: None) -> Ended:
+    """As `run`, in a copy of this process, which has imported what takes long.
+
+    Args:
+        options: of the command line.
+        act: is called while it works, with its number: waits, and does something to it or to what it works on.
+    """
+    with tempfile.TemporaryFile() as log:
+        process = get_context("fork").Process(target=_command, args=([*map(str, options)], log.fileno()))
+        sys.stdout.flush()
+        process.start()
+        act(int(process.pid or 0))
+        process.join(MOST_SECONDS)
+        is_late = process.is_alive()
+        process.kill()
+        process.join()
+        log.seek(0)
+        output = log.read().decode(errors="replace")
+    code = process.exitcode
+    return Ended(None if is_late or code == -signal.SIGKILL else code, output, is_late)
+
+
+def _command(options: list[str], log: int) -> None:
+    """What the forked process does."""
+    from glassplat.cli.main import main
+
+    bound_memory()
+    for stream in (1, 2):
+        os.dup2(log, stream)
+    sys.stdin = open(os.devnull)  # noqa: SIM115 - It is open until the process ends.
+    sys.exit(main(options))
+
+
+@contextmanager
+def small_disk(folder: Path, kilobytes: int) -> Iterator[Callable[[str], None]]:
+    """A file system of so many kilobytes at a new folder; what is yielded changes its options, such as `size=1g`.
+
+    Raises:
+        PermissionError: only the administrator may make one.
+    """
+    if os.geteuid() != 0:
+        raise PermissionError("only the administrator may mount a small disk; run the trial as such, in a container")
+    folder.mkdir(parents=True)
+
+    def mount(*options: str) -> None:
+        subprocess.run(["mount", "-t", "tmpfs", *options, "trial", str(folder)], check=True, capture_output=True)
+
+    mount("-o", f"size={kilobytes}k")
+    try:
+        yield lambda changed: mount("-o", f"remount,{changed}")
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=False)
+        folder.rmdir()
 
 
 def _send(process: subprocess.Popen[bytes], sent: Sent) -> None:

@@ -74,8 +74,8 @@ LensName = Literal["simple_pinhole", "simple_radial", "radial", "opencv", "openc
 USUAL_FOCAL = 1.2
 """Focal length in longer image sides, where a photograph does not tell: roughly a telephone's main lens."""
 SEED = 0
-OF_DATABASE = ("SQLite", "database")
-"""In what COLMAP says where its database fails."""
+OF_DATABASE = ("SQLite", "database", "basic_string")
+"""In what COLMAP says where its database fails; the last where a text is missing in it."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -37,6 +39,24 @@ def test_photographs_that_are_not_ours_are_damage_too(tmp_path: Path) -> None:
         opened.update_image(image)
     with pytest.raises(InputError, match="damaged"):
         database.inliers()
+
+
+def test_a_name_that_is_missing_is_damage_too(tmp_path: Path) -> None:
+    database = features(tmp_path)
+    script = f"""
+import sqlite3
+tables = sqlite3.connect({str(database.path)!r})
+tables.execute("PRAGMA writable_schema = 1")
+tables.execute("UPDATE sqlite_master SET sql = replace(sql, 'NOT NULL', '')")
+tables.commit()
+tables.close()
+tables = sqlite3.connect({str(database.path)!r})
+tables.execute("UPDATE images SET name = NULL")
+tables.commit()
+"""
+    subprocess.run([sys.executable, "-c", script], check=True)  # Its SQLite must not meet COLMAP's in one process.
+    with pytest.raises(InputError, match="damaged"):
+        database.feature_counts()
 
 
 def test_a_full_disk_and_errors_of_others_stay_what_they_are(tmp_path: Path) -> None:
