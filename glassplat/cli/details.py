@@ -201,4 +201,5 @@ def _describe_results(directory: RunDirectory, finding: Finding) -> None:
             finding.facts["measured"] = ", ".join(measures)
         except (ValueError, TypeError, AttributeError):
             finding.problems.append(f"{directory.results} is damaged; evaluate it again")
-    finding.next.append(f"glassplat render {path} --layers rgb --output PICTURES")
+    finding.next.append(f"glassplat view {path}    shows it in the browser")
+    finding.next.append(f"glassplat export {path} --output PAGE    makes a page to share, and files for other programs")

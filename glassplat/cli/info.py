@@ -17,7 +17,7 @@ from glassplat.cli.console import import_held, say, warn
 from glassplat.errors import InputError, UnknownFormatError, first_names
 from glassplat.files.images import IMAGE_SUFFIXES
 from glassplat.files.records import read_json
-from glassplat.files.writing import SCENE, SPLAT_SUFFIXES
+from glassplat.files.writing import SCENE, SPLAT_SUFFIXES, scene_source
 from glassplat.model.run_directory import RunDirectory
 from glassplat.prepare.photographs import broken_photographs
 from glassplat.prepare.video import VIDEO_SUFFIXES, NoOpenCVError, video_facts
@@ -197,6 +197,20 @@ def scene_finding(path: Path) -> Iterator[Finding]:
     yield import_held(DETAILS).scene_part(path)
 
 
+def export_finding(path: Path) -> Iterator[Finding]:
+    """A folder that `glassplat export` wrote.
+
+    Raises:
+        InputError: its splats cannot be read.
+    """
+    yield Finding("an exported scene", {"files": ", ".join(sorted(one.name for one in path.iterdir()))})
+    yield import_held(DETAILS).splats_part(scene_source(path))
+    opened = [f"glassplat view {path}    shows it in the browser"]
+    if (path / "index.html").is_file():
+        opened.append(f"open {path / 'index.html'} in a browser, or share it: it needs no server")
+    yield Finding(next=opened)
+
+
 CAPTURE_DETAILS = "glassplat.cli.details"
 
 
@@ -276,6 +290,8 @@ def _finder_of_folder(path: Path) -> Finder:
         return preparation_finding
     if (path / SCENE).is_file():
         return scene_finding
+    if scene_source(path) != path:
+        return export_finding
     if all(one.suffix.lower() in IMAGE_SUFFIXES for one in path.iterdir()):
         return photographs_finding
     return _capture_or_photographs

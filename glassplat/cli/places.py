@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 from glassplat.cli.console import message_console, say
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.records import read_json, reading
-from glassplat.files.writing import check_folder, make_folder, real_path
+from glassplat.files.writing import check_folder, make_folder, real_path, scene_source
 from glassplat.kernels.backend.devices import DeviceName
 from glassplat.model.run_directory import RunDirectory, write_text
 from glassplat.options import Finite, PaneLabel, Share, Up
@@ -91,12 +91,13 @@ def _recorded_command(record: Path) -> str | None:
 
 
 def check_scene(path: Path) -> None:
-    """Refuses a folder that no run was begun in, and a file that cannot be read.
+    """Refuses a folder that neither a run was begun in nor a scene exported to, and a file that cannot be read.
 
     Raises:
-        FileNotFoundError: there is no such file.
+        FileNotFoundError: nothing is there.
         InputError: the folder is no run, or the file cannot be read.
     """
+    path = scene_source(path)
     if path.is_dir() or not (path.is_file() or path.suffix):
         RunDirectory(path).check_begun()
     else:
@@ -113,8 +114,9 @@ def say_scene(path: Path) -> None:
 
 
 def _in_words(path: Path) -> str:
-    if path.is_file():
-        return f"a splat file of {path.stat().st_size / 1e6:.1f} MB"
+    source = scene_source(path)
+    if source.is_file():
+        return f"{'a splat file' if source == path else 'an exported scene'} of {source.stat().st_size / 1e6:.1f} MB"
     directory = RunDirectory(path)
     if directory.imported.is_file():
         return "a scene without a capture"
@@ -165,7 +167,7 @@ class SceneEdits:
     Attributes:
         remove_glass: no reflections at all, only what is behind the panes.
         as_mirror: labels of panes that become perfect mirrors.
-        reflectance: pane label and its reflectance at normal incidence, 0 to 1; `--reflectance 1 0.5 2 0`.
+        reflectance: pane label and its reflectance R0, that at normal incidence, 0 to 1; `--reflectance 1 0.5 2 0`.
         tilt: pane label and two angles in degrees, about the pane's first and second side; `--tilt 1 10 0`.
         shift: pane label and a distance along the pane's normal in world units, those of the capture's poses;
             the normal is in results.json, and a negative distance goes the other way; `--shift 1 0.05`.

@@ -197,7 +197,7 @@ def describe(dataset: Dataset, console: Console) -> None:
     say(
         console,
         f"{dataset.root}: {len(dataset.train)} training and {len(dataset.test)} test views, "
-        f"{len(dataset.points.positions)} points, {annotated} annotated views with "
+        f"{len(dataset.points.positions)} points, {counted(annotated, 'annotated view')} with "
         f"{counted(len(dataset.pane_labels), 'pane')}{given}",
     )
     for warning in dataset.warnings:

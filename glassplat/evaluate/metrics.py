@@ -314,9 +314,9 @@ def load_lpips() -> Lpips | str:
 
         network = LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True)
     except ImportError:
-        return "no LPIPS: torchmetrics or torchvision is not installed; install glassplat[lpips]"
+        return "pip install 'glassplat[lpips]'"
     except (OSError, RuntimeError) as error:  # torchvision of another build, or weights that cannot be had.
-        return f"no LPIPS: torchmetrics cannot load it: {error}"
+        return f"torchmetrics cannot load it: {error}"
     return Lpips(network)
 
 

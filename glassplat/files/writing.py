@@ -175,3 +175,10 @@ def shown(cell: object) -> str:
 
 def _line(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
+
+
+def scene_source(path: Path) -> Path:
+    """The splats in a folder that `glassplat export` wrote, the most exact of its files; any other path as it is."""
+    if (path / "recipe.json").is_file():
+        return path
+    return next((file for suffix in (".ply", ".glb", ".spz") if (file := path / f"scene{suffix}").is_file()), path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +14,7 @@ from glassplat.errors import InputError, input_checked
 from glassplat.files.ply import read_gaussians
 from glassplat.files.scene_folder import drawable, read_splats
 from glassplat.files.sidecars import read_cameras, read_planes
-from glassplat.files.writing import real_path
+from glassplat.files.writing import SPLAT_SUFFIXES, real_path, scene_source
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.recipe import with_background
@@ -32,6 +33,8 @@ AXES: dict[str, tuple[int, int, int]] = {
     "x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1),
 }  # fmt: skip
 EXTENT_MARGIN = 1.1
+LOADED = f"a run, a folder of an export, or a splat file ({', '.join(SPLAT_SUFFIXES)})"
+"""What can be opened."""
 log = logging.getLogger(__name__)
 
 
@@ -111,7 +114,7 @@ def load(
     `glassplat export` write them.
 
     Args:
-        path: a run's directory, a folder of `Model.save`, or a .ply, .spz, .splat or .glb.
+        path: a run's directory, a folder of `Model.save` or `glassplat export`, or a .ply, .spz, .splat or .glb.
         device: where the scene's tensors go; `auto` takes an NVIDIA GPU where one can be used.
         planes: panes of a splat file, a planes.json written by hand or by `export`; the one beside it if not given.
         up: which way is up in a splat file, for the cameras that look at it, if no cameras.json is beside it.
@@ -122,8 +125,12 @@ def load(
         FileNotFoundError: nothing is there.
     """
     path = Path(path)
-    if not path.is_dir() and (path.is_file() or path.suffix):
-        return _from_file(path, device, None if planes is None else Path(planes), up)
+    if not path.exists():
+        raise FileNotFoundError(f"there is nothing at {path}; expected {LOADED}")
+    source = scene_source(path)
+    if not source.is_dir():
+        model = _from_file(source, device, None if planes is None else Path(planes), up)
+        return model if source == path else replace(model, name=path.resolve().name)
     if planes is not None:
         raise InputError(f"{path} is no splat file, and has panes of its own or none; {planes} is for splat files")
     return _from_run(path, device)

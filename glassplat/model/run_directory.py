@@ -172,8 +172,11 @@ class RunDirectory:
         """Refuse what no run was begun in.
 
         Raises:
+            FileNotFoundError: nothing is there.
             InputError: there is no recipe.
         """
+        if not self.path.exists():
+            raise FileNotFoundError(f"there is nothing at {self.path}; expected what `glassplat train --output` wrote")
         self._read("recipe.json")
 
     def check_vacant(self) -> None:

@@ -116,7 +116,7 @@ class PaneControls:
         with gui.add_folder("Glass"):
             self._glass = gui.add_dropdown("Panes", ("as it is", "mirror", "none"))
             self._reflectances = {
-                label: gui.add_slider(f"R0 of pane {label}", 0.0, 1.0, 0.005, round(value, 3))
+                label: gui.add_slider(f"Reflectance R0, pane {label}", 0.0, 1.0, 0.005, round(value, 3))
                 for label, value in self._own.items()
             }
             self._gain = gui.add_slider("Gain", LEAST_GAIN, MOST_GAIN, 0.05, 1.0)

@@ -14,6 +14,7 @@ from glassplat.cli.main import main
 from glassplat.files.ply import read_gaussians
 from glassplat.files.sidecars import read_planes
 from glassplat.files.spz import read_spz
+from glassplat.model.loading import load
 from tests.cli.tiny_run import write_run
 from tests.training.tiny_capture import true_scene
 
@@ -38,6 +39,19 @@ def test_the_photographs_need_not_be_there(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     shutil.rmtree(tmp_path / "capture")
     assert main(["export", str(run), "--output", str(tmp_path / "out"), "--formats", "ply"]) == 0
+
+
+def test_the_folder_is_opened_like_any_other_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = exported(tmp_path, "--formats", "ply", "spz")
+    assert "1 pane -> " in capsys.readouterr().out
+    model = load(output)
+    assert torch.equal(model.scene.primary.means, true_scene().primary.means)
+    assert len(model.scene.planes) == 1 and model.name == "out"
+    assert main(["info", str(output)]) == 0
+    told = capsys.readouterr().out
+    assert "an exported scene" in told and f"next: glassplat view {output}" in told
+    assert main(["export", str(output), "--output", str(tmp_path / "again"), "--formats", "ply"]) == 0
+    assert len(load(tmp_path / "again").scene.planes) == 1
 
 
 def test_another_program_reads_the_ply(tmp_path: Path) -> None:
@@ -70,5 +84,5 @@ def test_foreign_folders_and_missing_runs_are_left_alone(tmp_path: Path, capsys:
     assert main(["export", str(run), "--output", str(output)]) == 2
     assert (output / "scene.ply").read_text() == "mine"
     assert main(["export", str(tmp_path / "none"), "--output", str(tmp_path / "new")]) == 2
-    assert "not a run directory" in " ".join(capsys.readouterr().err.split())
+    assert f"there is nothing at {tmp_path / 'none'}; expected" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "new").exists()
