@@ -220,7 +220,7 @@ def clock_jumps(draw: random.Random, whole: Whole, folder: Path) -> str:
 
 
 def killer(seconds: float) -> Callable[[int], None]:
-    """What kills a process after so many seconds."""
+    """Kill a process after so many seconds."""
 
     def kill(pid: int) -> None:
         time.sleep(seconds)

@@ -126,7 +126,7 @@ def run_forked(options: Sequence[str | Path], act: Callable[[int], None] = lambd
 
 
 def _command(options: list[str], log: int) -> None:
-    """What the forked process does."""
+    """Run a command of glassplat in the forked process."""
     from glassplat.cli.main import main
 
     bound_memory()
