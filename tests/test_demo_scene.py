@@ -48,7 +48,7 @@ def test_the_truth_covers_exactly_the_test_views_and_the_masks_only_training_vie
         assert sorted(path.stem for path in (SCENE / "gt" / layer).iterdir()) == TEST_NAMES
     strengths = {path.stem for path in (SCENE / "gt/strength").iterdir()}
     assert strengths == set(TEST_NAMES) | {f"{name}_pane" for name in TEST_NAMES}
-    masks = {path.stem for path in (SCENE / "masks").iterdir()}
+    masks = {path.stem for path in (SCENE / "panes").iterdir()}
     assert masks.isdisjoint(TEST_NAMES)
     assert json.loads((SCENE / "gt/planes.json").read_text())[0]["label"] == 1
 

@@ -63,7 +63,7 @@ def draw(scene: Path, output: Path) -> None:
     """Marks the scene's pane in a copy of it, and saves two pictures on the way."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / scene.name
-        shutil.copytree(scene, copy, ignore=shutil.ignore_patterns("masks", "planes.json", "annot*", "gt"))
+        shutil.copytree(scene, copy, ignore=shutil.ignore_patterns("panes", "masks", "planes.json", "annot*", "gt"))
         with marking_page(copy, width=SIZE[0], height=SIZE[1]) as page:
             eyes, corners = page.server.session.eyes, true_corners(scene)
             first, second, third = whole_views(eyes, corners)[:: APART + 1][:3]

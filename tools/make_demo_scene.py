@@ -33,7 +33,7 @@ and licensed with it (Apache-2.0). It shows the layout that `glassplat train` re
 |---|---|
 | `images/` | the photographs |
 | `sparse/0/` | the COLMAP text model: cameras, poses, points |
-| `masks/` | the pane in {masks} of the views; a pixel is the label of its pane, 0 where there is none |
+| `panes/` | the pane in {masks} of the views; a pixel is the label of its pane, 0 where there is none |
 | `gt/` | the exact layers of the test views, every {every}th by name; used by `eval` only, a real capture has none |
 
 Made by `tools/make_demo_scene.py` from a larger rendering of the same scene.
@@ -45,7 +45,7 @@ class Arguments:
     """Shrinks a capture to the size of a demo."""
 
     source: Path
-    """Capture directory with images/, masks/, sparse/0/ as COLMAP text, and gt/."""
+    """Capture directory with images/, panes/, sparse/0/ as COLMAP text, and gt/."""
     output: Path
     """Directory to write; must not exist yet."""
     factor: int = 2
@@ -115,7 +115,7 @@ def convert_pictures(source: Path, output: Path, factor: int) -> None:
     """Shrinks the photographs, the masks and the ground truth."""
     shrinks: dict[str, Shrink] = {
         "images": shrink_picture,
-        "masks": shrink_mask,
+        "panes": shrink_mask,
         "gt/trans": shrink_picture,
         "gt/refl": shrink_picture,
     }
@@ -151,7 +151,7 @@ def write_readme(output: Path) -> None:
     images = sorted((output / "images").iterdir())
     with Image.open(images[0]) as picture:
         width, height = picture.size
-    masks = len(list((output / "masks").iterdir()))
+    masks = len(list((output / "panes").iterdir()))
     text = README.format(views=len(images), width=width, height=height, masks=masks, every=TEST_EVERY)
     (output / "README.md").write_text(text)
 

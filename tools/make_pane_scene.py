@@ -106,7 +106,7 @@ def write_photograph(arguments: Arguments, number: int, seen: Seen, *, annotated
     noise = generator.normal(scale=arguments.noise / 255, size=(*seen.radiance.shape[:2], 3))
     Image.fromarray(picture(seen.radiance, noise)).save(arguments.output / "images" / name)
     if annotated:
-        Image.fromarray(seen.label[:, :, SUBPIXELS**2 // 2]).save(arguments.output / "masks" / name)
+        Image.fromarray(seen.label[:, :, SUBPIXELS**2 // 2]).save(arguments.output / "panes" / name)
 
 
 def write_layers(folder: Path, name: str, seen: Seen) -> None:
@@ -319,7 +319,7 @@ def main(arguments: Arguments) -> None:
         raise ValueError("nobody walks by in drawn places; leave out --passers-by or --drawn")
     if folder.exists():
         raise FileExistsError(f"{folder} exists; expected a new folder, so remove it first")
-    for part in ("images", "masks", "sparse/0", "gt/strength"):
+    for part in ("images", "panes", "sparse/0", "gt/strength"):
         (folder / part).mkdir(parents=True)
     drawn = chosen_place(arguments)
     print(folder.name, drawn.words, flush=True)

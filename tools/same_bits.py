@@ -181,9 +181,9 @@ def make_scenes(folder: Path) -> None:
 def shrink(source: Path, target: Path, factor: int = 4) -> None:
     """Copies a COLMAP text capture with photographs and masks of a quarter of the size, and every third point."""
     shutil.copytree(source, target, ignore=shutil.ignore_patterns("gt"))
-    for path in [*target.glob("images/*"), *target.glob("masks/*")]:
+    for path in [*target.glob("images/*"), *target.glob("panes/*"), *target.glob("masks/*")]:
         image = Image.open(path)
-        how = Image.Resampling.NEAREST if path.parent.name == "masks" else Image.Resampling.BOX
+        how = Image.Resampling.NEAREST if path.parent.name in ("panes", "masks") else Image.Resampling.BOX
         image.resize((image.width // factor, image.height // factor), how).save(path)
     cameras = target / "sparse" / "0" / "cameras.txt"
     lines = []

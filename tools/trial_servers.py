@@ -70,7 +70,7 @@ def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
 def names_fault(place: Path) -> str:
     """Fault of pages about a photograph that is called HTML."""
     data = write_tiny_capture(place / "capture")
-    for folder in ("images", "masks"):
+    for folder in ("images", "panes"):
         (data / folder / "0.png").rename(data / folder / HTML)
     file = data / "transforms.json"
     file.write_text(file.read_text().replace("images/0.png", f"images/{HTML}"))

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from glassplat.annotate.document import MarkedPane, depths, filled, seen_outline, with_strokes
 from glassplat.annotate.fit import PaneFit
-from glassplat.captures.dataset import PLANES
-from glassplat.captures.masks import MASK_FOLDER
+from glassplat.captures.dataset import Dataset
+from glassplat.captures.masks import MASK_FOLDER, PANE_FOLDER, PLANES
 from glassplat.captures.view import PhotoFile, View
 from glassplat.errors import InputError, first_names
 from glassplat.files.images import image_size, write_image
@@ -117,7 +117,7 @@ def write_results(root: Path, views: Sequence[View], eyes: Sequence[NumpyCamera]
         InputError: the folder holds masks that were not made here.
         OSError: something cannot be written.
     """
-    folder = root / MASK_FOLDER
+    folder = root / PANE_FOLDER
     earlier = earlier_masks(root)
     marked = set().union(*(pane.views() for pane, _ in panes))
     shown = [(view, eye) for view, eye in zip(views, eyes, strict=True) if view.name in marked]
@@ -126,21 +126,42 @@ def write_results(root: Path, views: Sequence[View], eyes: Sequence[NumpyCamera]
         names = {name: f"{name}.png" for name in names}
     for view, eye in shown:
         write_image(folder / names[view.name], in_photograph(view, pane_labels(view.name, eye, panes)))
-    for name in set(earlier) - set(names.values()):
-        (folder / name).unlink(missing_ok=True)
+    for path in set(earlier) - {folder / name for name in names.values()}:
+        path.unlink(missing_ok=True)
+    _forget_old_folder(root)
     with atomic_write(folder / RECORD) as temporary:
         temporary.write_text(json.dumps(sorted(names.values()), indent=1), encoding="utf-8")
     write_planes(root / PLANES, planes_of(panes, eyes))
     return sorted(names.values())
 
 
-def earlier_masks(root: Path) -> list[str]:
-    """Masks of a capture that were made here before.
+def check_own_masks(dataset: Dataset) -> None:
+    """Refuse a capture whose masks of panes were not made here.
 
     Raises:
         InputError: there are others.
     """
-    folder = root / MASK_FOLDER
+    if not earlier_masks(dataset.root) and any(view.is_annotated for view in (*dataset.train, *dataset.test)):
+        raise InputError(
+            f"the panes of {dataset.root} are marked by masks that were not made by `glassplat annotate`, and one "
+            "capture needs all of one kind: train with them as they are, or move them away and mark the panes here"
+        )
+
+
+def earlier_masks(root: Path) -> list[Path]:
+    """Masks of a capture's panes that were made here before; earlier versions kept them in `masks/`.
+
+    Raises:
+        InputError: there are others.
+    """
+    folders = [root / PANE_FOLDER]
+    if (root / MASK_FOLDER / RECORD).is_file():
+        folders.append(root / MASK_FOLDER)
+    return [path for folder in folders for path in _own_masks(folder)]
+
+
+def _own_masks(folder: Path) -> list[Path]:
+    """The masks in a folder, all of which were made here."""
     if not folder.is_dir():
         return []
     try:
@@ -154,7 +175,18 @@ def earlier_masks(root: Path) -> list[str]:
             f"{folder} holds masks that were not made by `glassplat annotate` ({first_names(others)}), and one capture "
             "needs all of one kind: train with them as they are, or move that folder away and mark the panes here"
         )
-    return [name for name in known if not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts]
+    plain = (name for name in known if not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts)
+    return [folder / name for name in plain]
+
+
+def _forget_old_folder(root: Path) -> None:
+    """Removes what is left of `masks/` if an earlier version wrote it: what is in there is left out of photographs."""
+    folder = root / MASK_FOLDER
+    if (folder / RECORD).is_file():
+        (folder / RECORD).unlink()
+        for path in sorted((folder, *folder.rglob("*")), reverse=True):
+            if path.is_dir() and not any(path.iterdir()):
+                path.rmdir()
 
 
 def pane_labels(name: str, eye: NumpyCamera, panes: Solved) -> Labels:

@@ -27,7 +27,7 @@ from glassplat.annotate.document import (
     write_document,
 )
 from glassplat.annotate.fit import Marks, PaneFit, TooFewMarksError, corner_information, fitted_pane, tilt_deviation
-from glassplat.annotate.results import earlier_masks, grabbed, write_results
+from glassplat.annotate.results import check_own_masks, grabbed, write_results
 from glassplat.captures.dataset import Dataset, load_dataset
 from glassplat.captures.view import View
 from glassplat.errors import InputError, input_checked
@@ -418,5 +418,5 @@ def opened_session(root: Path) -> Session:
     """
     dataset = load_dataset(root)
     check_folder(root)
-    earlier_masks(root)
+    check_own_masks(dataset)
     return Session(dataset)

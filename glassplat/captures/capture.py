@@ -77,7 +77,8 @@ class Capture:
         format_name: for messages, such as "COLMAP".
         warnings: full sentences.
         random_points: how to place points when `points` is None; None takes the default.
-        masks: mask file by name of the photograph where the format fixes it; None looks for them by name.
+        masks: masks of panes by name of the photograph where the format fixes them; None looks for them by name.
+        kept: masks whose black is left out, by name of the photograph, where the format names them.
     """
 
     shots: tuple[Shot, ...]
@@ -87,6 +88,7 @@ class Capture:
     warnings: tuple[str, ...] = ()
     random_points: Callable[[], RawPoints] | None = None
     masks: Mapping[str, Path] | None = None
+    kept: Mapping[str, Path] | None = None
 
 
 Loader = Callable[[Path], Capture | None]

@@ -1,6 +1,6 @@
 """COLMAP captures: a sparse model, binary or text, beside a folder of images.
 
-With label images `masks/<photograph's stem>.png` for the annotated photographs only, this is also the layout for
+With label images `panes/<photograph's stem>.png` for the annotated photographs only, this is also the layout for
 captures of transparent panes such as RTR's, whose own files were never published.
 
 Models are read here: on a truncated file COLMAP's own reader reads garbage or does not come back.

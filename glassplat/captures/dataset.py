@@ -16,7 +16,7 @@ import torch
 from glassplat.captures.axes import axes_evidence
 from glassplat.captures.capture import Capture, Shot
 from glassplat.captures.files import CaptureFiles, read_capture
-from glassplat.captures.masks import Polarity
+from glassplat.captures.masks import PLANES, Polarity
 from glassplat.captures.transforms import points_in_view
 from glassplat.captures.view import PointCloud, PreparedView, View, ViewOptions, prepare_view
 from glassplat.errors import InputError, first_names, input_checked
@@ -28,7 +28,6 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
 
-PLANES = "planes.json"
 SAMPLES = 9
 """Points along each side of a rectangle that are looked for in the photographs."""
 
@@ -160,7 +159,8 @@ def dataset_of(files: CaptureFiles, *, downscale: float = 1.0, background: Rgb =
     root, capture, shots, masks = files.root, files.capture, files.shots, files.masks
     options = ViewOptions(downscale, background)
     prepared = [
-        prepare_view(shot, masks.masks.get(shot.name), options, ignored=files.ignored.get(shot.name)) for shot in shots
+        prepare_view(shot, masks.masks.get(shot.name), options, ignored=files.ignored.get(shot.name, ()))
+        for shot in shots
     ]
     transparent = _any_transparent(shots)
     train, test, split = _split([p.view for p in prepared], capture)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from glassplat.captures import colmap, mirror_nerf, transforms
 from glassplat.captures.capture import Capture, Loader, Shot
-from glassplat.captures.masks import MaskSet, PaneMask, Polarity, find_ignored, find_masks, known_masks
+from glassplat.captures.masks import IgnoredMask, MaskSet, Polarity, find_masks
 from glassplat.errors import InputError, UnknownFormatError, first_names
 from glassplat.files.writing import check_capture_folder
 
@@ -30,7 +30,7 @@ class CaptureFiles:
         capture: what its format says.
         shots: all photographs, by name.
         masks: where the panes are, by name of the photograph, and their labels.
-        ignored: masks of what is not to be learned, by name of the photograph.
+        ignored: masks of what is not to be learned, by name of the photograph; several for some.
         mask_polarity: which value of black-and-white masks was taken for the pane.
     """
 
@@ -38,7 +38,7 @@ class CaptureFiles:
     capture: Capture
     shots: tuple[Shot, ...]
     masks: MaskSet
-    ignored: Mapping[str, PaneMask]
+    ignored: Mapping[str, tuple[IgnoredMask, ...]]
     mask_polarity: Polarity
 
     def __str__(self) -> str:
@@ -66,9 +66,9 @@ def read_capture(root: Path | str, *, mask_polarity: Polarity = "auto") -> Captu
     capture = _load_capture(root)
     shots = tuple(sorted((*capture.shots, *(capture.test_shots or ())), key=lambda shot: shot.name))
     _check_names(shots)
-    masks = _masks(root, capture, shots, mask_polarity)
-    ignored = find_ignored(root, {shot.name: shot.image_path for shot in shots})
-    return CaptureFiles(root, capture, shots, masks, ignored, mask_polarity)
+    photographs = {shot.name: shot.image_path for shot in shots}
+    masks = find_masks(root, photographs, mask_polarity, panes=capture.masks, kept=capture.kept)
+    return CaptureFiles(root, capture, shots, masks.panes, masks.ignored, mask_polarity)
 
 
 def _load_capture(root: Path) -> Capture:
@@ -81,13 +81,6 @@ def _load_capture(root: Path) -> Capture:
     looked_for = "; ".join(text for _, text in LOADERS)
     found = first_names(sorted(path.name for path in root.iterdir()), limit=8) or "nothing"
     raise UnknownFormatError(f"{root} is no capture that can be read. Looked for: {looked_for}. Found: {found}.")
-
-
-def _masks(root: Path, capture: Capture, shots: tuple[Shot, ...], polarity: Polarity) -> MaskSet:
-    """The masks that the format names, or else those whose names fit."""
-    if capture.masks is not None:
-        return known_masks(root, capture.masks, polarity)
-    return find_masks(root, {shot.name: shot.image_path for shot in shots}, polarity)
 
 
 def _check_names(shots: tuple[Shot, ...]) -> None:

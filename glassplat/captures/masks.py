@@ -1,14 +1,17 @@
-"""Pane masks: their files, the meaning of their values, and pixels that do not count.
+"""Masks of panes (`panes/`) and of what is left out (`masks/`, `ignore/`): their files and what their values mean.
 
-A mask is either a label image (0 no pane, 1..K the pane) or binary (0 and 255, one pane). Binary masks come in both
-polarities; which one is decided over the whole set, because one mask alone cannot tell.
+A mask of panes is either a label image (0 no pane, 1..K the pane) or binary (0 and 255, one pane). Binary masks come in
+both polarities; which one is decided over the whole set, because one mask alone cannot tell.
+
+Masks in `masks/`, or `x_mask.png` beside a photograph `x.png`, mean what they mean in COLMAP, nerfstudio, Brush, 3DGRUT
+and LichtFeld: what is black is left out. Earlier versions kept panes there; such captures are read as they were.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os.path import lexists
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -132,7 +135,8 @@ def _check_black_and_white(counts: NDArray[np.int64], path: Path, lossy: bool) -
         )
 
 
-MASK_FOLDER, IGNORE_FOLDER = "masks", "ignore"
+PANE_FOLDER, MASK_FOLDER, IGNORE_FOLDER = "panes", "masks", "ignore"
+PLANES = "planes.json"
 MASK_MARK = "_mask"
 FRAMED_BY_PANE = 0.8
 MOSTLY_PANE = 0.5
@@ -169,31 +173,161 @@ class MaskSet:
     warnings: tuple[str, ...] = ()
 
 
-def find_masks(root: Path, photographs: Mapping[str, Path], polarity: Polarity = "auto") -> MaskSet:
+@dataclass(frozen=True)
+class KeepMask:
+    """A mask file whose black pixels are left out: below one half, or zero where nothing is brighter than a label.
+
+    Attributes:
+        path: the file; its transparency counts in place of its colours where any pixel is transparent.
+    """
+
+    path: Path
+
+    def labels(self) -> NDArray[np.uint8]:
+        """[H, W] 1 where a pixel is left out.
+
+        Raises:
+            InputError: the file is no image.
+        """
+        shades = _brightness(self.path)
+        return (shades < (THRESHOLD if shades.max() > HIGHEST_LABEL else 1)).astype(np.uint8)
+
+
+IgnoredMask = KeepMask | PaneMask
+"""A mask whose `labels()` are above zero on what is not to be learned."""
+
+
+@dataclass(frozen=True)
+class CaptureMasks:
+    """Panes and left-out pixels of a capture, by mask file.
+
+    Attributes:
+        panes: where the panes are.
+        ignored: what is not to be learned, by name of the photograph; a photograph may have two masks of it.
+    """
+
+    panes: MaskSet
+    ignored: Mapping[str, tuple[IgnoredMask, ...]]
+
+
+def find_masks(
+    root: Path,
+    photographs: Mapping[str, Path],
+    polarity: Polarity = "auto",
+    *,
+    panes: Mapping[str, Path] | None = None,
+    kept: Mapping[str, Path] | None = None,
+) -> CaptureMasks:
     """Find and understand the masks of a capture.
 
-    Looked for, for a photograph `a/x.jpg`: `masks/a/x.png`, `masks/a/x.jpg.png`, `masks/a/x.jpg` and
-    `masks/a/x_mask.png`, each with any image suffix and without the folder where that is unique, and `x_mask.png`
-    beside the photograph.
+    Panes are in `panes/`; what is black in `masks/`, or above black in `ignore/`, is left out. In each folder is looked
+    for, for a photograph `a/x.jpg`: `a/x.png`, `a/x.jpg.png`, `a/x.jpg` and `a/x_mask.png`, each with any image suffix
+    and without the folder where that is unique; and for masks also `x_mask.png` beside the photograph.
 
     Args:
         root: the capture's folder.
         photographs: path of every photograph by name.
         polarity: which value of binary masks is the pane.
+        panes: masks of panes where the format says which they are, white on the pane; `masks/` is theirs then.
+        kept: masks of what is kept where the format names them; they go before those found by name.
 
     Raises:
         InputError: masks that match no photograph, two for one photograph, values of no clear meaning, no pane in any.
     """
-    paths = _match(root / MASK_FOLDER, photographs, beside=_beside)
-    if not paths:
-        if (root / MASK_FOLDER).is_dir():
+    ignored = find_ignored(root, photographs)
+    if panes is not None:
+        return CaptureMasks(_known_panes(root, panes, polarity), _joined(kept or {}, ignored))
+    paths = _match(root / PANE_FOLDER, photographs)
+    if not paths and (root / PANE_FOLDER).is_dir():
+        raise InputError(f"{root / PANE_FOLDER} holds no mask images; add masks, or remove the folder")
+    masks, warnings = _found_masks(root, photographs)
+    earlier = _why_panes(root, masks, marked=bool(paths))
+    if earlier is not None:
+        found = _understood(root, masks, polarity, read_mask_values)
+        warnings = (f"{earlier} {next(iter(masks.values())).parent} is read as panes; rename it to {PANE_FOLDER}/.",)
+        return CaptureMasks(replace(found, warnings=(*warnings, *found.warnings)), _joined(kept or {}, ignored))
+    found = _understood(root, paths, polarity, read_mask_values) if paths else MaskSet({})
+    return CaptureMasks(
+        replace(found, warnings=(*found.warnings, *warnings)), _joined({**masks, **(kept or {})}, ignored)
+    )
+
+
+def _found_masks(root: Path, photographs: Mapping[str, Path]) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """Masks in `masks/` and beside the photographs, and a warning where some belong to none."""
+    unmatched: list[str] = []
+    masks = _match(root / MASK_FOLDER, photographs, beside=_beside, unmatched=unmatched)
+    if not unmatched:
+        if not masks and (root / MASK_FOLDER).is_dir():
             raise InputError(f"{root / MASK_FOLDER} holds no mask images; add masks, or remove the folder")
-        return MaskSet({})
-    return _understood(root, paths, polarity, read_mask_values)
+        return masks, ()
+    if not masks:
+        raise InputError(_no_photograph(root / MASK_FOLDER, unmatched, photographs))
+    return masks, (f"{len(unmatched)} masks belong to no photograph ({first_names(sorted(unmatched))}).",)
+
+
+def _why_panes(root: Path, masks: Mapping[str, Path], *, marked: bool) -> str | None:
+    """Sentence on why masks are taken for panes, as in captures of earlier versions; None where they are not.
+
+    Raises:
+        InputError: they look like labels of panes, and these are in `panes/`.
+    """
+    highest = next((value for value in map(_highest_value, masks.values()) if value), 0)
+    labels = 0 < highest <= HIGHEST_LABEL
+    if marked:
+        if labels:
+            raise InputError(
+                f"the masks in {root / MASK_FOLDER} have no value above {highest}, as if they were labels of panes, "
+                f"but these are in {root / PANE_FOLDER}; write 0 for what to leave out and 255 for what to keep, or "
+                "remove the folder"
+            )
+        return None
+    if labels:
+        return "The masks hold labels of panes, as in captures of earlier versions."
+    return (
+        f"There is a {PLANES} but no {PANE_FOLDER}/, as in captures of earlier versions."
+        if (masks and (root / PLANES).is_file())
+        else None
+    )
+
+
+def _highest_value(path: Path) -> int:
+    """The highest shade of a mask; white for one of one bit."""
+    with input_checked():
+        image = open_image(path)
+    if image.mode == "1":
+        return WHITE
+    brightest = int(_brightness(path).max())
+    if path.suffix.lower() in LOSSY_SUFFIXES:
+        return int(brightest > LOSSY_NOISE) * WHITE
+    if image.mode == "P" and not np.ptp(np.array(image.convert("RGB")), axis=2).any():
+        return brightest  # Greys in a palette, as programs that shrink PNGs store them: its indices mean nothing.
+    return brightest and int(_read_shades(path).max())
+
+
+def _brightness(path: Path) -> NDArray[np.uint8]:
+    """[H, W] how bright a mask is, or how opaque where it has transparent pixels."""
+    with input_checked():
+        image = open_image(path)
+        if image.mode in SHADES_16:
+            return _in_eight_bits(np.array(image), path)
+        if image.mode in ("LA", "RGBA"):
+            alpha = np.array(image.getchannel("A"))
+            if alpha.min() < WHITE:
+                return alpha
+        image.info.pop("transparency", None)
+        return np.array(image.convert("RGB").convert("L") if image.mode == "P" else image.convert("L"))
+
+
+def _joined(kept: Mapping[str, Path], ignored: Mapping[str, PaneMask]) -> dict[str, tuple[IgnoredMask, ...]]:
+    """All masks of what is left out, by name of the photograph."""
+    joined: dict[str, tuple[IgnoredMask, ...]] = {name: (KeepMask(path),) for name, path in kept.items()}
+    for name, mask in ignored.items():
+        joined[name] = (*joined.get(name, ()), mask)
+    return joined
 
 
 def find_ignored(root: Path, photographs: Mapping[str, Path]) -> Mapping[str, PaneMask]:
-    """The masks of what is not to be learned, by name of the photograph: `ignore/`, named as pane masks are.
+    """The masks in `ignore/`, by name of the photograph.
 
     Every value above black is ignored; what that is, whether a passer-by or a car, does not matter.
 
@@ -210,18 +344,8 @@ def find_ignored(root: Path, photographs: Mapping[str, Path]) -> Mapping[str, Pa
     return found
 
 
-def known_masks(root: Path, paths: Mapping[str, Path], polarity: Polarity = "auto") -> MaskSet:
-    """The masks of a format that says which file belongs to which photograph, that white is the pane, and that
-    greys are split at one half.
-
-    Args:
-        root: the capture's folder.
-        paths: mask by name of the photograph.
-        polarity: `auto` is what the format says.
-
-    Raises:
-        InputError: a file that is no image, or no pane in any.
-    """
+def _known_panes(root: Path, paths: Mapping[str, Path], polarity: Polarity) -> MaskSet:
+    """The panes of a format that says which file belongs to which photograph; greys are split at one half."""
     return _understood(root, paths, "bright" if polarity == "auto" else polarity, read_mask_at_threshold)
 
 
@@ -256,12 +380,19 @@ def _present(labels: NDArray[np.uint8]) -> set[int]:
 
 
 def _match(
-    folder: Path, photographs: Mapping[str, Path], *, beside: Callable[[Path], list[Path]] = lambda path: []
+    folder: Path,
+    photographs: Mapping[str, Path],
+    *,
+    beside: Callable[[Path], list[Path]] = lambda path: [],
+    unmatched: list[str] | None = None,
 ) -> dict[str, Path]:
-    """Mask path by name of the photograph, in the order of the names; in the folder, or beside the photographs."""
+    """Mask path by name of the photograph, in the order of the names; in the folder, or beside the photographs.
+
+    What belongs to no photograph is appended to `unmatched`, or refused.
+    """
     found: dict[str, list[Path]] = defaultdict(list)
     names = _names_by_key(photographs)
-    unmatched: list[str] = []
+    strangers: list[str] = []
     for path in _image_files(folder):
         owners = next((names[key] for key in _keys_of_mask(path.relative_to(folder)) if key in names), [])
         if len(owners) > 1:
@@ -271,18 +402,25 @@ def _match(
         if owners:
             found[owners[0]].append(path)
         else:
-            unmatched.append(path.relative_to(folder).as_posix())
-    if unmatched:
-        raise InputError(
-            f"{len(unmatched)} masks in {folder} match no photograph: {first_names(sorted(unmatched))}; name a mask "
-            f"like its photograph, such as {PurePosixPath(min(photographs)).with_suffix('.png')}"
-        )
+            strangers.append(path.relative_to(folder).as_posix())
+    if strangers and unmatched is None:
+        raise InputError(_no_photograph(folder, strangers, photographs))
+    if unmatched is not None:
+        unmatched.extend(strangers)
     for name, path in photographs.items():
         found[name].extend(beside(path))
     for name, several in found.items():
         if len(several) > 1:
             raise InputError(f"{name} has {len(several)} masks: {first_names([str(p) for p in several])}; keep one")
     return {name: found[name][0] for name in sorted(found) if found[name]}
+
+
+def _no_photograph(folder: Path, unmatched: list[str], photographs: Mapping[str, Path]) -> str:
+    """Message about masks that belong to no photograph."""
+    return (
+        f"{len(unmatched)} masks in {folder} match no photograph: {first_names(sorted(unmatched))}; name a mask "
+        f"like its photograph, such as {PurePosixPath(min(photographs)).with_suffix('.png')}"
+    )
 
 
 def _image_files(folder: Path) -> Iterator[Path]:

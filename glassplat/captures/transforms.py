@@ -147,7 +147,11 @@ POINT_FILES = ("points3d.ply", "points3D.ply", "sparse_pc.ply")
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 Settings = Mapping[str, Any]
-FRAME: dict[str, Field] = {"file_path": Text(), "transform_matrix": Items(Items(COORDINATE, 4))}
+FRAME: dict[str, Field] = {
+    "file_path": Text(),
+    "transform_matrix": Items(Items(COORDINATE, 4)),
+    "mask_path": Optional(Text()),
+}
 FILE: dict[str, Field] = {
     "ply_file_path": Optional(Text()),
     "train_filenames": Optional(Items(Text())),
@@ -270,14 +274,13 @@ def _load_whole(root: Path) -> Capture:
     settings = read_settings(root / WHOLE)
     shots = shots_of(root, settings, WHOLE)
     train, test, warnings = _own_split(shots, settings)
-    if any("mask_path" in frame for frame in settings["frames"]):
-        warnings.append("mask_path says which pixels are valid, not where panes are; it is not used.")
     return Capture(
         shots=train,
         test_shots=test,
         points=read_points(root, settings),
         format_name=WHOLE,
         warnings=tuple(warnings),
+        kept=_mask_paths(root, settings, shots),
     )
 
 
@@ -292,6 +295,22 @@ def _load_split(root: Path) -> Capture:
         format_name=TRAIN,
         random_points=points_in_box if _is_blender(settings) else None,
     )
+
+
+def _mask_paths(root: Path, settings: Settings, shots: Mapping[str, Shot]) -> dict[str, Path]:
+    """The masks that frames name, by name of the photograph."""
+    paths = {
+        shots[frame["file_path"]].name: Path(normpath(root / frame["mask_path"].replace("\\", "/")))
+        for frame in settings["frames"]
+        if frame.get("mask_path")
+    }
+    missing = [str(path) for path in paths.values() if not isfile(path)]
+    if missing:
+        raise InputError(
+            f"mask_path of {WHOLE} names {len(missing)} masks that are missing: {first_names(missing)}; copy them "
+            "there, or delete the entries"
+        )
+    return paths
 
 
 def _is_blender(settings: Settings) -> bool:

@@ -6,7 +6,7 @@ PNG of 8 or 16 bits (n + 1) / 2, in an NPY file [H, W, 3] of floats the vectors 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -27,7 +27,7 @@ from glassplat.captures.cameras import (
     rigid_pose,
 )
 from glassplat.captures.capture import RawPoints, Shot
-from glassplat.captures.masks import PaneMask
+from glassplat.captures.masks import IgnoredMask, PaneMask
 from glassplat.errors import InputError, input_checked
 from glassplat.files.images import image_size, read_image, read_image_float
 from glassplat.options import WHITE, Rgb
@@ -116,15 +116,26 @@ class PhotoFile:
 
 @dataclass(frozen=True)
 class MaskFile:
-    """Recipe for reading the pane labels of one view; `size` is the photograph's, before undistortion."""
+    """Recipe for reading the labels of one view; `size` is the photograph's, before undistortion."""
 
-    mask: PaneMask
+    mask: IgnoredMask
     size: tuple[int, int]
     pixel_map: PixelMap
 
     def __call__(self) -> Tensor:
         """[H, W] uint8 in the pixel grid of the view's camera."""
         return torch.from_numpy(self.pixel_map.labels(nearest_resize(self.mask.labels(), *self.size)))
+
+
+@dataclass(frozen=True)
+class MaskFiles:
+    """Recipe for reading what any of several masks of one view marks."""
+
+    masks: tuple[MaskFile, ...]
+
+    def __call__(self) -> Tensor:
+        """[H, W] uint8, above zero where any mask is."""
+        return torch.stack([mask() for mask in self.masks]).amax(dim=0)
 
 
 @dataclass(frozen=True)
@@ -149,7 +160,7 @@ class PreparedView:
 
 
 def prepare_view(
-    shot: Shot, mask: PaneMask | None, options: ViewOptions, *, ignored: PaneMask | None = None
+    shot: Shot, mask: PaneMask | None, options: ViewOptions, *, ignored: Sequence[IgnoredMask] = ()
 ) -> PreparedView:
     """Check one photograph against its camera and set up how it is read; decodes no pixels of it.
 
@@ -170,7 +181,9 @@ def prepare_view(
         image_path=shot.image_path,
         read_photo=PhotoFile(shot.image_path, pixel_map, options.background),
         read_pane_labels=None if mask is None else _mask_file(mask, (width, height), pixel_map),
-        read_ignored=None if ignored is None else _mask_file(ignored, (width, height), pixel_map),
+        read_ignored=MaskFiles(tuple(_mask_file(one, (width, height), pixel_map) for one in ignored))
+        if ignored
+        else None,
     )
     return PreparedView(view, lens is not shot.lens)
 
@@ -191,7 +204,7 @@ def _reduced_size(pinhole: Pinhole, downscale: float, name: str) -> tuple[int, i
     return width, height
 
 
-def _mask_file(mask: PaneMask, size: tuple[int, int], pixel_map: PixelMap) -> MaskFile:
+def _mask_file(mask: IgnoredMask, size: tuple[int, int], pixel_map: PixelMap) -> MaskFile:
     """The mask at the photograph's size, which it must have up to an integer factor."""
     with input_checked():
         mask_size = image_size(mask.path)

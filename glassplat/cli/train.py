@@ -34,7 +34,7 @@ class Train(Generic[RecipeKind]):
     Attributes:
         recipe: method and its options; `train_options` tells the command line which there are.
         preset: what the options are unless they are given: the best that this project found, or those of the paper.
-        data: directory of the capture (COLMAP or transforms.json; pane masks in masks/).
+        data: directory of the capture (COLMAP or transforms.json; panes in panes/, what to leave out in masks/).
         output: directory of the run.
         iterations: length of the run; every schedule stretches with it.
         downscale: shrink the photographs by this factor.

@@ -256,7 +256,7 @@ def first_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
     if not dataset.pane_labels and dataset.planes is None:
         raise PlaneFitError(
             f"{_lack_of_masks(dataset)}, and planar needs to know where the panes are: expected masks of 3 to "
-            f"10 photographs in {dataset.root / 'masks'}, named <photograph's name>.png, each pixel the label 1, "
+            f"10 photographs in {dataset.root / 'panes'}, named <photograph's name>.png, each pixel the label 1, "
             "2, ... of a pane, or 0 (`glassplat annotate` writes them). `glassplat train splat` needs none"
         )
     if dataset.measured_points:
@@ -267,7 +267,11 @@ def first_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
 
 def _lack_of_masks(dataset: Dataset) -> str:
     count = sum(view.is_annotated for view in (*dataset.train, *dataset.test))
-    return f"none of the {count} masks of {dataset.root} names a pane" if count else f"{dataset.root} has no masks"
+    return (
+        f"none of the {count} masks of {dataset.root} names a pane"
+        if count
+        else f"{dataset.root} has no masks of panes"
+    )
 
 
 def finished_renderer(recipe: PlanarRecipe) -> Planar:

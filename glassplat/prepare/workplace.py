@@ -16,7 +16,7 @@ from glassplat.files.writing import atomic_write, check_folder, make_folder
 
 RECORD = "prepare.json"
 """In the capture: that it was prepared here, and the report."""
-HAND_MADE = ("masks", "planes.json", "annotations.json")
+HAND_MADE = ("panes", "masks", "ignore", "planes.json", "annotations.json")
 """In a capture: what somebody spent time on."""
 
 

@@ -85,7 +85,7 @@ def test_a_pane_is_marked_cut_and_written(page: Page) -> None:
     assert dataset.planes is not None and dataset.pane_labels == (1,)
     turned = math.degrees(math.acos(min(1.0, abs(float(dataset.planes.normals[0].double().numpy() @ FRONT.normal)))))
     assert turned < 1
-    cut, whole = (read_image(page.root / "masks" / name)[:, :, 0] for name in NAMES[:2])
+    cut, whole = (read_image(page.root / "panes" / name)[:, :, 0] for name in NAMES[:2])
     assert whole[tuple(true_corners(1).mean(axis=0).astype(int)[::-1])] == 1
     assert cut[round(inside[1]), round(inside[0])] == 0
     assert 0.35 < (cut == 1).sum() / (read_image(page.root / "images" / NAMES[0])[:, :, 0] == 150).sum() < 0.65
@@ -114,7 +114,7 @@ def test_what_stands_before_the_pane_is_found_within_a_rough_outline(room: Path)
         page.saved()
         assert page.color_at(inside)[2] < covered[2] - 15 and is_blue(page.color_at(beside))
         page.write()
-        mask = read_image(room / "masks" / NAMES[0])[:, :, 0]
+        mask = read_image(room / "panes" / NAMES[0])[:, :, 0]
         assert (mask[hedge] == 0).mean() > 0.97
         around = mask[y - 30 : y + 30, x - 37 : x + 22].size - mask[hedge].size
         assert (mask[y - 30 : y + 30, x - 37 : x + 22] == 1).sum() > 0.93 * around

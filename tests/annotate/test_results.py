@@ -37,9 +37,9 @@ def photographed_pane(root: Path, name: str) -> np.ndarray:
 def test_masks_show_the_pane_to_the_pixel(room: Path) -> None:
     finish(room, marked_document())
     for name in NAMES[:3]:
-        mask = read_image(room / "masks" / name)[:, :, 0] == 1
+        mask = read_image(room / "panes" / name)[:, :, 0] == 1
         assert (mask != photographed_pane(room, name)).mean() < 0.001
-    assert not (room / "masks" / NAMES[3]).exists()
+    assert not (room / "panes" / NAMES[3]).exists()
 
 
 def test_planes_and_masks_agree_with_each_other_and_the_truth(room: Path) -> None:
@@ -64,24 +64,24 @@ def test_what_stands_before_the_pane_is_cut_out(room: Path) -> None:
     left = [[0, 0], [150, 0], [150, 220], [0, 220]]
     stroke = {"kind": "polygon", "effect": "cut", "radius": 1, "points": left}
     finish(room, marked_document(strokes={"0.png": [stroke], "3.png": [stroke]}))
-    cut, whole = (read_image(room / "masks" / name)[:, :, 0] == 1 for name in NAMES[:2])
+    cut, whole = (read_image(room / "panes" / name)[:, :, 0] == 1 for name in NAMES[:2])
     assert not cut[:, :150].any() and cut[:, 150:].any() and whole[:, :150].any()
-    assert (room / "masks" / "3.png").exists(), "a photograph with nothing but a cut is marked, too"
+    assert (room / "panes" / "3.png").exists(), "a photograph with nothing but a cut is marked, too"
 
 
 def test_writing_again_replaces_what_was_written_and_nothing_else(room: Path) -> None:
     finish(room, marked_document((0, 1, 2)))
     finish(room, marked_document((1, 2)))
-    assert sorted(path.name for path in (room / "masks").glob("*.png")) == ["1.png", "2.png"]
-    Image.new("L", (300, 220), 1).save(room / "masks" / "4.png")
+    assert sorted(path.name for path in (room / "panes").glob("*.png")) == ["1.png", "2.png"]
+    Image.new("L", (300, 220), 1).save(room / "panes" / "4.png")
     with pytest.raises(InputError, match=r"not made by `glassplat annotate` \(4\.png\)"):
         opened_session(room)
-    assert (room / "masks" / "4.png").exists()
+    assert (room / "panes" / "4.png").exists()
 
 
 def test_a_record_that_names_other_files_removes_none(room: Path) -> None:
     finish(room, marked_document())
-    (room / "masks" / "annotated.json").write_text(json.dumps(["../transforms.json", *NAMES[:3]]))
+    (room / "panes" / "annotated.json").write_text(json.dumps(["../transforms.json", *NAMES[:3]]))
     finish(room, marked_document((1, 2)))
     assert (room / "transforms.json").exists()
 
@@ -89,7 +89,7 @@ def test_a_record_that_names_other_files_removes_none(room: Path) -> None:
 def test_without_a_pane_nothing_is_written(room: Path) -> None:
     with pytest.raises(InputError, match="no pane is known yet"):
         finish(room, marked_document((0,)))
-    assert not (room / "masks").exists() and not (room / "planes.json").exists()
+    assert not (room / "panes").exists() and not (room / "planes.json").exists()
 
 
 def test_the_nearer_pane_hides_the_farther_one(room: Path) -> None:

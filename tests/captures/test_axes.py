@@ -76,6 +76,6 @@ def test_transforms_in_opencv_axes_are_refused_with_masks_to_tell(capture) -> No
     labels = np.zeros((24, 32), dtype=np.uint8)
     labels[8:16, 12:20] = 1
     for name in capture.names[1:6]:
-        capture.write_mask(f"masks/{name}", labels)
+        capture.write_mask(f"panes/{name}", labels)
     with pytest.raises(InputError, match="look away from the scene: 0% of the masks"):
         load_dataset(capture.root)

@@ -100,7 +100,7 @@ def test_distorted_photographs_and_masks_are_undistorted(capture, model: str, ex
     rows, columns = np.mgrid[0:height, 0:width] + 0.5
     blob = ((np.hypot(columns - x, rows - y) < 4) * 255).astype(np.uint8)
     Image.fromarray(np.repeat(blob[:, :, None], 3, axis=2)).save(capture.root / "images" / "0001.png")
-    capture.write_mask("masks/0001.png", blob // 255)
+    capture.write_mask("panes/0001.png", blob // 255)
 
     view = next(v for v in load_dataset(capture.root).train if v.name == "0001.png")
     world = np.linalg.inv(capture.poses[1]) @ [*corner, 1.0]
@@ -236,7 +236,7 @@ def test_a_text_model_may_come_from_another_system(capture) -> None:
 
 def test_a_model_without_photographs_beside_masks_is_named(capture) -> None:
     folder = capture.write_colmap()
-    capture.write_mask("masks/0001.png", np.ones((24, 32), dtype=np.uint8))
+    capture.write_mask("panes/0001.png", np.ones((24, 32), dtype=np.uint8))
     (folder / "images.bin").write_bytes(bytes(8))
     with pytest.raises(InputError, match=r"images\.bin registers no photograph"):
         load_dataset(capture.root)

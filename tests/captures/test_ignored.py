@@ -1,7 +1,9 @@
-"""What `ignore/` marks is neither learned nor measured."""
+"""What `masks/` leaves out and `ignore/` marks is neither learned nor measured."""
 
 from __future__ import annotations
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from glassplat.captures.dataset import load_dataset
 from glassplat.captures.view import View
 from glassplat.errors import InputError
 from glassplat.evaluate.evaluate import evaluate
+from glassplat.files.sidecars import write_planes
 from glassplat.panes.material import compared_region, reduced_photograph
 from glassplat.render.frame import Frame
 from glassplat.render.planar import Planar
@@ -47,6 +50,115 @@ def test_masks_of_what_is_ignored_are_read_beside_those_of_panes(tmp_path: Path)
     assert first is not None and second is not None
     assert bool(first[:10, :20].all()) and int(first.sum()) == 200
     assert bool(second[:, 30:].all()) and int(second.sum()) == 280
+
+
+def ignored_of(root: Path) -> dict[str, torch.Tensor]:
+    data = load_dataset(root)
+    return {v.name: v.ignored for v in (*data.train, *data.test) if v.ignored is not None}
+
+
+def write_shades(path: Path, shades: np.ndarray) -> None:
+    path.parent.mkdir(exist_ok=True)
+    Image.fromarray(shades).save(path)
+
+
+KEPT = np.full((28, 40), 255, dtype=np.uint8)
+KEPT[5:20, 8:18] = 0
+DROPPED = torch.from_numpy(KEPT == 0)
+
+
+@pytest.mark.parametrize(
+    "name", ["masks/1.png.png", "masks/1.png", "masks/1_mask.png", "masks/1.jpg", "images/1_mask.png"]
+)
+def test_what_is_black_in_masks_is_left_out_under_any_name(tmp_path: Path, name: str) -> None:
+    root = write_tiny_capture(tmp_path / "capture")
+    write_shades(root / name, KEPT)
+    found = ignored_of(root)
+    assert list(found) == ["1.png"] and torch.equal(found["1.png"], DROPPED)
+    assert load_dataset(root).pane_labels == (1,), "the panes are those of panes/"
+
+
+def test_masks_of_one_bit_of_sixteen_of_transparency_and_of_a_palette_leave_out_alike(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path / "capture")
+    transparent = np.dstack([np.full((28, 40, 3), 90, dtype=np.uint8), KEPT])
+    soft = KEPT.copy()
+    soft[20, 8:18] = 200
+    (root / "masks").mkdir()
+    Image.fromarray(soft).quantize(4).save(root / "masks/0.png")
+    for number, shades in enumerate([KEPT > 0, KEPT.astype(np.uint16) * 257, transparent], start=1):
+        write_shades(root / f"masks/{number}.png", shades)
+    found = ignored_of(root)
+    assert sorted(found) == ["0.png", "1.png", "2.png", "3.png"]
+    assert all(torch.equal(ignored, DROPPED) for ignored in found.values())
+
+
+def test_both_kinds_of_masks_of_a_photograph_leave_out(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path / "capture")
+    write_shades(root / "masks/1.png", KEPT)
+    write_ignored(root, "1.png", (slice(24, 28), slice(0, 40)))
+    expected = DROPPED.clone()
+    expected[24:] = True
+    assert torch.equal(ignored_of(root)["1.png"], expected)
+
+
+def test_frames_name_their_masks(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path / "capture")
+    write_shades(root / "kept/first.png", KEPT)
+    settings = json.loads((root / "transforms.json").read_text())
+    frame = next(frame for frame in settings["frames"] if frame["file_path"] == "images/1.png")
+    frame["mask_path"] = "kept/first.png"
+    (root / "transforms.json").write_text(json.dumps(settings))
+    found = ignored_of(root)
+    assert list(found) == ["1.png"] and torch.equal(found["1.png"], DROPPED)
+    (root / "kept/first.png").unlink()
+    with pytest.raises(InputError, match=r"mask_path .* 1 masks that are missing: .*first\.png"):
+        load_dataset(root)
+
+
+def test_masks_of_photographs_without_a_pose_are_mentioned(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path / "capture")
+    write_shades(root / "masks/1.png", KEPT)
+    write_shades(root / "masks/elsewhere.png", KEPT)
+    assert any("1 masks belong to no photograph (elsewhere.png)" in text for text in load_dataset(root).warnings)
+    (root / "masks/1.png").unlink()
+    with pytest.raises(InputError, match=r"match no photograph: elsewhere\.png"):
+        load_dataset(root)
+
+
+def test_a_capture_of_earlier_versions_keeps_its_panes_and_says_so_once(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path / "capture")
+    now = load_dataset(root)
+    (root / "panes").rename(root / "masks")
+    before = load_dataset(root)
+    assert before.pane_labels == now.pane_labels == (1,)
+    for old, new in zip(before.train, now.train, strict=True):
+        assert old.ignored is None and torch.equal(old.pane_labels, new.pane_labels)
+    assert [text for text in before.warnings if "rename it to panes/" in text] == list(before.warnings)
+
+
+def test_black_and_white_panes_of_earlier_versions_are_known_by_their_planes(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path / "capture")
+    shutil.rmtree(root / "panes")
+    write_shades(root / "masks/1.png", 255 - KEPT)
+    assert load_dataset(root).pane_labels == () and len(ignored_of(root)) == 1
+    write_planes(root / "planes.json", true_scene().planes)
+    assert load_dataset(root).pane_labels == (1,) and not ignored_of(root)
+
+
+def test_labels_of_panes_in_both_folders_are_refused(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path / "capture")
+    shutil.copytree(root / "panes", root / "masks")
+    with pytest.raises(InputError, match=r"no value above 1, as if they were labels of panes"):
+        load_dataset(root)
+
+
+def test_what_masks_leave_out_has_no_gradient(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path / "capture")
+    write_shades(root / "masks/1.png.png", KEPT)
+    view = next(view for view in load_dataset(root).train if view.name == "1.png")
+    image = torch.rand(28, 40, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    (gradient,) = torch.autograd.grad(PhotometricLoss(0.2)(Frame(image), view, true_scene()), image)
+    assert not bool(gradient[DROPPED].any()) and bool(gradient[~DROPPED].any(dim=1).all())
 
 
 def test_masks_that_belong_to_no_photograph_are_refused(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from glassplat.captures.dataset import Dataset, load_dataset
-from glassplat.captures.masks import find_masks
+from glassplat.captures.masks import CaptureMasks, MaskSet, find_masks
 from glassplat.captures.view import View
 from glassplat.errors import InputError
 
@@ -33,12 +33,11 @@ def labels_of(data: Dataset, name: str = "0001.png") -> np.ndarray:
 @pytest.mark.parametrize(
     "path",
     [
-        "masks/0001.png",
-        "masks/0001.png.png",
-        "masks/0001.tif",
-        "masks/0001_mask.png",
-        "masks/0001.png_mask.bmp",
-        "images/0001_mask.png",
+        "panes/0001.png",
+        "panes/0001.png.png",
+        "panes/0001.tif",
+        "panes/0001_mask.png",
+        "panes/0001.png_mask.bmp",
     ],
 )
 def test_every_naming_is_found(capture, path: str) -> None:
@@ -54,12 +53,12 @@ def test_every_naming_is_found(capture, path: str) -> None:
 def test_masks_of_nested_photographs(capture) -> None:
     capture.names = [f"cam{index % 2}/{index // 2}.png" for index in range(10)]
     capture.write_colmap()
-    capture.write_mask("masks/cam0/1.png", INSIDE)
-    capture.write_mask("masks/cam1/1.png", INSIDE * 2)
+    capture.write_mask("panes/cam0/1.png", INSIDE)
+    capture.write_mask("panes/cam1/1.png", INSIDE * 2)
     data = load_dataset(capture.root)
     assert list(annotated(data)) == ["cam0/1.png", "cam1/1.png"]
     assert data.pane_labels == (1, 2)
-    capture.write_mask("masks/2.png", INSIDE)
+    capture.write_mask("panes/2.png", INSIDE)
     with pytest.raises(InputError, match=r"could belong to cam0/2\.png, cam1/2\.png"):
         load_dataset(capture.root)
 
@@ -67,7 +66,7 @@ def test_masks_of_nested_photographs(capture) -> None:
 def test_folder_may_be_left_out_where_the_name_is_unique(capture) -> None:
     capture.names = [f"cam{index % 2}/{index}.png" for index in range(10)]
     capture.write_colmap()
-    capture.write_mask("masks/3.png", INSIDE)
+    capture.write_mask("panes/3.png", INSIDE)
     assert list(annotated(load_dataset(capture.root))) == ["cam1/3.png"]
 
 
@@ -75,8 +74,8 @@ def test_labels_of_several_panes_stay(capture) -> None:
     capture.write_colmap()
     panes = INSIDE.copy()
     panes[6:12, 8:20] = 7
-    capture.write_mask("masks/0001.png", panes)
-    capture.write_mask("masks/0002.png", INSIDE * 3)
+    capture.write_mask("panes/0001.png", panes)
+    capture.write_mask("panes/0002.png", INSIDE * 3)
     data = load_dataset(capture.root)
     assert data.pane_labels == (1, 3, 7)
     np.testing.assert_array_equal(labels_of(data), panes)
@@ -87,7 +86,7 @@ def test_every_way_to_store_black_and_white(capture, kind: str) -> None:
     capture.write_colmap()
     bright = INSIDE * 255
     rgb = np.repeat(bright[:, :, None], 3, axis=2)
-    path = capture.root / "masks" / ("0001.jpg" if kind == "jpeg" else "0001.png")
+    path = capture.root / "panes" / ("0001.jpg" if kind == "jpeg" else "0001.png")
     path.parent.mkdir()
     palette = Image.new("P", (WIDTH, HEIGHT))
     palette.putpalette([255, 255, 255, 0, 0, 0])
@@ -112,8 +111,8 @@ def test_colour_table_keeps_labels(capture) -> None:
     image = Image.new("P", (WIDTH, HEIGHT))
     image.putpalette([0, 0, 0, 200, 10, 10, 10, 200, 10])
     image.paste(2, (8, 6, 20, 18))
-    (capture.root / "masks").mkdir()
-    image.save(capture.root / "masks" / "0001.png")
+    (capture.root / "panes").mkdir()
+    image.save(capture.root / "panes" / "0001.png")
     np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), INSIDE * 2)
 
 
@@ -130,13 +129,13 @@ def test_colour_table_keeps_labels(capture) -> None:
 )
 def test_values_that_are_neither_labels_nor_white_are_refused(capture, pixels: np.ndarray, message: str) -> None:
     capture.write_colmap()
-    capture.write_mask("masks/0001.tif", pixels)
+    capture.write_mask("panes/0001.tif", pixels)
     with pytest.raises(InputError, match=message) as caught:
         load_dataset(capture.root)
     assert "0001.tif" in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["masks", "masks/0001.png"])
+@pytest.mark.parametrize("name", ["panes", "panes/0001.png", "masks", "masks/0001.png"])
 def test_a_link_to_nowhere_is_named(capture, name: str) -> None:
     capture.write_colmap()
     (capture.root / name).parent.mkdir(exist_ok=True)
@@ -147,7 +146,7 @@ def test_a_link_to_nowhere_is_named(capture, name: str) -> None:
 
 def test_a_mask_of_one_pixel_is_no_reduced_mask(capture) -> None:
     capture.write_colmap()
-    capture.write_mask("masks/0001.png", np.ones((1, 1), dtype=np.uint8))
+    capture.write_mask("panes/0001.png", np.ones((1, 1), dtype=np.uint8))
     with pytest.raises(InputError, match="is 1x1 pixels large, its photograph 32x24"):
         load_dataset(capture.root)
 
@@ -157,15 +156,15 @@ def test_transparency_of_a_colour_table_says_nothing_about_panes(capture) -> Non
     image = Image.new("P", (WIDTH, HEIGHT))
     image.putpalette([0, 0, 0, 255, 255, 255])
     image.paste(1, (8, 6, 20, 18))
-    (capture.root / "masks").mkdir()
-    image.save(capture.root / "masks" / "0001.png", transparency=bytes([0, 128]))
+    (capture.root / "panes").mkdir()
+    image.save(capture.root / "panes" / "0001.png", transparency=bytes([0, 128]))
     np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), INSIDE)
 
 
 @pytest.mark.parametrize("pixels", [INSIDE.astype(np.uint16) * 3, INSIDE.astype(np.uint16) * 3 * 257])
 def test_labels_may_be_stored_in_sixteen_bits(capture, pixels: np.ndarray) -> None:
     capture.write_colmap()
-    capture.write_mask("masks/0001.png", pixels)
+    capture.write_mask("panes/0001.png", pixels)
     np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), INSIDE * 3)
 
 
@@ -173,7 +172,7 @@ def test_soft_edges_are_cut_at_the_middle(capture) -> None:
     capture.write_colmap()
     soft = (INSIDE * 255).astype(np.uint8)
     soft[6, 8:20] = np.linspace(40, 250, 12).astype(np.uint8)
-    capture.write_mask("masks/0001.png", soft)
+    capture.write_mask("panes/0001.png", soft)
     np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), (soft >= 128).astype(np.uint8))
 
 
@@ -182,14 +181,14 @@ def test_ambiguous_values_are_refused(capture, values: dict[int, int]) -> None:
     capture.write_colmap()
     pixels = np.where(INSIDE > 0, values[1], 0).astype(np.uint8)
     pixels[6:8, 8:20] = values[2]
-    path = capture.write_mask("masks/0001.png", pixels)
+    path = capture.write_mask("panes/0001.png", pixels)
     with pytest.raises(InputError, match=rf"{path} holds the grey values 0, .*neither pane labels"):
         load_dataset(capture.root)
 
 
 def test_photograph_as_a_mask_is_refused(capture) -> None:
     capture.write_colmap()
-    capture.write_mask("masks/0001.png", np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH).astype(np.uint8))
+    capture.write_mask("panes/0001.png", np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH).astype(np.uint8))
     with pytest.raises(InputError, match="neither pane labels"):
         load_dataset(capture.root)
 
@@ -198,15 +197,15 @@ def test_several_colours_are_refused(capture) -> None:
     capture.write_colmap()
     pixels = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)
     pixels[:5, :5, 0] = pixels[10:, 10:, 1] = 255
-    capture.write_mask("masks/0001.png", pixels)
+    capture.write_mask("panes/0001.png", pixels)
     with pytest.raises(InputError, match="several colours"):
         load_dataset(capture.root)
 
 
 def test_labels_beside_black_and_white_are_refused(capture) -> None:
     capture.write_colmap()
-    capture.write_mask("masks/0001.png", INSIDE)
-    capture.write_mask("masks/0002.png", INSIDE * 255)
+    capture.write_mask("panes/0001.png", INSIDE)
+    capture.write_mask("panes/0002.png", INSIDE * 255)
     with pytest.raises(InputError, match="some masks are label images"):
         load_dataset(capture.root)
 
@@ -214,7 +213,7 @@ def test_labels_beside_black_and_white_are_refused(capture) -> None:
 def test_inverted_masks_are_recognised_by_their_border(capture) -> None:
     capture.write_colmap()
     for name in ("0001.png", "0002.png", "0003.png"):
-        capture.write_mask(f"masks/{name}", (1 - INSIDE) * 255)
+        capture.write_mask(f"panes/{name}", (1 - INSIDE) * 255)
     data = load_dataset(capture.root)
     np.testing.assert_array_equal(labels_of(data), INSIDE)
     assert any("inverted" in warning for warning in data.warnings)
@@ -224,7 +223,7 @@ def test_inverted_masks_are_recognised_by_their_border(capture) -> None:
 
 def test_stated_polarity_does_not_touch_label_images(capture) -> None:
     capture.write_colmap()
-    capture.write_mask("masks/0001.png", INSIDE)
+    capture.write_mask("panes/0001.png", INSIDE)
     data = load_dataset(capture.root, mask_polarity="dark")
     np.testing.assert_array_equal(labels_of(data), INSIDE)
 
@@ -232,7 +231,7 @@ def test_stated_polarity_does_not_touch_label_images(capture) -> None:
 def test_panes_that_fill_the_image_are_not_inverted(capture) -> None:
     capture.write_colmap()
     for name in ("0001.png", "0002.png", "0003.png"):
-        capture.write_mask(f"masks/{name}", np.full((HEIGHT, WIDTH), 255, dtype=np.uint8))
+        capture.write_mask(f"panes/{name}", np.full((HEIGHT, WIDTH), 255, dtype=np.uint8))
     data = load_dataset(capture.root)
     assert labels_of(data).min() == 1
     assert any("cover 100%" in warning for warning in data.warnings)
@@ -240,8 +239,8 @@ def test_panes_that_fill_the_image_are_not_inverted(capture) -> None:
 
 def test_view_without_a_pane_is_mentioned(capture) -> None:
     capture.write_colmap()
-    capture.write_mask("masks/0001.png", INSIDE * 255)
-    capture.write_mask("masks/0002.png", INSIDE * 0)
+    capture.write_mask("panes/0001.png", INSIDE * 255)
+    capture.write_mask("panes/0002.png", INSIDE * 0)
     data = load_dataset(capture.root)
     assert labels_of(data, "0002.png").max() == 0
     assert any("0002.png" in warning for warning in data.warnings)
@@ -250,11 +249,11 @@ def test_view_without_a_pane_is_mentioned(capture) -> None:
 @pytest.mark.parametrize(
     ("path", "pixels", "message"),
     [
-        ("masks/0001.png", INSIDE * 0, "none of the 1 masks .* marks a pane"),
-        ("masks/other.png", INSIDE, r"1 masks in .* match no photograph: other\.png; .* such as 0000\.png"),
-        ("masks/0001.png", INSIDE[:20], r"masks/0001\.png is 32x20 pixels large, its photograph 32x24"),
-        ("masks/readme.txt", None, "holds no mask images"),
-        ("masks/0001.png", None, "as an image"),
+        ("panes/0001.png", INSIDE * 0, "none of the 1 masks .* marks a pane"),
+        ("panes/other.png", INSIDE, r"1 masks in .* match no photograph: other\.png; .* such as 0000\.png"),
+        ("panes/0001.png", INSIDE[:20], r"panes/0001\.png is 32x20 pixels large, its photograph 32x24"),
+        ("panes/readme.txt", None, "holds no mask images"),
+        ("panes/0001.png", None, "as an image"),
     ],
 )
 def test_masks_that_cannot_be_used(capture, path: str, pixels: np.ndarray | None, message: str) -> None:
@@ -271,8 +270,8 @@ def test_masks_that_cannot_be_used(capture, path: str, pixels: np.ndarray | None
 
 def test_two_masks_for_one_photograph_are_refused(capture) -> None:
     capture.write_colmap()
-    capture.write_mask("masks/0001.png", INSIDE)
-    capture.write_mask("images/0001_mask.png", INSIDE)
+    capture.write_mask("panes/0001.png", INSIDE)
+    capture.write_mask("panes/0001.png.png", INSIDE)
     with pytest.raises(InputError, match=r"0001\.png has 2 masks"):
         load_dataset(capture.root)
 
@@ -280,19 +279,19 @@ def test_two_masks_for_one_photograph_are_refused(capture) -> None:
 @pytest.mark.parametrize("factor", [2, 3])
 def test_integer_scaled_masks_take_the_nearest_pixel(capture, factor: int) -> None:
     capture.write_colmap()
-    capture.write_mask("masks/0001.png", np.kron(INSIDE, np.ones((factor, factor), dtype=np.uint8)))
+    capture.write_mask("panes/0001.png", np.kron(INSIDE, np.ones((factor, factor), dtype=np.uint8)))
     np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), INSIDE)
 
 
 def test_half_size_mask_covers_the_same_area(capture) -> None:
     capture.write_colmap()
-    capture.write_mask("masks/0001.png", INSIDE[::2, ::2])
+    capture.write_mask("panes/0001.png", INSIDE[::2, ::2])
     np.testing.assert_array_equal(labels_of(load_dataset(capture.root)), INSIDE)
 
 
 def test_downscaling_keeps_labels_pure(capture) -> None:
     capture.write_colmap()
-    capture.write_mask("masks/0001.png", INSIDE * 5)
+    capture.write_mask("panes/0001.png", INSIDE * 5)
     labels = labels_of(load_dataset(capture.root, downscale=2.0))
     np.testing.assert_array_equal(labels, INSIDE[1::2, 1::2] * 5)
 
@@ -302,4 +301,4 @@ def test_no_masks_at_all(capture, tmp_path: Path) -> None:
     data = load_dataset(capture.root)
     assert not annotated(data)
     assert data.pane_labels == ()
-    assert find_masks(tmp_path / "nowhere", {}).masks == {}
+    assert find_masks(tmp_path / "nowhere", {}) == CaptureMasks(MaskSet({}), {})

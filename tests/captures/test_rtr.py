@@ -21,7 +21,7 @@ def test_panes_are_labelled_in_the_annotated_photographs_only(capture, binary: b
     capture.write_colmap(binary=binary)
     annotated = ("IMG_0001", "IMG_0004", "IMG_0006")
     for stem in annotated:
-        capture.write_mask(f"masks/{stem}.png", label_mask())
+        capture.write_mask(f"panes/{stem}.png", label_mask())
     data = load_dataset(capture.root)
     assert data.pane_labels == (1, 2)
     assert data.measured_points
@@ -35,7 +35,7 @@ def test_panes_are_labelled_in_the_annotated_photographs_only(capture, binary: b
 def test_the_same_masks_beside_a_transforms_file(capture) -> None:
     capture.write_images()
     capture.write_transforms({"fl_x": 30.0, "w": 32, "h": 24, "frames": capture.frames()})
-    capture.write_mask("masks/0003.png", label_mask())
+    capture.write_mask("panes/0003.png", label_mask())
     data = load_dataset(capture.root)
     assert [view.name for view in data.train if view.is_annotated] == ["0003.png"]
     assert data.pane_labels == (1, 2)

@@ -122,12 +122,6 @@ def test_split_that_names_no_frame(capture) -> None:
         load(capture, train_filenames=["nothing.png"], test_filenames=["images/0001.png"])
 
 
-def test_validity_masks_are_not_panes(capture) -> None:
-    frames = capture.frames()
-    frames[0]["mask_path"] = "valid/0000.png"
-    assert "mask_path" in load(capture, frames=frames).warnings[0]
-
-
 @pytest.mark.parametrize("name", ["points3d.ply", "sparse_pc.ply", "cloud.ply"])
 @pytest.mark.parametrize("binary", [True, False])
 def test_points_beside_the_file(capture, name: str, binary: bool) -> None:

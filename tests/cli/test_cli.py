@@ -105,9 +105,9 @@ def test_bad_input_ends_with_one_message(tmp_path: Path, capsys: pytest.CaptureF
 
 def test_planar_without_masks_says_what_to_annotate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capture = tmp_path / "capture"
-    shutil.copytree(SCENE, capture, ignore=shutil.ignore_patterns("masks", "gt"))
+    shutil.copytree(SCENE, capture, ignore=shutil.ignore_patterns("panes", "gt"))
     options = ["--output", str(tmp_path / "run"), "--downscale", "4", "--iterations", "20"]
-    words = ("error:", "has no masks", "capture/masks", "`glassplat train splat` needs none")
+    words = ("error:", "has no masks of panes", "capture/panes", "`glassplat train splat` needs none")
     fails_with(["train", "planar", "--data", str(capture), *options], capsys, *words)
     assert not (tmp_path / "run").exists()
 

@@ -41,14 +41,14 @@ def test_a_capture_is_described_with_its_panes(capsys: pytest.CaptureFixture[str
 
 
 def test_a_capture_without_masks_is_to_be_annotated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copytree(SCENE, tmp_path / "capture", ignore=shutil.ignore_patterns("masks", "gt"))
+    shutil.copytree(SCENE, tmp_path / "capture", ignore=shutil.ignore_patterns("panes", "gt"))
     found = told(tmp_path / "capture", capsys)
     assert found["facts"]["panes"] == "none marked"
     assert any("glassplat annotate" in line for line in found["next"])
 
 
 def test_estimated_normals_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    capture = shutil.copytree(SCENE, tmp_path / "capture", ignore=shutil.ignore_patterns("masks", "gt"))
+    capture = shutil.copytree(SCENE, tmp_path / "capture", ignore=shutil.ignore_patterns("panes", "gt"))
     (capture / "normals").mkdir()
     for photograph in sorted((capture / "images").iterdir())[1:4]:
         (capture / "normals" / photograph.with_suffix(".npy").name).touch()

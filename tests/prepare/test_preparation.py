@@ -90,10 +90,10 @@ def test_a_capture_is_replaced_only_by_force(prepared: Path, capsys: pytest.Capt
     before = (prepared / "sparse" / "0" / "images.bin").read_bytes()
     assert main(["prepare", str(source), "--output", str(prepared)]) == 2
     assert "--force" in capsys.readouterr().err
-    (prepared / "masks").mkdir()
+    (prepared / "panes").mkdir()
     assert main(["prepare", str(source), "--output", str(prepared), "--force"]) == 2
     assert "which somebody made" in " ".join(capsys.readouterr().err.split())
-    (prepared / "masks").rmdir()
+    (prepared / "panes").rmdir()
     assert (prepared / "sparse" / "0" / "images.bin").read_bytes() == before
 
 

@@ -61,7 +61,7 @@ def test_a_drawn_capture_is_read_has_noise_and_clips(tmp_path: Path) -> None:
     dataset = load_dataset(tmp_path / "room")
     planes = json.loads((tmp_path / "room/gt/planes.json").read_text())
     assert dataset.pane_labels == tuple(plane["label"] for plane in planes)
-    assert len(list((tmp_path / "room/masks").iterdir())) <= 5
+    assert len(list((tmp_path / "room/panes").iterdir())) <= 5
     photo = dataset.test[0]
     strength = read_image(tmp_path / "room/gt/strength" / f"{Path(photo.name).stem}_pane.png")[..., 0]
     clear = read_image(tmp_path / "room/gt/trans" / f"{Path(photo.name).stem}.png")

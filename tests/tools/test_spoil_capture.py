@@ -24,7 +24,7 @@ def test_photographs_differ_by_their_factors_and_nothing_else_does(tmp_path: Pat
         expected = (before * torch.from_numpy(factor).float()).clamp(0, 1)
         torch.testing.assert_close(after, expected, atol=0.01, rtol=0.05)
     assert np.std([np.log2(factor).mean() for factor in factors.values()]) > 0.1
-    for path in ("transforms.json", "masks/1.png", "points3d.ply"):
+    for path in ("transforms.json", "panes/1.png", "points3d.ply"):
         assert (capture / path).read_bytes() == (tmp_path / "copy" / path).read_bytes()
 
 

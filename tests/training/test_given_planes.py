@@ -30,7 +30,7 @@ PANE = true_scene().planes
 def capture(tmp_path: Path) -> Path:
     """The tiny capture with its pane as a rectangle and without masks."""
     root = write_tiny_capture(tmp_path / "capture")
-    shutil.rmtree(root / "masks")
+    shutil.rmtree(root / "panes")
     write_planes(root / "planes.json", PANE)
     return root
 

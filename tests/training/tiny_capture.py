@@ -56,13 +56,13 @@ def pane_frame(planes: Planes) -> torch.Tensor:
 def write_tiny_capture(root: Path) -> Path:
     """The same on disk as a `transforms.json` capture, all views annotated; returns its folder."""
     dataset, frames = tiny_capture(), []
-    for folder in ("images", "masks"):
+    for folder in ("images", "panes"):
         (root / folder).mkdir(parents=True)
     for view in dataset.train:
         camera = view.camera
         Image.fromarray(view.photo.numpy()).save(root / "images" / view.name)
         labels = shown_panes(true_scene().planes, camera)[0].to(torch.uint8)
-        Image.fromarray(labels.numpy()).save(root / "masks" / view.name)
+        Image.fromarray(labels.numpy()).save(root / "panes" / view.name)
         world_from_opengl = camera.cam_from_world.inverse() * torch.tensor([1, -1, -1, 1])
         frames.append({"file_path": f"images/{view.name}", "transform_matrix": world_from_opengl.tolist()})
     first = dataset.train[0].camera
