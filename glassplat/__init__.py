@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from glassplat.render.deferred import Deferred
     from glassplat.render.frame import Frame
     from glassplat.render.planar import Planar
+    from glassplat.render.rasterization import rasterization
     from glassplat.render.splat import Splat
     from glassplat.render.traced import Traced
     from glassplat.scene.camera import Camera
@@ -68,6 +69,7 @@ __all__ = [  # noqa: RUF022 - In the order in which the documentation tells of t
     "Planar",
     "Deferred",
     "Traced",
+    "rasterization",
     "StepDone",
     "StageEntered",
     "ActionDone",
@@ -96,6 +98,7 @@ HOMES = {
     "render.deferred": ("Deferred",),
     "render.frame": ("Frame",),
     "render.planar": ("Planar",),
+    "render.rasterization": ("rasterization",),
     "render.splat": ("Splat",),
     "render.traced": ("Traced",),
     "scene.camera": ("Camera",),
