@@ -119,6 +119,12 @@ class Dataset:
     downscale: float = 1.0
     mask_polarity: Polarity = "auto"
 
+    def __repr__(self) -> str:
+        return (
+            f"Dataset({str(self.root)!r}: {len(self.train)} training and {len(self.test)} test views, "
+            f"{len(self.points.positions)} points, panes {self.pane_labels})"
+        )
+
 
 def load_dataset(
     root: Path | str, *, downscale: float = 1.0, background: Rgb = WHITE, mask_polarity: Polarity = "auto"

@@ -58,6 +58,9 @@ class View:
     read_ignored: Callable[[], Tensor] | None = None
     _read: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
+    def __repr__(self) -> str:
+        return f"View({self.name!r}, {self.camera})"
+
     @property
     def photo(self) -> Tensor:
         """[H, W, 3] uint8 sRGB, undistorted and reduced; stays in memory once read.

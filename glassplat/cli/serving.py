@@ -19,9 +19,9 @@ from glassplat.annotate.session import opened_session
 from glassplat.cli.console import say
 from glassplat.cli.runs import announce, capture_of
 from glassplat.errors import InputError
-from glassplat.model.model import Model
+from glassplat.model.model import Model, shown_of
 from glassplat.model.run_directory import RunDirectory
-from glassplat.model.watching import KeptBeside, shown_of
+from glassplat.model.watching import KeptBeside
 from glassplat.viewer.server import Viewer
 
 if TYPE_CHECKING:

@@ -19,8 +19,10 @@ from rich.console import Console
 from glassplat.captures.files import CaptureFiles, read_capture
 from glassplat.captures.masks import Polarity
 from glassplat.cli.console import import_now, message_console, say
+from glassplat.errors import InputError, input_checked
+from glassplat.files.records import read_text
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
-from glassplat.methods.recipe import RECIPES, Preset, Recipe, recipe_of
+from glassplat.methods.recipe import RECIPES, Preset, Recipe, recipe_from_json, recipe_of
 from glassplat.model.run_directory import CHECKPOINT_SECONDS, RunDirectory, RunSettings, check_output
 from glassplat.options import Downscale, Essential, Positive, Seed, Several
 
@@ -34,7 +36,7 @@ class Train(Generic[RecipeKind]):
     Attributes:
         recipe: method and its options; `train_options` tells the command line which there are.
         preset: what the options are unless they are given: the best that this project found, or those of the paper.
-        data: directory of the capture (COLMAP or transforms.json; panes in panes/, what to leave out in masks/).
+        data: directory of the capture: COLMAP or transforms.json, panes in panes/.
         output: directory of the run.
         iterations: length of the run; every schedule stretches with it.
         downscale: shrink the photographs by this factor.
@@ -43,6 +45,7 @@ class Train(Generic[RecipeKind]):
         resume: go on with the run in `output`.
         mask_polarity: which value of black-and-white masks is the pane.
         checkpoint_every: seconds from one checkpoint to the next; an end or an interrupt writes one in any case.
+        config: a recipe.json to begin from.
         view: look at it in the browser meanwhile.
     """
 
@@ -57,6 +60,7 @@ class Train(Generic[RecipeKind]):
     mask_polarity: Polarity = "auto"
     checkpoint_every: Positive = CHECKPOINT_SECONDS
     preset: Preset = "glassplat"
+    config: Path | None = None
     view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
 
     def ready(self) -> None:
@@ -102,16 +106,36 @@ def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:
     """Type and settings for tyro of a command line of `train`.
 
     Returns:
-        `Train`, with the recipes of the preset that the arguments name as defaults and, where they ask for help, with
-        the options that help should show; and the arguments for it.
+        `Train`, with the recipes of the preset or of the file that the arguments name as defaults and, where they ask
+        for help, with the options that help should show; and the arguments for it.
+
+    Raises:
+        InputError: the file is no recipe, or another method's.
     """
     full = FULL_HELP in arguments
     recipes = [recipe_of(method, asked_preset(arguments)) for method in RECIPES]
+    if (config := last_value(arguments, "--config")) is not None:
+        given = configured(Path(config), arguments)
+        recipes = [given if recipe.method == given.method else recipe for recipe in recipes]
     if not full and any(help_option in arguments for help_option in HELP):
         recipes = [in_brief(recipe) for recipe in recipes]
     choices = [Annotated[type(r), tyro.conf.subcommand(r.method, default=r)] for r in recipes]
     any_recipe: Any = functools.reduce(operator.or_, choices)
     return Train[any_recipe], ["--help" if argument == FULL_HELP else argument for argument in arguments]
+
+
+def configured(path: Path, arguments: Sequence[str]) -> Any:
+    """The recipe in a file, which is of the method that the arguments name.
+
+    Raises:
+        InputError: it is no recipe, or another method's.
+    """
+    with input_checked():
+        recipe = recipe_from_json(read_text(path), str(path))
+    asked = next((argument for argument in arguments if argument in RECIPES), recipe.method)
+    if asked != recipe.method:
+        raise InputError(f"{path} is a recipe of {recipe.method}; expected one of {asked}, or `train {recipe.method}`")
+    return recipe
 
 
 def asked_preset(arguments: Sequence[str]) -> Preset:

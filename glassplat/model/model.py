@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import base64
+import html
+import io
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
+from PIL import Image
 from torch import Tensor
 
 from glassplat.captures.dataset import Dataset, with_corrected_cameras
@@ -24,7 +28,7 @@ from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory, write_text
 from glassplat.panes.material import with_pane
 from glassplat.publish.camera_paths import orbit
-from glassplat.publish.web_page import write_page
+from glassplat.publish.web_page import best_view, write_page
 from glassplat.render.environment import equirect_from_environment
 from glassplat.render.frame import Frame, Renderer, check_layers
 from glassplat.render.layers import layer_image
@@ -32,6 +36,13 @@ from glassplat.scene import scene
 from glassplat.scene.camera import Camera
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
+from glassplat.viewer.drawing import ERROR, Keeper, Shown
+from glassplat.viewer.render_loop import LOCAL, vacant_port
+from glassplat.viewer.server import Viewer
+
+HIDDEN_LAYERS = ("alpha",)
+NOTEBOOK_WIDTH = 480
+"""Pixels."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -61,6 +72,31 @@ class Model:
             f"{panes} {'pane' if panes == 1 else 'panes'}, {len(self.cameras)} cameras)"
         )
 
+    def _repr_html_(self) -> str:
+        """A small picture from a photograph's camera that shows the panes well, for notebooks."""
+        told = html.escape(repr(self))
+        if not self.cameras:
+            return f"<p>{told}</p>"
+        names = tuple(self.cameras)
+        name = names[best_view(self.scene.planes, tuple(self.cameras.values()))]
+        camera = self.cameras[name]
+        width = min(NOTEBOOK_WIDTH, camera.width)
+        small = camera.resized(width, max(1, round(width * camera.height / camera.width)))
+        file = io.BytesIO()
+        Image.fromarray((255 * self.image(small)).round().byte().numpy()).save(file, "JPEG", quality=90)
+        picture = base64.b64encode(file.getvalue()).decode()
+        return f'<p>{told}</p><img src="data:image/jpeg;base64,{picture}" alt="{html.escape(name)}">'
+
+    def show(self) -> Viewer:
+        """Shows it in the browser as `glassplat view` does, at the `address` of what it returns, until its `stop()`.
+
+        Raises:
+            InputError: viser is not installed.
+        """
+        viewer = Viewer(shown_of(self, {}), LOCAL, vacant_port(LOCAL))
+        viewer.start()
+        return viewer
+
     @property
     def renderer(self) -> Renderer:
         """Renderer of the scene: a function `(scene, camera) -> Frame`."""
@@ -85,15 +121,22 @@ class Model:
 
         Args:
             camera: any pinhole camera, or the name of one of `cameras`.
-            layers: which ones the frame has to have; most are there in any case.
+            layers: which ones the frame has.
 
         Raises:
-            InputError: the method renders no such layer; says which it does.
-            KeyError: no camera has that name.
+            InputError: the method renders no such layer, or no camera has that name; says which there are.
         """
+        frame = self._frame(camera, layers)
+        return replace(frame, layers={name: layer for name, layer in frame.layers.items() if name in layers})
+
+    def _frame(self, camera: Camera | str, layers: Sequence[str]) -> Frame:
+        """The frame with these layers, and with what else the renderer makes on the way."""
         check_layers(self.renderer, self.scene, layers, self.recipe.method)
-        chosen = self.cameras[camera] if isinstance(camera, str) else camera
-        return self.renderer.with_layers(layers)(self.scene, chosen)
+        if isinstance(camera, str):
+            if camera not in self.cameras:
+                raise InputError(f"no camera is called {camera!r}; expected one of {first_names(list(self.cameras))}")
+            camera = self.cameras[camera]
+        return self.renderer.with_layers(layers)(self.scene, camera)
 
     @torch.no_grad()
     def image(self, camera: Camera | str, layer: str = "rgb") -> Tensor:
@@ -104,9 +147,9 @@ class Model:
             layer: one of `layers`.
 
         Raises:
-            InputError, KeyError: as `render` does.
+            InputError: as `render` does.
         """
-        image = layer_image(self.render(camera, layers=(layer,)), layer).cpu()
+        image = layer_image(self._frame(camera, (layer,)), layer).cpu()
         return image if image.dim() == 3 else image[..., None].expand(-1, -1, 3)
 
     def orbit(self, frames: int) -> list[Camera]:
@@ -228,6 +271,20 @@ class Model:
             InputError: the format is not known, or cannot hold this model.
         """
         return save_model(self, Path(path), overwrite=overwrite)
+
+
+def shown_of(model: Model, photographs: Mapping[str, Callable[[], Tensor]], keeper: Keeper | None = None) -> Shown:
+    """A model as the viewer shows it.
+
+    Args:
+        model: to be looked at.
+        photographs: [H, W, 3] uint8 by name, read when asked for.
+        keeper: writes what is made in the browser; None where nothing may be written.
+    """
+    layers: list[str] = [layer for layer in model.layers if layer not in HIDDEN_LAYERS]
+    if photographs:
+        layers.append(ERROR)
+    return Shown(model.name, model.scene, model.renderer, layers, tuple(model.cameras.items()), photographs, keeper)
 
 
 def planar_of(recipe: Any) -> PlanarRecipe:

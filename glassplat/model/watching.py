@@ -5,24 +5,22 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from shlex import quote
-
-from torch import Tensor
 
 from glassplat.captures.dataset import Dataset
 from glassplat.errors import InputError
 from glassplat.files.sidecars import write_cameras
 from glassplat.files.writing import make_folder
-from glassplat.model.model import Model, save_folder
+from glassplat.model.model import Model, save_folder, shown_of
 from glassplat.model.training import Training
 from glassplat.render.frame import Renderer
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
 from glassplat.training.messages import Message, StepDone
-from glassplat.viewer.drawing import ERROR, Keeper, Shown
+from glassplat.viewer.drawing import Shown
 from glassplat.viewer.render_loop import DrawingShare, check_port
 from glassplat.viewer.server import Viewer
 
@@ -87,25 +85,10 @@ class KeptBeside:
         return self._folder / name.strip()
 
 
-HIDDEN_LAYERS = ("alpha",)
 REFRESH_SECONDS = 2.0
 """From one picture of a scene that is being trained to the next, where nobody moves."""
 PAUSE_SECONDS = 0.2
 """How soon a paused training hears that it should end."""
-
-
-def shown_of(model: Model, photographs: Mapping[str, Callable[[], Tensor]], keeper: Keeper | None = None) -> Shown:
-    """A model as the viewer shows it.
-
-    Args:
-        model: what to look at.
-        photographs: [H, W, 3] uint8 by name, read when asked for.
-        keeper: writes what is made in the browser; None where nothing may be written.
-    """
-    layers: list[str] = [layer for layer in model.layers if layer not in HIDDEN_LAYERS]
-    if photographs:
-        layers.append(ERROR)
-    return Shown(model.name, model.scene, model.renderer, layers, tuple(model.cameras.items()), photographs, keeper)
 
 
 class WatchedTraining:

@@ -79,6 +79,10 @@ class Frame:
     screen: tuple[ScreenPass, ...] = ()
     space: tuple[SpacePass, ...] = ()
 
+    def __repr__(self) -> str:
+        height, width = self.rgb.shape[:2]
+        return f"Frame({width}x{height}, layers: {', '.join(self.layers) or 'none'})"
+
     @property
     def photographed(self) -> Tensor:
         """[H, W, 3] what a photograph shows: the image, with the photographer where panes show one and it was asked."""

@@ -149,6 +149,10 @@ class Camera:
         focal = height / 2 / math.tan(fov_rad / 2)
         return Camera(pose, focal, focal, width / 2, height / 2, width, height)
 
+    def __repr__(self) -> str:
+        center = ", ".join(f"{value:.4g}" for value in self.center.detach().tolist())
+        return f"Camera({self.width}x{self.height}, fx={self.fx:.4g}, fy={self.fy:.4g}, at ({center}))"
+
     @property
     def intrinsics(self) -> Tensor:
         """[4] tensor (fx, fy, cx, cy)."""

@@ -52,6 +52,11 @@ class Gaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def __repr__(self) -> str:
+        kind = "discs" if self.are_discs else "ellipsoids"
+        channels = f", {', '.join(self.channels)}" if self.channels else ""
+        return f"Gaussians({len(self)} {kind}, SH degree {self.active_sh_degree}{channels}, {self.means.device})"
+
     @property
     def max_sh_degree(self) -> int:
         """Highest degree the coefficients can hold; -1 when there are none."""

@@ -57,6 +57,10 @@ class Planes:
     def __len__(self) -> int:
         return len(self.labels)
 
+    def __repr__(self) -> str:
+        reflectances = [round(float(value), 3) for value in self.logit_reflectances.detach().sigmoid()]
+        return f"Planes(labels={self.labels}, mirrors={self.mirrors}, R0={reflectances})"
+
     @property
     def normals(self) -> Tensor:
         """[K, 3] unit normals."""

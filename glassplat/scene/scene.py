@@ -41,6 +41,9 @@ class Environment:
                 f"raw has shape {shape}; expected (6, S, S, 3), six square faces with three colour channels each"
             )
 
+    def __repr__(self) -> str:
+        return f"Environment({FACES} faces of {self.size}x{self.size})"
+
     @property
     def size(self) -> int:
         """Texels along the side of a face, S."""
@@ -120,6 +123,10 @@ class Scene:
     up: Direction | None = None
     exposures: Exposures = field(default_factory=Exposures.neutral)
     poses: PoseCorrections = field(default_factory=PoseCorrections.none)
+
+    def __repr__(self) -> str:
+        sets = (f"{name}={gaussians}" for name, gaussians in self.gaussian_sets().items())
+        return f"Scene({', '.join(sets)}, planes={self.planes}, extent={self.extent:.4g})"
 
     def gaussian_sets(self) -> dict[str, Gaussians]:
         """The sets of Gaussians by name; surroundings and photographer are among them where there are any."""

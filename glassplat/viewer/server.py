@@ -256,6 +256,9 @@ class Viewer:
         self._server.on_client_connect(survived(self._connected))
         self._server.on_client_disconnect(survived(self._gone))
 
+    def __repr__(self) -> str:
+        return f"look at {self.address}"
+
     @property
     def port(self) -> int:
         """Port of the server; another one than was asked for if that was taken."""

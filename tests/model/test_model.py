@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
+import io
 from pathlib import Path
+from urllib.request import HTTPCookieProcessor, build_opener
 
 import pytest
 import torch
+from PIL import Image
 
 import glassplat
 from glassplat import Camera, Gaussians, InputError, Model, Planar, PlanarRecipe, Scene, SplatRecipe
@@ -33,7 +37,7 @@ def test_a_run_is_loaded_and_rendered_as_its_renderer_does(tmp_path: Path) -> No
     assert (loaded.panes, loaded.layers[0], loaded.path) == ((LABEL,), "rgb", tmp_path / "run")
     frame = loaded.render("2.png", layers=["reflection", "depth"])
     torch.testing.assert_close(frame.rgb, Planar()(true_scene(), loaded.cameras["2.png"]).rgb)
-    assert {"reflection", "depth"} <= set(frame.layers)
+    assert {"reflection", "depth"} == set(frame.layers), "what was not asked for stays inside"
 
 
 def test_gradients_reach_the_scene_and_the_camera() -> None:
@@ -56,8 +60,35 @@ def test_every_layer_is_an_image(tmp_path: Path) -> None:
         assert 0 <= float(image.min()) <= float(image.max()) <= 1
     with pytest.raises(InputError, match=r"planar renders no layer base; expected .*reflection"):
         whole.image("2.png", "base")
-    with pytest.raises(KeyError, match="nobody"):
+    with pytest.raises(InputError, match=r"no camera is called 'nobody\.png'; expected one of .*0\.png"):
         whole.render("nobody.png")
+
+
+def test_everything_public_is_told_in_one_line() -> None:
+    whole = model()
+    data = tiny_capture()
+    for thing in (whole, whole.scene, whole.cameras["2.png"], whole.render("2.png"), data, data.train[0]):
+        assert type(thing).__name__ in repr(thing) and "\n" not in repr(thing) and len(repr(thing)) < 300
+    assert repr(whole.scene.planes) == f"Planes(labels=({LABEL},), mirrors=(), R0=[0.3])"
+
+
+def test_a_notebook_shows_a_picture_of_the_model() -> None:
+    shown = model()._repr_html_()
+    head, _, rest = shown.partition("base64,")
+    picture = Image.open(io.BytesIO(base64.b64decode(rest.partition('"')[0])))
+    assert "30 Gaussians" in head and picture.size == (40, 28)
+    expected = dataclasses.replace(model(), cameras={})._repr_html_()
+    assert "0 cameras" in expected and "<img" not in expected
+
+
+def test_a_model_is_shown_in_the_browser_until_it_is_stopped() -> None:
+    viewer = model().show()
+    try:
+        assert viewer.address in repr(viewer)
+        with build_opener(HTTPCookieProcessor()).open(viewer.address) as answer:
+            assert answer.status == 200
+    finally:
+        viewer.stop()
 
 
 def test_edits_are_new_models() -> None:

@@ -16,7 +16,7 @@ from glassplat.methods.glossy_recipes import DeferredRecipe
 from glassplat.methods.mirrors import ENDED, DensifyWhilePropagating, Propagate, ResetRaised
 from glassplat.methods.planar import PaneSetup, planar_population
 from glassplat.methods.planar_recipe import PlanarRecipe, ReflectionWeights
-from glassplat.methods.recipe import RECIPES, recipe_of
+from glassplat.methods.recipe import RECIPES, recipe_of, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.render.planar import Planar
 from glassplat.scene.scene import Scene
@@ -46,6 +46,21 @@ def parsed(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_the_table_of_a_page_is_that_of_the_preset(method: str) -> None:
     page = (DOCS / f"{method}.md").read_text(encoding="utf-8")
     assert with_table(page, method) == page, "python -m tools.make_differences writes the tables anew"
+
+
+@pytest.mark.parametrize("method", RECIPES)
+def test_a_recipe_of_a_file_gives_defaults_that_options_override(
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "recipe.json"
+    recipe = replace(recipe_of(method, "paper"), background=(0.5, 0.5, 0.5))
+    file.write_text(recipe_to_json(recipe))
+    assert parsed([method, "--config", str(file)], monkeypatch) == recipe
+    assert parsed([method, f"--config={file}", "--sh-degree", "1"], monkeypatch) == replace(recipe, sh_degree=1)
+    other = next(name for name in RECIPES if name != method)
+    assert main.main(["train", other, "--config", str(file), "--data", "x", "--output", "y"]) == 2
+    assert f"is a recipe of {method}" in " ".join(capsys.readouterr().err.split())
+    assert main.main(["train", method, "--config", str(tmp_path / "no.json"), "--data", "x", "--output", "y"]) == 2
 
 
 def test_every_difference_has_a_reason_and_no_reason_is_idle() -> None:
