@@ -359,3 +359,20 @@ Blend = Literal["srgb", "linear"]
 """The space in which transmission and reflection are blended: as photographed, or in radiance."""
 Shading = Literal["deferred", "forward"]
 """Whether each pixel is shaded, or each Gaussian."""
+
+
+@dataclass(frozen=True)
+class Cleaning:
+    """Rules for what is taken out of a scene; panes, their glass and what is mirrored from afar stay.
+
+    Attributes:
+        box: two opposite corners, world units; what has its centre outside goes.
+        isolated: what is that many times its own size (or the median size, if larger) away from its fourth neighbour
+            goes; 0 keeps it.
+        oversized: what has a standard deviation above that share of its distance from the nearest camera goes; 0 keeps
+            it.
+    """
+
+    box: tuple[Finite, Finite, Finite, Finite, Finite, Finite] | None = None
+    isolated: NotNegative = 8.0
+    oversized: NotNegative = 1.0

@@ -1,4 +1,4 @@
-"""The command line: `glassplat prepare | annotate | train | eval | render | dereflect | export | info | demo`.
+"""The command line: `glassplat prepare | annotate | train | eval | render | dereflect | clean | export | info | demo`.
 
 A command's module is imported when the command is chosen, and nothing before that which takes long: the list of
 commands appears at once, and Ctrl-C works from the beginning. What does a command's work, and PyTorch with it, is
@@ -44,6 +44,7 @@ COMMANDS = {
         "Dereflect",
         "Take the reflections out of a planar run's photographs; one PNG per photograph, under its name.",
     ),
+    "clean": Listed("publish", "Clean", "Take floaters out of a scene, and give it metres; writes another scene."),
     "view": Listed(
         "look", "View", "Look at a scene in the browser, layer by layer, with its panes as they are or edited."
     ),

@@ -1,7 +1,8 @@
-"""`glassplat export` and `dereflect`: scenes in other formats, and photographs without reflections."""
+"""`glassplat clean`, `export` and `dereflect`: tidy scenes, other formats, and photographs without reflections."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -12,14 +13,58 @@ from rich.console import Console
 from glassplat.cli.console import import_now
 from glassplat.cli.places import SceneEdits, SplatFile, Split, check_claim, check_scene, say_scene
 from glassplat.errors import InputError
-from glassplat.files.writing import WRITTEN
+from glassplat.files.writing import WRITTEN, check_folder
 from glassplat.kernels.backend.devices import DeviceName
 from glassplat.model.run_directory import RunDirectory
+from glassplat.options import Cleaning, Finite, Positive
 
 if TYPE_CHECKING:
     Format = str
 else:
     Format = Literal[WRITTEN]
+
+
+@dataclass(frozen=True)
+class Clean:
+    """Take floaters out of a scene, and give it metres; writes another scene.
+
+    Attributes:
+        scene: a run's directory, or a splat file of any program (.ply, .spz, .glb, .splat).
+        output: where the clean scene goes, a new folder; `glassplat view` and `export` read it like a run.
+        rules: what goes.
+        scale: two points, x y z each in world units, and how many metres apart they are; `view` measures points.
+        file: what a splat file does not say of itself.
+        device: where to work; auto takes an NVIDIA GPU where one can be used.
+    """
+
+    scene: tyro.conf.Positional[Path]
+    output: Path
+    rules: Annotated[Cleaning, tyro.conf.arg(name="")] = field(default_factory=Cleaning)
+    scale: tuple[Finite, Finite, Finite, Finite, Finite, Finite, Positive] | None = None
+    file: Annotated[SplatFile, tyro.conf.arg(name="")] = field(default_factory=SplatFile)
+    device: DeviceName = "auto"
+
+    def ready(self) -> None:
+        """Refuses what is no scene, points that do not differ, and an output that is there."""
+        check_scene(self.scene)
+        self.file.check()
+        if self.scale is not None and self.scale[:3] == self.scale[3:6]:
+            raise InputError(f"--scale got the point {self.scale[:3]} twice; expected two points that are apart")
+        check_folder(self.output)
+        if os.path.lexists(self.output) and any(self.output.iterdir()):
+            raise InputError(f"{self.output} is not empty; nothing was written. Choose a new folder for --output")
+        say_scene(self.scene)
+        import_now("glassplat.cli.writing")
+
+    def run(self, console: Console) -> None:
+        """Writes the clean scene."""
+        from glassplat.cli.writing import write_clean
+
+        write_clean(self, console)
+
+    def left_behind(self) -> str:
+        """Text after an interrupt: the state on disk, and how to go on."""
+        return f"{self.scene} is as it was; remove {self.output} and repeat the command"
 
 
 @dataclass(frozen=True)

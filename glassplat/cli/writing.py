@@ -37,7 +37,7 @@ from glassplat.scene.scene import Scene, without_glass
 
 if TYPE_CHECKING:
     from glassplat.cli.look import Render, Video
-    from glassplat.cli.publish import Dereflect, Export
+    from glassplat.cli.publish import Clean, Dereflect, Export
 
 
 def write_layers(command: Render, console: Console) -> None:
@@ -171,6 +171,21 @@ def followed(
     for number, picture in enumerate(pictures, start=1):
         yield picture
         progress.show(Step(what, number, total))
+
+
+def write_clean(command: Clean, console: Console) -> None:
+    """Writes the clean scene, and says what went."""
+    model = command.file.opened(command.scene, command.device)
+    tidy, found = model.cleaned(command.rules)
+    told = ", ".join(f"{count} {rule}" for rule, count in found.items() if count) or "no floaters"
+    say(console, f"{len(tidy.scene.primary)} of {len(model.scene.primary)} Gaussians stay; found {told}")
+    if command.scale is not None:
+        *points, metres = command.scale
+        factor = metres / math.dist(points[:3], points[3:])
+        tidy = tidy.scaled(factor)
+        say(console, f"one unit is a metre now; it was {factor:.4g} m")
+    tidy.save(command.output)
+    say(console, f"next: glassplat view {command.output}")
 
 
 def write_files(command: Export, console: Console) -> None:

@@ -26,8 +26,10 @@ from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.recipe import recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory, write_text
+from glassplat.options import Cleaning
 from glassplat.panes.material import with_pane
 from glassplat.publish.camera_paths import orbit
+from glassplat.publish.cleaning import Floaters, cleaned
 from glassplat.publish.web_page import best_view, write_page
 from glassplat.render.environment import equirect_from_environment
 from glassplat.render.frame import Frame, Renderer, check_layers
@@ -177,6 +179,32 @@ class Model:
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> Model:
         """The same with some tensors replaced, by their names in `scene.parameters()`; gradients flow to them."""
         return self.with_scene(self.scene.with_parameters(parameters))
+
+    def cleaned(self, cleaning: Cleaning | None = None) -> tuple[Model, dict[str, int]]:
+        """The model without floaters, and how many Gaussians each rule found.
+
+        Args:
+            cleaning: the rules; the usual ones if None.
+
+        Raises:
+            InputError: nothing would be left.
+        """
+        centers = torch.stack([camera.center for camera in self.cameras.values()])
+        bare, found = cleaned(self.scene, Floaters(self.scene.primary, centers), cleaning or Cleaning())
+        return self.with_scene(bare), found
+
+    def scaled(self, factor: float) -> Model:
+        """The model in other units, its cameras too; it belongs to no capture any more, whose units are the old ones.
+
+        Raises:
+            ValueError: the factor is not positive and finite.
+        """
+        cameras = {}
+        for name, camera in self.cameras.items():
+            pose = camera.cam_from_world.clone()
+            pose[:3, 3] *= factor
+            cameras[name] = replace(camera, cam_from_world=pose)
+        return replace(self, scene=scene.scaled(self.scene, factor), cameras=cameras, path=None)
 
     def without_glass(self) -> Model:
         """Without any panes: what is seen when nothing reflects."""

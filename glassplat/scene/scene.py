@@ -175,6 +175,27 @@ LARGEST_LOGIT = 50.0
 """Its sigmoid is 1 in both precisions, and it is finite, so that the scene can still be written."""
 
 
+def scaled(scene: Scene, factor: float) -> Scene:
+    """The scene in other units: all lengths times a factor, about the origin; 1 changes no bit.
+
+    Raises:
+        ValueError: the factor is not positive and finite.
+    """
+    if not 0 < factor < math.inf:
+        raise ValueError(f"a scene cannot be scaled by {factor}; expected a positive number")
+    sets: dict[str, Any] = {}
+    for name in GAUSSIAN_SETS:
+        gaussians: Gaussians = getattr(scene, name)
+        sizes = {"means": gaussians.means * factor, "log_scales": gaussians.log_scales + math.log(factor)}
+        sets[name] = gaussians.with_tensors(sizes)
+    planes, region = scene.planes, scene.environment.region
+    lengths = {"centers": planes.centers * factor, "half_sizes": planes.half_sizes * factor}
+    if region is not None:
+        x, y, z, radius = (factor * length for length in region)
+        sets["environment"] = replace(scene.environment, region=(x, y, z, radius))
+    return replace(scene, **sets, planes=planes.with_tensors(lengths), extent=factor * scene.extent)
+
+
 def without_glass(scene: Scene) -> Scene:
     """The scene without panes: what is seen when nothing reflects."""
     return replace(

@@ -160,6 +160,7 @@ FIRST_WORDS = {
     "eval run": "run: a planar run of 3000 iterations on gone",
     "render run --output new": "run: a planar run of 3000 iterations on gone",
     "dereflect run --output new": "run: a planar run of 3000 iterations on gone",
+    "clean run --output new": "run: a planar run of 3000 iterations on gone",
     "export run --output new": "run: a planar run of 3000 iterations on gone",
     "video run --output film.gif": "run: a planar run of 3000 iterations on gone",
     "view splats.ply": "splats.ply: a splat file of 0.0 MB",

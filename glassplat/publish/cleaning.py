@@ -1,0 +1,70 @@
+"""Floaters: Gaussians outside a box, far from all others, or large for how near they are to a camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from glassplat.errors import InputError
+from glassplat.options import Cleaning
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Scene
+
+NEIGHBOURS = 4
+"""Floaters come in twos and threes."""
+
+
+class Floaters:
+    """Sizes and distances of a scene's Gaussians, measured once, so that rules can be tried one after the other."""
+
+    def __init__(self, gaussians: Gaussians, cameras: Tensor) -> None:
+        """Measures.
+
+        Args:
+            gaussians: N of them.
+            cameras: [V, 3] centres; at least one.
+        """
+        from scipy.spatial import cKDTree  # Takes long to import, and most commands never need it.
+
+        self._gaussians = gaussians
+        means = gaussians.means.detach().double().cpu().numpy()
+        count = min(NEIGHBOURS, len(means) - 1)
+        apart = cKDTree(means).query(means, k=count + 1, workers=-1)[0].reshape(len(means), -1)[:, -1]
+        near = cKDTree(cameras.detach().double().cpu().numpy()).query(means)[0]
+        self._apart, self._near = torch.from_numpy(apart), torch.from_numpy(near)
+        self._longest = gaussians.log_scales.detach().double().cpu().amax(dim=1).exp()
+
+    def found(self, cleaning: Cleaning) -> dict[str, Tensor]:
+        """[N] bool for each rule: which Gaussians it takes out."""
+        everywhere = torch.zeros(len(self._longest), dtype=torch.bool)
+        found = {"outside": everywhere, "isolated": everywhere, "oversized": everywhere}
+        if cleaning.box is not None:
+            corners = torch.tensor(cleaning.box, dtype=torch.float64).reshape(2, 3)
+            means = self._gaussians.means.detach().double().cpu()
+            found["outside"] = ((means < corners.amin(dim=0)) | (means > corners.amax(dim=0))).any(dim=1)
+        if cleaning.isolated:
+            found["isolated"] = self._apart > cleaning.isolated * self._longest.clamp(min=float(self._longest.median()))
+        if cleaning.oversized:
+            found["oversized"] = self._longest > cleaning.oversized * self._near
+        return found
+
+
+def cleaned(scene: Scene, floaters: Floaters, cleaning: Cleaning) -> tuple[Scene, dict[str, int]]:
+    """The scene without what the rules take out, and how many Gaussians each of them found.
+
+    Args:
+        scene: to be cleaned; it is left as it is.
+        floaters: of its primary Gaussians.
+        cleaning: the rules.
+
+    Raises:
+        InputError: nothing would be left.
+    """
+    found = floaters.found(cleaning)
+    kept = ~torch.stack(list(found.values())).any(dim=0)
+    if not bool(kept.any()):
+        raise InputError(f"nothing would be left of {len(kept)} Gaussians; expected a larger box, or milder rules")
+    primary = scene.primary.select(kept.to(scene.primary.means.device))
+    return replace(scene, primary=primary), {rule: int(gone.sum()) for rule, gone in found.items()}

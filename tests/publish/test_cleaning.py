@@ -1,0 +1,112 @@
+"""Floaters go, everything else stays, and units may be changed without a pixel's difference."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+import glassplat
+from glassplat.cli.main import main
+from glassplat.errors import InputError
+from glassplat.methods.planar_recipe import PlanarRecipe
+from glassplat.model.model import Model
+from glassplat.options import Cleaning
+from glassplat.publish.cleaning import Floaters, cleaned
+from glassplat.scene.gaussians import Gaussians
+from tests.cli.tiny_run import write_run
+from tests.training.tiny_capture import tiny_capture, true_scene
+
+CAMERA = torch.zeros(1, 3)
+
+
+def wall(count: int = 12) -> Gaussians:
+    """[count^2] small Gaussians on a wall three units away."""
+    x, y = torch.meshgrid(torch.linspace(-1, 1, count), torch.linspace(-1, 1, count), indexing="ij")
+    means = torch.stack([x, y, torch.full_like(x, 3.0)], dim=-1).reshape(-1, 3)
+    number = len(means)
+    return Gaussians(
+        means,
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(number, 1),
+        torch.full((number, 3), 0.1).log(),
+        torch.zeros(number),
+        torch.zeros(number, 1, 3),
+    )
+
+
+def with_one(gaussians: Gaussians, mean: tuple[float, float, float], deviation: float) -> Gaussians:
+    one = gaussians.select(torch.tensor([0])).with_tensors(
+        {"means": torch.tensor([mean]), "log_scales": torch.full((1, 3), deviation).log()}
+    )
+    return gaussians.joined(one)
+
+
+@pytest.mark.parametrize(
+    ("mean", "deviation", "rule"),
+    [
+        ((0.0, 0.0, 1.0), 0.1, "isolated"),
+        ((0.0, 0.0, 0.5), 0.8, "oversized"),
+    ],
+)
+def test_a_floater_is_found_by_one_rule_and_the_wall_by_none(mean, deviation: float, rule: str) -> None:
+    floaters = Floaters(with_one(wall(), mean, deviation), CAMERA)
+    for name, found in floaters.found(Cleaning()).items():
+        assert found.nonzero().flatten().tolist() == ([144] if name == rule else [])
+    off = Cleaning(isolated=0, oversized=0)
+    assert not any(bool(found.any()) for found in floaters.found(off).values())
+
+
+def test_a_large_gaussian_far_away_stays() -> None:
+    found = Floaters(with_one(wall(), (0.0, 0.0, 40.0), 12.0), CAMERA).found(Cleaning())
+    assert not any(bool(gone.any()) for gone in found.values())
+
+
+def test_a_box_keeps_what_is_in_it_whichever_corners_are_given() -> None:
+    scene = dataclasses.replace(true_scene(), primary=wall())
+    floaters = Floaters(scene.primary, CAMERA)
+    for box in ((-2.0, -2.0, 0.0, 0.0, 2.0, 4.0), (0.0, 2.0, 4.0, -2.0, -2.0, 0.0)):
+        left, counts = cleaned(scene, floaters, Cleaning(box=box))
+        assert counts["outside"] == 72 and bool((left.primary.means[:, 0] <= 0).all())
+    assert torch.equal(left.planes.centers, scene.planes.centers) and len(scene.primary) == 144
+    with pytest.raises(InputError, match="nothing would be left of 144"):
+        cleaned(scene, floaters, Cleaning(box=(5.0, 5.0, 5.0, 6.0, 6.0, 6.0)))
+
+
+def test_units_change_no_picture() -> None:
+    model = Model(
+        true_scene(),
+        PlanarRecipe(background=(0.0, 0.0, 0.0)),
+        {view.name: view.camera for view in tiny_capture().train},
+        "tiny",
+    )
+    scaled = model.scaled(2.5)
+    torch.testing.assert_close(scaled.image("2.png"), model.image("2.png"), atol=2e-4, rtol=0)
+    torch.testing.assert_close(
+        scaled.render("2.png", layers=["depth"]).layers["depth"],
+        2.5 * model.render("2.png", layers=["depth"]).layers["depth"],
+        atol=1e-3,
+        rtol=1e-3,
+    )
+    assert scaled.scene.extent == 2.5 * model.scene.extent
+    with pytest.raises(ValueError, match="positive"):
+        model.scaled(0.0)
+
+
+def test_the_command_writes_another_scene_in_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, output = write_run(tmp_path / "run"), tmp_path / "clean"
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    points = ["0", "0", "0", "0", "0", "2", "1"]
+    assert (
+        main(["clean", str(run), "--output", str(output), "--scale", *points, *["--isolated", "0", "--oversized", "0"]])
+        == 0
+    )
+    assert "one unit is a metre now; it was 0.5 m" in " ".join(capsys.readouterr().out.split())
+    old, new = glassplat.load(run), glassplat.load(output)
+    torch.testing.assert_close(new.scene.planes.centers, old.scene.planes.centers / 2)
+    torch.testing.assert_close(new.image("2.png"), old.image("2.png"), atol=2e-4, rtol=0)
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+    assert main(["clean", str(run), "--output", str(run)]) == 2
+    assert main(["clean", str(run), "--output", str(tmp_path / "no"), "--scale", *"1231234"]) == 2
+    assert "expected two points" in " ".join(capsys.readouterr().err.split())
