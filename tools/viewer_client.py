@@ -17,7 +17,14 @@ from websockets.asyncio.client import ClientConnection, connect
 
 from glassplat.access import cookie_name
 
-CONTROLS = ("GuiDropdownMessage", "GuiSliderMessage", "GuiButtonMessage", "GuiButtonGroupMessage", "GuiTextMessage")
+CONTROLS = (
+    "GuiDropdownMessage",
+    "GuiSliderMessage",
+    "GuiButtonMessage",
+    "GuiButtonGroupMessage",
+    "GuiTextMessage",
+    "GuiCheckboxMessage",
+)
 
 
 class ViewerClient:

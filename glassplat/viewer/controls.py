@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from glassplat.options import Cleaning
 from glassplat.publish.camera_paths import interpolated
+from glassplat.publish.cleaning import Floaters
 from glassplat.render.layers import LABEL_COLORS
 from glassplat.scene.camera import Camera
 from glassplat.scene.panes import Planes
@@ -163,6 +165,109 @@ class PaneControls:
 def within(value: float, least: float, most: float) -> float:
     """The value within a range, which a client need not keep to; the least where it is no number."""
     return min(max(value, least), most) if value == value else least
+
+
+MOST_ISOLATED, MOST_OVERSIZED = 40.0, 4.0
+BOX_HINT = "x y z x y z"
+
+
+class CleanControls:
+    """A folder of controls that take floaters out, as `glassplat clean` does."""
+
+    def __init__(self, gui: Any, shown: Shown) -> None:
+        """Lays them out; they do nothing yet.
+
+        Args:
+            gui: of the client.
+            shown: what is looked at.
+        """
+        self._shown, usual = shown, Cleaning()
+        self._floaters: Floaters | None = None
+        with gui.add_folder("Clean", expand_by_default=False):
+            self._on = gui.add_checkbox("Take floaters out", False)
+            self._isolated = gui.add_slider("Isolated", 0.0, MOST_ISOLATED, 0.5, usual.isolated)
+            self._oversized = gui.add_slider("Oversized", 0.0, MOST_OVERSIZED, 0.05, usual.oversized)
+            self._box = gui.add_text("Box", "", hint=BOX_HINT)
+            self._told = gui.add_markdown("")
+
+    def listen(self, changed: Callable[[], None]) -> None:
+        """From now on `changed` is called whenever something else is wished for."""
+        for control in (self._on, self._isolated, self._oversized, self._box):
+            control.on_update(survived(lambda _: changed()))
+
+    def applied(self, wish: Wish) -> Wish:
+        """The wish, with what the controls leave of the scene."""
+        if not self._on.value:
+            self._told.content = ""
+            return wish
+        primary = self._shown.scene.primary
+        if self._floaters is None:
+            self._floaters = Floaters(primary, torch.stack([camera.center for _, camera in self._shown.cameras]))
+        cleaning = Cleaning(
+            box_of(self._box.value),
+            within(self._isolated.value, 0.0, MOST_ISOLATED),
+            within(self._oversized.value, 0.0, MOST_OVERSIZED),
+        )
+        kept = ~torch.stack(list(self._floaters.found(cleaning).values())).any(dim=0)
+        self._told.content = f"{int(kept.sum())} of {len(primary)} Gaussians stay"
+        return replace(wish, kept=kept) if bool(kept.any()) else wish
+
+
+def box_of(text: str) -> tuple[float, float, float, float, float, float] | None:
+    """Two corners of a box that somebody typed; None where they are not six numbers."""
+    try:
+        x, y, z, u, v, w = (float(number) for number in text.replace(",", " ").split())
+    except ValueError:
+        return None
+    return (x, y, z, u, v, w) if np.isfinite([x, y, z, u, v, w]).all() else None
+
+
+MEASURE_COLOR = (86, 180, 233)
+
+
+class MeasureControls:
+    """A checkbox, and the distance between the last two points that were clicked while it was on."""
+
+    def __init__(self, handle: Any) -> None:
+        """Has no points yet, and no controls before `lay_out`."""
+        self._handle = handle
+        self._points: list[np.ndarray] = []
+        self._is_listening = False
+
+    def lay_out(self, clicked: Callable[[np.ndarray], None]) -> None:
+        """Puts the controls there; `clicked` is called with the direction [3] of a click."""
+        with self._handle.gui.add_folder("Measure", expand_by_default=False):
+            self._on = self._handle.gui.add_checkbox("Click two points", False)
+            self._told = self._handle.gui.add_markdown(self._distance())
+        self._on.on_update(survived(lambda _: self._listen(clicked)))
+
+    def take(self, point: np.ndarray) -> None:
+        """One more point [3]; a third begins anew."""
+        self._points = [*self._points, point] if len(self._points) < 2 else [point]
+        self._told.content = self._distance()
+        ends = np.stack([self._points[0], self._points[-1]]).astype(np.float32)
+        self._handle.scene.add_line_segments(
+            "/measured", ends[None], MEASURE_COLOR, thickness=3.0, thickness_units="screen"
+        )
+
+    def _listen(self, clicked: Callable[[np.ndarray], None]) -> None:
+        """Hears clicks from the first time that it is on; pages look otherwise once they are to report clicks."""
+        if not self._on.value or self._is_listening:
+            return
+        self._is_listening = True
+        scene = self._handle.scene
+        # Before 1.1, viser had one way to hear of clicks and drawn rectangles.
+        register = scene.on_click() if hasattr(scene, "on_click") else scene.on_pointer_event("click")
+        register(survived(lambda event: clicked(np.array(event.ray_direction)) if self._on.value else None))
+
+    def _distance(self) -> str:
+        if len(self._points) < 2:
+            return f"{len(self._points)} of two points"
+        ends = " ".join(f"{value:.4g}" for point in self._points for value in point)
+        return (
+            f"{np.linalg.norm(self._points[1] - self._points[0]):.4g} units; in metres with "
+            f"`glassplat clean ... --scale {ends} METRES`"
+        )
 
 
 MOST_KEYFRAMES = 200

@@ -96,6 +96,8 @@ Glass = Literal["as it is", "mirror", "none"]
 LEAST_GAIN, MOST_GAIN = 0.1, 10.0
 ERROR = "error"
 """The layer that compares with a photograph."""
+MEASURED_ROWS, SURFACE_COVERAGE = 480, 0.5
+"""Of the picture in which points are measured, and below which it shows no surface."""
 
 
 class PaneMove(NamedTuple):
@@ -120,6 +122,7 @@ class Wish:
         gain: factor on what the panes mirror.
         moves: panes that are elsewhere than in the scene.
         against: position of the photograph that the layer `error` compares with; None for the other layers.
+        kept: [N] bool, the primary Gaussians that stay; None where nothing is cleaned.
     """
 
     cam_from_world: Tensor
@@ -131,6 +134,7 @@ class Wish:
     gain: float = 1.0
     moves: tuple[PaneMove, ...] = ()
     against: int | None = None
+    kept: Tensor | None = None
 
     def camera(self, height: int) -> Camera:
         """The camera of a picture with that many rows."""
@@ -140,7 +144,9 @@ class Wish:
 
 
 def edited(scene: Scene, wish: Wish) -> Scene:
-    """The scene with the panes as they are wished for; what is not wished for keeps every bit."""
+    """The scene with the panes as they are wished for and cleaned; what is not wished for keeps every bit."""
+    if wish.kept is not None and len(wish.kept) == len(scene.primary):
+        scene = replace(scene, primary=scene.primary.select(wish.kept.to(scene.primary.means.device)))
     if not len(scene.planes) or wish.glass == "none":
         return without_glass(scene) if len(scene.planes) else scene
     for move in wish.moves:
@@ -190,6 +196,27 @@ def error_drawn(
     missing = max(1, round(wish.aspect * rows)) - columns
     left = missing // 2
     return _picture(torch.nn.functional.pad(colors, (0, 0, left, missing - left)))
+
+
+@torch.no_grad()
+def point_along(scene: Scene, renderer: Renderer, wish: Wish, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[3] the point that a picture of a wish shows in a direction [3], world axes.
+
+    Raises:
+        ValueError: there is nothing.
+    """
+    camera = wish.camera(MEASURED_ROWS)
+    x, y, z = (camera.cam_from_world[:3, :3].double().numpy() @ direction).tolist()
+    if z <= 0:
+        raise ValueError("the direction is behind the camera")
+    column, row = int(camera.fx * x / z + camera.cx), int(camera.fy * y / z + camera.cy)
+    frame = renderer.with_layers(["depth"])(edited(scene, wish), camera)
+    is_inside = 0 <= row < camera.height and 0 <= column < camera.width
+    if not is_inside or float(frame.layers["alpha"][row, column]) < SURFACE_COVERAGE:
+        raise ValueError("nothing is there")
+    depth = float(frame.layers["depth"][row, column])
+    point: NDArray[np.float64] = camera.center.double().numpy() + depth / z * direction
+    return point
 
 
 def _has(frame: Frame, layer: str) -> bool:

@@ -26,7 +26,7 @@ from websockets.http11 import Request, Response
 
 from glassplat.access import Access, RefusedError
 from glassplat.errors import InputError
-from glassplat.files.records import COORDINATE, ByName, Field, Items, Number, Optional, Whole, checked
+from glassplat.files.records import COORDINATE, ByName, Choice, Field, Items, Number, Optional, Whole, checked
 
 LARGEST_MESSAGE = 64 * 1024
 """Bytes; a page sends cameras and what is typed into controls."""
@@ -82,11 +82,19 @@ MESSAGES: dict[str, dict[str, Field]] = {
     "TransformControlsUpdateMessage": {**GIZMO, "wxyz": TURN, "position": POSITION},
     "TransformControlsDragStartMessage": GIZMO,
     "TransformControlsDragEndMessage": GIZMO,
+    "ScenePointerMessage": {
+        "event_type": Choice(("click",)),
+        "ray_origin": POSITION,
+        "ray_direction": Items(Number(-1.001, 1.001), 3),
+        "screen_pos": Items(Items(Number(0, 1), 2), 1),
+    },
 }
 """What browsers may say, by viser's names, and within which bounds; nothing else is heard.
 
 Among what is not heard: that the scene be shared through a public server, uploads, and pictures of other views.
 """
+if "modifier" in viser._messages.ScenePointerMessage.__dataclass_fields__:  # Since viser 1.1.
+    MESSAGES["ScenePointerMessage"]["modifier"] = Choice((None,))
 
 
 def understood(data: str | bytes) -> bytes | None:

@@ -26,8 +26,15 @@ from glassplat.publish.web_page import best_view, surveyed
 from glassplat.render.frame import Renderer
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
-from glassplat.viewer.controls import KeyframeControls, PaneControls, PhotographControls, survived
-from glassplat.viewer.drawing import ERROR, Shown, Viewpoints, Wish, drawn, edited, error_drawn, matrix_of
+from glassplat.viewer.controls import (
+    CleanControls,
+    KeyframeControls,
+    MeasureControls,
+    PaneControls,
+    PhotographControls,
+    survived,
+)
+from glassplat.viewer.drawing import ERROR, Shown, Viewpoints, Wish, drawn, edited, error_drawn, matrix_of, point_along
 from glassplat.viewer.render_loop import RenderLoop, RenderThread, check_port
 
 LARGEST_HEIGHT, MOST_PIXELS = 1080, 4_000_000
@@ -61,6 +68,8 @@ class Client:
         self._status, self._nearest = "", viewer.first
         self._layer: Any = None
         self._panes: PaneControls | None = None
+        self._clean: CleanControls | None = None
+        self._measure = MeasureControls(handle)
         self.keyframes = KeyframeControls(handle, viewer.shown.scene.extent, self.camera)
         self._failure = ""
         self._waiting: Any = handle.add_notification(*WAITING, loading=True, with_close_button=False)
@@ -114,6 +123,7 @@ class Client:
         self._nearest = self._viewer.viewpoints.nearest(position, matrix_of(wxyz)[:, 2])
         against = self._nearest if self._layer.value == ERROR else None
         wish = Wish(cam_from_world(wxyz, position), fov_rad, aspect, self._layer.value, against=against)
+        wish = wish if self._clean is None else self._clean.applied(wish)
         return wish if self._panes is None else self._panes.applied(wish)
 
     def camera(self) -> Camera | None:
@@ -155,14 +165,33 @@ class Client:
         if self._panes is not None:
             self._panes.remove()
         self._panes = PaneControls(self._handle, panes) if len(panes) else None
+        # A scene that is trained changes from step to step.
+        self._clean = None if self._viewer.buttons else CleanControls(gui, shown)
+        self._measure.lay_out(self.measure)
         self._photographs = PhotographControls(gui, shown, self._nearest)
         # Now that all are there: a control may be used as soon as it listens.
         if self._panes is not None:
             self._panes.listen(self.ask)
+        if self._clean is not None:
+            self._clean.listen(self.ask)
         self._photographs.listen(self.stand_at)
         self.keyframes.lay_out(self.go, None if shown.keeper is None else self.keep_keyframes)
         if shown.keeper is not None:
             self._add_saving(f"{shown.title}-edited")
+
+    def measure(self, direction: NDArray[np.float64]) -> None:
+        """Takes the point that is seen in a direction [3], world axes, as an end of what is measured."""
+
+        def work() -> None:
+            wish = self.wish()
+            if wish is None:
+                return
+            try:
+                self._measure.take(point_along(self._viewer.shown.scene, self._viewer.shown.renderer, wish, direction))
+            except ValueError as error:
+                self._notify("No point", str(error), "red")
+
+        self._viewer.loop.call(survived(work))
 
     def keep_scene(self, name: str) -> None:
         """Saves the scene as it is edited here, under a new name; says how that went."""

@@ -1,0 +1,96 @@
+"""In the viewer floaters go before anybody's eyes, and two clicks measure a distance."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from glassplat.model.model import shown_of
+from glassplat.scene.camera import Camera
+from glassplat.scene.scene import Scene
+from glassplat.viewer.controls import box_of
+from glassplat.viewer.drawing import Wish, edited, point_along
+from glassplat.viewer.server import Viewer
+from tests.model.test_model import model
+from tests.publish.test_cleaning import wall
+from tests.viewer.free_port import free_port
+from tools.viewer_client import ViewerClient
+
+POSE = Camera.look_at((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), up=(0.0, -1.0, 0.0)).cam_from_world.float()
+
+
+def wall_scene() -> Scene:
+    gaussians = wall(24).with_tensors({"logit_opacities": torch.full((576,), 8.0)})
+    return Scene(gaussians, 1.0)
+
+
+def test_a_wish_takes_out_what_is_not_kept() -> None:
+    scene = model().scene
+    kept = torch.arange(len(scene.primary)) % 2 == 0
+    wish = Wish(POSE, 1.0, 1.0, kept=kept)
+    assert torch.equal(edited(scene, wish).primary.means, scene.primary.means[kept])
+    assert edited(scene, replace(wish, kept=kept[:-1])).primary is scene.primary, "the scene is another one by now"
+
+
+def test_a_point_lies_where_the_wall_is_and_nowhere_beside_it() -> None:
+    splat = shown_of(replace(model(), scene=wall_scene()), {}).renderer
+    wish = Wish(POSE, 1.0, 1.0)
+    for aside in (0.0, 0.2, -0.25):
+        direction = np.array([aside, 0.0, 1.0]) / np.hypot(aside, 1.0)
+        found = point_along(wall_scene(), splat, wish, direction)
+        np.testing.assert_allclose(found, [3 * aside, 0.0, 3.0], atol=0.05)
+    for away in ([0.45, 0.0, 0.89], [0.0, 0.0, -1.0], [0.9, 0.0, 0.43]):
+        with pytest.raises(ValueError, match=r"nothing is there|behind"):
+            point_along(wall_scene(), splat, wish, np.array(away))
+
+
+def test_a_box_is_six_numbers() -> None:
+    assert box_of("0 1 2, 3 4 5") == (0, 1, 2, 3, 4, 5)
+    assert box_of("0 1 2") is box_of("a b c d e f") is box_of("0 1 2 3 4 nan") is None
+
+
+def test_two_clicks_are_measured_and_floaters_go_and_come_back() -> None:
+    viewer = Viewer(shown_of(replace(model(), scene=wall_scene()), {}), "127.0.0.1", free_port())
+    viewer.start()
+
+    async def work() -> None:
+        async with ViewerClient(viewer.address) as client:
+            await client.picture()
+            await client.look(position=(0.0, 0.0, 0.0), look_at=(0.0, 0.0, 1.0))
+            await client.set("Click two points", True)
+            (inner,) = viewer._clients.values()
+            for aside in (0.25, -0.25):
+                await asyncio.sleep(0.3)
+                await client.send(
+                    "ScenePointerMessage",
+                    event_type="click",
+                    ray_origin=(0.0, 0.0, 0.0),
+                    ray_direction=(aside / math.hypot(aside, 1), 0.0, 1 / math.hypot(aside, 1)),
+                    screen_pos=((0.5, 0.5),),
+                    modifier=None,
+                )
+            async with asyncio.timeout(60):
+                while len(inner._measure._points) < 2:
+                    await asyncio.sleep(0.05)
+            first, second = inner._measure._points
+            assert np.linalg.norm(first - second) == pytest.approx(1.5, abs=0.05)
+            assert "--scale" in inner._measure._told.content
+            await client.set("Box", "-2 -2 0 0 2 4")
+            await client.set("Take floaters out", True)
+            async with asyncio.timeout(60):
+                while inner.wish().kept is None or int(inner.wish().kept.sum()) != 288:
+                    await asyncio.sleep(0.05)
+            await client.set("Take floaters out", False)
+            async with asyncio.timeout(60):
+                while inner.wish().kept is not None:
+                    await asyncio.sleep(0.05)
+
+    try:
+        asyncio.run(work())
+    finally:
+        viewer.stop()
