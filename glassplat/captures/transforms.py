@@ -279,7 +279,7 @@ def _load_whole(root: Path) -> Capture:
         test_shots=test,
         points=read_points(root, settings),
         format_name=WHOLE,
-        warnings=tuple(warnings),
+        warnings=(*warnings, *_unused_priors(settings)),
         kept=_mask_paths(root, settings, shots),
     )
 
@@ -311,6 +311,19 @@ def _mask_paths(root: Path, settings: Settings, shots: Mapping[str, Shot]) -> di
             "there, or delete the entries"
         )
     return paths
+
+
+PRIORS = {
+    "depth_file_path": "depths are not used",
+    "normal_file_path": "estimated normals are read from a folder normals/ beside the photographs",
+}
+"""What frames of nerfstudio and its kin name beside the photograph, and what becomes of it."""
+
+
+def _unused_priors(settings: Settings) -> list[str]:
+    """Warnings about files that frames name and nobody reads."""
+    counts = {key: sum(bool(frame.get(key)) for frame in settings["frames"]) for key in PRIORS}
+    return [f"{count} frames have a {key}, which is left out: {PRIORS[key]}." for key, count in counts.items() if count]
 
 
 def _is_blender(settings: Settings) -> bool:

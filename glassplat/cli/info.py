@@ -15,7 +15,7 @@ from rich.console import Console
 from glassplat.captures.files import CaptureFiles, read_capture
 from glassplat.cli.console import import_held, say, warn
 from glassplat.errors import InputError, UnknownFormatError, first_names
-from glassplat.files.images import IMAGE_SUFFIXES
+from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
 from glassplat.files.records import read_json
 from glassplat.files.writing import SCENE, SPLAT_SUFFIXES, scene_source
 from glassplat.model.run_directory import RunDirectory
@@ -109,7 +109,9 @@ def photographs_finding(path: Path) -> Iterator[Finding]:
     Raises:
         InputError: there are none.
     """
-    found = sorted(one for one in path.rglob("*") if one.suffix.lower() in IMAGE_SUFFIXES and one.is_file())
+    found = sorted(
+        one for one in path.rglob("*") if one.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) and one.is_file()
+    )
     if not found:
         names = first_names(sorted(one.name for one in path.iterdir()), 8) or "nothing"
         raise InputError(f"{path} is nothing that is known; expected {KINDS}; it holds {names}")
@@ -292,7 +294,7 @@ def _finder_of_folder(path: Path) -> Finder:
         return scene_finding
     if scene_source(path) != path:
         return export_finding
-    if all(one.suffix.lower() in IMAGE_SUFFIXES for one in path.iterdir()):
+    if all(one.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) for one in path.iterdir()):
         return photographs_finding
     return _capture_or_photographs
 

@@ -7,6 +7,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from itertools import count, takewhile
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import TYPE_CHECKING
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+HEIF_SUFFIXES = (".heic", ".heif")
+"""Of telephones; read where pi-heif is installed."""
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF", "PPM", "TGA", "JPEG2000")
 """What a photograph or a mask may be, whatever its suffix; not PostScript and others that start programs."""
 MOST_PIXELS = 2**27
@@ -33,6 +36,17 @@ _FULL_SCALE_16 = 65535
 # Damaged tags that do not matter end in warnings that name no file; those that do matter raise errors.
 warnings.filterwarnings("ignore", module=r"PIL\.")
 Image.MAX_IMAGE_PIXELS = None  # `opened` sets the bound, and says which file is too large; Pillow warns and names none.
+
+
+@cache
+def reads_heif() -> bool:
+    """Return whether HEIC photographs can be read, from now on by Pillow."""
+    try:
+        from pi_heif import register_heif_opener
+    except ImportError:
+        return False
+    register_heif_opener()
+    return True
 
 
 def open_image(path: Path) -> Image.Image:
@@ -130,7 +144,7 @@ def opened(path: Path) -> Iterator[Image.Image]:
         ValueError: the file is no image, is cut off or too large.
     """
     try:
-        with Image.open(path, formats=FORMATS) as image:
+        with Image.open(path, formats=(*FORMATS, "HEIF") if reads_heif() else FORMATS) as image:
             if image.width * image.height > MOST_PIXELS:
                 size = f"{image.width}x{image.height} pixels large"
                 raise ValueError(f"it is {size}; expected at most {MOST_PIXELS / 1e6:.0f} megapixels: reduce it")

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from glassplat.files.gaussforge import read_forged
 from glassplat.files.glb import MAGIC, read_glb
 from glassplat.files.ply import is_compressed, read_compressed, read_gaussians, write_gaussians
 from glassplat.files.ply_table import read_table
@@ -39,7 +40,7 @@ from glassplat.files.sidecars import (
     write_poses,
 )
 from glassplat.files.spz import GZIP, read_spz
-from glassplat.files.writing import SCENE, SPLAT_SUFFIXES, atomic_write
+from glassplat.files.writing import FORGED_SUFFIXES, SCENE, SPLAT_SUFFIXES, atomic_write
 from glassplat.scene.activations import SH_ZERO
 from glassplat.scene.corrections import Direction
 from glassplat.scene.gaussians import Gaussians
@@ -201,7 +202,7 @@ LEAST_SCALE = 1e-12
 def read_splats(path: Path | str) -> Gaussians:
     """Reads the Gaussians of a file in the frame of a PLY (y down, z forward), as they are stored.
 
-    What kind of file it is, its first bytes say; a .splat, which begins with anything, its name.
+    What kind of file it is, its first bytes say; a .splat, .sog or .ksplat its name.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -217,6 +218,8 @@ def read_splats(path: Path | str) -> Gaussians:
         return read_spz(path)
     if head == MAGIC:
         return read_glb(path)
+    if path.suffix.lower() in FORGED_SUFFIXES:
+        return read_forged(path)
     if path.suffix.lower() == ".splat":
         return _read_rows(path)
     raise ValueError(f"{path} is no splat file that can be read; expected one of {', '.join(SPLAT_SUFFIXES)}")

@@ -11,12 +11,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from uuid import uuid4
 
-SPLAT_SUFFIXES = (".ply", ".spz", ".glb", ".splat")
+FORGED_SUFFIXES = (".sog", ".ksplat")
+"""Formats that an extra reads and writes."""
+SPLAT_SUFFIXES = (".ply", ".spz", ".glb", ".splat", *FORGED_SUFFIXES)
 """Of files of Gaussians that are read."""
 SPLAT_WRITERS = {
     "ply": "glassplat.files.ply:write_gaussians",
     "spz": "glassplat.files.spz:write_spz",
     "glb": "glassplat.files.glb:write_glb",
+    "sog": "glassplat.files.gaussforge:write_forged",
+    "ksplat": "glassplat.files.gaussforge:write_forged",
 }
 """Formats that Gaussians are written in, by suffix: the function `(path, gaussians)` of each, imported when needed."""
 WRITTEN = (*SPLAT_WRITERS, "html")
@@ -181,4 +185,5 @@ def scene_source(path: Path) -> Path:
     """The splats in a folder that `glassplat export` wrote, the most exact of its files; any other path as it is."""
     if (path / "recipe.json").is_file():
         return path
-    return next((file for suffix in (".ply", ".glb", ".spz") if (file := path / f"scene{suffix}").is_file()), path)
+    suffixes = (".ply", ".glb", ".spz", *FORGED_SUFFIXES)
+    return next((file for suffix in suffixes if (file := path / f"scene{suffix}").is_file()), path)

@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 
 from glassplat.errors import InputError, first_names
-from glassplat.files.images import IMAGE_SUFFIXES, SHADES_16, image_size, opened, picture_paths, read_image
+from glassplat.files.images import (
+    HEIF_SUFFIXES,
+    IMAGE_SUFFIXES,
+    SHADES_16,
+    image_size,
+    opened,
+    picture_paths,
+    read_image,
+    reads_heif,
+)
 from glassplat.files.records import reading
 
 
@@ -37,9 +46,9 @@ class Note:
 
 Listener = Callable[[Progress | Note], None]
 
-UNREADABLE = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
-"""Photographs that Pillow cannot read: those of telephones that nobody told otherwise, and raw ones."""
-HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif")
+UNREADABLE = (".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
+"""Photographs that Pillow cannot read."""
+HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 """In bytes 8 to 12 of such a file, whatever its name: telephones and chats call some of them `.jpg`."""
 LEAST_SIDE = 64
 """Pixels of the shorter side; a smaller picture holds too few places to recognise."""
@@ -186,9 +195,9 @@ def _photograph_paths(folder: Path) -> list[Path]:
         raise InputError(
             f"{len(unreadable)} photographs in {folder} are {kinds} files, which cannot be read "
             f"({first_names(list(unreadable))}); save them as JPEG and remove these (a telephone does so by itself "
-            "with 'most compatible' in the camera's settings)"
+            "with 'most compatible' in the camera's settings). HEIC is read after pip install 'glassplat[heic]'"
         )
-    paths = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
+    paths = [path for path in files if path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)]
     if not paths:
         found = first_names(sorted(path.name for path in files)) or "nothing"
         raise InputError(f"no photograph in {folder}; expected {', '.join(IMAGE_SUFFIXES)} files, found {found}")
@@ -198,9 +207,9 @@ def _photograph_paths(folder: Path) -> list[Path]:
 def _unreadable_kind(path: Path) -> str | None:
     """Kind of a photograph that Pillow cannot read, by its name or first bytes; None for all others."""
     suffix = path.suffix.lower()
-    if suffix in UNREADABLE:
+    if suffix in UNREADABLE or (suffix in HEIF_SUFFIXES and not reads_heif()):
         return suffix[1:].upper()
-    if suffix not in IMAGE_SUFFIXES:
+    if suffix not in IMAGE_SUFFIXES or reads_heif():
         return None
     try:
         with reading(path), path.open("rb") as file:

@@ -122,6 +122,14 @@ def test_split_that_names_no_frame(capture) -> None:
         load(capture, train_filenames=["nothing.png"], test_filenames=["images/0001.png"])
 
 
+@pytest.mark.parametrize("prior", ["depth_file_path", "normal_file_path"])
+def test_priors_that_are_not_used_are_named(capture, prior: str) -> None:
+    frames = capture.frames()
+    frames[0][prior] = "elsewhere/0000.png"
+    assert any(f"1 frames have a {prior}" in warning for warning in load(capture, frames=frames).warnings)
+    assert not any("frames have a" in warning for warning in load(capture).warnings)
+
+
 @pytest.mark.parametrize("name", ["points3d.ply", "sparse_pc.ply", "cloud.ply"])
 @pytest.mark.parametrize("binary", [True, False])
 def test_points_beside_the_file(capture, name: str, binary: bool) -> None:

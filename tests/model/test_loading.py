@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from glassplat import InputError, load
 from glassplat.cli.main import main
 from glassplat.files.ply import write_gaussians
 from glassplat.files.sidecars import write_planes
-from glassplat.files.writing import SPLAT_SUFFIXES, SPLAT_WRITERS, splat_writer
+from glassplat.files.writing import FORGED_SUFFIXES, SPLAT_SUFFIXES, SPLAT_WRITERS, splat_writer
 from tests.cli.tiny_run import write_run
 from tests.files.test_spz import typical
 from tests.training.tiny_capture import true_scene
@@ -89,5 +90,29 @@ def test_hostile_files_get_one_message(suffix: str, tmp_path: Path, capsys: pyte
 
 @pytest.mark.parametrize("kind", SPLAT_WRITERS)
 def test_every_format_that_is_written_is_read(kind: str, tmp_path: Path) -> None:
+    if f".{kind}" in FORGED_SUFFIXES:
+        pytest.importorskip("gaussforge")
     splat_writer(kind)(tmp_path / f"a.{kind}", typical())
     assert len(load(tmp_path / f"a.{kind}", device="cpu").scene.primary) == len(typical())
+
+
+@pytest.mark.parametrize("suffix", FORGED_SUFFIXES)
+def test_lossy_formats_keep_every_gaussian_near_its_place(suffix: str, tmp_path: Path) -> None:
+    pytest.importorskip("gaussforge")
+    model = load(write_run(tmp_path / "run"), device="cpu").without_glass()
+    model.save(tmp_path / f"a{suffix}")
+    found = load(tmp_path / f"a{suffix}", device="cpu").scene.primary
+    moved = torch.cdist(model.scene.primary.means, found.means).amin(dim=1)
+    assert float(moved.max()) < 1e-3 * model.scene.extent
+
+
+@pytest.mark.parametrize("suffix", FORGED_SUFFIXES)
+def test_without_gaussforge_it_is_said_how_to_get_it(
+    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "gaussforge", None)
+    (tmp_path / f"a{suffix}").write_bytes(b"PK")
+    with pytest.raises(InputError, match=r"pip install 'glassplat\[formats\]'"):
+        load(tmp_path / f"a{suffix}", device="cpu")
+    with pytest.raises(ValueError, match=r"pip install 'glassplat\[formats\]'"):
+        splat_writer(suffix[1:])(tmp_path / f"b{suffix}", typical())

@@ -10,10 +10,13 @@ import pytest
 from PIL import ExifTags, Image
 
 from glassplat.errors import InputError
+from glassplat.prepare import photographs
 from glassplat.prepare.photographs import Photograph, capture_names, photographs_in, read_photograph
 from tests.prepare.conftest import Heard
 
 SIZE = (120, 90)
+TELEPHONE = Path(__file__).parents[1] / "data_files" / "telephone.heic"
+"""Taken upright: a white bar on the left, a green rectangle at the upper right; stored on its side."""
 
 
 def picture(seed: int = 0, size: tuple[int, int] = SIZE) -> Image.Image:
@@ -183,15 +186,35 @@ def nothing(folder: Path) -> None:
         (several, r"2 of 3 photographs cannot be used \(1\.png, 2\.png\).*Of the first: cannot read .*1\.png as"),
         (no_picture, r"cannot read .*1\.png as an image"),
         (tiny, r"thumbnail\.png is 30x20 pixels large; expected a photograph, 64"),
-        (heic, r"1 photographs in .* are HEIC files.*IMG_1\.HEIC.*save them as JPEG"),
+        (heic, r"1 photographs in .* are HEIC files.*IMG_1\.HEIC.*save them as JPEG.*pip install 'glassplat\[heic\]'"),
         (heic_by_another_name, r"1 photographs in .* are HEIC files.*IMG_2\.jpg.*save them as JPEG"),
         (too_few, r"holds 2 photographs; expected at least 3"),
         (only_twins, r"holds 1 photographs, and 1\.png \(as 0\.png\), 2\.png \(as 0\.png\) the same again"),
         (nothing, r"no photograph in .*found notes\.txt"),
     ],
 )
-def test_what_cannot_be_used_is_named(spoil: object, expected: str, tmp_path: Path, heard: Heard) -> None:
+def test_what_cannot_be_used_is_named(
+    spoil: object, expected: str, tmp_path: Path, heard: Heard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(photographs, "reads_heif", lambda: False)
     folder = three(tmp_path / "in")
     spoil(folder)  # type: ignore[operator]
     with pytest.raises(InputError, match=expected):
         photographs_in(folder, 1600, heard)
+
+
+def test_photographs_of_a_telephone_are_read_upright_under_any_name(tmp_path: Path, heard: Heard) -> None:
+    pytest.importorskip("pi_heif")
+    folder = three(tmp_path / "in")
+    for name in ("IMG_1.HEIC", "IMG_2.jpg"):
+        # One byte after the end makes them two photographs.
+        (folder / name).write_bytes(TELEPHONE.read_bytes() + name[4:5].encode())
+    seen = found(folder, heard)
+    assert sorted(seen) == ["0.png", "1.png", "2.png", "IMG_1.HEIC", "IMG_2.jpg"]
+    for name in ("IMG_1.HEIC", "IMG_2.jpg"):
+        photograph = seen[name]
+        assert (photograph.width, photograph.height, photograph.device) == (72, 96, "Maker Telephone")
+        assert photograph.focal == pytest.approx(26 / np.hypot(36, 24) * np.hypot(72, 96))
+        pixels = read_photograph(photograph).astype(int)
+        np.testing.assert_allclose(pixels[2, -3], (0, 255, 80), atol=12)
+        np.testing.assert_allclose(pixels[:, 2], 250, atol=12)
