@@ -1,10 +1,11 @@
 """Makes the screenshots of docs/tutorial.md and docs/capture.md, from scenes of our own.
 
-    python -m tools.make_capture_pictures --scene SCENE --capture CAPTURE --run RUN --output docs/images
+    python -m tools.make_capture_pictures --scene SCENE --capture CAPTURE --run RUN --busy BUSY --output docs/images
 
 `--scene` ships the truth about its panes (`gt/planes.json`), which is where corners are clicked on the page of
 `glassplat annotate`; of `--capture`, which `glassplat prepare` made, the report is shown, and of `--run` the overview
-that `glassplat eval` wrote. What is not given keeps its pictures.
+that `glassplat eval` wrote. `--busy` is a scene of `tools.make_pane_scene --passers-by`; a photograph of it is shown
+beside its masks. What is not given keeps its pictures.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from glassplat.prepare.report_page import PAGE
 from glassplat.scene.camera import NumpyCamera
@@ -29,6 +30,8 @@ SIZE = (1180, 700)
 PAGE_SIZE = (1180, 860)
 PAGE_QUALITY = 82
 COLORS = 128
+GAP, CAPTION = 8, 22
+"""Pixels between tiles, and above them."""
 APART = 4
 """Of the photographs that show the whole pane, every how manyth is marked."""
 
@@ -78,12 +81,35 @@ def draw(scene: Path, output: Path) -> None:
             save(page, output / "annotate-cut.png")
 
 
+def draw_masks(scene: Path, picture: Path) -> None:
+    """Saves a photograph in which somebody passes beside its mask of panes and its mask of what is left out."""
+    somebody = {path.name: np.array(Image.open(path)) > 0 for path in sorted((scene / "gt/passers_by").iterdir())}
+    name = max((scene / "panes").iterdir(), key=lambda path: somebody.get(path.name, np.zeros(1)).sum()).name
+    tiles = {
+        f"images/{name}": Image.open(scene / "images" / name),
+        f"panes/{name} (label 1)": Image.fromarray(
+            (np.array(Image.open(scene / "panes" / name)) > 0).astype("u1") * 255
+        ),
+        f"masks/{name}": Image.fromarray(np.where(somebody[name], 0, 255).astype(np.uint8)),
+    }
+    width, height = tiles[f"images/{name}"].size
+    sheet = Image.new("RGB", (3 * width + 2 * GAP, height + CAPTION), "white")
+    for place, (caption, tile) in enumerate(tiles.items()):
+        left = place * (width + GAP)
+        sheet.paste(tile.convert("RGB"), (left, CAPTION))
+        ImageDraw.Draw(sheet).rectangle((left, CAPTION, left + width - 1, CAPTION + height - 1), outline="grey")
+        ImageDraw.Draw(sheet).text((left, 2), caption, fill="black", font_size=CAPTION - 6)
+    sheet.save(picture, quality=PAGE_QUALITY, optimize=True)
+    print(picture)
+
+
 def main() -> None:
     """Reads the arguments and draws."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path)
     parser.add_argument("--capture", type=Path)
     parser.add_argument("--run", type=Path)
+    parser.add_argument("--busy", type=Path)
     parser.add_argument("--output", type=Path, default=Path("docs/images"))
     options = parser.parse_args()
     if options.scene:
@@ -92,6 +118,8 @@ def main() -> None:
         draw_page(options.capture / PAGE, options.output / "tutorial-prepare.jpg")
     if options.run:
         draw_page(options.run / "index.html", options.output / "tutorial-eval.jpg")
+    if options.busy:
+        draw_masks(options.busy, options.output / "masks.jpg")
 
 
 if __name__ == "__main__":
