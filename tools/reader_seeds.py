@@ -210,7 +210,6 @@ def _database(path: Path) -> None:
     features.create("opencv")
     features.feature_counts()
     features.descriptors()
-    features.inliers()
 
 
 def _environment(path: Path) -> None:

@@ -85,34 +85,6 @@ def stop_on_interrupt() -> Iterator[StopRequest]:
             signal.signal(number, handler)
 
 
-def run_training(
-    recipe: Any,
-    settings: RunSettings,
-    directory: RunDirectory,
-    dataset: Dataset,
-    *,
-    resume: bool,
-    listen: Listener,
-    checkpoint_every: float = CHECKPOINT_SECONDS,
-) -> TrainState:
-    """Trains to the end or to the user's interrupt, and leaves a run directory from which both can go on.
-
-    Args:
-        recipe: as for `Run`, like the others.
-        settings: what was asked for beside it.
-        directory: where everything goes.
-        dataset: photographs to fit.
-        resume: go on from the checkpoint in `directory`.
-        listen: gets every message.
-        checkpoint_every: seconds from one checkpoint to the next.
-
-    Raises:
-        InputError, KeyboardInterrupt, TrainingDivergedError, OSError: as `Run` does.
-    """
-    run = Run(recipe, settings, directory, dataset, resume=resume, checkpoint_every=checkpoint_every)
-    return run.to_the_end(listen)
-
-
 class Run:
     """A training run in its directory, followed message by message.
 

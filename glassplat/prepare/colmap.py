@@ -193,20 +193,6 @@ class FeatureDatabase:
         with self._opened() as database:
             return [np.asarray(database.read_descriptors(one).data) for one in _image_ids(database)]
 
-    def inliers(self) -> dict[tuple[int, int], int]:
-        """Number of matches that agree on the camera's motion, by pair of photographs; pairs with any."""
-        with self._opened() as database:
-            numbers = {image.image_id: int(Path(image.name).stem) for image in database.read_all_images()}
-            keys, counts = database.read_two_view_geometry_num_inliers()
-            pairs = (
-                (library.pycolmap.pair_id_to_image_pair(key), count) for key, count in zip(keys, counts, strict=True)
-            )
-            return {
-                (min(a, b), max(a, b)): int(count)
-                for (a, b), count in (((numbers[one], numbers[other]), count) for (one, other), count in pairs)
-                if count
-            }
-
     @contextmanager
     def _opened(self) -> Iterator[Any]:
         """The file as COLMAP's database."""

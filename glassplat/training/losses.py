@@ -133,21 +133,18 @@ def disc_normals(frame: Frame, view: View, scene: Scene) -> Tensor:
     Both sides have a gradient. Pixels on the image's border have no N and are left out.
     """
     inner = slice(1, -1), slice(1, -1)
-    from_depth = _normals_in_camera(frame.layers["depth"], view.camera)
+    from_depth = normals_of_depths(frame.layers["depth"], view.camera)
     to_camera = view.camera.cam_from_world[:3, :3].T.to(frame.layers["normal"])
     blended = (frame.layers["normal"][inner] @ to_camera).unbind(-1)
     agreement = sum(a * b for a, b in zip(blended, from_depth, strict=True))
     return (frame.layers["alpha"][inner] - agreement).mean()
 
 
-def depth_map_normals(depth: Tensor, camera: Camera) -> Tensor:
-    """Unit normals [H - 2, W - 2, 3] of a depth map [H, W], world axes, towards the camera; zero where it is empty."""
-    normals = torch.stack(_normals_in_camera(depth, camera), dim=-1)
-    return normals @ camera.cam_from_world[:3, :3].to(depth)
+def normals_of_depths(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """Unit normals of a depth map [H, W] in camera axes, towards the camera, each coordinate an image [H - 2, W - 2].
 
-
-def _normals_in_camera(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """The same in camera axes, one image per coordinate: in that layout every operation runs over a contiguous one."""
+    Zero where it is empty. In that layout every operation runs over a contiguous image.
+    """
     x = (torch.arange(camera.width, device=depth.device) + 0.5 - camera.cx) / camera.fx
     y = (torch.arange(camera.height, device=depth.device) + 0.5 - camera.cy) / camera.fy
     points = depth * x.to(depth), depth * y.to(depth)[:, None], depth

@@ -24,7 +24,7 @@ from glassplat.methods.planar_recipe import PlanarRecipe, ReflectionWeights
 from glassplat.methods.recipe import recipe_from_json, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory, RunSettings
-from glassplat.model.training import run_training
+from glassplat.model.training import Run
 from glassplat.panes.options import PlaneFitError
 from glassplat.scene.scene import Scene
 from glassplat.training.checkpoint import load_checkpoint, recorded_seconds, save_checkpoint
@@ -50,15 +50,8 @@ def run(
         if isinstance(message, StepDone) and message.step == interrupt_at:
             signal.raise_signal(by)
 
-    return run_training(
-        RECIPE,
-        SETTINGS,
-        RunDirectory(path),
-        tiny_capture(),
-        resume=resume,
-        listen=listen,
-        checkpoint_every=checkpoint_every,
-    )
+    begun = Run(RECIPE, SETTINGS, RunDirectory(path), tiny_capture(), resume=resume, checkpoint_every=checkpoint_every)
+    return begun.to_the_end(listen)
 
 
 @pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -107,7 +100,7 @@ def test_nothing_is_lost_when_nobody_is_there_to_hear_it(gone: BaseException, as
 
     directory = RunDirectory(tmp_path)
     with pytest.raises(KeyboardInterrupt if asked and isinstance(gone, OSError) else type(gone)):
-        run_training(RECIPE, SETTINGS, directory, tiny_capture(), resume=False, listen=listen)
+        Run(RECIPE, SETTINGS, directory, tiny_capture(), resume=False).to_the_end(listen)
     assert load_checkpoint(directory.checkpoint).step == 7
     assert_same(run(tmp_path, resume=True).scene, run(tmp_path / "whole").scene)
 
@@ -218,23 +211,21 @@ def test_two_trainings_do_not_share_a_folder(tmp_path: Path) -> None:
                     run(tmp_path, resume=resume)
                 refused.append(str(caught.value))
 
-    run_training(RECIPE, SETTINGS, RunDirectory(tmp_path), tiny_capture(), resume=False, listen=listen)
+    Run(RECIPE, SETTINGS, RunDirectory(tmp_path), tiny_capture(), resume=False).to_the_end(listen)
     assert len(refused) == 2 and all("another training is writing into" in text for text in refused)
 
 
 def test_a_run_too_short_for_its_stages_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     settings = replace(SETTINGS, iterations=6)
     with pytest.raises(InputError, match=r"6 iterations leave no room for the stage '2 .*'; expected at least 8"):
-        run_training(
-            PlanarRecipe(), settings, RunDirectory(tmp_path / "run"), tiny_capture(), resume=False, listen=print
-        )
+        Run(PlanarRecipe(), settings, RunDirectory(tmp_path / "run"), tiny_capture(), resume=False).to_the_end(print)
     assert not (tmp_path / "run").exists()
 
 
 def test_a_scene_that_cannot_be_begun_leaves_no_folder(tmp_path: Path) -> None:
     bare = replace(tiny_capture(), pane_labels=())
     with pytest.raises(PlaneFitError, match="needs to know where the panes are"):
-        run_training(PlanarRecipe(), SETTINGS, RunDirectory(tmp_path / "run"), bare, resume=False, listen=print)
+        Run(PlanarRecipe(), SETTINGS, RunDirectory(tmp_path / "run"), bare, resume=False).to_the_end(print)
     assert not (tmp_path / "run").exists()
 
 
@@ -277,9 +268,7 @@ def test_a_broken_test_photograph_ends_a_run_at_the_start(tmp_path: Path) -> Non
         assert not isinstance(message, StepDone) or message.step < 2000, "the photograph was not found"
 
     with pytest.raises(InputError, match=path.name):
-        run_training(
-            RECIPE, RunSettings("", 10**6), RunDirectory(tmp_path / "run"), dataset, resume=False, listen=listen
-        )
+        Run(RECIPE, RunSettings("", 10**6), RunDirectory(tmp_path / "run"), dataset, resume=False).to_the_end(listen)
 
 
 def test_the_checkpoint_of_another_method_is_not_gone_on_with(tmp_path: Path) -> None:

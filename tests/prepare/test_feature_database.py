@@ -31,16 +31,6 @@ def test_a_database_that_is_cut_off_is_named(tmp_path: Path, kept: float) -> Non
         database.feature_counts()
 
 
-def test_photographs_that_are_not_ours_are_damage_too(tmp_path: Path) -> None:
-    database = features(tmp_path)
-    with closing(library.pycolmap.Database.open(database.path)) as opened:
-        image = opened.read_all_images()[0]
-        image.name = "portrait.png"
-        opened.update_image(image)
-    with pytest.raises(InputError, match="damaged"):
-        database.inliers()
-
-
 def test_a_name_that_is_missing_is_damage_too(tmp_path: Path) -> None:
     database = features(tmp_path)
     script = f"""

@@ -17,7 +17,7 @@ from glassplat.methods.mirrors import ENDED, RAISED, Propagate, RefineEnvironmen
 from glassplat.methods.recipe import recipe_from_json, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory, RunSettings
-from glassplat.model.training import run_training
+from glassplat.model.training import Run
 from glassplat.render.deferred import Deferred
 from glassplat.scene.activations import logit
 from glassplat.scene.scene import Scene
@@ -288,7 +288,7 @@ def test_where_nothing_reflects_the_rates_are_those_of_splat() -> None:
 
 def scene_after(recipe: Any, iterations: int, directory: Path) -> Scene:
     settings = RunSettings("tiny", iterations=iterations)
-    run_training(recipe, settings, RunDirectory(directory), tiny_capture(), resume=False, listen=lambda message: None)
+    Run(recipe, settings, RunDirectory(directory), tiny_capture(), resume=False).to_the_end(lambda message: None)
     return load_checkpoint(directory / "checkpoint.safetensors").scene
 
 

@@ -9,7 +9,7 @@ from glassplat.render.frame import Frame
 from glassplat.render.splat import Splat
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
-from glassplat.training.losses import depth_map_normals, disc_normals, distortion
+from glassplat.training.losses import disc_normals, distortion, normals_of_depths
 from tests.render.tiny_scene import camera_at
 from tests.training.tiny_capture import tiny_capture
 
@@ -44,7 +44,7 @@ def test_normals_of_a_depth_map_are_those_of_its_plane() -> None:
         frame = frame_of(wall(tilt))
         # Where the plane faces the camera, which looks along +z.
         expected = torch.tensor([0.0, torch.tensor(tilt).sin(), -torch.tensor(tilt).cos()], dtype=torch.float64)
-        normals = depth_map_normals(frame.layers["depth"], CAMERA)
+        normals = torch.stack(normals_of_depths(frame.layers["depth"], CAMERA), dim=-1)
         torch.testing.assert_close(normals[10:16, 12:24].mean((0, 1)), expected, atol=0.02, rtol=0)
         blended = frame.layers["normal"][12:16, 15:20] / frame.layers["alpha"][12:16, 15:20, None]
         torch.testing.assert_close(blended, expected.expand_as(blended), atol=1e-6, rtol=0)

@@ -17,7 +17,7 @@ from glassplat.files.sidecars import read_cameras, write_colmap
 from glassplat.methods.recipe import RECIPES
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory, RunSettings
-from glassplat.model.training import run_training
+from glassplat.model.training import Run
 from glassplat.render.deferred import Deferred
 from glassplat.render.frame import Renderer
 from glassplat.render.planar import Planar
@@ -198,7 +198,7 @@ def test_a_run_leaves_the_refined_cameras(tmp_path: Path) -> None:
     directory = RunDirectory(tmp_path / "run")
     settings = RunSettings(str(tmp_path / "capture"), 30)
     recipe = SplatRecipe(poses=PoseRefinement(rate=1e-2))
-    state = run_training(recipe, settings, directory, dataset, resume=False, listen=lambda message: None)
+    state = Run(recipe, settings, directory, dataset, resume=False).to_the_end(lambda message: None)
     refined = with_corrected_cameras(dataset, state.scene)
     recorded = dict(read_cameras(directory.path / "cameras.json"))
     for before, after in zip(dataset.train, refined.train, strict=True):
