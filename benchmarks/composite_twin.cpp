@@ -1,6 +1,6 @@
 // The two hot loops of compositing once more, by a C++ compiler: what `python -m benchmarks.twin` holds the kernels against.
 //
-// The same steps as glassplat/kernels/composite/cpu_forward.py and cpu_backward.py, for four channels, images of whole
+// The same steps as glassplat/kernels/composite/cpu.py and cpu_backward.py, for four channels, images of whole
 // tiles, and neither glass nor deviations. Names are those of glassplat/kernels/composite/cpu_tile.py.
 #include <cmath>
 #include <cstdint>

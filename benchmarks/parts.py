@@ -19,7 +19,7 @@ import numba
 import torch
 
 from glassplat.captures.dataset import load_dataset
-from glassplat.cli.demo import SCENE
+from glassplat.cli.train import SCENE
 from glassplat.files.writing import Table
 from glassplat.kernels.backend.cpu import Kernel
 from glassplat.methods.recipe import RECIPES, photo_background, recipe_of, settled

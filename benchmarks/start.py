@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from glassplat.cli.demo import SCENE
+from glassplat.cli.train import SCENE
 from glassplat.files.writing import Table
 
 ROUNDS = 3

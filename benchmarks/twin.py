@@ -26,8 +26,8 @@ from benchmarks.scene import bench_camera, room
 from benchmarks.timing import Work
 from glassplat.files.writing import Table
 from glassplat.kernels.composite import cpu_tile as tile
+from glassplat.kernels.composite.cpu import composite_forward
 from glassplat.kernels.composite.cpu_backward import composite_backward
-from glassplat.kernels.composite.cpu_forward import composite_forward
 from glassplat.kernels.records import Splats, TileBins
 from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.frame import joined_splats, project_gaussians

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
     from glassplat.methods.planar_recipe import PlanarRecipe
     from glassplat.methods.splat_recipe import SplatRecipe
-    from glassplat.model.loading import load
-    from glassplat.model.model import Model
+    from glassplat.model.model import Model, load
     from glassplat.model.training import Training
     from glassplat.render.deferred import Deferred
     from glassplat.render.frame import Frame
@@ -92,8 +91,10 @@ HOMES = {
     ),
     "methods.planar_recipe": ("PlanarRecipe",),
     "methods.splat_recipe": ("SplatRecipe",),
-    "model.loading": ("load",),
-    "model.model": ("Model",),
+    "model.model": (
+        "Model",
+        "load",
+    ),
     "model.training": ("Training",),
     "render.deferred": ("Deferred",),
     "render.frame": ("Frame",),

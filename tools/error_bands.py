@@ -24,7 +24,7 @@ from glassplat.evaluate.evaluate import timed_render
 from glassplat.evaluate.metrics import quantized
 from glassplat.evaluate.truth import TrueView, load_truth
 from glassplat.files.writing import Table
-from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
+from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 
 BANDS = ("all", "coarse", "fine")
 

@@ -17,7 +17,7 @@ from typing import Any
 from glassplat.cli.runs import open_run
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.evaluate.metrics import quantized
-from glassplat.evaluate.sheet import TITLE_HEIGHT, Panel, composed
+from glassplat.evaluate.report import TITLE_HEIGHT, Panel, composed
 from glassplat.files.images import write_image
 from glassplat.render.layers import normal_colors
 

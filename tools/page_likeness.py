@@ -20,8 +20,7 @@ import torch
 from glassplat.captures.dataset import TEST_EVERY
 from glassplat.evaluate.metrics import psnr
 from glassplat.files.spz import FLIP
-from glassplat.model.loading import load
-from glassplat.model.model import Model
+from glassplat.model.model import Model, load
 from glassplat.scene.camera import Camera
 from tools.browser import Browser
 

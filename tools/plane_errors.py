@@ -23,8 +23,8 @@ from glassplat.evaluate.metrics import plane_table
 from glassplat.evaluate.truth import GroundTruth, load_truth
 from glassplat.files.ply import read_gaussians
 from glassplat.files.writing import Table
+from glassplat.panes import PlaneFitError
 from glassplat.panes.fit import fit_planes
-from glassplat.panes.options import PlaneFitError
 
 COLUMNS = ("scene / pane", "fits", "refused", "good", "degrees, median (max)", "% of extent, median (max)", "seconds")
 LEAST_SHARE = 0.01

@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from glassplat.captures.dataset import TEST_EVERY
 from glassplat.files.images import read_image, write_image
-from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
+from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 
 FIGURES = (0.4, 0.9)
 """Heights of passers-by, as shares of the photograph's."""

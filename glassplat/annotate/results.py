@@ -24,7 +24,7 @@ from glassplat.files.records import read_json
 from glassplat.files.sidecars import GLASS_REFLECTANCE, write_planes
 from glassplat.files.writing import atomic_write
 from glassplat.panes.masks import min_area_rectangle
-from glassplat.scene.activations import logit
+from glassplat.scene import logit
 from glassplat.scene.camera import NumpyCamera
 from glassplat.scene.panes import Planes
 

@@ -15,9 +15,8 @@ from glassplat.cli.progress import WorkProgress
 from glassplat.files.writing import check_capture_folder
 from glassplat.options import Range, Share
 from glassplat.prepare.colmap import LensName, Mapper
-from glassplat.prepare.preparation import Preparation, check_places, prepare
+from glassplat.prepare.preparation import Preparation, Workplace, check_places, prepare
 from glassplat.prepare.reconstruction import Settings
-from glassplat.prepare.workplace import Workplace
 
 
 @dataclass(frozen=True)

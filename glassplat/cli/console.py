@@ -219,7 +219,7 @@ def _answered(answer: signal._HANDLER) -> Iterator[None]:
 
 
 BAD_INPUT_CODE, FAILURE_CODE = 2, 1
-BAD_INPUT = ("glassplat.panes.options.PlaneFitError", "glassplat.kernels.backend.devices.CudaUnavailableError")
+BAD_INPUT = ("glassplat.panes.PlaneFitError", "glassplat.kernels.backend.devices.CudaUnavailableError")
 FAILURES = ("glassplat.training.loop.TrainingDivergedError",)
 GPU_IS_FULL = ("torch.OutOfMemoryError",)
 """By name: this module is loaded before PyTorch, and also where PyTorch is what cannot be loaded."""

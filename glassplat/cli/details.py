@@ -16,10 +16,10 @@ from glassplat.files.records import read_json
 from glassplat.files.scene_folder import read_scene, read_splats
 from glassplat.methods.planar import fitted_planes
 from glassplat.model.run_directory import RunDirectory
+from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.material import virtual_points
-from glassplat.panes.options import PlaneFit, PlaneFitError
+from glassplat.prepare.preparation import RECORD
 from glassplat.prepare.report_page import PAGE, write_page
-from glassplat.prepare.workplace import RECORD
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 

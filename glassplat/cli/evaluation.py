@@ -21,11 +21,11 @@ from glassplat.evaluate.evaluate import (
     evaluate,
     with_aligned_test_views,
 )
-from glassplat.evaluate.metric_names import PLANE_COLUMNS, missing_reasons, shown_metrics, written
+from glassplat.evaluate.metrics import PLANE_COLUMNS, missing_reasons, shown_metrics, written
 from glassplat.evaluate.report import Report
 from glassplat.methods.planar import fitted_planes
 from glassplat.model.run_directory import write_text
-from glassplat.panes.options import PlaneFit, PlaneFitError
+from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.render.planar import Planar, with_photographer
 from glassplat.training.checkpoint import recorded_seconds
 

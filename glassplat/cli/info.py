@@ -19,9 +19,8 @@ from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
 from glassplat.files.records import read_json
 from glassplat.files.writing import SCENE, SPLAT_SUFFIXES, scene_source
 from glassplat.model.run_directory import RunDirectory
-from glassplat.prepare.photographs import broken_photographs
-from glassplat.prepare.video import VIDEO_SUFFIXES, NoOpenCVError, video_facts
-from glassplat.prepare.workplace import RECORD
+from glassplat.prepare.photographs import VIDEO_SUFFIXES, NoOpenCVError, broken_photographs, video_facts
+from glassplat.prepare.preparation import RECORD
 
 KINDS = f"a capture, photographs, a video, a run, an exported scene, or a splat file ({', '.join(SPLAT_SUFFIXES)})"
 """What there is to be found."""

@@ -37,30 +37,30 @@ COMMANDS = {
     "train": Listed("train", "Train", "Train a scene from photographs."),
     "eval": Listed("evaluate", "Evaluate", "Measure a run on its test views and write comparison sheets."),
     "render": Listed(
-        "look", "Render", "Render the layers of a run from its cameras, with its panes as they are or edited."
+        "scene", "Render", "Render the layers of a run from its cameras, with its panes as they are or edited."
     ),
     "dereflect": Listed(
-        "publish",
+        "scene",
         "Dereflect",
         "Take the reflections out of a planar run's photographs; one PNG per photograph, under its name.",
     ),
-    "clean": Listed("publish", "Clean", "Take floaters out of a scene, and give it metres; writes another scene."),
+    "clean": Listed("scene", "Clean", "Take floaters out of a scene, and give it metres; writes another scene."),
     "view": Listed(
-        "look", "View", "Look at a scene in the browser, layer by layer, with its panes as they are or edited."
+        "scene", "View", "Look at a scene in the browser, layer by layer, with its panes as they are or edited."
     ),
     "video": Listed(
-        "look",
+        "scene",
         "Video",
         "Film a scene along a path: one layer, several side by side, or one wiped over another.",
     ),
     "export": Listed(
-        "publish",
+        "scene",
         "Export",
         "Write a scene as others read it: PLY, SPZ, GLB, a web page with live panes, and the panes beside them.",
     ),
     "info": Listed("info", "Info", "Say what a folder or file is, whether it is healthy, and what to do next."),
     "demo": Listed(
-        "demo",
+        "train",
         "Demo",
         "Train planar and splat on the bundled showcase and compare them; goes on where it was interrupted.",
     ),

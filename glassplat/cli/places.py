@@ -155,7 +155,7 @@ class SplatFile:
 
     def opened(self, path: Path, device: DeviceName) -> Model:
         """The run or the splat file at a path."""
-        from glassplat.model.loading import load
+        from glassplat.model.model import load
 
         return load(path, device=device, planes=self.planes, up=self.up)
 
@@ -222,7 +222,7 @@ def in_surroundings(scene: Scene, panorama: Path) -> Scene:
         InputError: the scene mirrors no environment, or the panorama cannot be read.
     """
     from glassplat.files.sidecars import read_equirect
-    from glassplat.render.environment import environment_from_equirect
+    from glassplat.render.deferred import environment_from_equirect
 
     if scene.environment.is_empty:
         raise InputError("nothing in the run mirrors its surroundings; train it with `glassplat train deferred`")

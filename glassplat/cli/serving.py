@@ -26,7 +26,7 @@ from glassplat.viewer.server import Viewer
 
 if TYPE_CHECKING:
     from glassplat.cli.capture import Annotate
-    from glassplat.cli.look import View
+    from glassplat.cli.scene import View
 
 
 def serve_viewer(command: View, console: Console) -> None:

@@ -19,10 +19,14 @@ from rich.console import Console
 from glassplat.captures.files import CaptureFiles, read_capture
 from glassplat.captures.masks import Polarity
 from glassplat.cli.console import import_now, message_console, say
+from glassplat.cli.places import check_targets
 from glassplat.errors import InputError, input_checked
 from glassplat.files.records import read_text
+from glassplat.files.writing import check_folder
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
+from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.recipe import RECIPES, Preset, Recipe, recipe_from_json, recipe_of
+from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import CHECKPOINT_SECONDS, RunDirectory, RunSettings, check_output
 from glassplat.options import Downscale, Essential, Positive, Seed, Several
 
@@ -178,3 +182,56 @@ def has_essentials(kind: type) -> bool:
 def is_essential(hint: Any) -> bool:
     """Return whether an annotation marks an option as one that many runs need."""
     return any(isinstance(data, Essential) for data in typing.get_args(hint)[1:])
+
+
+SCENE = Path(__file__).parents[1] / "demo_scene"
+LEAST_ITERATIONS = 8
+"""Of which each stage of `planar` gets one."""
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Train planar and splat on the bundled showcase and compare them; goes on where it was interrupted.
+
+    Attributes:
+        output: where the two runs go.
+        iterations: length of each run.
+        seed: fixes every random choice.
+        device: where to train; auto takes an NVIDIA GPU where one can be used.
+    """
+
+    output: Path = Path("runs/demo")
+    iterations: Several = 3000
+    seed: Seed = 0
+    device: DeviceName = "auto"
+
+    def ready(self) -> None:
+        """Refuses an output that cannot be written, and a run that is too short for the stages of `planar`."""
+        check_folder(self.output)
+        check_targets(self.output, self.folders, [])
+        if self.iterations < LEAST_ITERATIONS:
+            raise InputError(f"--iterations is {self.iterations}; expected at least {LEAST_ITERATIONS}")
+
+    @property
+    def folders(self) -> list[Path]:
+        """Of the two runs."""
+        return [self.output / method for method in (PlanarRecipe.method, SplatRecipe.method)]
+
+    def run(self, console: Console) -> None:
+        """Trains both methods, evaluates them and says where the pictures are."""
+        recipes: tuple[Recipe, ...] = (PlanarRecipe(), SplatRecipe())
+        for recipe, folder in zip(recipes, self.folders, strict=True):
+            run = Train(recipe, SCENE, folder, self.iterations, seed=self.seed, device=self.device)
+            run = run.resuming(RunDirectory(folder).checkpoint.is_file())
+            say(console, f"training {recipe.method}")
+            run.ready()
+            run.run(console)
+        from glassplat.cli.evaluation import evaluate_run, print_results
+        from glassplat.cli.runs import open_run
+
+        print_results(console, *(evaluate_run(open_run(folder, self.device)) for folder in self.folders))
+        say(console, f"pictures: {self.output / 'planar' / 'index.html'} and {self.output / 'planar' / 'sheets'}")
+
+    def left_behind(self) -> str:
+        """Text after an interrupt: the state on disk, and how to go on."""
+        return f"what is finished stays in {self.output}: repeat the command to go on"

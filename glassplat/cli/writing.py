@@ -36,8 +36,7 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene, without_glass
 
 if TYPE_CHECKING:
-    from glassplat.cli.look import Render, Video
-    from glassplat.cli.publish import Clean, Dereflect, Export
+    from glassplat.cli.scene import Clean, Dereflect, Export, Render, Video
 
 
 def write_layers(command: Render, console: Console) -> None:

@@ -15,11 +15,14 @@ from torch import Tensor
 from glassplat.captures.dataset import Dataset, detached_camera
 from glassplat.captures.view import View, with_ignored_right
 from glassplat.errors import InputError
-from glassplat.evaluate.metric_names import NO_LPIPS, SMALLEST_REGION, Outcome, json_values
 from glassplat.evaluate.metrics import (
+    NO_LPIPS,
+    SMALLEST_REGION,
     Lpips,
+    Outcome,
     color_corrected,
     environment_metrics,
+    json_values,
     learned_environment,
     load_lpips,
     missing_panes,

@@ -40,9 +40,9 @@ from glassplat.files.records import (
     shown,
 )
 from glassplat.files.writing import atomic_write
-from glassplat.kernels.maths.color import linear_from_srgb
+from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.kernels.project.reference import sh_basis
-from glassplat.scene.activations import SH_ZERO
+from glassplat.scene import SH_ZERO
 from glassplat.scene.camera import quat_product, rotation_from_quat
 from glassplat.scene.gaussians import DISC_SCALES, Gaussians
 

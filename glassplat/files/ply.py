@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.files.ply_table import PlyTable, read_table, write_table
-from glassplat.scene.activations import SH_ZERO
+from glassplat.scene import SH_ZERO
 from glassplat.scene.gaussians import DISC_SCALES, PER_GAUSSIAN, Gaussians
 
 CHUNK = 256

@@ -41,7 +41,7 @@ from glassplat.files.sidecars import (
 )
 from glassplat.files.spz import GZIP, read_spz
 from glassplat.files.writing import FORGED_SUFFIXES, SCENE, SPLAT_SUFFIXES, atomic_write
-from glassplat.scene.activations import SH_ZERO
+from glassplat.scene import SH_ZERO
 from glassplat.scene.corrections import Direction
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene

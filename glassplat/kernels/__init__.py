@@ -1,1 +1,8 @@
 """Differentiable operations on tensors; each has a CPU kernel and a plain-PyTorch twin of the same name."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+Fresnel = Literal["pane", "schlick", "none"]
+"""How reflectance follows the angle: as that of a pane with two surfaces, by Schlick's curve of one, or not at all."""

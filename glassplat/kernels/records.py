@@ -246,7 +246,7 @@ class Rays(NamedTuple):
 
 
 class Shapes(NamedTuple):
-    """Activated Gaussians as rays meet them: means [N, 3], frames [N, 3, 3] (rows, see `maths/ray_hit.py`),
+    """Activated Gaussians as rays meet them: means [N, 3], frames [N, 3, 3] (rows, see `maths/disc.py`),
     opacities [N], sh [N, K, 3].
     """
 

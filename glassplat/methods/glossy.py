@@ -26,10 +26,11 @@ from glassplat.options import BLACK
 from glassplat.render.deferred import INVISIBLE, Deferred
 from glassplat.render.splat import Splat
 from glassplat.render.traced import Traced, mirrored_contributions
-from glassplat.scene.activations import logit
+from glassplat.scene import logit
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify, GrowSh, Population, PruneIdle, ResetOpacity, population_of
 from glassplat.training.corrections import exposures_begun, exposures_learnt, poses_begun, poses_learnt
+from glassplat.training.densify import as_discs
 from glassplat.training.losses import (
     LossTerm,
     MonocularNormals,
@@ -39,7 +40,6 @@ from glassplat.training.losses import (
     weighted,
 )
 from glassplat.training.options import PUBLISHED_ITERATIONS, GaussianRates, Rate, Rhythm
-from glassplat.training.points import as_discs
 from glassplat.training.stage import Action, Every, Stage
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from glassplat.options import (
     Share,
     ShDegree,
 )
-from glassplat.scene.activations import SH_ZERO
+from glassplat.scene import SH_ZERO
 from glassplat.training.options import (
     PUBLISHED_ITERATIONS,
     DefaultDensify,

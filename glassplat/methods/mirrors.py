@@ -22,11 +22,10 @@ from torch.nn.functional import interpolate, normalize
 
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import View, estimated_normals
-from glassplat.render.deferred import cell_side, depth_normals, seen_surface, view_directions
-from glassplat.render.environment import resized
+from glassplat.render.deferred import cell_side, depth_normals, resized, seen_surface, view_directions
 from glassplat.render.frame import Frame, Renderer
 from glassplat.render.layers import contributions, gathered
-from glassplat.scene.activations import SH_ZERO, logit
+from glassplat.scene import SH_ZERO, logit
 from glassplat.scene.camera import Camera, moved, quat_product, rotation_from_quat
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene

@@ -12,6 +12,7 @@ from torch import Tensor
 from glassplat.captures.dataset import Dataset
 from glassplat.methods.splat import image_terms
 from glassplat.options import BLACK
+from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.fit import fit_planes, with_mirrors
 from glassplat.panes.material import (
     JudgedPane,
@@ -21,7 +22,6 @@ from glassplat.panes.material import (
     photographs_of,
     virtual_points,
 )
-from glassplat.panes.options import PlaneFit, PlaneFitError
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
@@ -36,7 +36,7 @@ from glassplat.training.corrections import (
     poses_begun,
     poses_learnt,
 )
-from glassplat.training.densify import append, apply_edit, keep
+from glassplat.training.densify import append, apply_edit, gaussians_from_points, keep
 from glassplat.training.losses import (
     LossTerm,
     depth_deviation_loss,
@@ -48,7 +48,6 @@ from glassplat.training.losses import (
 )
 from glassplat.training.messages import Working
 from glassplat.training.options import PUBLISHED_ITERATIONS, Rate
-from glassplat.training.points import gaussians_from_points
 from glassplat.training.stage import Clock, Every, PostStep, Stage, TrainState, Work
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from glassplat.kernels.fresnel import Fresnel
+from glassplat.kernels import Fresnel
 from glassplat.options import (
     ESSENTIAL,
     Ascending,
@@ -19,7 +19,7 @@ from glassplat.options import (
     Share,
     ShDegree,
 )
-from glassplat.panes.options import PlaneFit
+from glassplat.panes import PlaneFit
 from glassplat.training.options import (
     PUBLISHED_ITERATIONS,
     DefaultDensify,

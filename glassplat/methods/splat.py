@@ -11,9 +11,9 @@ from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import GrowSh, Population, population_of
 from glassplat.training.corrections import exposures_begun, exposures_learnt, poses_begun, poses_learnt
+from glassplat.training.densify import as_discs
 from glassplat.training.losses import LossTerm, PhotometricLoss, disc_normals, distortion, view_dependence, weighted
 from glassplat.training.options import PUBLISHED_ITERATIONS
-from glassplat.training.points import as_discs
 from glassplat.training.stage import Every, Stage
 
 if TYPE_CHECKING:

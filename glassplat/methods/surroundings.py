@@ -14,14 +14,13 @@ from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import PointCloud
 from glassplat.methods.mirrors import made_mirrors, mirror_lookalikes
 from glassplat.render.frame import Renderer
-from glassplat.scene.activations import logit
+from glassplat.scene import logit
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Environment
-from glassplat.training.densify import apply_edit, forget
+from glassplat.training.densify import apply_edit, as_discs, forget, in_morton_order
 from glassplat.training.messages import Working
 from glassplat.training.options import MirrorSearch, SurroundingsStart
-from glassplat.training.points import as_discs, in_morton_order
 from glassplat.training.stage import TrainState
 
 LARGEST_MISS = 0.35

@@ -277,7 +277,7 @@ class RunDirectory:
         """Writes the scene in the formats that others read; returns its folder."""
         from glassplat.files.scene_folder import write_scene
         from glassplat.files.sidecars import write_equirect
-        from glassplat.render.environment import equirect_from_environment
+        from glassplat.render.deferred import equirect_from_environment
 
         folder = self.path / "point_cloud" / f"iteration_{step}"
         write_scene(folder, scene)

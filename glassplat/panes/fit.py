@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.masks import (
     FramedPlanes,
     PaneView,
@@ -21,9 +22,8 @@ from glassplat.panes.masks import (
     plane_candidates,
 )
 from glassplat.panes.objective import MIDDLE, Objective, edge_matches, pane_rectangle
-from glassplat.panes.options import PlaneFit, PlaneFitError
 from glassplat.panes.search import Fit, best_plane, best_supported, tilt_uncertainty
-from glassplat.scene.activations import logit
+from glassplat.scene import logit
 from glassplat.scene.camera import Camera
 from glassplat.scene.panes import Planes
 

@@ -14,7 +14,7 @@ from torch.quasirandom import SobolEngine
 
 from glassplat.captures.view import View
 from glassplat.render.planar import Planar
-from glassplat.scene.activations import logit
+from glassplat.scene import logit
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes, crosses_pane, in_image

@@ -2,19 +2,274 @@
 
 from __future__ import annotations
 
+import json
+import os
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from glassplat import __version__
 from glassplat.captures.colmap_library import quiet_pycolmap
-from glassplat.errors import InputError
-from glassplat.files.writing import missing_folders, real_path, remove_empty
-from glassplat.prepare.photographs import Listener, Photograph, photographs_in
-from glassplat.prepare.reconstruction import Settings, best_solution, write_capture
-from glassplat.prepare.report import Report, report_of
-from glassplat.prepare.video import VIDEO_SUFFIXES, frames_of
-from glassplat.prepare.workplace import Workplace
+from glassplat.errors import InputError, first_names
+from glassplat.files.records import read_json
+from glassplat.files.writing import atomic_write, check_folder, make_folder, missing_folders, real_path, remove_empty
+from glassplat.prepare.photographs import FEWEST, VIDEO_SUFFIXES, Listener, Photograph, frames_of, photographs_in
+from glassplat.prepare.reconstruction import Settings, Solution, best_solution, image_numbers, write_capture
+
+RECORD = "prepare.json"
+"""In the capture: that it was prepared here, and the report."""
+HAND_MADE = ("panes", "masks", "ignore", "planes.json", "annotations.json")
+"""In a capture: what somebody spent time on."""
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """The folder in which a capture is made.
+
+    Attributes:
+        output: where the capture will be.
+    """
+
+    output: Path
+
+    @property
+    def folder(self) -> Path:
+        """Beside the output, so that the finished capture is moved in one step."""
+        return self.output.with_name(f"{self.output.name}.partial")
+
+    @property
+    def capture(self) -> Path:
+        """The capture while it is written."""
+        return self.folder / "capture"
+
+    def begin(self, settings: Mapping[str, Any], *, resume: bool, force: bool) -> None:
+        """Makes the folder, or finds the one of an interrupted preparation.
+
+        Args:
+            settings: what the work depends on; an interrupted one goes on with the same only.
+            resume: go on with what was interrupted.
+            force: begin again, and replace a capture that was prepared before.
+
+        Raises:
+            InputError: the output is something else, or what lies there does not fit.
+        """
+        self._check_output(force)
+        known = self._known_settings()
+        if known is not None and force and not resume:
+            shutil.rmtree(self.folder)
+            known = None
+        if known is not None and not resume:
+            raise InputError(
+                f"{self.folder} holds an interrupted preparation of {self.output}; go on from it with --resume, or "
+                "begin again with --force"
+            )
+        if known is not None and known != json.loads(json.dumps(settings)):
+            changed = sorted(key for key in {*known, *settings} if known.get(key) != settings.get(key))
+            raise InputError(
+                f"{self.folder} was begun with another {first_names(changed)}; give the same to --resume, or begin "
+                "again with --force"
+            )
+        if known is None:
+            make_folder(self.folder)
+            with atomic_write(self.folder / "settings.json") as temporary:
+                temporary.write_text(json.dumps(settings, indent=1), encoding="utf-8")
+
+    def finish(self, record: Mapping[str, Any]) -> None:
+        """Writes the record into the finished capture and moves it to the output."""
+        with atomic_write(self.capture / RECORD) as temporary:
+            temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        if self.output.exists():
+            before = self.folder / "before"
+            shutil.rmtree(before, ignore_errors=True)
+            os.replace(self.output, before)
+        os.replace(self.capture, self.output)
+        self.discard()
+
+    def discard(self) -> None:
+        """Removes the folder."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _check_output(self, force: bool) -> None:
+        check_folder(self.output)
+        check_folder(self.folder)
+        found = sorted(path.name for path in self.output.iterdir()) if self.output.exists() else []
+        if not found:
+            return
+        if RECORD not in found:
+            raise InputError(
+                f"{self.output} is not empty, and not from `glassplat prepare` (it holds {first_names(found)}); "
+                "nothing was written. Choose a new folder for --output"
+            )
+        if not force:
+            raise InputError(
+                f"{self.output} holds a capture that was prepared before; choose a new folder for --output, or replace "
+                "it with --force"
+            )
+        made = [name for name in HAND_MADE if name in found]
+        if made:
+            raise InputError(
+                f"{self.output} holds {first_names(made)}, which somebody made and which would not fit new poses; move "
+                "the folder away, or choose a new one for --output"
+            )
+
+    def _known_settings(self) -> dict[str, Any] | None:
+        """Those of an interrupted preparation; None where there is none.
+
+        Raises:
+            InputError: the folder is something else.
+        """
+        if not self.folder.exists() or not any(self.folder.iterdir()):
+            return None
+        try:
+            content = read_json(self.folder / "settings.json")
+        except (OSError, ValueError):
+            content = None
+        if not isinstance(content, dict):
+            raise InputError(
+                f"{self.folder} is in the way, and not from `glassplat prepare`; move it, or choose another --output"
+            )
+        return content
+
+
+FEW_FEATURES = 500
+SHORT_TRACK = 3.0
+LARGE_ERROR = 1.5
+USUAL_FOCALS = (0.4, 3.0)
+"""In longer image sides."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """A preparation in figures.
+
+    Attributes:
+        photographs: how many there were.
+        registered: how many were placed, all connected with each other.
+        missing: names of the files that were not.
+        groups: sizes of the groups of photographs that were placed, each by itself; each photograph counts once.
+        points: measured places in the scene.
+        reprojection_error: mean distance of a point from where photographs show it, in pixels.
+        track_length: mean number of photographs that a point was measured in.
+        features: of the middle photograph.
+        cameras: each lens in words.
+        attempt: the settings that this came from.
+        attempts: how many were made.
+        advice: what would make it better, full sentences.
+    """
+
+    photographs: int
+    registered: int
+    missing: tuple[str, ...]
+    groups: tuple[int, ...]
+    points: int
+    reprojection_error: float
+    track_length: float
+    features: int
+    cameras: tuple[str, ...]
+    attempt: str
+    attempts: int
+    advice: tuple[str, ...]
+
+    @property
+    def share(self) -> float:
+        """Of the photographs, those that were placed."""
+        return self.registered / self.photographs
+
+    def lines(self) -> list[str]:
+        """The report for people."""
+        missing = f" (not: {first_names(list(self.missing), 8)})" if self.missing else ""
+        return [
+            f"{self.registered} of {self.photographs} photographs placed{missing}, with {self.attempt}",
+            f"{self.points} points, each in {self.track_length:.1f} photographs on average, "
+            f"{self.reprojection_error:.2f} pixels off",
+            *(f"camera: {camera}" for camera in self.cameras),
+            *(f"advice: {line}" for line in self.advice),
+        ]
+
+    def as_json(self) -> dict[str, Any]:
+        """The report for programs."""
+        return asdict(self)
+
+
+def report_of(solution: Solution) -> Report:
+    """The figures of a solution; one without any model has zeros."""
+    photographs = solution.database.photographs
+    missing = solution.missing()
+    model = solution.models[0] if solution.models else None
+    features = int(np.median(solution.database.feature_counts()))
+    figures = Report(
+        photographs=len(photographs),
+        registered=solution.registered,
+        missing=tuple(one.path.name for one in missing),
+        groups=_groups(solution),
+        points=int(model.num_points3D()) if model else 0,
+        reprojection_error=float(model.compute_mean_reprojection_error()) if model else 0.0,
+        track_length=float(model.compute_mean_track_length()) if model else 0.0,
+        features=features,
+        cameras=tuple(_described(model)) if model else (),
+        attempt=solution.attempt,
+        attempts=solution.tried,
+        advice=(),
+    )
+    return Report(**{**figures.__dict__, "advice": tuple(_advice(figures, missing, solution))})
+
+
+def _groups(solution: Solution) -> tuple[int, ...]:
+    """Number of photographs that each model adds to the larger ones; part of a group may be placed twice."""
+    known: set[int] = set()
+    sizes = []
+    for model in solution.models:
+        added = set(image_numbers(model)) - known
+        known |= added
+        if len(added) >= FEWEST:
+            sizes.append(len(added))
+    return tuple(sizes)
+
+
+def _described(model: Any) -> list[str]:
+    """Each lens that took a placed photograph."""
+    used = {image.camera_id for image in model.images.values() if image.has_pose}
+    return [
+        f"{camera.width}x{camera.height}, focal length {camera.mean_focal_length():.0f} pixels"
+        for key, camera in sorted(model.cameras.items())
+        if key in used
+    ]
+
+
+def _advice(figures: Report, missing: Sequence[Photograph], solution: Solution) -> list[str]:
+    advice = []
+    if missing:
+        advice.append(
+            f"photograph once more around {first_names([one.path.name for one in missing], 3)}: steps of half a metre, "
+            "each picture sharing two thirds with the one before, and some that show what stands next to the glass"
+        )
+    if len(figures.groups) > 1:
+        advice.append(
+            f"the photographs fall into {len(figures.groups)} groups that share nothing "
+            f"({', '.join(map(str, figures.groups))} photographs): take some that connect them, or prepare each alone"
+        )
+    if figures.features < FEW_FEATURES:
+        advice.append(
+            f"photographs have only {figures.features} features on average: more light, a steadier hand, or a larger "
+            "--max-size"
+        )
+    if figures.points and figures.track_length < SHORT_TRACK:
+        advice.append("points are seen in few photographs: take more, with smaller steps")
+    if figures.reprojection_error > LARGE_ERROR:
+        advice.append("points have large errors for a still scene: see that nothing large moves, or try --lens opencv")
+    model = solution.models[0] if solution.models else None
+    if model is not None and any(not _usual(camera) for camera in model.cameras.values()):
+        advice.append("a focal length is unusual, the lens was badly determined: photograph from different distances")
+    return advice
+
+
+def _usual(camera: Any) -> bool:
+    least, most = USUAL_FOCALS
+    return bool(least <= camera.mean_focal_length() / max(camera.width, camera.height) <= most)
 
 
 @dataclass(frozen=True)

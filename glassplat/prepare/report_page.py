@@ -17,11 +17,11 @@ from PIL import Image
 
 from glassplat.captures.dataset import Dataset, load_dataset
 from glassplat.captures.view import PointCloud, View
-from glassplat.evaluate.overview_style import STYLE
+from glassplat.evaluate.report import STYLE
 from glassplat.files.records import read_json
 from glassplat.files.writing import atomic_write
 from glassplat.panes.material import virtual_points
-from glassplat.prepare.workplace import RECORD
+from glassplat.prepare.preparation import RECORD
 from glassplat.scene.camera import NumpyCamera
 from glassplat.scene.panes import Planes
 

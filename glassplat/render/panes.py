@@ -9,9 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from glassplat.kernels import Fresnel
 from glassplat.kernels.composite import composite
-from glassplat.kernels.fresnel import Fresnel
-from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
+from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 from glassplat.kernels.panes import blend_panes, pane_hits
 from glassplat.kernels.project import GradientSum
 from glassplat.kernels.records import TILE, BlendedPanes, PaneHits, Panes, Projected, Splats

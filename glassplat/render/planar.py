@@ -9,8 +9,8 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from glassplat.kernels import Fresnel
 from glassplat.kernels.composite import color_and_depth, composite, join_channels
-from glassplat.kernels.fresnel import Fresnel
 from glassplat.kernels.panes import layer_slopes, pane_layers, slopes_at
 from glassplat.kernels.project import GradientSum
 from glassplat.kernels.records import Deviation, PaneHits, Panes, Splats

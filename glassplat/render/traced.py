@@ -15,7 +15,7 @@ from glassplat.kernels.records import Traced as Found
 from glassplat.kernels.trace import build_bvh, shapes_of, trace
 from glassplat.render.deferred import INVISIBLE, Surface, reflected_rays, seen_surface, view_directions
 from glassplat.render.frame import MEDIAN_DEPTH, NEAR_PER_EXTENT, Frame, SpacePass, check_colored, over_background
-from glassplat.scene.activations import SH_ZERO
+from glassplat.scene import SH_ZERO
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene

@@ -21,6 +21,8 @@ from glassplat.training.densify import (
     apply_edit,
     densified,
     forget,
+    gaussians_from_points,
+    in_morton_order,
     keep,
     perturb_opacities,
     resampled,
@@ -30,7 +32,6 @@ from glassplat.training.densify import (
 from glassplat.training.losses import LossTerm, mean_opacity, mean_scale, of_all, weighted
 from glassplat.training.messages import Working
 from glassplat.training.options import DefaultDensify, McmcDensify, Rate, Rhythm, Strategy
-from glassplat.training.points import gaussians_from_points, in_morton_order
 from glassplat.training.stage import Action, AverageLast, Clock, Every, PostStep, TrainState, Work
 
 MEGAPIXEL = 1e6

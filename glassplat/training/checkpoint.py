@@ -13,8 +13,7 @@ from torch import Tensor
 from glassplat.errors import InputError, input_checked
 from glassplat.files.records import ByName, Field, Items, Nullable, Number, Optional, Text, Whole, checked
 from glassplat.files.scene_folder import DIRECTION, EXTENT, SH_DEGREE, direction
-from glassplat.files.sidecars import HIGHEST_LABEL, REGION
-from glassplat.files.tensors_file import TensorsFile, opened_tensors, write_tensors
+from glassplat.files.sidecars import HIGHEST_LABEL, REGION, TensorsFile, opened_tensors, write_tensors
 from glassplat.scene.corrections import Exposures, PoseCorrections
 from glassplat.scene.gaussians import DISC_SCALES, PER_GAUSSIAN, Gaussians
 from glassplat.scene.panes import Planes

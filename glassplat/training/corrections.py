@@ -11,7 +11,7 @@ from torch import Tensor
 
 from glassplat.captures.dataset import Dataset
 from glassplat.render.planar import Planar
-from glassplat.scene.activations import logit
+from glassplat.scene import logit
 from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import Exposures, PoseCorrections, upward
 from glassplat.scene.gaussians import Gaussians

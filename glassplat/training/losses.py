@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from glassplat.captures.view import FOLDER, View, estimated_normals, with_ignored_right
-from glassplat.kernels.gradient_conflict import gradient_conflict as shared_edges
-from glassplat.kernels.harmonic_energy import harmonic_energy
+from glassplat.kernels.loss_terms import gradient_conflict as shared_edges
+from glassplat.kernels.loss_terms import harmonic_energy
 from glassplat.kernels.photometric import photometric
 from glassplat.render.deferred import cell_means, cell_side, depth_normals
 from glassplat.render.frame import Frame

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.cli.demo import SCENE
 from glassplat.cli.main import main
+from glassplat.cli.train import SCENE
 
 PROMISED = {
     "method", "iterations", "resolution", "split", "seed", "num_gaussians", "train_seconds", "seconds_per_frame",

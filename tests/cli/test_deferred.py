@@ -15,7 +15,7 @@ from glassplat.cli.runs import open_run
 from glassplat.errors import InputError
 from glassplat.files.images import read_image
 from glassplat.files.sidecars import read_equirect, write_equirect
-from glassplat.render.environment import equirect_from_environment
+from glassplat.render.deferred import equirect_from_environment
 from glassplat.scene.scene import Environment
 from glassplat.training.checkpoint import load_checkpoint
 from tests.training.object_capture import few_steps, write_object_capture

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from glassplat.cli.demo import LEAST_ITERATIONS
 from glassplat.cli.main import main
+from glassplat.cli.train import LEAST_ITERATIONS
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.training.stage import missed_stages
 

@@ -18,7 +18,7 @@ from glassplat.cli.evaluate import Evaluate
 from glassplat.cli.main import main
 from glassplat.errors import InputError
 from glassplat.kernels.backend.devices import CudaUnavailableError
-from glassplat.panes.options import PlaneFitError
+from glassplat.panes import PlaneFitError
 from glassplat.training.loop import TrainingDivergedError
 
 

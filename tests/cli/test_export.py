@@ -14,7 +14,7 @@ from glassplat.cli.main import main
 from glassplat.files.ply import read_gaussians
 from glassplat.files.sidecars import read_planes
 from glassplat.files.spz import read_spz
-from glassplat.model.loading import load
+from glassplat.model.model import load
 from tests.cli.tiny_run import write_run
 from tests.training.tiny_capture import true_scene
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from glassplat.cli.demo import SCENE
 from glassplat.cli.main import main
+from glassplat.cli.train import SCENE
 from glassplat.files.ply import write_gaussians
 from glassplat.files.spz import write_spz
 from glassplat.scene.gaussians import Gaussians

@@ -11,7 +11,7 @@ from glassplat.cli.main import main
 from glassplat.cli.places import SceneEdits
 from glassplat.errors import InputError
 from glassplat.files.images import read_image
-from glassplat.model.loading import load
+from glassplat.model.model import load
 from glassplat.scene.scene import Scene, as_mirrors, shifted, tilted, with_reflectance, without_glass
 from tests.cli.tiny_run import rendered, write_run
 from tests.training.tiny_capture import true_scene

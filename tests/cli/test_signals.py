@@ -13,12 +13,10 @@ from pathlib import Path
 import pytest
 
 from glassplat.cli.console import Interrupted, held_signals, raised_signals
-from glassplat.cli.demo import SCENE, Demo
 from glassplat.cli.evaluate import Evaluate
-from glassplat.cli.look import Render
 from glassplat.cli.main import main
-from glassplat.cli.publish import Dereflect
-from glassplat.cli.train import Train
+from glassplat.cli.scene import Dereflect, Render
+from glassplat.cli.train import SCENE, Demo, Train
 from glassplat.files.writing import atomic_write
 from glassplat.methods.splat_recipe import SplatRecipe
 

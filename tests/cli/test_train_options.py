@@ -10,15 +10,15 @@ from typing import Any
 import pytest
 
 from glassplat.cli import main as cli
-from glassplat.cli.demo import SCENE
 from glassplat.cli.main import main
+from glassplat.cli.train import SCENE
 from glassplat.errors import InputError
 from glassplat.methods.glossy_recipes import DeferredRecipe
 from glassplat.methods.planar_recipe import Perturbation, PlanarRecipe
 from glassplat.methods.recipe import RECIPES
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.options import check_options
-from glassplat.panes.options import PlaneFit
+from glassplat.panes import PlaneFit
 from glassplat.training.options import GaussianRates, McmcDensify, NormalPropagation
 
 LARGE = str(10**30)

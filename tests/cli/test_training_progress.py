@@ -11,9 +11,9 @@ import pytest
 from rich.console import Console
 
 from glassplat.cli import progress as training_progress
-from glassplat.cli.demo import SCENE
 from glassplat.cli.main import main
 from glassplat.cli.progress import FIRST_PAUSE, LONGEST_PAUSE, StepLines, TrainingProgress, in_words
+from glassplat.cli.train import SCENE
 from glassplat.training.messages import (
     ActionDone,
     CheckpointWritten,

@@ -10,8 +10,7 @@ import torch
 from glassplat.captures.dataset import load_dataset
 from glassplat.errors import InputError
 from glassplat.evaluate.evaluate import EvaluatedView, evaluate, peak_memory_mib
-from glassplat.evaluate.metric_names import json_values
-from glassplat.evaluate.metrics import plane_table, psnr
+from glassplat.evaluate.metrics import json_values, plane_table, psnr
 from glassplat.evaluate.truth import load_truth
 from glassplat.render.frame import Frame
 from glassplat.scene.camera import Camera

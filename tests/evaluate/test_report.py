@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from glassplat.evaluate.evaluate import evaluate
-from glassplat.evaluate.metric_names import (
+from glassplat.evaluate.metrics import (
     FACTS,
     METRICS,
     PLANE_COLUMNS,
@@ -15,8 +15,16 @@ from glassplat.evaluate.metric_names import (
     SURFACE_METRICS,
     written,
 )
-from glassplat.evaluate.report import Report, overview_page, sheet_names
-from glassplat.evaluate.sheet import BACKGROUND, CAPTION_HEIGHT, MARGIN, TITLE_HEIGHT, comparison_sheet
+from glassplat.evaluate.report import (
+    BACKGROUND,
+    CAPTION_HEIGHT,
+    MARGIN,
+    TITLE_HEIGHT,
+    Report,
+    comparison_sheet,
+    overview_page,
+    sheet_names,
+)
 from glassplat.evaluate.truth import TrueSurface
 from glassplat.files.images import read_image
 from glassplat.options import Blend

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from glassplat.files.sidecars import read_equirect, write_equirect
-from glassplat.kernels.maths.color import linear_from_srgb
+from glassplat.kernels.maths.images import linear_from_srgb
 
 
 def panorama(height: int = 6) -> torch.Tensor:

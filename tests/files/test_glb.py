@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from glassplat.files.glb import CHUNK, EXTENSION, HEADER, read_glb, write_glb
 from glassplat.kernels.project.reference import rotations, sh_basis
-from glassplat.scene.activations import SH_ZERO
+from glassplat.scene import SH_ZERO
 from glassplat.scene.camera import rotation_from_quat
 from glassplat.scene.gaussians import Gaussians
 from tests.files.test_spz import shapes, typical

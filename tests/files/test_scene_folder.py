@@ -8,7 +8,7 @@ import torch
 from glassplat.files.scene_folder import read_scene, write_scene
 from glassplat.files.sidecars import read_equirect
 from glassplat.model.run_directory import RunDirectory
-from glassplat.render.environment import equirect_from_environment
+from glassplat.render.deferred import equirect_from_environment
 from glassplat.scene.scene import Environment, Scene
 from tests.render.tiny_scene import in_single_precision, showcase
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from glassplat.files.tensors_file import opened_tensors, write_tensors
+from glassplat.files.sidecars import opened_tensors, write_tensors
 
 TENSORS = {"a": torch.arange(1000.0), "b": torch.zeros(0, 3)}
 

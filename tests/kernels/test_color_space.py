@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
+from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 
 
 def test_the_two_curves_are_inverse_and_increase() -> None:

@@ -9,9 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.gradient_conflict import gradient_conflict
-from glassplat.kernels.gradient_conflict.reference import gradient_conflict as twin
-from glassplat.kernels.gradient_conflict.reference import sobel
+from glassplat.kernels.loss_terms import gradient_conflict, sobel
+from glassplat.kernels.loss_terms import gradient_conflict_in_torch as twin
 
 
 def pictures(height: int, width: int, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:

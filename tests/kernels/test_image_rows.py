@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.composite import color_and_depth, join_channels
-from glassplat.kernels.harmonic_energy import _EnergyInTorch, harmonic_energy
+from glassplat.kernels.loss_terms import _EnergyInTorch, harmonic_energy
 from glassplat.kernels.panes import pane_layers
 
 DTYPES = [(torch.float32, 1e-5), (torch.float64, 1e-12)]

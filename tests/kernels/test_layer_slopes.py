@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
+from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 from glassplat.kernels.panes import layer_slopes, slopes_at
 from glassplat.kernels.panes.reference import layer_slopes as reference_layer_slopes
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.fresnel import Fresnel
+from glassplat.kernels import Fresnel
 from glassplat.kernels.maths.pane import LAWS
 from glassplat.kernels.panes import blend_panes
 from glassplat.kernels.panes.reference import two_surfaces

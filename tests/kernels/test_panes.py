@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.fresnel import Fresnel
+from glassplat.kernels import Fresnel
 from glassplat.kernels.maths.pane import LAWS
 from glassplat.kernels.panes import blend_panes, pane_hits
 from glassplat.kernels.panes.reference import blend_panes as blend_twin

@@ -15,12 +15,12 @@ from torch.nn.functional import normalize
 from glassplat.captures.view import CAMERA_FROM_PICTURE, FOLDER, View
 from glassplat.methods.mirrors import FACING, facing, made_mirrors, mirror_lookalikes, neighbours, seen_normals
 from glassplat.render.splat import Splat
-from glassplat.scene.activations import SH_ZERO
+from glassplat.scene import SH_ZERO
 from glassplat.scene.camera import Camera, rotation_from_quat
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Environment, Scene
+from glassplat.training.densify import as_discs
 from glassplat.training.options import MirrorSearch
-from glassplat.training.points import as_discs
 from tests.training.brightened_views import brightened_views
 
 SIZE, GREY = 96, 0.4

@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 
 from glassplat.methods.mirrors import colors_disturbed, normals_propagated
-from glassplat.scene.activations import SH_ZERO
+from glassplat.scene import SH_ZERO
 from glassplat.scene.gaussians import Gaussians
 from glassplat.training.options import NormalPropagation
 

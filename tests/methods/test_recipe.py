@@ -11,9 +11,8 @@ from typing import Any
 
 import pytest
 
-from glassplat.cli.demo import Demo
-from glassplat.cli.look import Render
-from glassplat.cli.train import Train
+from glassplat.cli.scene import Render
+from glassplat.cli.train import Demo, Train
 from glassplat.errors import InputError
 from glassplat.methods.recipe import RECIPES, recipe_from_json, recipe_of, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe

@@ -13,7 +13,7 @@ from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
 from glassplat.methods.mirrors import GrowShAfterPropagation
 from glassplat.methods.surroundings import AddEnvironment, AddSurroundings, BeginReflections
 from glassplat.render.splat import Splat
-from glassplat.scene.activations import logit
+from glassplat.scene import logit
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import GrowSh, ResetOpacity
 from glassplat.training.options import MirrorSearch, SurroundingsStart

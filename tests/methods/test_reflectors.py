@@ -11,7 +11,7 @@ from glassplat.captures.view import View
 from glassplat.methods.mirrors import Search, evenly, in_region, residual_spreads
 from glassplat.render.deferred import Deferred
 from glassplat.render.layers import contributions
-from glassplat.scene.activations import SH_ZERO, logit
+from glassplat.scene import SH_ZERO, logit
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Environment, Scene

@@ -25,7 +25,7 @@ from glassplat.methods.recipe import recipe_from_json, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory, RunSettings
 from glassplat.model.training import Run
-from glassplat.panes.options import PlaneFitError
+from glassplat.panes import PlaneFitError
 from glassplat.scene.scene import Scene
 from glassplat.training.checkpoint import load_checkpoint, recorded_seconds, save_checkpoint
 from glassplat.training.messages import CheckpointWritten, Message, RunBegun, StepDone, Working

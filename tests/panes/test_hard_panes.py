@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.fit import fit_planes
-from glassplat.panes.options import PlaneFit, PlaneFitError
 from glassplat.scene.camera import Camera, rotation_from_quat
 from tests.panes.pane_scene import (
     EYES,

@@ -7,9 +7,9 @@ import logging
 import numpy as np
 import pytest
 
+from glassplat.panes import PlaneFit
 from glassplat.panes.fit import fit_planes, meeting_of_each, odd_ones
 from glassplat.panes.masks import FramedPlanes, PlaneEquations, pane_views
-from glassplat.panes.options import PlaneFit
 from tests.panes.pane_scene import EYES, FRONT, Annotations, Pane, frame_and_clutter, scene_of
 
 QUICK = PlaneFit(hypotheses=300, refined=2)

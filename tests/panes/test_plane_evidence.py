@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from glassplat.panes import PlaneFit
 from glassplat.panes.fit import fit_planes
 from glassplat.panes.masks import FramedPlanes, PlaneEquations, pane_views
 from glassplat.panes.objective import Objective
-from glassplat.panes.options import PlaneFit
 from glassplat.panes.search import Fit, best_supported, first_hypotheses, score
 from tests.panes.pane_scene import FRONT, Pane, camera_from, frame_and_clutter, label_image, normal_error, scene_of
 

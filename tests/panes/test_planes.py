@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.fit import fit_planes
 from glassplat.panes.masks import FramedPlanes, PlaneEquations, mask_agreement, pane_views
 from glassplat.panes.objective import Objective, planes_nearby
-from glassplat.panes.options import PlaneFit, PlaneFitError
 from glassplat.scene.camera import Camera, rotation_from_quat
 from tests.panes.pane_scene import (
     EYES,

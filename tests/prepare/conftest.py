@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from glassplat.cli.demo import SCENE
+from glassplat.cli.train import SCENE
 from glassplat.prepare.photographs import Note, Progress
 
 CONNECTED = ("0000", "0001", "0003", "0004", "0006", "0007", "0009", "0010", "0012", "0013")

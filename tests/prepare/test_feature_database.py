@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from contextlib import closing
 from pathlib import Path
 
 import pytest
 
-from glassplat.captures import colmap_library as library
 from glassplat.errors import InputError
 from glassplat.prepare.colmap import FeatureDatabase, sound
 from glassplat.prepare.photographs import Photograph

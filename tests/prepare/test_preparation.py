@@ -11,8 +11,8 @@ import pytest
 from PIL import Image, ImageOps
 
 from glassplat.captures.dataset import Dataset, load_dataset
-from glassplat.cli.demo import SCENE
 from glassplat.cli.main import main
+from glassplat.cli.train import SCENE
 from glassplat.errors import InputError
 from glassplat.prepare import colmap
 from glassplat.prepare.photographs import Note, Progress

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from glassplat.prepare.photographs import Photograph
+from glassplat.prepare.preparation import report_of
 from glassplat.prepare.reconstruction import Solution
-from glassplat.prepare.report import report_of
 
 
 class FakeDatabase:

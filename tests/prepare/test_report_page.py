@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from glassplat.captures.dataset import load_dataset
-from glassplat.cli.demo import SCENE
 from glassplat.cli.main import main
+from glassplat.cli.train import SCENE
 from glassplat.prepare.report_page import PAGE, plan, write_page
 
 RECORD = {

@@ -10,8 +10,8 @@ import pytest
 
 from glassplat.errors import InputError
 from glassplat.files.images import image_size
-from glassplat.prepare import video
-from glassplat.prepare.video import Footage, chosen_frames, frames_of
+from glassplat.prepare import photographs as video
+from glassplat.prepare.photographs import Footage, chosen_frames, frames_of
 from tests.prepare.conftest import Heard
 
 WIDTH, HEIGHT = 320, 240

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
+from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 from glassplat.options import Blend
 from glassplat.render.frame import Frame
 from glassplat.render.planar import Planar, as_mirror_image, dereflected_photo

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.environment import cube_lookup
-from glassplat.render.environment import (
+from glassplat.render.deferred import (
     environment_from_equirect,
     equirect_from_environment,
     panorama_directions,

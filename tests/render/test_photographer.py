@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.maths.color import linear_from_srgb
+from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.render.planar import Planar
 from glassplat.scene.camera import Camera, rotation_from_quat
 from glassplat.scene.corrections import Direction, world_from_photographer

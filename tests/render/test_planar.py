@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from glassplat.kernels.fresnel import Fresnel
-from glassplat.kernels.maths.color import linear_from_srgb
+from glassplat.kernels import Fresnel
+from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.kernels.maths.pane import LAWS
 from glassplat.kernels.panes.reference import REFLECTANCE
 from glassplat.options import Blend

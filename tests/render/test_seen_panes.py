@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.maths.color import linear_from_srgb
+from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.options import Blend
 from glassplat.render.layers import contributions
 from glassplat.render.panes import FAINT, curves, glass_owners, nearest_hits, panes_in_camera, seen_panes

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.maths.color import linear_from_srgb
+from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.options import Blend
 from glassplat.render.panes import tinted
 from glassplat.render.planar import Planar

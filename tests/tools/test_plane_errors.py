@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from glassplat.captures.dataset import Dataset, load_dataset
-from glassplat.cli.demo import SCENE
+from glassplat.cli.train import SCENE
 from glassplat.evaluate.truth import GroundTruth, load_truth
 from tools.plane_errors import Fit, fits_of, main, row
 

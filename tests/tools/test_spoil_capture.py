@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from glassplat.files.images import read_image
-from glassplat.kernels.maths.color import linear_from_srgb
+from glassplat.kernels.maths.images import linear_from_srgb
 from tests.training.object_capture import write_object_capture
 from tests.training.tiny_capture import write_tiny_capture
 from tools.spoil_capture import add_passers_by, disturb_poses, disturb_transforms, frames_of, spoil

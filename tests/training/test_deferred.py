@@ -19,7 +19,7 @@ from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory, RunSettings
 from glassplat.model.training import Run
 from glassplat.render.deferred import Deferred
-from glassplat.scene.activations import logit
+from glassplat.scene import logit
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import ResetOpacity
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint

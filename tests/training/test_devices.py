@@ -28,7 +28,6 @@ ON_THE_CPU = (
     "/panes/",
     "/captures/",
     "/methods/surroundings.py",
-    "/training/points.py",
     "/scene/gaussians.py",
     "/scene/panes.py",
     "/scene/scene.py",

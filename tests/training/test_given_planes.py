@@ -17,7 +17,7 @@ from glassplat.errors import InputError
 from glassplat.files.sidecars import read_planes, write_planes
 from glassplat.methods.planar import PaneSetup, fitted_planes
 from glassplat.methods.planar_recipe import PlanarRecipe
-from glassplat.panes.options import PlaneFit, PlaneFitError
+from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.scene.panes import Planes
 from glassplat.training.stage import TrainState
 from tests.training.progress_of import finished

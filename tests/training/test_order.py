@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from glassplat.kernels.trace.bvh import MORTON_BITS, morton_codes
-from glassplat.training.points import in_morton_order
+from glassplat.training.densify import in_morton_order
 
 
 def test_the_corners_of_a_cube_come_in_the_order_of_the_curve() -> None:

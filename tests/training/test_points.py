@@ -10,8 +10,8 @@ import torch
 
 from glassplat.captures.capture import RawPoints
 from glassplat.captures.view import PointCloud
-from glassplat.scene.activations import SH_ZERO
-from glassplat.training.points import gaussians_from_points, morton_order
+from glassplat.scene import SH_ZERO
+from glassplat.training.densify import gaussians_from_points, morton_order
 
 
 def cloud(count: int, seed: int = 0) -> PointCloud:

@@ -27,9 +27,9 @@ from glassplat.scene.corrections import PoseCorrections, moved_camera
 from glassplat.scene.scene import Scene
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.corrections import center_poses, poses_begun
+from glassplat.training.densify import as_discs
 from glassplat.training.loop import train
 from glassplat.training.options import PoseRefinement
-from glassplat.training.points import as_discs
 from glassplat.training.stage import TrainState
 from tests.render.test_deferred import glossy as deferred_scene
 from tests.render.test_planar import CAMERA

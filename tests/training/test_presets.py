@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from glassplat.cli import main
-from glassplat.cli.demo import SCENE
-from glassplat.kernels.maths.color import linear_from_srgb
+from glassplat.cli.train import SCENE
+from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.methods.glossy_recipes import DeferredRecipe
 from glassplat.methods.mirrors import ENDED, DensifyWhilePropagating, Propagate, ResetRaised
 from glassplat.methods.planar import PaneSetup, planar_population

@@ -15,10 +15,10 @@ from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.scene.scene import Scene
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
+from glassplat.training.densify import gaussians_from_points
 from glassplat.training.loop import TrainingDivergedError, differentiate, train
 from glassplat.training.losses import LossTerm, PhotometricLoss
 from glassplat.training.messages import ActionDone, StageEntered, StepDone
-from glassplat.training.points import gaussians_from_points
 from glassplat.training.stage import Stage, TrainState
 from tests.training.progress_of import finished
 from tests.training.tiny_capture import tiny_capture, true_scene

@@ -2,20 +2,389 @@
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
+from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
+from glassplat.kernels.backend.cpu_vector import (
+    absolute,
+    bits_of,
+    interleaved,
+    item,
+    minimum,
+    select,
+    store,
+    vector_kind,
+    without_fourths,
+)
 from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.composite.cpu_backward import composite_backward
 from glassplat.kernels.composite.cpu_discs import composite_discs, composite_discs_gradients
-from glassplat.kernels.composite.cpu_forward import composite_forward
-from glassplat.kernels.composite.cpu_tile import new_pair_rows, sum_pair_rows
-from glassplat.kernels.records import Deviation, Splats, TileBins
+from glassplat.kernels.composite.cpu_tile import (
+    SPLATS,
+    exponent,
+    lane_of,
+    list_block,
+    list_plain_block,
+    new_pair_rows,
+    sum_pair_rows,
+)
+from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
+from glassplat.kernels.records import LEAST_ALPHA, Deviation, Splats, TileBins
+
+# Planes of a tile's results; SUMS has one per channel. T_AGAIN, CENTER, DEVIATION and LEAN belong to the second
+# traversal, which sums distances from the mean that the first one has found.
+MASK, T_AGAIN, CENTER, DEVIATION, LEAN, SUMS = (plane * tile.PIXELS for plane in range(6))
+STOP_AFTER = 8
+"""Splats after which a block looks whether all of its pixels have stopped."""
+
+
+def _blend_block(real: type, with_glass: bool) -> Scalar:
+    """Builds the loop over the splats of a block, of which some may be glass."""
+    full, load = vector_kind(real, tile.LANES)
+    x_centers, y_centers = tile.pixel_centers(real)
+    exp2 = tile.tile_functions(real).exp2
+    zero, t_min, alpha_max = real(0.0), real(TRANSMITTANCE_MIN), real(ALPHA_MAX)
+    least = real(math.log2(ALPHA_MIN))
+    T, LAST, T_GLASS, LAST_GLASS = tile.T, tile.LAST, tile.T_GLASS, tile.LAST_GLASS
+    MEAN_X, MEAN_Y, ORDER, VALUES, PIXELS = tile.MEAN_X, tile.MEAN_Y, tile.ORDER, tile.VALUES, tile.PIXELS
+
+    @inlined
+    def blend_block(state, at_state, planes, at, batch, width, entries, count, x, y, weights, keep):
+        """Blends the first four channels; returns how many splats it took, and whether any pixel still runs."""
+        xs, ys = x_centers() + x, y_centers() + y
+        none, most = full(zero), full(alpha_max)
+        t, last = load(state, at_state + T), load(state, at_state + LAST)
+        s0, s1 = load(planes, at + SUMS), load(planes, at + SUMS + PIXELS)
+        s2, s3 = load(planes, at + SUMS + 2 * PIXELS), load(planes, at + SUMS + 3 * PIXELS)
+        if with_glass:
+            t_glass, last_glass = load(state, at_state + T_GLASS), load(state, at_state + LAST_GLASS)
+            mask = load(planes, at + MASK)
+        e = 0
+        while e < count:
+            k = item(entries, e)
+            glass = with_glass and k < 0
+            k = ~k if glass else k
+            splat = k * width
+            bits = exponent(batch, splat, xs - item(batch, splat + MEAN_X), ys - item(batch, splat + MEAN_Y))
+            alpha = select(bits >= least, minimum(exp2(bits), most), none)
+            position = full(item(batch, splat + ORDER))
+            if with_glass and glass:
+                weight = alpha * t_glass
+                after = t_glass - weight
+                alive = (after >= t_min) & (t > zero)
+                t_glass = select(alive, after, -absolute(t_glass))
+                last_glass = select(alive, position, last_glass)
+                mask = mask + select(alive, weight * t * item(batch, splat + VALUES), none)
+                weight = none
+            else:
+                weight = alpha * t
+                after = t - weight
+                alive = after >= t_min
+                weight = select(alive, weight, none)
+                t = select(alive, after, -absolute(t))
+                last = select(alive, position, last)
+                s0 = s0 + weight * item(batch, splat + VALUES)
+                s1 = s1 + weight * item(batch, splat + VALUES + 1)
+                s2 = s2 + weight * item(batch, splat + VALUES + 2)
+                s3 = s3 + weight * item(batch, splat + VALUES + 3)
+            if keep:
+                store(weights, e * tile.LANES, weight)
+            e += 1
+            if e % STOP_AFTER == 0 and bits_of(t > zero) == 0:
+                break
+        store(state, at_state + T, t)
+        store(state, at_state + LAST, last)
+        store(planes, at + SUMS, s0)
+        store(planes, at + SUMS + PIXELS, s1)
+        store(planes, at + SUMS + 2 * PIXELS, s2)
+        store(planes, at + SUMS + 3 * PIXELS, s3)
+        if with_glass:
+            store(state, at_state + T_GLASS, t_glass)
+            store(state, at_state + LAST_GLASS, last_glass)
+            store(planes, at + MASK, mask)
+        return e, bits_of(t > zero) != 0
+
+    return blend_block
+
+
+def _blend_more(real: type) -> Scalar:
+    load = vector_kind(real, tile.LANES).load
+    VALUES, PIXELS = tile.VALUES, tile.PIXELS
+
+    @inlined
+    def blend_more(planes, at, batch, width, entries, count, column, weights):
+        """Adds four more channels, the first of which is a splat's `column`, with the weights that are kept."""
+        at += SUMS + (column - VALUES) * PIXELS
+        s0, s1 = load(planes, at), load(planes, at + PIXELS)
+        s2, s3 = load(planes, at + 2 * PIXELS), load(planes, at + 3 * PIXELS)
+        for e in range(count):
+            k = item(entries, e)
+            if k >= 0:
+                value, weight = k * width + column, load(weights, e * tile.LANES)
+                s0 = s0 + weight * item(batch, value)
+                s1 = s1 + weight * item(batch, value + 1)
+                s2 = s2 + weight * item(batch, value + 2)
+                s3 = s3 + weight * item(batch, value + 3)
+        store(planes, at, s0)
+        store(planes, at + PIXELS, s1)
+        store(planes, at + 2 * PIXELS, s2)
+        store(planes, at + 3 * PIXELS, s3)
+
+    return blend_more
+
+
+def _deviate_block(real: type) -> Scalar:
+    full, load = vector_kind(real, tile.LANES)
+    x_centers, y_centers = tile.pixel_centers(real)
+    exp2 = tile.tile_functions(real).exp2
+    zero, alpha_max, least = real(0.0), real(ALPHA_MAX), real(math.log2(ALPHA_MIN))
+    MEAN_X, MEAN_Y, ORDER, LAST = tile.MEAN_X, tile.MEAN_Y, tile.ORDER, tile.LAST
+
+    @inlined
+    def deviate_block(state, at_state, planes, at, batch, width, entries, count, x, y, column):
+        """Adds up how far a splat's `column` lies from CENTER, over splats that `blend_block` has taken."""
+        xs, ys = x_centers() + x, y_centers() + y
+        none, most = full(zero), full(alpha_max)
+        t, last, center = load(planes, at + T_AGAIN), load(state, at_state + LAST), load(planes, at + CENTER)
+        deviation, lean = load(planes, at + DEVIATION), load(planes, at + LEAN)
+        for e in range(count):
+            k = item(entries, e)
+            if k >= 0:
+                splat = k * width
+                bits = exponent(batch, splat, xs - item(batch, splat + MEAN_X), ys - item(batch, splat + MEAN_Y))
+                shown = (bits >= least) & (last >= item(batch, splat + ORDER))
+                weight = select(shown, minimum(exp2(bits), most), none) * t
+                t = t - weight
+                difference = item(batch, splat + column) - center
+                deviation = deviation + weight * absolute(difference)
+                lean = lean + select(difference > zero, weight, select(difference < zero, -weight, none))
+        store(planes, at + T_AGAIN, t)
+        store(planes, at + DEVIATION, deviation)
+        store(planes, at + LEAN, lean)
+
+    return deviate_block
+
+
+def _clear(real: type) -> Scalar:
+    full, zero, LANES, PIXELS = vector_kind(real, tile.LANES).full, real(0.0), tile.LANES, tile.PIXELS
+
+    @inlined
+    def clear(planes, groups):
+        """No mask and no sums yet."""
+        for i in range(0, PIXELS, LANES):
+            store(planes, MASK + i, full(zero))
+        for i in range(SUMS, SUMS + groups * 4 * PIXELS, LANES):
+            store(planes, i, full(zero))
+
+    return clear
+
+
+def _write_tile(real: type) -> Scalar:
+    """Builds the function that puts a tile into the images, which are flat."""
+    one = real(1.0)
+    load, load_row = vector_kind(real, tile.LANES).load, vector_kind(real, tile.BLOCK).load
+    BLOCK, ACROSS, LANES, PIXELS, T = tile.BLOCK, tile.ACROSS, tile.LANES, tile.PIXELS, tile.T
+
+    @inlined
+    def write_whole_block(state, at, planes, i, image, alpha, first, width, channels):
+        """A block of three or four channels that lies within the image; `first` is its first pixel."""
+        s0, s1 = load(planes, SUMS + i), load(planes, SUMS + PIXELS + i)
+        s2, s3 = load(planes, SUMS + 2 * PIXELS + i), load(planes, SUMS + 3 * PIXELS + i)
+        rows = interleaved((s0, s1, s2, s3))
+        for y in range(BLOCK):
+            store(alpha, first + y * width, one - load_row(state, at + T + i + y * BLOCK))
+            if channels == 4:
+                store(image, (first + y * width) * 4, rows[y])
+            else:
+                eight, four = without_fourths(rows[y])
+                store(image, (first + y * width) * 3, eight)
+                store(image, (first + y * width) * 3 + 8, four)
+
+    @inlined
+    def write_block(state, at, planes, i, image, alpha, first, width, columns, rows, channels):
+        for y in range(min(BLOCK, rows)):
+            for x in range(min(BLOCK, columns)):
+                pixel, lane = first + y * width + x, i + y * BLOCK + x
+                alpha[pixel] = one - state[at + T + lane]
+                for d in range(channels):
+                    image[pixel * channels + d] = planes[SUMS + d * PIXELS + lane]
+
+    @inlined
+    def write_tile(state, at, planes, image, alpha, first, width, columns, rows, channels):
+        for b in range(tile.BLOCKS):
+            x, y = b % ACROSS * BLOCK, b // ACROSS * BLOCK
+            corner = first + y * width + x
+            if 3 <= channels <= 4 and x + BLOCK <= columns and y + BLOCK <= rows:
+                write_whole_block(state, at, planes, b * LANES, image, alpha, corner, width, channels)
+            elif x < columns and y < rows:
+                write_block(state, at, planes, b * LANES, image, alpha, corner, width, columns - x, rows - y, channels)
+
+    return write_tile
+
+
+@inlined
+def write_mask(planes, mask, first, width, columns, rows):
+    """Puts a tile into the mask, which is flat."""
+    for y in range(rows):
+        for x in range(columns):
+            mask[first + y * width + x] = planes[MASK + lane_of(x, y)]
+
+
+@inlined
+def write_deviation(planes, where, deviation, first, width, columns, rows):
+    """Puts a tile into the deviation, which is flat like the factor `where` on it."""
+    for y in range(rows):
+        for x in range(columns):
+            pixel = first + y * width + x
+            deviation[pixel] = planes[DEVIATION + lane_of(x, y)] * where[pixel]
+
+
+def _begin_deviation(real: type) -> Scalar:
+    one, zero, least_alpha = real(1.0), real(0.0), real(LEAST_ALPHA)
+    PIXELS = tile.PIXELS
+
+    @inlined
+    def begin_deviation(state, at, planes, channel, where, first, width, columns, rows):
+        """Starts the second traversal of a tile; False where nobody asks for it."""
+        wanted = False
+        for y in range(rows):
+            for x in range(columns):
+                wanted |= where[first + y * width + x] != zero
+        for i in range(PIXELS):
+            covered = one - state[at + tile.T + i]
+            total = planes[SUMS + channel * PIXELS + i]
+            planes[CENTER + i] = total / max(covered, least_alpha) if covered > least_alpha else zero
+            planes[T_AGAIN + i] = one
+            planes[DEVIATION + i] = planes[LEAN + i] = zero
+        return wanted
+
+    return begin_deviation
+
+
+@functools.cache
+def composite_forward(real: type) -> Kernel:
+    """Builds the kernel that blends all tiles."""
+    pack, place, fetch, reached, _ = tile.tile_functions(real)
+    blend_plain, blend_mixed = _blend_block(real, False), _blend_block(real, True)
+    blend_more, deviate_block = _blend_more(real), _deviate_block(real)
+    begin, clear, finish, write_tile = tile.begin_state(real), _clear(real), tile.finish_state(real), _write_tile(real)
+    begin_deviation, zero = _begin_deviation(real), real(0.0)
+    BLOCK, ACROSS, BLOCKS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.BLOCKS, tile.LANES, tile.PIXELS
+    VALUES, ORDER, CHUNK, GLASS, STATE = tile.VALUES, tile.ORDER, tile.CHUNK, tile.GLASS, tile.STATE
+    TILES = tile.TILES
+
+    @kernel("composite_forward", real)
+    def forward(
+        means, conics, opacities, channels, marks, splats_per_camera, num_primary, image_width, height,
+        deviation_channel, where,
+        pair_splats, tile_offsets, splat_offsets, active,
+        packed, pairs, state, spread, image, alpha, mask, deviation,
+    ):  # fmt: skip
+        num_splats, num_channels = channels.shape
+        width, groups = packed.size // max(1, num_splats), (num_channels + 3) // 4
+        num_chunks = (num_splats + SPLATS - 1) // SPLATS
+        pack_stride = even_stride(num_chunks)
+        for task in prange(num_chunks):
+            chunk = task * pack_stride % num_chunks
+            for s in range(chunk * SPLATS, min(num_splats, (chunk + 1) * SPLATS)):
+                if splat_offsets[s + 1] > splat_offsets[s]:
+                    pack(packed, s * width, means[s], conics[s], opacities[s])
+                    glass = s % splats_per_camera - num_primary
+                    for d in range(width - VALUES):
+                        packed[s * width + VALUES + d] = channels[s, d] if d < num_channels else zero
+                    if glass >= 0:
+                        packed[s * width + VALUES] = marks[s // splats_per_camera, glass]
+        num_tasks = (active.size + TILES - 1) // TILES
+        stride = even_stride(num_tasks)
+        for task in prange(num_tasks):
+            planes = np.empty(SUMS + groups * 4 * PIXELS, real)
+            batch, entries = np.empty(CHUNK * width, real), np.empty(CHUNK + 1, np.int32)
+            weights: Any = np.empty(CHUNK * LANES, real)
+            begun = task * stride % num_tasks * TILES
+            for n in range(begun, min(active.size, begun + TILES)):
+                camera, x0, y0, columns, rows = place(active[n], image_width, height)
+                start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
+                at = n * STATE
+                running = begin(state, at, columns, rows)
+                if start == stop:
+                    continue
+                clear(planes, groups)
+                for first in range(start, stop, CHUNK):
+                    last = min(first + CHUNK, stop)
+                    fetch(batch, packed, pair_splats, first, last, width, x0, y0)
+                    any_glass = False
+                    for p in range(first, last):
+                        bits = reached(batch, (p - first) * width) & running
+                        if pair_splats[p] - camera * splats_per_camera >= num_primary:
+                            bits |= np.int64(1) << GLASS
+                            any_glass = True
+                        pairs[p] = bits
+                        batch[(p - first) * width + ORDER] = real(np.int32(p - start))
+                    for b in range(BLOCKS):
+                        if any_glass:
+                            count = list_block(entries, pairs, first, last, b)
+                        else:
+                            count = list_plain_block(entries, pairs, first, last, b)
+                        if count == 0:
+                            continue
+                        x, y = real(b % ACROSS * BLOCK), real(b // ACROSS * BLOCK)
+                        i = b * LANES
+                        if any_glass:
+                            taken, runs = blend_mixed(
+                                state, at + i, planes, i, batch, width, entries, count, x, y, weights, groups > 1
+                            )
+                        else:
+                            taken, runs = blend_plain(
+                                state, at + i, planes, i, batch, width, entries, count, x, y, weights, groups > 1
+                            )
+                        for group in range(1, groups):
+                            blend_more(planes, i, batch, width, entries, taken, VALUES + 4 * group, weights)
+                        if not runs:
+                            running &= ~(np.int64(1) << b)
+                            # What the block was not asked about any more does not reach it in the backward pass either.
+                            for e in range(taken, count):
+                                k = entries[e]
+                                pairs[first + (~k if k < 0 else k)] &= ~(np.int32(1) << b)
+                    if running == 0:
+                        stop = last
+                        break
+                finish(state, at)
+                corner = (camera * height + y0) * image_width + x0
+                write_tile(state, at, planes, image, alpha, corner, image_width, columns, rows, num_channels)
+                if num_primary < splats_per_camera:
+                    write_mask(planes, mask, corner, image_width, columns, rows)
+                if deviation_channel < 0:
+                    continue
+                if not begin_deviation(state, at, planes, deviation_channel, where, corner, image_width, columns, rows):
+                    continue
+                for first in range(start, stop, CHUNK):
+                    last = min(first + CHUNK, stop)
+                    fetch(batch, packed, pair_splats, first, last, width, x0, y0)
+                    for p in range(first, last):
+                        batch[(p - first) * width + ORDER] = real(np.int32(p - start))
+                    for b in range(BLOCKS):
+                        count = list_block(entries, pairs, first, last, b)
+                        x, y = real(b % ACROSS * BLOCK), real(b // ACROSS * BLOCK)
+                        deviate_block(
+                            state, at + b * LANES, planes, b * LANES, batch, width, entries, count, x, y,
+                            VALUES + deviation_channel,
+                        )  # fmt: skip
+                keep = n * 2 * PIXELS
+                spread[keep : keep + PIXELS] = planes[CENTER : CENTER + PIXELS]
+                spread[keep + PIXELS : keep + 2 * PIXELS] = planes[LEAN : LEAN + PIXELS]
+                write_deviation(planes, where, deviation, corner, image_width, columns, rows)
+
+    return forward
+
 
 __all__ = ["composite", "composite_discs", "composite_discs_gradients", "composite_gradients"]
 

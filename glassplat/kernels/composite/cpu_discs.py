@@ -34,8 +34,7 @@ from glassplat.kernels.backend.cpu_vector import (
 from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.composite.cpu_tile import lane_of, list_block
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
-from glassplat.kernels.maths.disc import MAP, meet_maths
-from glassplat.kernels.maths.ray_hit import MOST_DEVIATIONS
+from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, meet_maths
 from glassplat.kernels.records import REAL_OF, Discs, TileBins
 
 # Columns of a packed disc: first its outline as a packed splat, of which ORDER is reused once blocks are known.

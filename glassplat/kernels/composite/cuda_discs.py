@@ -22,9 +22,8 @@ from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.backend.devices import SIMULATED
 from glassplat.kernels.composite.cuda_tile import BUCKET, PIXELS, at, tile_steps
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar, blend_maths
-from glassplat.kernels.maths.disc import MAP, meet_maths
+from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, meet_maths
 from glassplat.kernels.maths.fast_maths import exp2_maths, fused_maths, reciprocal_maths
-from glassplat.kernels.maths.ray_hit import MOST_DEVIATIONS
 from glassplat.kernels.records import REAL_OF, TILE, Discs, TileBins
 
 CENTER_X, CENTER_Y, U_X, U_Y, V_X, V_Y, W_X, W_Y, OPACITY, Z, INVERSE_Z, COLUMNS = range(12)

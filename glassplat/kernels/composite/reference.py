@@ -10,8 +10,7 @@ from torch import Tensor
 
 from glassplat.kernels.composite import BlendedDiscs, Composite
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from glassplat.kernels.maths.disc import LOW_PASS
-from glassplat.kernels.maths.ray_hit import MOST_DEVIATIONS
+from glassplat.kernels.maths.disc import LOW_PASS, MOST_DEVIATIONS
 from glassplat.kernels.records import LEAST_ALPHA, Deviation, Discs, Splats, TileBins
 
 TILE = 16

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple, get_args
 
+from glassplat.kernels import Fresnel
 from glassplat.kernels.backend.cpu import inlined
-from glassplat.kernels.fresnel import Fresnel
 from glassplat.kernels.maths.blending import Scalar
 
 LAWS: tuple[Fresnel, ...] = get_args(Fresnel)

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from glassplat.kernels import Fresnel
 from glassplat.kernels.backend.devices import kernels_for
-from glassplat.kernels.fresnel import Fresnel
 from glassplat.kernels.maths.pane import LAWS
 from glassplat.kernels.records import BlendedPanes, PaneHits, Panes, check_device, check_tensors
 

@@ -31,7 +31,7 @@ from glassplat.kernels.backend.cpu_vector import (
     vector_kind,
 )
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.color import color_space_maths
+from glassplat.kernels.maths.images import color_space_maths
 from glassplat.kernels.maths.pane import pane_maths
 from glassplat.kernels.records import REAL_OF, TILE, PaneHits
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.color import color_space_maths
+from glassplat.kernels.maths.images import color_space_maths
 from glassplat.kernels.maths.pane import pane_maths
 from glassplat.kernels.panes.reference import layer_slopes
 from glassplat.kernels.records import REAL_OF, TILE, PaneHits

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from glassplat.kernels.fresnel import Fresnel
-from glassplat.kernels.maths.color import linear_from_srgb, srgb_from_linear
+from glassplat.kernels import Fresnel
+from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 from glassplat.kernels.records import TILE, BlendedPanes, PaneHits, Panes
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from glassplat.kernels.backend.cpu import Kernel, inlined, kernel
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.ssim import RADIUS, ssim_maths
+from glassplat.kernels.maths.images import RADIUS, ssim_maths
 from glassplat.kernels.records import REAL_OF
 
 CHANNELS = 3

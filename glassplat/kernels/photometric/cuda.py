@@ -15,7 +15,7 @@ from torch import Tensor
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, kernel
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.ssim import RADIUS, ssim_maths
+from glassplat.kernels.maths.images import RADIUS, ssim_maths
 from glassplat.kernels.records import REAL_OF, TILE
 
 CHANNELS = 3

@@ -44,7 +44,7 @@ def project(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, n
 
 
 def project_discs(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, near: float) -> tuple[Tensor, ...]:
-    """As `glassplat.kernels.project.cpu_discs.project_discs`."""
+    """As `glassplat.kernels.project.cpu.project_discs`."""
     outputs = _outputs(inputs, ((2,), (MAP,), (), (), (3,), (3,), (2,), (3,), (2,)))
     lens = _lenses(inputs[5], inputs[6], width, height)
     blocks, real = blocks_for(len(inputs[0]), THREADS), REAL_OF[inputs[0].dtype]
@@ -68,7 +68,7 @@ def project_discs_gradients(
     inputs: Sequence[Tensor], width: int, height: int, degree: int,
     *, seen: tuple[Tensor, Tensor], cotangents: Sequence[Tensor], needs_camera: bool,
 ) -> tuple[list[Tensor], Tensor]:  # fmt: skip
-    """As `glassplat.kernels.project.cpu_discs.project_discs_gradients`."""
+    """As `glassplat.kernels.project.cpu.project_discs_gradients`."""
     found = [torch.zeros_like(tensor) for tensor in inputs[:5]]
     lens = _lenses(inputs[5], inputs[6], width, height)
     return _gradients(project_discs_backward, inputs, lens, degree, (*seen, *cotangents), needs_camera, found)

@@ -8,9 +8,8 @@ import numpy as np
 
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
-from glassplat.kernels.maths.disc import MAP, disc_maths, outline_maths
+from glassplat.kernels.maths.disc import MAP, MOST_LOG_SCALE, disc_maths, outline_maths
 from glassplat.kernels.maths.projection import shape_maths, vector_maths
-from glassplat.kernels.maths.ray_hit import MOST_LOG_SCALE
 from glassplat.kernels.project.steps import Footprint, view_steps
 
 

@@ -24,8 +24,8 @@ from torch.autograd.function import once_differentiable
 
 from glassplat.kernels.backend.devices import kernels_for
 from glassplat.kernels.maths.blending import ALPHA_MIN
+from glassplat.kernels.maths.disc import MOST_DEVIATIONS, MOST_LOG_SCALE
 from glassplat.kernels.maths.harmonics import check_sh_degree
-from glassplat.kernels.maths.ray_hit import MOST_DEVIATIONS, MOST_LOG_SCALE
 from glassplat.kernels.project.reference import rotations
 from glassplat.kernels.records import FLAT, SOLID, Bvh, RawGaussians, Rays, Shapes, Traced, check_tensors
 

@@ -23,8 +23,8 @@ from torch import Tensor
 
 from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
 from glassplat.kernels.maths.blending import ALPHA_MAX, TRANSMITTANCE_MIN, Scalar, blend_maths
+from glassplat.kernels.maths.disc import ray_hit_maths
 from glassplat.kernels.maths.harmonics import color_maths
-from glassplat.kernels.maths.ray_hit import ray_hit_maths
 from glassplat.kernels.records import REAL_OF, Bvh, Shapes
 from glassplat.kernels.trace import reach
 from glassplat.kernels.trace.bvh import half_widths_maths, hilbert_codes, level_offsets

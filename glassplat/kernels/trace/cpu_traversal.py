@@ -17,7 +17,7 @@ from torch import Tensor
 from glassplat.kernels.backend.cpu import Kernel, inlined, kernel
 from glassplat.kernels.backend.cpu_vector import bits_of, lowest_bit, maximum, minimum, store, vector_kind
 from glassplat.kernels.maths.blending import Scalar, blend_maths
-from glassplat.kernels.maths.ray_hit import EDGE_ON, MOST_DEVIATIONS
+from glassplat.kernels.maths.disc import EDGE_ON, MOST_DEVIATIONS
 from glassplat.kernels.records import REAL_OF
 from glassplat.kernels.trace.steps import (
     CHUNK,
@@ -86,7 +86,7 @@ def _entry(real: type) -> Scalar:
 def _lanes(real: type, flat: bool) -> Scalar:
     """Puts down (t, squared |q|) of a ray and eight Gaussians; returns which of them it may meet, as bits.
 
-    What `maths/ray_hit.py` does with one of them.
+    What `maths/disc.py` does with one of them.
     """
     load, edge_on, farthest = vector_kind(real, WIDTH).load, real(EDGE_ON**2), real(MOST_DEVIATIONS**2)
     zero = real(0.0)
@@ -126,7 +126,7 @@ def _lanes(real: type, flat: bool) -> Scalar:
         length = f0 * f0 + f1 * f1 + f2 * f2
         t = (e0 * f0 + e1 * f1 + e2 * f2) / length
         u, v, w = t * f0 - e0, t * f1 - e1, t * f2 - e2
-        # What rounding leaves along the ray, see `maths/ray_hit.py`.
+        # What rounding leaves along the ray, see `maths/disc.py`.
         rest = (u * f0 + v * f1 + w * f2) / length
         u, v, w = u - rest * f0, v - rest * f1, w - rest * f2
         squared = u * u + v * v + w * w

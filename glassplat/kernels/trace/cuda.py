@@ -24,9 +24,9 @@ from torch import Tensor
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.blending import ALPHA_MAX, TRANSMITTANCE_MIN, Scalar
+from glassplat.kernels.maths.disc import ray_hit_maths
 from glassplat.kernels.maths.fast_maths import exp2_maths
 from glassplat.kernels.maths.harmonics import MAX_DEGREE, color_maths
-from glassplat.kernels.maths.ray_hit import ray_hit_maths
 from glassplat.kernels.records import REAL_OF, Bvh, Shapes
 from glassplat.kernels.trace import reach
 from glassplat.kernels.trace.bvh import curve_cells, curve_place, half_widths_maths, level_offsets

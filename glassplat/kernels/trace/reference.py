@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from glassplat.kernels.maths.ray_hit import EDGE_ON, MOST_DEVIATIONS
+from glassplat.kernels.maths.disc import EDGE_ON, MOST_DEVIATIONS
 from glassplat.kernels.project.reference import sh_basis
 from glassplat.kernels.records import FLAT, Bvh, RawGaussians, Rays, Shapes, Traced
 from glassplat.kernels.trace import shapes_of

@@ -6,7 +6,7 @@ import math
 
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar
-from glassplat.kernels.maths.ray_hit import MOST_DEVIATIONS
+from glassplat.kernels.maths.disc import MOST_DEVIATIONS
 
 CHUNK = 16
 """Hits that a search returns at most."""

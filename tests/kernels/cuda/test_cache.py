@@ -17,9 +17,9 @@ pytest.importorskip("numba_cuda", reason="numba-cuda is not installed; `make set
 
 from numba import config
 
+from glassplat.kernels.backend import cuda as cache
 from glassplat.kernels.backend import cuda as launch
-from glassplat.kernels.backend import cuda_code as cache
-from glassplat.kernels.backend.cuda_code import ImageCache
+from glassplat.kernels.backend.cuda import ImageCache
 from glassplat.kernels.backend.devices import SIMULATED
 from glassplat.kernels.maths.fast_maths import exp2_maths, reciprocal_maths
 from tests.kernels.test_cache import printed_by

@@ -17,8 +17,7 @@ pytest.importorskip("numba_cuda", reason="numba-cuda is not installed; `make set
 from cuda.bindings.driver import CUresult
 from numba import types
 
-from glassplat.kernels.backend.cuda import Expected, blocks_for, kernel
-from glassplat.kernels.backend.cuda_code import ImageCache, MachineCode
+from glassplat.kernels.backend.cuda import Expected, ImageCache, MachineCode, blocks_for, kernel
 from glassplat.kernels.backend.devices import SIMULATED
 
 if SIMULATED:

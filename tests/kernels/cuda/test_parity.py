@@ -14,6 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from glassplat.kernels import Fresnel
 from glassplat.kernels import adam as adam_operation
 from glassplat.kernels import composite as composite_operation
 from glassplat.kernels import environment as environment_operation
@@ -25,7 +26,6 @@ from glassplat.kernels.adam import reference as adam_twin
 from glassplat.kernels.backend.devices import SIMULATED, kernels_for
 from glassplat.kernels.composite import reference as composite_twin
 from glassplat.kernels.environment import reference as environment_twin
-from glassplat.kernels.fresnel import Fresnel
 from glassplat.kernels.panes import reference as panes_twin
 from glassplat.kernels.photometric import reference as photometric_twin
 from glassplat.kernels.project import reference as project_twin

@@ -1,11 +1,11 @@
-"""`glassplat render`, `view` and `video`: layers as images, a scene in the browser, and films."""
+"""`glassplat render`, `view`, `video`, `export` and `dereflect`: what is made of a scene."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
@@ -13,10 +13,10 @@ from rich.console import Console
 from glassplat.cli.console import import_now
 from glassplat.cli.places import SceneEdits, SplatFile, Split, check_claim, check_file, check_scene, say_scene
 from glassplat.errors import InputError, input_checked
-from glassplat.files.writing import check_folder
+from glassplat.files.writing import WRITTEN, check_folder
 from glassplat.kernels.backend.devices import DeviceName
 from glassplat.model.run_directory import RunDirectory
-from glassplat.options import Range
+from glassplat.options import Cleaning, Finite, Positive, Range
 from glassplat.publish.film import check_encoder
 from glassplat.viewer.render_loop import LOCAL, check_port
 
@@ -172,3 +172,140 @@ class Video:
     def left_behind(self) -> str:
         """Text after an interrupt: the state on disk, and how to go on."""
         return "nothing was written: repeat the command"
+
+
+if TYPE_CHECKING:
+    Format = str
+else:
+    Format = Literal[WRITTEN]
+
+
+@dataclass(frozen=True)
+class Clean:
+    """Take floaters out of a scene, and give it metres; writes another scene.
+
+    Attributes:
+        scene: a run's directory, or a splat file of any program (.ply, .spz, .glb, .splat).
+        output: where the clean scene goes, a new folder; `glassplat view` and `export` read it like a run.
+        rules: what goes.
+        scale: two points, x y z each in world units, and how many metres apart they are; `view` measures points.
+        file: what a splat file does not say of itself.
+        device: where to work; auto takes an NVIDIA GPU where one can be used.
+    """
+
+    scene: tyro.conf.Positional[Path]
+    output: Path
+    rules: Annotated[Cleaning, tyro.conf.arg(name="")] = field(default_factory=Cleaning)
+    scale: tuple[Finite, Finite, Finite, Finite, Finite, Finite, Positive] | None = None
+    file: Annotated[SplatFile, tyro.conf.arg(name="")] = field(default_factory=SplatFile)
+    device: DeviceName = "auto"
+
+    def ready(self) -> None:
+        """Refuses what is no scene, points that do not differ, and an output that is there."""
+        check_scene(self.scene)
+        self.file.check()
+        if self.scale is not None and self.scale[:3] == self.scale[3:6]:
+            raise InputError(f"--scale got the point {self.scale[:3]} twice; expected two points that are apart")
+        check_folder(self.output)
+        if os.path.lexists(self.output) and any(self.output.iterdir()):
+            raise InputError(f"{self.output} is not empty; nothing was written. Choose a new folder for --output")
+        say_scene(self.scene)
+        import_now("glassplat.cli.writing")
+
+    def run(self, console: Console) -> None:
+        """Writes the clean scene."""
+        from glassplat.cli.writing import write_clean
+
+        write_clean(self, console)
+
+    def left_behind(self) -> str:
+        """Text after an interrupt: the state on disk, and how to go on."""
+        return f"{self.scene} is as it was; remove {self.output} and repeat the command"
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a scene as others read it: PLY, SPZ, GLB, a web page with live panes, and the panes beside them.
+
+    Attributes:
+        scene: a run's directory, or a splat file of any program (.ply, .spz, .glb, .splat).
+        output: where the files go; a new folder, or one that this command wrote.
+        formats: which files; glb is glTF with KHR_gaussian_splatting, html a page that shows the scene in any browser,
+            by itself and without a server.
+        layer: all is the scene with its panes beside it, as planes.json and glass.ply; transmission is the place
+            without its panes and what they reflect.
+        title: of the page; the run's name if not given.
+        spz_version: 3, which every reader knows, or 4.
+        file: what a splat file does not say of itself.
+        edits: changes to the panes.
+        device: where to render what has to be rendered; auto takes an NVIDIA GPU where one can be used.
+    """
+
+    scene: tyro.conf.Positional[Path]
+    output: Path
+    formats: tuple[Format, ...] = ("ply", "spz", "html")
+    layer: Literal["all", "transmission"] = "all"
+    title: str | None = None
+    spz_version: Literal[3, 4] = 3
+    file: Annotated[SplatFile, tyro.conf.arg(name="")] = field(default_factory=SplatFile)
+    edits: Annotated[SceneEdits, tyro.conf.arg(name="")] = field(default_factory=SceneEdits)
+    device: DeviceName = "auto"
+
+    def ready(self) -> None:
+        """Refuses what contradicts itself, what is no scene, and an output that holds something else."""
+        if not self.formats:
+            raise InputError(f"nothing to write without --formats; expected some of {', '.join(WRITTEN)}")
+        check_scene(self.scene)
+        self.file.check()
+        check_claim(self.output, "export")
+        say_scene(self.scene)
+        import_now("glassplat.cli.writing")
+
+    def run(self, console: Console) -> None:
+        """Writes the files."""
+        from glassplat.cli.writing import write_files
+
+        write_files(self, console)
+
+    def left_behind(self) -> str:
+        """Text after an interrupt: the state on disk, and how to go on."""
+        return f"files already written to {self.output} are whole: repeat the command for all of them"
+
+
+@dataclass(frozen=True)
+class Dereflect:
+    """Take the reflections out of a planar run's photographs; one PNG per photograph, under its name.
+
+    Attributes:
+        run_directory: the run's directory.
+        output: where the images go; a new folder, or one that this command wrote.
+        split: which photographs.
+        source: photo keeps the photograph, and takes the rendered reflection off it where a pane is; render shows
+            the rendered scene without its panes.
+        device: where to render; auto takes an NVIDIA GPU where one can be used.
+        data: where the capture is now, if it has moved since training.
+    """
+
+    run_directory: tyro.conf.Positional[Path]
+    output: Path
+    split: Split = "all"
+    source: Literal["photo", "render"] = "photo"
+    device: DeviceName = "auto"
+    data: Path | None = None
+
+    def ready(self) -> None:
+        """Refuses what is no run, and an output that holds something else; imports what renders."""
+        RunDirectory(self.run_directory).check_begun()
+        check_claim(self.output, "dereflect")
+        say_scene(self.run_directory)
+        import_now("glassplat.cli.writing")
+
+    def run(self, console: Console) -> None:
+        """Writes the images."""
+        from glassplat.cli.writing import write_dereflected
+
+        write_dereflected(self, console)
+
+    def left_behind(self) -> str:
+        """Text after an interrupt: the state on disk, and how to go on."""
+        return f"images already written to {self.output} are whole: repeat the command for all of them"

@@ -1,8 +1,0 @@
-"""Laws of reflection, by name."""
-
-from __future__ import annotations
-
-from typing import Literal
-
-Fresnel = Literal["pane", "schlick", "none"]
-"""How reflectance follows the angle: as that of a pane with two surfaces, by Schlick's curve of one, or not at all."""
