@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import logging
+import re
 import socket
 import warnings
 from collections.abc import Callable, Mapping
@@ -97,7 +98,7 @@ class Client:
         """Shows a line above the controls."""
         self._status = status
         if self._told is not None:
-            self._told.content = status
+            self._told.content = plain(status)
 
     def leave(self) -> None:
         """The browser has gone."""
@@ -156,7 +157,7 @@ class Client:
         layers = tuple(shown.layers)
         chosen = layers[0] if self._layer is None else self._layer.value
         gui.reset()
-        self._told = gui.add_markdown(self._status) if self._viewer.buttons else None
+        self._told = gui.add_markdown(plain(self._status)) if self._viewer.buttons else None
         for name, act in self._viewer.buttons.items():
             gui.add_button(name).on_click(survived(lambda _, act=act: act()))
         self._layer = gui.add_dropdown("Layer", layers, initial_value=chosen)
@@ -229,6 +230,11 @@ class Client:
 
     def _notify(self, title: str, body: str, color: str) -> None:
         self._handle.add_notification(title, body, color=color)
+
+
+def plain(text: str) -> str:
+    """Markdown of a text that the page is to show as it is: names in it may look like HTML."""
+    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", text)
 
 
 def cam_from_world(wxyz: NDArray[np.float64], position: NDArray[np.float64]) -> Tensor:

@@ -80,3 +80,20 @@ def test_who_waits_for_the_first_picture_is_told_so() -> None:
             eventually(lambda: WAITING[1] in browser.evaluate("document.body.innerText"))
     finally:
         viewer.stop()
+
+
+@needs_browser
+def test_names_in_the_line_above_the_controls_are_text() -> None:
+    # viser runs what stands in braces of its Markdown; a failed save tells a path there.
+    status = "not saved: {globalThis.ran = 1} <b>name</b> *a* _b_ `c` [d](e) \\f"
+    viewer = Viewer(SHOWN, "127.0.0.1", free_port(), buttons={"Pause": lambda: None})
+    viewer.start()
+    try:
+        with Browser(viewer.address, 400, 300) as browser:
+            eventually(lambda: bool(viewer._clients) and "Pause" in browser.evaluate("document.body.innerText"))
+            viewer.refresh(status)
+            eventually(lambda: "not saved" in browser.evaluate("document.body.innerText"), 20)
+            assert status in browser.evaluate("document.body.innerText")
+            assert browser.evaluate("typeof globalThis.ran") == "undefined"
+    finally:
+        viewer.stop()
