@@ -70,7 +70,7 @@ lowest:
 	"$(PYTHON)" -m venv --clear $(LOWEST)
 	$(LOWEST)/$(IN_VENV)/python -m pip --quiet install uv
 	$(LOWEST)/$(IN_VENV)/uv pip install --quiet --python $(LOWEST) --resolution lowest-direct \
-		--editable '.[prepare,view,video]' 'pytest>=8.3' 'hypothesis>=6.100'
+		--editable '.[prepare,view,video]' 'pytest>=8.3' 'hypothesis>=6.100' 'gsply>=0.4' 'pygltflib>=1.16'
 	$(LOWEST)/$(IN_VENV)/python -m pytest $(PORTABLE_TESTS)
 
 dist:
