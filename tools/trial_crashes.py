@@ -253,9 +253,18 @@ def written(draw: random.Random, whole: Whole, folder: Path) -> str:
 
 
 def marked(draw: random.Random, whole: Whole, folder: Path) -> str:
-    """Two programs save marks of one capture, and are killed: what was saved is there."""
-    room, context = write_room(folder / "room"), get_context("fork")
-    logs = [folder / "1", folder / "2"]
+    """Two programs save marks of one capture, and are killed or out of disk: what was saved is there."""
+    with small_disk(folder, 1 << 20) as change:
+        room = write_room(folder / "room")
+        used = sum(path.stat().st_size + 4096 for path in room.rglob("*")) // 1024
+        if draw.random() < 0.5:
+            change(f"size={used + draw.choice((0, 4, 8, 16))}k")
+        return marks_fault(draw, room, [folder.with_name(f"{folder.name}-{number}") for number in (1, 2)])
+
+
+def marks_fault(draw: random.Random, room: Path, logs: Sequence[Path]) -> str:
+    """Fault of marks that two programs save at once, each with a log whose name ends in its number."""
+    context = get_context("fork")
     savers = [context.Process(target=save_marks, args=(room, log)) for log in logs]
     for saver in savers:
         saver.start()
@@ -267,6 +276,8 @@ def marked(draw: random.Random, whole: Whole, folder: Path) -> str:
     document = read_document(room)
     there = {next(iter(pane["corners"][0].values()))[0] for pane in document["panes"]}
     told = {float(line) for log in logs if log.exists() for line in log.read_text().splitlines()}
+    for log in logs:
+        log.unlink(missing_ok=True)
     return f"{sorted(told - there)} were saved and are gone" if told - there else ""
 
 
@@ -275,7 +286,7 @@ def save_marks(room: Path, log: Path) -> None:
     session = opened_session(room)
     with log.open("w") as lines:
         for number in range(20):
-            place = float(100 * int(log.name) + number)
+            place = float(100 * int(log.name[-1]) + number)
             known = session.described()
             label = next(
                 label for label in range(1, 65) if label not in [p["label"] for p in known["document"]["panes"]]
@@ -287,21 +298,33 @@ def save_marks(room: Path, log: Path) -> None:
                 try:
                     session.save(asked)
                     break
+                except OSError:  # The disk is full, which the page says; nothing was saved.
+                    return
                 except ChangedElsewhereError as changed:
                     asked = {name: changed.answer[name] for name in ("document", "version")}
             print(place, file=lines, flush=True)
 
 
 def prepared(draw: random.Random, whole: Whole, folder: Path) -> str:
-    """A preparation is killed, and goes on."""
-    photographs = copy_photographs(folder / "photographs")
-    command: list[str | Path] = ["prepare", photographs, "--output", folder / "capture", "--max-size", "320"]
-    ended = run_forked(command, act=killer(draw.uniform(0.5, 15)))
-    if ended.code is not None:
-        return ended.fault()
-    if (folder / "capture").exists() and not (folder / "capture.partial").exists():
-        return run_forked(["info", folder / "capture"]).fault()
-    last = run_forked([*command, "--resume"])
+    """A preparation is killed or out of disk, and goes on."""
+    is_killed = draw.random() < 0.5
+    with small_disk(folder, 1 << 20) as change:
+        photographs = copy_photographs(folder / "photographs")
+        command: list[str | Path] = ["prepare", photographs, "--output", folder / "capture", "--max-size", "320"]
+        if not is_killed:
+            size = sum(path.stat().st_size + 4096 for path in folder.rglob("*")) // 1024
+            change(f"size={size + draw.choice((0, 16, 100, 400, 1600, 3200))}k")
+        ended = run_forked(command, killer(draw.uniform(0.5, 15))) if is_killed else run_forked(command)
+        change("size=1g")
+        return ended.fault() or prepared_again(command, folder / "capture")
+
+
+def prepared_again(command: Sequence[str | Path], capture: Path) -> str:
+    """Fault of a preparation that goes on, where it was not done."""
+    is_begun = capture.with_name("capture.partial").exists()
+    if capture.exists() and not is_begun:
+        return run_forked(["info", capture]).fault()
+    last = run_forked([*command, *(["--resume"] if is_begun else [])])
     return "" if last.code == 0 else f"prepare --resume: {last.fault() or last.output[-400:]}"
 
 

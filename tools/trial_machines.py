@@ -8,13 +8,16 @@ import shutil
 import stat
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 from tests.cli.tiny_run import write_run
 from tools.trial import Case
-from tools.trial_process import run
+from tools.trial_process import run, small_disk
 
 KINDS = ("home", "locale", "name", "cache", "two", "threads", "columns", "temporary")
+ONE_CACHE = {"NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator"}
+"""Kernels come from NUMBA_CACHE_DIR alone, not from where they lie ready."""
 LOCALES = ("C", "POSIX", "tr_TR.UTF-8", "de_DE.ISO-8859-1", "C.UTF-8", "nonsense", "")
 NAMES = ("a b", "a\nb", "\N{GRINNING FACE}", "[bold]x[/bold]", "-x", "a'b\"c", "%s{0}", "é" * 80, "a\tb", "\udcff")
 
@@ -30,8 +33,13 @@ def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
         draw, folder = random.Random(f"{seed} {number}"), place / f"case {number}"
         folder.mkdir()
         kind = KINDS[number % len(KINDS)]
-        what, environment, source = machine(kind, draw, folder, scene)
-        yield Case(f"{number} {kind} {what!r}", tried(environment, source, folder, truth, twice=kind == "two"))
+        with ExitStack() as disks:
+            if kind == "cache":  # The administrator may write into any folder, but not to a disk that is read-only.
+                change = disks.enter_context(small_disk(folder / "kernels", 1 << 20))
+            what, environment, source = machine(kind, draw, folder, scene)
+            if what == "read-only":
+                change("ro")
+            yield Case(f"{number} {kind} {what!r}", tried(environment, source, folder, truth, twice=kind == "two"))
         for path in folder.rglob("*"):
             if path.is_dir() and not path.is_symlink():
                 path.chmod(stat.S_IRWXU)
@@ -62,11 +70,13 @@ def machine(kind: str, draw: random.Random, folder: Path, scene: Path) -> tuple[
         return what, known, place
     elif kind == "cache":
         what = draw.choice(("cut", "garbage", "empty", "read-only", "a file"))
-        damaged_cache(what, draw, kernels)
-        known.update(NUMBA_CACHE_DIR=str(kernels))
+        damaged_cache(what, draw, kernels / "cache")
+        known.update(NUMBA_CACHE_DIR=str(kernels / "cache"))
+        if what in ("cut", "garbage", "empty"):
+            known.update(ONE_CACHE)
     elif kind == "two":
         what = "a fresh cache"
-        known.update(NUMBA_CACHE_DIR=str(kernels))
+        known.update(ONE_CACHE, NUMBA_CACHE_DIR=str(kernels))
     elif kind == "threads":
         what = draw.choice(("1", "2", "3", "7"))
         known.update(NUMBA_NUM_THREADS=what, OMP_NUM_THREADS=what)
@@ -84,22 +94,20 @@ def damaged_cache(what: str, draw: random.Random, kernels: Path) -> None:
     if what == "a file":
         kernels.write_text("x")
         return
-    shared = kernels.parent.parent / "filled"
+    shared = kernels.parent.parent.parent / "filled"
     if not shared.exists():
-        scene = kernels.parent.parent / "run"
+        scene = shared.with_name("run")
         run(
             ["render", scene, "--output", shared.with_name("filling"), "--device", "cpu"],
-            environment=dict(os.environ) | {"NUMBA_CACHE_DIR": str(shared)},
+            environment=dict(os.environ) | {"NUMBA_CACHE_DIR": str(shared)} | ONE_CACHE,
         )
     shutil.copytree(shared, kernels)
     files = [path for path in kernels.rglob("*") if path.is_file()]
     for path in files if what == "empty" else draw.sample(files, max(1, len(files) // 2)):
         data = path.read_bytes()
-        if what == "read-only":
-            path.chmod(0o400)
-        elif what == "garbage":
+        if what == "garbage":
             path.write_bytes(draw.randbytes(len(data)))
-        else:
+        elif what != "read-only" or draw.random() < 0.5:  # Half of what cannot be written is cut short as well.
             path.write_bytes(b"" if what == "empty" else data[: draw.randrange(len(data) + 1)])
 
 

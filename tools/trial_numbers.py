@@ -1,7 +1,7 @@
 """Values that nobody should give, through the Python interface: a finite picture, or an error that says what is wrong.
 
 Any field of a scene and of a camera gets NaN, infinities, zeros and 1e30; cameras stand in Gaussians and on panes; a
-hundred thousand Gaussians lie in one tile; and trainings begin with photographs in which nothing can be learned.
+million Gaussians lie in one tile; and trainings begin with photographs in which nothing can be learned.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import glassplat
 from glassplat import Camera, Dataset, Scene, Training, View
 from glassplat.captures.view import PointCloud
 from glassplat.render.frame import Renderer
-from tests.render.tiny_scene import camera_at, pane
+from tests.render.tiny_scene import camera_at, in_single_precision, pane
 from tests.training.tiny_capture import tiny_capture, true_scene
 from tools.trial import Case
 
@@ -70,9 +70,11 @@ def picture(draw: random.Random) -> tuple[str, Callable[[], None]]:
         name, camera = "inside", at(scene.primary.means[draw.randrange(len(scene.primary))])
     elif kind == "pane":
         name = draw.choice(("in the pane", "edge on"))
-        camera = camera_at(0.1, -0.05, 2.0) if name == "in the pane" else camera_at(2.0, 0.0, 2.0)
-        camera = replace(camera, cam_from_world=camera.cam_from_world.float())
-        scene = replace(scene, planes=pane(2.0).to(torch.float32)) if hasattr(scene.planes, "to") else scene
+        planes = pane(2.0, half=0.5)
+        normal = planes.raw_normals[0] / planes.raw_normals[0].norm()
+        across = planes.tangents[0] - (planes.tangents[0] @ normal) * normal
+        camera = at(planes.centers[0] + (2.0 if name == "edge on" else 0.0) * across / across.norm())
+        scene = in_single_precision(replace(scene, planes=planes))
     else:
         name, scene = crowded(scene, draw)
 
@@ -122,19 +124,20 @@ def poisoned_camera(camera: Camera, draw: random.Random) -> tuple[str, Camera]:
 
 
 def at(place: torch.Tensor) -> Camera:
-    """A camera in the middle of a Gaussian."""
+    """A camera at a place."""
     camera = camera_at(*place.tolist())
     return replace(camera, cam_from_world=camera.cam_from_world.float())
 
 
 def crowded(scene: Scene, draw: random.Random) -> tuple[str, Scene]:
-    """A hundred thousand Gaussians in one place."""
-    times = 100_000 // len(scene.primary)
+    """A hundred thousand or a million Gaussians in one place."""
+    count = draw.choice((100_000, 1_000_000))
+    times = count // len(scene.primary)
     tensors = {
         name: tensor.repeat(times, *[1] * (tensor.dim() - 1)) for name, tensor in scene.primary.tensors().items()
     }
     tensors["means"] = torch.zeros_like(tensors["means"]) + torch.tensor([0.0, 0.0, draw.uniform(1, 4)])
-    return "100,000 in one place", replace(scene, primary=scene.primary.with_tensors(tensors))
+    return f"{count} in one place", replace(scene, primary=scene.primary.with_tensors(tensors))
 
 
 def training(draw: random.Random) -> tuple[str, Callable[[], None]]:

@@ -6,6 +6,7 @@ interrupted goes on.
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import threading
@@ -196,8 +197,15 @@ class FeatureDatabase:
     @contextmanager
     def _opened(self) -> Iterator[Any]:
         """The file as COLMAP's database."""
-        with sound(self.path), closing(library.pycolmap.Database.open(self.path)) as database:
-            yield database
+        with sound(self.path):
+            database = library.pycolmap.Database.open(self.path)
+            try:
+                with closing(database):
+                    yield database
+            except RuntimeError:
+                # Where closing failed, as on a full disk, so does the destructor, and ends the process: it never runs.
+                ctypes.pythonapi.Py_IncRef(ctypes.py_object(database))
+                raise
 
     def _focal(self, key: tuple[str, int, int]) -> float | None:
         """Median focal length in the photographs of one camera; None if none has one."""

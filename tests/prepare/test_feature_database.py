@@ -13,8 +13,8 @@ from glassplat.prepare.colmap import FeatureDatabase, sound
 from glassplat.prepare.photographs import Photograph
 
 
-def features(folder: Path) -> FeatureDatabase:
-    photographs = [Photograph(Path(f"{index}.png"), f"{index}.png", 64, 48, "", None) for index in range(3)]
+def features(folder: Path, count: int = 3) -> FeatureDatabase:
+    photographs = [Photograph(Path(f"{index}.png"), f"{index}.png", 64, 48, "", None) for index in range(count)]
     found = FeatureDatabase(folder / "features.db", folder, photographs)
     found.create("opencv")
     return found
@@ -52,3 +52,20 @@ def test_a_full_disk_and_errors_of_others_stay_what_they_are(tmp_path: Path) -> 
         raise RuntimeError("SQLite error: database or disk is full")
     with pytest.raises(RuntimeError, match="of another kind"), sound(tmp_path):
         raise RuntimeError("of another kind")
+
+
+def test_a_full_disk_does_not_end_the_process(tmp_path: Path) -> None:
+    script = f"""
+import resource, signal
+from pathlib import Path
+from glassplat.errors import InputError
+from tests.prepare.test_feature_database import features
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (220_000, 220_000))
+try:
+    features(Path({str(tmp_path)!r}), 400)
+except InputError:
+    print("told")
+"""
+    ended = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout) == (0, "told\n"), ended.stderr[-500:]
