@@ -160,6 +160,7 @@ MOST_PANES = 16
 """The page orders the panes of every pixel by hand."""
 POSTER_WIDTH, POSTER_QUALITY = 640, 70
 LEAST_OPACITY = 1 / 255
+DESCRIPTION = "Look around, take the reflections off the glass, or turn it into a mirror."
 
 
 def write_page(
@@ -207,6 +208,7 @@ def page_text(scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Cam
         {
             "title": html.escape(title),
             "subtitle": html.escape(subtitle),
+            "description": html.escape(DESCRIPTION if count else "Look around a scene of Gaussians."),
             "style": asset("style.css"),
             "poster": in_base64(poster),
             "scene": in_script(description | {"channelRange": channel_range}),

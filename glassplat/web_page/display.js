@@ -7,6 +7,7 @@ function makeDisplay(canvas, scene, renderer, navigation, panel) {
   const { isSoftware } = renderer, sort = makeSorter(scene), pace = makePace(isSoftware), noted = [];
   let stale = true, sorting = false, order = NONE;
   let quiet = REST, drawn = 0, job = null, waiting = [], last = 0;
+  const isStill = matchMedia('(prefers-reduced-motion: reduce)').matches;
   const isResting = () => quiet >= REST;
 
   // The photograph's field of view fills the shorter side of the window.
@@ -112,7 +113,7 @@ function makeDisplay(canvas, scene, renderer, navigation, panel) {
     const seconds = Math.min((time - last) / 1000, 0.25), pose = navigation.pose;
     last = time;
     if (document.hidden || renderer.isLost()) return;
-    const active = [navigation.advance(seconds), panel.walk(seconds)].some(Boolean) || pose() !== tick.seen;
+    const active = [navigation.advance(seconds), panel.walk(seconds), panel.turn(isStill ? 1 : seconds)].some(Boolean) || pose() !== tick.seen;
     tick.seen = pose();
     quiet = active ? 0 : quiet + seconds;
     if (fit()) [stale, order] = [true, NONE];
@@ -127,6 +128,7 @@ function makeDisplay(canvas, scene, renderer, navigation, panel) {
     sorting = true;
     while (!await sorted(pose, lens));
     renderer.resize(width, height);
+    panel.turn(1);
     whole({ ...viewOf(1, false), pose, intrinsics: lens.intrinsics, divider: 2, ...wanted });
     if (renderer.isLost()) throw new Error('the browser has taken the canvas away');
     const rows = renderer.pixels();

@@ -1,6 +1,7 @@
 // Where the camera is: turns about a point that it looks at, moves, snaps to photographs, and stays near them.
 
 const EASE = (t) => t * t * (3 - 2 * t);
+const LEAST_SHOWN = 0.05;  // Share of a photograph that a pane fills where it is worth a stop.
 
 function makeNavigation(scene, changed) {
   const { views, up, focus, reach } = scene;
@@ -74,7 +75,31 @@ function makeNavigation(scene, changed) {
 
   function flyTo(view, seconds = 0.9) {
     still();
-    flight = { from: pose, to: poseOf(view), pivots: [pivot, pivotOf(view)], seconds, passed: 0 };
+    flight = { view, from: pose, to: poseOf(view), pivots: [pivot, pivotOf(view)], seconds, passed: 0 };
+  }
+
+  // The photographs that show a pane, each beside one that was taken near it; all where none shows any.
+  function route() {
+    const shown = views.filter((view) => scene.panes.some((pane) => {
+      const { fx, fy, width, height } = view;
+      const bounds = boundsOf(pane, poseOf(view), [fx, fy, width / 2, height / 2], [width, height], scene.near);
+      return bounds && (bounds[2] - bounds[0]) * (bounds[3] - bounds[1]) > LEAST_SHOWN * width * height;
+    }));
+    const left = new Set(shown.length ? shown : views), ordered = [];
+    for (let at = views[scene.first]; left.size; ordered.push(at)) {
+      at = nearestTo(at.position, [...left]);
+      left.delete(at);
+    }
+    return ordered;
+  }
+
+  const nearestTo = (position, among) => among.reduce((best, view) =>
+    norm(minus(view.position, position)) < norm(minus(best.position, position)) ? view : best);
+
+  // The photograph so many steps along the route from where the camera is, or flies to.
+  function neighbour(step) {
+    const at = flight ? flight.view : nearestTo(centerOf(pose), ordered);
+    return ordered[(Math.max(ordered.indexOf(at), 0) + step + ordered.length) % ordered.length];
   }
 
   // A slow sway about the first view, so that reflections glide over the glass before anybody touches anything.
@@ -116,13 +141,12 @@ function makeNavigation(scene, changed) {
     return true;
   }
 
-  set(poseOf(views[scene.first]), pivotOf(views[scene.first]));
+  const begun = viewOfAddress(views) || views[scene.first], ordered = route();
+  set(poseOf(begun), pivotOf(begun));
   return {
-    advance, orbit, pan, dolly, walk, flyTo, sway, still, velocity, sight,
+    advance, orbit, pan, dolly, walk, flyTo, neighbour, sway, still, velocity, sight,
     place: (next) => { still(); set(next, pivot); },
     pose: () => pose,
-    nearest: () => views.reduce((best, view, k) =>
-      norm(minus(view.position, centerOf(pose))) < norm(minus(views[best].position, centerOf(pose))) ? k : best, 0),
   };
 }
 

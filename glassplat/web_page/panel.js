@@ -1,10 +1,12 @@
 // The controls around the picture. They change a state and say that it changed; drawing is not their business.
 
 const element = (id) => document.getElementById(id);
+const viewOfAddress = (views) => views.find((view) => location.hash === `#view=${encodeURIComponent(view.name)}`);
 const STATE = { layer: 'rgb', compare: false, divider: 0.5, glass: 'real', pane: 'all' };
 
 function makePanel(scene, navigation, changed) {
   const state = { ...STATE, reflectances: scene.panes.map((pane) => pane.reflectance) };
+  const silver = scene.panes.map(() => 0);  // How far each pane is on its way from glass to a mirror.
   const body = document.body;
   const chosen = () => scene.panes.map((_, k) => k).filter((k) => state.pane === 'all' || Number(state.pane) === k);
   const percent = (share) => `${(100 * share).toFixed(share < 0.1 ? 1 : 0)} %`;
@@ -33,17 +35,22 @@ function makePanel(scene, navigation, changed) {
     show();
   }
 
-  function snap(step) {
-    const at = (navigation.nearest() + step + scene.views.length) % scene.views.length;
-    navigation.flyTo(scene.views[at]);
-    element('photo').textContent = scene.views[at].name;
+  function standAt(view) {
+    navigation.flyTo(view);
+    element('photo').textContent = view.name;
+    location.replace(`#view=${encodeURIComponent(view.name)}`);
     changed();
   }
 
+  window.addEventListener('hashchange', () => {
+    const view = viewOfAddress(scene.views);
+    if (view && view.name !== element('photo').textContent) standAt(view);
+  });
+
   const actions = {
     compare: () => set('compare', !state.compare),
-    before: () => snap(-1),
-    after: () => snap(1),
+    before: () => standAt(navigation.neighbour(-1)),
+    after: () => standAt(navigation.neighbour(1)),
     home: () => { navigation.flyTo(scene.views[scene.first]); changed(); },
     full: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.()),
     help: () => element('help').toggleAttribute('hidden'),
@@ -89,6 +96,19 @@ function makePanel(scene, navigation, changed) {
     event.preventDefault();
   });
 
+  // Glass turns into a mirror within a second. Whether any pane still does.
+  function turn(seconds) {
+    const mirrors = state.glass === 'mirror' ? chosen() : [];
+    let turning = false;
+    silver.forEach((share, k) => {
+      const end = mirrors.includes(k) ? 1 : 0;
+      silver[k] = state.glass === 'none' ? 0 : share + clamped(end - share, -seconds, seconds);
+      turning ||= silver[k] !== share;
+    });
+    if (turning) changed();
+    return turning;
+  }
+
   function walk(seconds) {
     if (!walking.size) return false;
     const step = 0.5 * navigation.sight() * seconds, held = (key) => (walking.has(key) ? step : 0);
@@ -98,11 +118,10 @@ function makePanel(scene, navigation, changed) {
 
   // What draw() has to know of the state.
   function wanted() {
-    const mirror = state.glass === 'mirror' ? chosen() : [];
     const layers = state.compare ? [state.layer === 'without_panes' ? 'rgb' : state.layer, 'without_panes'] : [state.layer, state.layer];
     return {
       glass: state.glass !== 'none' && scene.panes.length > 0,
-      reflectances: state.reflectances.map((share, k) => (mirror.includes(k) ? 1 - 1e-6 : share)),
+      reflectances: state.reflectances.map((share, k) => share + EASE(silver[k]) * (1 - 1e-6 - share)),
       layers,
       divider: state.compare ? state.divider : 2,
     };
@@ -115,5 +134,5 @@ function makePanel(scene, navigation, changed) {
     element('panes').parentElement.hidden = false;
   }
   show();
-  return { wanted, walk, set, state };
+  return { wanted, walk, turn, set, state };
 }
