@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from glassplat.methods.splat_recipe import SplatRecipe
     from glassplat.model.model import Model, load
     from glassplat.model.training import Training
+    from glassplat.options import Cleaning
     from glassplat.render.deferred import Deferred
     from glassplat.render.frame import Frame
     from glassplat.render.planar import Planar
@@ -68,6 +69,7 @@ __all__ = [  # noqa: RUF022 - In the order in which the documentation tells of t
     "Planar",
     "Deferred",
     "Traced",
+    "Cleaning",
     "rasterization",
     "StepDone",
     "StageEntered",
@@ -96,6 +98,7 @@ HOMES = {
         "load",
     ),
     "model.training": ("Training",),
+    "options": ("Cleaning",),
     "render.deferred": ("Deferred",),
     "render.frame": ("Frame",),
     "render.planar": ("Planar",),

@@ -54,7 +54,8 @@ def rasterization(
     """Render Gaussians into cameras, called as `gsplat.rasterization` is, on the CPU or on CUDA.
 
     Differentiable in the Gaussians, `viewmats` and `backgrounds`, not in `Ks`. Coverage is cut off at 0.99 and below
-    1/255, as in 3DGS and gsplat's main branch (its release 1.5.3 cuts off at 0.999).
+    1/255, as in 3DGS and gsplat's main branch (its release 1.5.3 cuts off at 0.999). Gradients of `viewmats` are
+    gsplat's along rigid motions; it inverts them for view directions as if they might be any matrix.
 
     Args:
         means: [N, 3] centres, world units.
