@@ -157,6 +157,7 @@ def fitted_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Pl
         names=[name for name, _, _ in shown],
         labels=labels or None,
         options=fit,
+        unmarked=[(view.name, view.camera) for view in dataset.train if view.pane_labels is None],
     )
     return fitted if not len(given) else given.to(fitted.centers.device).joined(fitted)
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,12 +18,22 @@ from glassplat.panes.masks import (
     PaneView,
     PlaneEquations,
     agreement_of_each,
+    joined,
     mask_agreement,
     pane_views,
     plane_candidates,
 )
-from glassplat.panes.objective import MIDDLE, Objective, edge_matches, pane_rectangle
-from glassplat.panes.search import Fit, best_plane, best_supported, tilt_uncertainty
+from glassplat.panes.objective import MIDDLE, JointObjective, Objective, edge_matches, pane_rectangle
+from glassplat.panes.search import (
+    Fit,
+    angle,
+    best_joint_plane,
+    best_plane,
+    best_supported,
+    contradiction,
+    in_one_surface,
+    tilt_uncertainty,
+)
 from glassplat.scene import logit
 from glassplat.scene.camera import Camera
 from glassplat.scene.panes import Planes
@@ -97,6 +108,11 @@ LEAST_APART = 0.01
 """Distance between annotated cameras below which nothing is tried, in scene extents."""
 MOST_DOUBT = 5.0
 """Degrees by which a plane may be turned without its masks telling before it is refused."""
+MOST_CONTRADICTION = 0.7
+"""What may tell against a plane, as `contradiction` counts it, before it is refused."""
+MOST_LOSS = 0.04
+"""By how much more may tell against a plane shared with other panes than against a pane's own. Of two well measured
+panes that are turned by 2 degrees 0.03 does, by 3 degrees 0.05; planes that chance put before the true one, 0.03."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +134,7 @@ def fit_planes(
     names: Sequence[str] | None = None,
     labels: Sequence[int] | None = None,
     options: PlaneFit | None = None,
+    unmarked: Sequence[tuple[str, Camera]] = (),
 ) -> Planes:
     """A reflection plane for every pane that the masks name, in the order of their labels.
 
@@ -128,7 +145,8 @@ def fit_planes(
     wall or the floor. No points are needed: further planes are drawn through the masks.
 
     Gaussians may mislead, so that each pane is fitted to the measured points as well, and of both planes the one is
-    kept that masks and measured points support better (`plane_evidence`).
+    kept that masks and measured points support better (`plane_evidence`). Panes of one front get one plane, which the
+    masks of all place together (`JointObjective`), unless that fits one of them worse than its own.
 
     Args:
         centers: [N, 3] centres of the primary Gaussians, or SfM points.
@@ -138,6 +156,7 @@ def fit_planes(
         names: of the annotated photographs, for messages.
         labels: the panes to fit; all that the masks name if None.
         options: how to fit; the defaults if None.
+        unmarked: names and cameras of photographs without masks, of which a refusal names the best to mark.
 
     Returns:
         Planes whose normals point to the side that most annotated cameras are on.
@@ -156,17 +175,28 @@ def fit_planes(
     clouds = {"the points" if measured is None else "the Gaussians": _usable(centers)}
     if measured is not None:
         clouds = {"the measured points": _usable(measured)} | clouds
-    panes = []
+    found = []
     for label in labels:
         views = pane_views(annotations, label, most=options.most_views, names=names)
-        try:
-            panes.append(_fit_pane(label, clouds, views, extent=extent, options=options))
-        except PlaneFitError as error:
-            if len(labels) == 1:
-                raise
-            without = f"Or do without it: with label {label} erased from the masks, it is learned like all else"
-            raise PlaneFitError(f"{error}. {without}") from error
+        with _told(label, len(labels)):
+            found.append(_found_pane(label, clouds, views, extent=extent, options=options))
+    panes = []
+    for pane in _in_one_plane(found, options.seed):
+        with _told(pane.label, len(labels)):
+            panes.append(_finished(pane, options, unmarked))
     return _planes(panes, labels, options).to(centers.device)
+
+
+@contextmanager
+def _told(label: int, count: int) -> Iterator[None]:
+    """Says what else can be done about a pane that has no plane, where it is one of several."""
+    try:
+        yield
+    except PlaneFitError as error:
+        if count == 1:
+            raise
+        without = f"Or do without it: with label {label} erased from the masks, it is learned like all else"
+        raise PlaneFitError(f"{error}. {without}") from error
 
 
 def _usable(positions: Tensor) -> Array:
@@ -174,48 +204,183 @@ def _usable(positions: Tensor) -> Array:
     return points[np.isfinite(points).all(axis=1)]
 
 
-def _fit_pane(
+class _UndecidedError(ValueError):
+    """The masks of a pane leave its plane open."""
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A pane and its plane before the rectangle is bounded.
+
+    Attributes:
+        label: of the pane.
+        evidence: its masks and the points that were measured.
+        plane: the best one, of H = 1.
+        fault: why this plane cannot be trusted; None if it can.
+    """
+
+    label: int
+    evidence: Objective
+    plane: FramedPlanes
+    fault: ValueError | None = None
+
+
+def _found_pane(
     label: int, clouds: Mapping[str, Array], views: Sequence[PaneView], *, extent: float, options: PlaneFit
-) -> _Pane:
-    """The pane on the plane, of those fitted to each cloud, that masks and the first cloud support best."""
+) -> _Found:
+    """The plane, of those fitted to each cloud, that masks and the first cloud support best."""
     _check_views(label, views, extent)
     objectives = {}
     for source, points in clouds.items():
         chosen = points[plane_candidates(points, views, band=options.band)]
         objectives[source] = Objective(views, chosen, extent, options.inlier_distance * extent)
+    evidence = next(iter(objectives.values()))
+    sound, faulty = [], []
+    for source, objective in objectives.items():
+        rng = np.random.default_rng((options.seed, label))
+        plane = best_plane(objective, hypotheses=options.hypotheses, refine=options.refined, rng=rng)
+        fault = _fault(plane, objective, options)
+        sound += [Fit(source, plane)] if fault is None else []
+        faulty += [] if fault is None else [_Found(label, evidence, plane, fault)]
+    return _Found(label, evidence, best_supported(label, sound, evidence)) if sound else faulty[0]
+
+
+def _fault(plane: FramedPlanes, objective: Objective, options: PlaneFit) -> ValueError | None:
+    """The reason not to trust the plane of a pane; None if there is none."""
     try:
-        fits = _fits(label, objectives, options)
-        found = best_supported(label, fits, next(iter(objectives.values())))
-        report_masks(label, found, views)
-        return _pane(found.planes, views, options.margin)
+        _check_agreement(plane.planes, objective.views, options.least_agreement)
+        _check_outlines(plane, objective)
+        _check_certainty(plane, objective)
+    except ValueError as error:
+        return error
+    return None
+
+
+def _in_one_plane(found: Sequence[_Found], seed: int) -> list[_Found]:
+    """The panes, those of one front on one plane, which all their masks place together.
+
+    A pane that few or cut outlines leave undecided is decided by its neighbours.
+    """
+    panes = {pane.label: pane for pane in found}
+    for labels in _neighbours(found):
+        joint = _joint([panes[label] for label in labels], seed)
+        panes |= {pane.label: pane for pane in joint}
+    trusted = [pane for pane in panes.values() if pane.fault is None]
+    return [_decided(pane, trusted) if isinstance(pane.fault, _UndecidedError) else pane for pane in panes.values()]
+
+
+def _decided(pane: _Found, trusted: Sequence[_Found]) -> _Found:
+    """The pane on that plane of another one which serves it as well as its own; as it is if there is none."""
+    losses = [_loss(pane, other.plane) for other in trusted]
+    if not losses or min(losses) > MOST_LOSS:
+        return pane
+    other = trusted[int(np.argmin(losses))]
+    log.warning("pane %d takes the plane of pane %d, on which its masks meet: %s", pane.label, other.label, pane.fault)
+    return replace(pane, plane=other.plane, fault=None)
+
+
+def _loss(pane: _Found, plane: FramedPlanes) -> float:
+    """The excess of the contradiction of a plane over that of the pane's own."""
+    return float((contradiction(plane, pane.evidence) - contradiction(pane.plane, pane.evidence))[0])
+
+
+def _neighbours(found: Sequence[_Found]) -> list[list[int]]:
+    """Labels of panes with trusted planes that may lie in one surface, directly or by way of third ones."""
+    groups: list[list[_Found]] = []
+    for pane in (pane for pane in found if pane.fault is None):
+        near = [group for group in groups if any(_may_share(pane, other) for other in group)]
+        groups = [group for group in groups if group not in near] + [[*(p for group in near for p in group), pane]]
+    return [[pane.label for pane in group] for group in groups if len(group) > 1]
+
+
+def _may_share(one: _Found, other: _Found) -> bool:
+    return in_one_surface(one.plane, other.plane, (one.evidence, other.evidence))
+
+
+def _joint(panes: Sequence[_Found], seed: int) -> list[_Found]:
+    """Those of the panes that one plane serves as well as their own, on it."""
+    panes = list(panes)
+    while len(panes) > 1:
+        objective = JointObjective([pane.evidence for pane in panes])
+        rng = np.random.default_rng((seed, *(pane.label for pane in panes)))
+        plane = best_joint_plane(objective, joined([pane.plane for pane in panes]), rng)
+        losses = [_loss(pane, plane) for pane in panes]
+        if max(losses) <= MOST_LOSS:
+            turned = ", ".join(f"{p.label} by {np.degrees(angle(p.plane, plane)):.2f}" for p in panes)
+            log.info("panes on one plane, which turns them by degrees: %s", turned)
+            return [replace(pane, plane=plane) for pane in panes]
+        del panes[int(np.argmax(losses))]
+    return panes
+
+
+def _finished(pane: _Found, options: PlaneFit, unmarked: Sequence[tuple[str, Camera]]) -> _Pane:
+    """The pane with its rectangle.
+
+    Raises:
+        PlaneFitError: its plane cannot be trusted, or its masks agree nowhere on it.
+    """
+    views = pane.evidence.views
+    try:
+        if pane.fault is not None:
+            raise pane.fault
+        report_masks(pane.label, pane.plane, views)
+        return _pane(pane.plane.planes, views, options.margin)
     except ValueError as error:
         raise PlaneFitError(
-            f"pane {label}, annotated in {len(views)} views: {error}. Check that label {label} means the same flat "
-            "pane in every mask, and annotate more views, from places well apart, that show its outline inside of the "
-            "image with nothing standing before it"
+            f"pane {pane.label}, annotated in {len(views)} views: {error}. Check that label {pane.label} means the "
+            "same flat pane in every mask, and annotate more views, from places well apart, that show its outline "
+            f"inside of the image with nothing standing before it{_worth_marking(views, unmarked)}"
         ) from error
 
 
-def _fits(label: int, objectives: Mapping[str, Objective], options: PlaneFit) -> list[Fit]:
-    """A plane for each objective that leads to one.
+MOST_NAMED = 3
+"""Photographs that a refusal names."""
 
-    Raises:
-        ValueError: none does; the first one's reason.
-    """
-    fits, errors = [], []
-    for source, objective in objectives.items():
-        rng = np.random.default_rng((options.seed, label))
-        found = best_plane(objective, hypotheses=options.hypotheses, refine=options.refined, rng=rng)
-        try:
-            _check_agreement(found.planes, objective.views, options.least_agreement)
-            _check_certainty(found, objective)
-        except ValueError as error:
-            errors.append(error)
-        else:
-            fits.append(Fit(source, found))
-    if not fits:
-        raise errors[0]
-    return fits
+
+def _worth_marking(views: Sequence[PaneView], unmarked: Sequence[tuple[str, Camera]]) -> str:
+    """Names of photographs without masks that should show the pane well from elsewhere, for a message."""
+    middle = _seen_middle(views)
+    eyes = [view.center for view in views]
+    names: list[str] = []
+    held = [(name, _eye(camera)) for name, camera in unmarked if _shows(camera, middle)]
+    while held and len(names) < MOST_NAMED:
+        apart = [min(_turn(middle, eye, other) for other in eyes) for _, eye in held]
+        name, eye = held.pop(int(np.argmax(apart)))
+        names.append(name)
+        eyes.append(eye)
+    return f": {', '.join(names)} should show it well" if names else ""
+
+
+def _eye(camera: Camera) -> Array:
+    eye: Array = camera.center.detach().cpu().double().numpy()
+    return eye
+
+
+def _seen_middle(views: Sequence[PaneView]) -> Array:
+    """[3] the point nearest to the rays through the middles of the masks."""
+    system, right = np.zeros((3, 3)), np.zeros(3)
+    for view in views:
+        row, column = np.nonzero(view.mask)
+        ray = view.directions(np.array([[np.median(column) + 0.5, np.median(row) + 0.5]]))[0]
+        across: Array = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
+        system = system + across
+        right = right + across @ view.center
+    return np.asarray(np.linalg.lstsq(system, right, rcond=None)[0])
+
+
+def _shows(camera: Camera, point: Array) -> bool:
+    """Return whether a point lies well inside of a camera's image."""
+    x, y, z = (camera.cam_from_world[:3] @ camera.cam_from_world.new_tensor([*point, 1.0])).tolist()
+    if z <= 0:
+        return False
+    column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    return 0.2 < column / camera.width < 0.8 and 0.2 < row / camera.height < 0.8
+
+
+def _turn(middle: Array, eye: Array, other: Array) -> float:
+    """Radians between the directions in which two cameras see a point."""
+    first, second = eye - middle, other - middle
+    return float(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second))
 
 
 def _check_views(label: int, views: Sequence[PaneView], extent: float) -> None:
@@ -250,11 +415,20 @@ def _check_outline(label: int, views: Sequence[PaneView]) -> None:
         )
 
 
+def _check_outlines(found: FramedPlanes, objective: Objective) -> None:
+    against = float(contradiction(found, objective)[0])
+    if against > MOST_CONTRADICTION:
+        raise ValueError(
+            f"on no plane do the outlines of its masks meet; on the best one {against:.2f} of what is known tells "
+            f"against it, expected at most {MOST_CONTRADICTION}"
+        )
+
+
 def _check_certainty(found: FramedPlanes, objective: Objective) -> None:
     degrees = float(np.degrees(tilt_uncertainty(found, objective, MIDDLE)[0]))
     if degrees <= MOST_DOUBT:
         return
-    raise ValueError(
+    raise _UndecidedError(
         f"the plane could turn by {min(degrees, 90):.0f} degrees before its masks tell; too little of its outline lies "
         f"inside of the images, and {len(objective.points)} points lie along it"
     )

@@ -24,6 +24,7 @@ from glassplat.panes.masks import (
     PlaneEquations,
     Rectangle,
     in_plane_axes,
+    mask_agreement,
     meet,
     min_area_rectangle,
     support,
@@ -231,6 +232,8 @@ USUAL_FRAME, FRAME_WEIGHT = 0.02, 0.01
 """Height of a frame over its glass that is not unlikely, scene extents, and the weight of that against the edges."""
 EDGES = 600
 """Edge points that are followed, in all views together."""
+PIXELS = 600
+"""Pixels whose rays are followed to compare masks, in all views together."""
 
 
 @dataclass(frozen=True)
@@ -276,6 +279,10 @@ class Objective:
             return np.zeros(len(planes))
         return support(planes, self.points, distance=self.distance)
 
+    def agreement(self, planes: PlaneEquations) -> Array:
+        """[H] how well the masks agree on each plane."""
+        return mask_agreement(planes, self.views, pixels_per_view=PIXELS // len(self.views))
+
     def anchors(self, planes: PlaneEquations) -> Array:
         """[H, 3] a point near the middle of the pane on each plane."""
         return pane_centers(planes, self.views)
@@ -312,6 +319,47 @@ class Objective:
             for weight, block in zip(weights, residuals, strict=True)
         ]
         return Terms(np.concatenate(residuals, axis=1), np.concatenate(spread, axis=1), unknown * each)
+
+
+@dataclass(frozen=True)
+class JointObjective:
+    """Everything known about several panes in one plane, behind frames of one height; each pane counts alike.
+
+    Attributes:
+        parts: what is known about each pane, at least one.
+    """
+
+    parts: Sequence[Objective]
+
+    @property
+    def extent(self) -> float:
+        """Radius of the capture in world units."""
+        return self.parts[0].extent
+
+    def agreement(self, planes: PlaneEquations) -> Array:
+        """[H] how well the masks agree on each plane, in the mean over the panes."""
+        return self._mean([part.agreement(planes) for part in self.parts])
+
+    def anchors(self, planes: PlaneEquations) -> Array:
+        """[H, 3] a point near the middle of all panes on each plane."""
+        return self._mean([part.anchors(planes) for part in self.parts])
+
+    def reach(self, planes: PlaneEquations) -> Array:
+        """[H] median distance of the cameras from the middle of a pane, in the mean over the panes."""
+        return self._mean([part.reach(planes) for part in self.parts])
+
+    def terms(self, planes: FramedPlanes, tolerance: float, *, edges: int = EDGES) -> Terms:
+        """The residuals of H planes; as `Objective.terms`, with so many edge points for each pane."""
+        terms = [part.terms(planes, tolerance, edges=edges) for part in self.parts]
+        return Terms(
+            np.concatenate([term.residuals for term in terms], axis=1),
+            np.concatenate([term.weights for term in terms], axis=1) / len(terms),
+            self._mean([term.rest for term in terms]),
+        )
+
+    def _mean(self, values: Sequence[Array]) -> Array:
+        mean: Array = np.mean(values, axis=0)
+        return mean
 
 
 CELLS = 128  # Along the longer side of the map of the plane.

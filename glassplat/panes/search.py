@@ -9,13 +9,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from glassplat.panes.masks import FramedPlanes, joined, mask_agreement, random_planes
+from glassplat.panes.masks import FramedPlanes, joined, random_planes
 from glassplat.panes.objective import (
     COARSE,
     EDGES,
     FINE,
     MIDDLE,
     USUAL_FRAME,
+    JointObjective,
     Objective,
     Terms,
     moved,
@@ -24,6 +25,7 @@ from glassplat.panes.objective import (
 )
 
 Array = NDArray[np.float64]
+Evidence = Objective | JointObjective
 
 ITERATIONS = 15
 STEP = 3e-4
@@ -36,7 +38,7 @@ SETTLED = 1e-4
 """Change of a parameter below which a plane has arrived."""
 
 
-def refined(planes: FramedPlanes, objective: Objective, tolerances: Sequence[float]) -> FramedPlanes:
+def refined(planes: FramedPlanes, objective: Evidence, tolerances: Sequence[float]) -> FramedPlanes:
     """Each plane after tilt, offset and height of the frame have minimised the objective.
 
     The Geman-McClure loss ignores what is far off, and it must: where something stands before the pane, the mask's edge
@@ -52,7 +54,7 @@ def refined(planes: FramedPlanes, objective: Objective, tolerances: Sequence[flo
     return planes
 
 
-def _minimised(planes: FramedPlanes, objective: Objective, tolerance: float) -> FramedPlanes:
+def _minimised(planes: FramedPlanes, objective: Evidence, tolerance: float) -> FramedPlanes:
     """All planes after damped steps; those that have arrived are left where they are."""
     count = len(planes)
     damping, active = np.full(count, FIRST_DAMPING), np.arange(count)
@@ -73,14 +75,14 @@ def _minimised(planes: FramedPlanes, objective: Objective, tolerance: float) -> 
     return planes
 
 
-def _scales(planes: FramedPlanes, objective: Objective) -> Array:
+def _scales(planes: FramedPlanes, objective: Evidence) -> Array:
     """[H, 4] what a step of one means for each plane: a radian twice, a distance of the cameras, a scene extent."""
     ones = np.ones(len(planes))
     return np.stack([ones, ones, objective.reach(planes.planes), objective.extent * ones], axis=1)
 
 
 def _quadratic(
-    planes: FramedPlanes, objective: Objective, tolerance: float, anchors: Array, scales: Array
+    planes: FramedPlanes, objective: Evidence, tolerance: float, anchors: Array, scales: Array
 ) -> tuple[Array, Array, Array]:
     """The cost [H] of planes, and its Gauss-Newton matrix [H, 4, 4] and gradient [H, 4] (halved)."""
     here, moved_residuals = _nearby(planes, objective, tolerance, anchors, scales)
@@ -90,7 +92,7 @@ def _quadratic(
 
 
 def _nearby(
-    planes: FramedPlanes, objective: Objective, tolerance: float, anchors: Array, scales: Array
+    planes: FramedPlanes, objective: Evidence, tolerance: float, anchors: Array, scales: Array
 ) -> tuple[Terms, Array]:
     """The terms of planes, and the residuals [4, H, M] after a small step along each axis."""
     count = len(planes)
@@ -126,7 +128,7 @@ def _replaced(planes: FramedPlanes, index: NDArray[np.int64], others: FramedPlan
     return joined([planes, others]).select(order)
 
 
-def tilt_uncertainty(planes: FramedPlanes, objective: Objective, tolerance: float) -> Array:
+def tilt_uncertainty(planes: FramedPlanes, objective: Evidence, tolerance: float) -> Array:
     """[H] angle, radians, by which each plane could turn before its cost shows a change of `NOTICEABLE`.
 
     The plane is free to shift and the frame to grow meanwhile. The Gauss-Newton matrix at the plane tells.
@@ -157,8 +159,11 @@ FRAME_SPREAD = 0.5
 """Standard deviation of the logarithm of the height of frames in each round."""
 COARSE_EDGES = 200
 """Edge points, in all views together, while hypotheses are many."""
-PIXELS = 600
-"""Pixels whose rays are followed to compare masks, in all views together."""
+ONE_SURFACE, LARGEST_RISE = float(np.radians(8)), 0.05
+"""Angle between the planes of two panes, and distance of the one's middle from the other's plane in scene extents, up
+to which it is tried whether they lie in one plane."""
+HIGHEST_FRAME = 0.1
+"""Height of a frame over its glass, in scene extents, above which a plane is taken for a wrong one."""
 
 
 def best_plane(objective: Objective, *, hypotheses: int, refine: int, rng: np.random.Generator) -> FramedPlanes:
@@ -182,20 +187,51 @@ def best_plane(objective: Objective, *, hypotheses: int, refine: int, rng: np.ra
     shaken = _followed(beam, objective, (tilt, shift), tolerance, rng)
     best_first = np.argsort(contradiction(beam, objective, (COARSE, MIDDLE)), kind="stable")
     leading = joined([beam.select(best_first[:refine]), shaken.select(np.arange(min(refine, len(shaken))))])
-    finished = _agreed(refined(leading, objective, (MIDDLE, FINE)), objective)
+    finished = _possible(_agreed(refined(leading, objective, (MIDDLE, FINE)), objective), objective)
     return finished.select(np.array([np.argmin(contradiction(finished, objective))]))
+
+
+def best_joint_plane(objective: JointObjective, starts: FramedPlanes, rng: np.random.Generator) -> FramedPlanes:
+    """The one plane on which the masks of several panes coincide best, near those that they led to one by one.
+
+    Args:
+        objective: what is known about the panes.
+        starts: the plane of each, fitted alone.
+        rng: source of randomness.
+    """
+    beam = starts
+    for tilt, shift, tolerance in (*ROUNDS[1:], SHAKE):
+        beam = joined([beam, _followed(beam, objective, (tilt, shift), tolerance, rng)])
+    finished = _possible(refined(beam, objective, (COARSE, MIDDLE, FINE)), objective)
+    return finished.select(np.array([np.argmin(contradiction(finished, objective))]))
+
+
+def in_one_surface(one: FramedPlanes, other: FramedPlanes, objectives: tuple[Objective, Objective]) -> bool:
+    """Return whether two panes, from their planes fitted one by one, may lie in one surface.
+
+    Args:
+        one: plane of the first pane.
+        other: plane of the second pane.
+        objectives: what is known about each.
+    """
+    if angle(one, other) > ONE_SURFACE:
+        return False
+    middles = [objective.anchors(plane.planes) for objective, plane in zip(objectives, (one, other), strict=True)]
+    # Of the two planes one may be turned about its own middle, so that it passes the other's far off.
+    rises = abs(one.planes.distances(middles[1])), abs(other.planes.distances(middles[0]))
+    return float(np.min(rises)) <= LARGEST_RISE * objectives[0].extent
 
 
 def contradiction(
     planes: FramedPlanes,
-    objective: Objective,
+    objective: Evidence,
     tolerances: tuple[float, ...] = (COARSE, MIDDLE, FINE),
     *,
     edges: int = EDGES,
 ) -> Array:
     """[H] what tells against planes, their masks included, at several tolerances; in no unit, near 0 on the pane."""
     costs = [objective.terms(planes, tolerance, edges=edges).cost for tolerance in tolerances]
-    mean: Array = np.mean(costs, axis=0) - AGREEMENT_WEIGHT * _agreement(planes, objective)
+    mean: Array = np.mean(costs, axis=0) - AGREEMENT_WEIGHT * objective.agreement(planes.planes)
     return mean
 
 
@@ -211,7 +247,7 @@ def first_hypotheses(objective: Objective, count: int, rng: np.random.Generator)
         drawn.append(through.select(np.argsort(-objective.support(through), kind="stable")[: count // 4]))
     usual = USUAL_FRAME * objective.extent
     planes = joined([FramedPlanes(part, np.full(len(part), usual)) for part in drawn])
-    scores = _agreement(planes, objective) + AGREEMENT_WEIGHT * objective.support(planes.planes)
+    scores = objective.agreement(planes.planes) + AGREEMENT_WEIGHT * objective.support(planes.planes)
     best_first = _agreed(planes.select(np.argsort(-scores, kind="stable")[:POOL]), objective, least=BY_AREAS)
     costs = contradiction(best_first, objective, (ROUNDS[0][2],), edges=COARSE_EDGES)
     by_edges = np.argsort(costs, kind="stable")
@@ -220,7 +256,7 @@ def first_hypotheses(objective: Objective, count: int, rng: np.random.Generator)
 
 
 def _followed(
-    beam: FramedPlanes, objective: Objective, spread: tuple[float, float], tolerance: float, rng: np.random.Generator
+    beam: FramedPlanes, objective: Evidence, spread: tuple[float, float], tolerance: float, rng: np.random.Generator
 ) -> FramedPlanes:
     """The best plane around each of the beam's, best first."""
     tilt, shift = spread
@@ -234,18 +270,20 @@ def _followed(
     return family.select(best[np.argsort(costs.min(axis=1), kind="stable")])
 
 
-def _agreed(planes: FramedPlanes, objective: Objective, *, least: int = 0) -> FramedPlanes:
+def _possible(planes: FramedPlanes, objective: Evidence) -> FramedPlanes:
+    """The planes whose frames are no higher than frames are; all of them if there is none."""
+    kept = np.flatnonzero(planes.frames <= HIGHEST_FRAME * objective.extent)
+    return planes.select(kept) if len(kept) else planes
+
+
+def _agreed(planes: FramedPlanes, objective: Evidence, *, least: int = 0) -> FramedPlanes:
     """The first so many planes, and all others that the masks do not rule out beside the best.
 
     Where other panes or posts hide much of a pane, edges that meet by chance may outdo its own.
     """
-    agreement = _agreement(planes, objective)
+    agreement = objective.agreement(planes.planes)
     kept = (agreement >= LEAST_OF_BEST * agreement.max()) | (np.arange(len(planes)) < least)
     return planes.select(np.flatnonzero(kept))
-
-
-def _agreement(planes: FramedPlanes, objective: Objective) -> Array:
-    return mask_agreement(planes.planes, objective.views, pixels_per_view=PIXELS // len(objective.views))
 
 
 log = logging.getLogger("glassplat.panes")

@@ -142,6 +142,88 @@ def test_a_plane_that_one_edge_leaves_free_is_refused_with_what_to_annotate() ->
         fit_planes(BARE[:0], annotations, extent=EXTENT, options=QUICK)
 
 
+def front_pane(x: float, half_width: float, degrees: float = 0.0) -> Pane:
+    """A pane of a shop front, turned about the vertical by some degrees."""
+    turn = np.radians(degrees)
+    normal, tangent = np.array([np.sin(turn), 0, -np.cos(turn)]), np.array([np.cos(turn), 0, np.sin(turn)])
+    return Pane(np.array([x, -0.1, 2.0]), normal, tangent, (half_width, 0.5))
+
+
+def test_a_pane_that_its_masks_leave_open_is_placed_by_its_neighbour_in_the_same_front() -> None:
+    panes = [front_pane(-0.5, 0.45), front_pane(0.2, 0.1)]
+    annotations = scene_of(panes, (*EYES, (0.3, 0.6, -1.1)))
+    coarse = [
+        (
+            camera,
+            torch.where(
+                ragged((labels == 2).to(torch.uint8), amplitude=1.0, seed=number) == 1, 2, labels * (labels == 1)
+            ),
+        )
+        for number, (camera, labels) in enumerate(annotations)
+    ]
+    with pytest.raises(PlaneFitError, match=r"pane 2, .* could turn by"):
+        fit_planes(BARE, coarse, extent=EXTENT, labels=[2], options=QUICK)
+    together = fit_planes(BARE, coarse, extent=EXTENT, options=QUICK)
+    assert normal_error(together, 1, panes[1]) < 1
+    torch.testing.assert_close(together.normals[0], together.normals[1])
+
+
+def test_an_ill_measured_pane_of_a_front_is_placed_by_all_masks_together() -> None:
+    panes = [front_pane(-0.5, 0.45), front_pane(0.35, 0.15)]
+    annotations = scene_of(panes, (*EYES, (0.3, 0.6, -1.1)))
+    rough = [
+        (
+            camera,
+            torch.where(ragged(torch.where(labels == 2, 1, 0), amplitude=1.2, seed=10 + number) == 1, 2, labels % 2),
+        )
+        for number, (camera, labels) in enumerate(annotations)
+    ]
+    alone = fit_planes(BARE, rough, extent=EXTENT, labels=[2], options=QUICK)
+    together = fit_planes(BARE, rough, extent=EXTENT, options=QUICK)
+    assert normal_error(alone, 0, panes[1]) > 1
+    assert normal_error(together, 1, panes[1]) < 0.7
+    torch.testing.assert_close(together.normals[0], together.normals[1])
+
+
+def test_panes_that_are_turned_against_each_other_keep_planes_of_their_own() -> None:
+    panes = [front_pane(-0.5, 0.45), front_pane(0.5, 0.45, degrees=5)]
+    planes = fit_planes(BARE, scene_of(panes, (*EYES, (0.3, 0.6, -1.1))), extent=EXTENT, options=QUICK)
+    for index, pane in enumerate(panes):
+        assert normal_error(planes, index, pane) < 1.5
+    assert float(torch.linalg.cross(planes.normals[0], planes.normals[1]).norm()) > np.sin(np.radians(3))
+
+
+def test_a_refusal_names_photographs_that_show_the_pane_from_elsewhere() -> None:
+    wide = Pane(np.array([0.0, -10.3, 2.0]), FRONT.normal, FRONT.tangent, (10.0, 10.0))
+    cameras = [camera_from(eye, FRONT.center) for eye in EYES]
+    annotations = [(camera, label_image(camera, [wide])) for camera in cameras]
+    middle = np.array([0.0, -1.0, 2.0])
+    unmarked = [
+        ("away.jpg", camera_from((0.0, 0.0, -1.0), np.array([0.0, 0.0, -5.0]))),
+        ("beside.jpg", camera_from((0.0, 0.05, -1.0), middle)),
+        ("from-the-right.jpg", camera_from((3.0, 0.0, 0.0), middle)),
+        ("from-the-left.jpg", camera_from((-3.0, 0.0, 0.0), middle)),
+        ("from-below.jpg", camera_from((0.0, 3.0, -0.5), middle)),
+    ]
+    with pytest.raises(PlaneFitError, match=r"should show it well") as raised:
+        fit_planes(BARE[:0], annotations, extent=EXTENT, options=QUICK, unmarked=unmarked)
+    named = str(raised.value).partition("standing before it")[2]
+    assert all(name in named for name in ("from-the-right.jpg", "from-the-left.jpg", "from-below.jpg"))
+    assert "away.jpg" not in named and "beside.jpg" not in named
+
+
+def test_masks_whose_outlines_meet_on_no_plane_are_refused() -> None:
+    rng = np.random.default_rng(0)
+    annotations = []
+    for camera, labels in scene_of([FRONT]):
+        row, column = np.mgrid[: labels.shape[0], : labels.shape[1]]
+        center, size = rng.uniform([60, 80], [160, 220]), rng.uniform(20, 60, 2)
+        found = ((row - center[0]) / size[0]) ** 2 + ((column - center[1]) / size[1]) ** 2 < 1
+        annotations.append((camera, torch.from_numpy(found.astype(np.uint8))))
+    with pytest.raises(PlaneFitError, match=r"pane 1, .* on no plane do the outlines .* annotate more views"):
+        fit_planes(BARE[:0], annotations, extent=EXTENT, options=replace(QUICK, least_agreement=0.01))
+
+
 def test_views_from_one_place_are_refused_with_what_to_annotate() -> None:
     eyes = tuple((0.001 * i, 0.0, -1.0) for i in range(3))
     with pytest.raises(
