@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import re
 import runpy
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -15,6 +17,7 @@ import torch
 
 import glassplat
 from glassplat.captures.view import estimated_normals
+from glassplat.cli import main
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 DEMO = Path(glassplat.__file__).parent / "demo_scene"
@@ -63,6 +66,31 @@ def test_gradients_lead_back(place: Path) -> None:
     said = said_by("4_gradients.py", "runs/place", "--downscale", "4", "--steps", "21", folder=place)
     losses = [float(number) for number in re.findall(r"loss (0\.\d+)", said)]
     assert losses[-1] < losses[0]
+
+
+def cells_of_the_notebook() -> list[str]:
+    cells = json.loads((EXAMPLES / "colab.ipynb").read_text(encoding="utf-8"))["cells"]
+    assert not any(cell.get("outputs") for cell in cells)
+    return ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+
+
+def test_the_commands_of_the_notebook_exist() -> None:
+    lines = [line for cell in cells_of_the_notebook() for line in cell.splitlines() if line.startswith("!glassplat")]
+    calls = [shlex.split(line)[1:] for line in lines]
+    assert [call[0] for call in calls] == ["--version", "demo", "export"]
+    for call in calls[1:]:
+        assert type(main.parsed(call)).__name__.startswith(main.COMMANDS[call[0]].kind)
+
+
+def test_the_notebook_shows_layers_of_its_run(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (place / "runs" / "demo").mkdir()
+    shutil.copytree(place / "runs" / "place", place / "runs" / "demo" / "planar")
+    monkeypatch.chdir(place)
+    *statements, shown = next(cell for cell in cells_of_the_notebook() if "glassplat.load" in cell).splitlines()
+    names = {"torch": torch}
+    exec("\n".join(statements), names)
+    height, width = names["pictures"][0].shape[:2]
+    assert eval(shown, names).size == (4 * width, height)
 
 
 HUB = """
