@@ -235,6 +235,8 @@ class Export:
         layer: all is the scene with its panes beside it, as planes.json and glass.ply; transmission is the place
             without its panes and what they reflect.
         title: of the page; the run's name if not given.
+        credit: shown on the page: who made the scene, and its licence.
+        url: where the page will lie on the web. Previews of links to it show preview.jpg, which then lies beside it.
         spz_version: 3, which every reader knows, or 4.
         file: what a splat file does not say of itself.
         edits: changes to the panes.
@@ -246,6 +248,8 @@ class Export:
     formats: tuple[Format, ...] = ("ply", "spz", "html")
     layer: Literal["all", "transmission"] = "all"
     title: str | None = None
+    credit: str = ""
+    url: str | None = None
     spz_version: Literal[3, 4] = 3
     file: Annotated[SplatFile, tyro.conf.arg(name="")] = field(default_factory=SplatFile)
     edits: Annotated[SceneEdits, tyro.conf.arg(name="")] = field(default_factory=SceneEdits)
@@ -255,6 +259,8 @@ class Export:
         """Refuses what contradicts itself, what is no scene, and an output that holds something else."""
         if not self.formats:
             raise InputError(f"nothing to write without --formats; expected some of {', '.join(WRITTEN)}")
+        if self.url is not None and not self.url.startswith(("https://", "http://")):
+            raise InputError(f"--url is {self.url}; expected an address that begins with https://")
         check_scene(self.scene)
         self.file.check()
         check_claim(self.output, "export")

@@ -29,6 +29,7 @@ from glassplat.model.model import CAMERAS, ENVIRONMENT, GLASS, PLANES, Model, sa
 from glassplat.prepare.photographs import Progress as Step
 from glassplat.publish.camera_paths import interpolated, keyframes_of, widened
 from glassplat.publish.film import side_by_side, wiped, write_film
+from glassplat.publish.web_page import PREVIEW, Sharing, write_preview
 from glassplat.render.frame import check_layers
 from glassplat.render.layers import layer_image
 from glassplat.render.planar import Planar, dereflected_photo
@@ -192,7 +193,7 @@ def write_files(command: Export, console: Console) -> None:
     model = command.file.opened(command.scene, command.device)
     model = model.with_scene(_chosen(command, command.edits.applied(model.scene)))
     splats = {kind: command.output / f"scene.{kind}" for kind in SPLAT_WRITERS}
-    beside = [command.output / name for name in ("index.html", GLASS, PLANES, CAMERAS)]
+    beside = [command.output / name for name in ("index.html", PREVIEW, GLASS, PLANES, CAMERAS)]
     check_targets(command.output, [*beside, *splats.values()], [])
     if claim_folder(command.output, "export", command.scene):
         say(console, f"replacing the files of an earlier run of this command in {command.output}")
@@ -219,7 +220,9 @@ def _write_page(command: Export, model: Model, console: Console) -> None:
     if model.renderer.page_settings() is None:
         warn(console, f"no page was written: it does not show {model.recipe.method} runs of this kind")
         return
-    save_page(model, path, command.title or model.name)
+    save_page(model, path, command.title or model.name, sharing=Sharing(command.credit, command.url))
+    if command.url is not None:
+        write_preview(command.output / PREVIEW, model.scene, model.renderer, tuple(model.cameras.items()))
     say(console, f"{path.stat().st_size / 1e6:.2f} MB, open it in a browser -> {path}")
 
 

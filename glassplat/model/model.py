@@ -42,7 +42,7 @@ from glassplat.options import BLACK, Cleaning, Up
 from glassplat.panes.material import OPAQUE_SHEET, glass_gaussians, with_intensity, with_pane
 from glassplat.publish.camera_paths import orbit
 from glassplat.publish.cleaning import Floaters, cleaned
-from glassplat.publish.web_page import best_view, bounding_ball, cameras_around, write_page
+from glassplat.publish.web_page import PRIVATE, Sharing, best_view, bounding_ball, cameras_around, write_page
 from glassplat.render.deferred import equirect_from_environment
 from glassplat.render.frame import Frame, Renderer, check_layers
 from glassplat.render.layers import layer_image
@@ -413,7 +413,7 @@ def save_model(model: Savable, path: Path, *, overwrite: bool) -> Path:
     return path
 
 
-def save_page(model: Savable, path: Path, title: str) -> None:
+def save_page(model: Savable, path: Path, title: str, *, sharing: Sharing = PRIVATE) -> None:
     """Writes the page that shows a model with live panes in any browser.
 
     Raises:
@@ -422,7 +422,7 @@ def save_page(model: Savable, path: Path, title: str) -> None:
     if model.renderer.page_settings() is None:
         raise InputError(f"the page shows planar and splat scenes, not {model.recipe.method} ones of this kind")
     with input_checked():
-        write_page(path, model.scene, model.renderer, tuple(model.cameras.items()), title)
+        write_page(path, model.scene, model.renderer, tuple(model.cameras.items()), title, sharing=sharing)
 
 
 def write_beside(folder: Path, scene: Scene) -> list[Path]:

@@ -17,6 +17,7 @@ from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import urljoin, urlsplit
 
 import numpy as np
 import torch
@@ -30,7 +31,7 @@ from glassplat.render.panes import glass_owners, nearest_hits, panes_in_camera
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
-from glassplat.scene.scene import Scene
+from glassplat.scene.scene import Scene, without_glass
 
 COUNT = 24
 WIDTH, HEIGHT = 960, 640
@@ -161,10 +162,61 @@ MOST_PANES = 16
 POSTER_WIDTH, POSTER_QUALITY = 640, 70
 LEAST_OPACITY = 1 / 255
 DESCRIPTION = "Look around, take the reflections off the glass, or turn it into a mirror."
+PREVIEW = "preview.jpg"
+PREVIEW_WIDTH, PREVIEW_HEIGHT = 1200, 630
+"""What the programs that preview links ask for, pixels."""
+DIVIDER = 3
+"""Half the width of the line between the halves of a preview, pixels."""
+
+
+class Sharing(NamedTuple):
+    """Credit and address of a page, for it and for links to it.
+
+    Attributes:
+        credit: who made the scene, and its licence; plain text.
+        url: the page's address; a picture beside it, `PREVIEW`, shows up in previews of links. None without them.
+    """
+
+    credit: str = ""
+    url: str | None = None
+
+
+PRIVATE = Sharing()
+
+
+@torch.no_grad()
+def write_preview(path: Path | str, scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Camera]]) -> None:
+    """Writes the picture for previews of links, atomically: the first view, on its right half without its panes.
+
+    Args:
+        path: the JPEG file.
+        scene: what to show.
+        renderer: how.
+        cameras: as of `write_page`.
+    """
+    view = cameras[best_view(scene.planes, [camera for _, camera in cameras])][1]
+    focal = max(view.fx * PREVIEW_WIDTH / view.width, view.fy * PREVIEW_HEIGHT / view.height)
+    middle = PREVIEW_WIDTH // 2
+    camera = replace(
+        view, fx=focal, fy=focal, cx=float(middle), cy=PREVIEW_HEIGHT / 2, width=PREVIEW_WIDTH, height=PREVIEW_HEIGHT
+    )
+    image = renderer(scene, camera).rgb
+    if len(scene.planes):
+        bare = renderer(without_glass(scene), camera).rgb
+        image = torch.cat([image[:, :middle], bare[:, middle:]], dim=1)
+        image[:, middle - DIVIDER : middle + DIVIDER] = 1
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(jpeg(image))
 
 
 def write_page(
-    path: Path | str, scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Camera]], title: str
+    path: Path | str,
+    scene: Scene,
+    renderer: Renderer,
+    cameras: Sequence[tuple[str, Camera]],
+    title: str,
+    *,
+    sharing: Sharing = PRIVATE,
 ) -> None:
     """Writes the page, atomically.
 
@@ -174,17 +226,25 @@ def write_page(
         renderer: how; a `Planar` or a `Splat`.
         cameras: of the photographs, by name; at least one. People may look round near them.
         title: of the page.
+        sharing: what it says of its origin and address.
 
     Raises:
         ValueError: another renderer, no camera, more panes than a page can show, or values that are not finite.
     """
-    page = page_text(scene, renderer, cameras, title)
+    page = page_text(scene, renderer, cameras, title, sharing=sharing)
     with atomic_write(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
 
 @torch.no_grad()
-def page_text(scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Camera]], title: str) -> str:
+def page_text(
+    scene: Scene,
+    renderer: Renderer,
+    cameras: Sequence[tuple[str, Camera]],
+    title: str,
+    *,
+    sharing: Sharing = PRIVATE,
+) -> str:
     """Text of the page."""
     settings = renderer.page_settings()
     if settings is None:
@@ -209,6 +269,8 @@ def page_text(scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Cam
             "title": html.escape(title),
             "subtitle": html.escape(subtitle),
             "description": html.escape(DESCRIPTION if count else "Look around a scene of Gaussians."),
+            "credit": html.escape(sharing.credit),
+            "preview": preview_tags(sharing.url),
             "style": asset("style.css"),
             "poster": in_base64(poster),
             "scene": in_script(description | {"channelRange": channel_range}),
@@ -219,6 +281,16 @@ def page_text(scene: Scene, renderer: Renderer, cameras: Sequence[tuple[str, Cam
             "script": "\n".join(asset(name) for name in SCRIPTS),
         },
     )
+
+
+def preview_tags(url: str | None) -> str:
+    """Tags for previews of links to an address, which may be of the page or of its folder; none without an address."""
+    if url is None:
+        return ""
+    last = urlsplit(url).path.rpartition("/")[2]
+    picture = urljoin(url if not last or "." in last else url + "/", PREVIEW)
+    tags = {"og:url": url, "og:image": picture, "og:image:width": PREVIEW_WIDTH, "og:image:height": PREVIEW_HEIGHT}
+    return "\n".join(f'<meta property="{name}" content="{html.escape(str(value))}">' for name, value in tags.items())
 
 
 def asset(name: str) -> str:

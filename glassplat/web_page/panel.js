@@ -47,7 +47,17 @@ function makePanel(scene, navigation, changed) {
     if (view && view.name !== element('photo').textContent) standAt(view);
   });
 
+  // Shows, selected, the tag of a frame with this page in it, and copies it where the browser lets it.
+  function embed() {
+    const code = document.querySelector('#embed textarea'), title = document.title.replace(/[&"<]/g, (c) => `&#${c.charCodeAt(0)};`);
+    element('embed').toggleAttribute('hidden');
+    code.value = `<iframe src="${location.href}" title="${title}" width="800" height="500" style="border: 0" allow="fullscreen"></iframe>`;
+    code.select();
+    navigator.clipboard?.writeText(code.value).catch(() => {});
+  }
+
   const actions = {
+    embed,
     compare: () => set('compare', !state.compare),
     before: () => standAt(navigation.neighbour(-1)),
     after: () => standAt(navigation.neighbour(1)),
@@ -59,7 +69,8 @@ function makePanel(scene, navigation, changed) {
   const LAYER_KEYS = ['rgb', 'without_panes', 'reflection', 'strength'];
   const KEYS = {
     c: actions.compare, ArrowLeft: actions.before, ArrowRight: actions.after, Home: actions.home, r: actions.home,
-    f: actions.full, '?': actions.help, h: actions.hide, Escape: () => element('help').setAttribute('hidden', ''),
+    f: actions.full, '?': actions.help, h: actions.hide,
+    Escape: () => { for (const id of ['help', 'embed']) element(id).setAttribute('hidden', ''); },
     g: () => set('glass', state.glass === 'none' ? 'real' : 'none'),
     m: () => set('glass', state.glass === 'mirror' ? 'real' : 'mirror'),
   };
@@ -88,7 +99,8 @@ function makePanel(scene, navigation, changed) {
   window.addEventListener('blur', () => walking.clear());
   window.addEventListener('keyup', (event) => walking.delete(event.key.toLowerCase()));
   window.addEventListener('keydown', (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches('input')) return;
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.target.matches('input, textarea') && event.key !== 'Escape') return;
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     if ('wasdqe'.includes(key)) { walking.add(key); navigation.still(); changed(); }
     else if (LAYER_KEYS[Number(key) - 1]) set('layer', LAYER_KEYS[Number(key) - 1]);

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from glassplat.evaluate.metrics import psnr
-from glassplat.publish.web_page import SCRIPTS, SHADERS, asset, filled, page_text, write_page
+from glassplat.publish.web_page import SCRIPTS, SHADERS, Sharing, asset, filled, page_text, write_page, write_preview
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
@@ -114,6 +115,7 @@ def test_the_next_photograph_shows_a_pane_and_stands_in_the_address(tmp_path: Pa
     write_page(tmp_path / "index.html", true_scene(), Planar(), [("away.png", away), *CAMERAS], "Route")
     with Browser(tmp_path / "index.html", 320, 240) as browser:
         stops = set()
+        browser.wait("glassplat.then(() => true)", "the page")
         for _ in range(len(CAMERAS) + 1):
             browser.keys("Right")
             address = browser.evaluate("decodeURIComponent(location.hash)")
@@ -290,6 +292,27 @@ def test_the_page_is_one_file_of_little_script() -> None:
     outside = re.findall(r"(?:src|href|url)\s*[=(]\s*[\"']?(?!data:)[a-z]+:", page)
     assert not outside and "http://" not in page and "https://" not in page
     assert sum(len(asset(name)) for name in (*SCRIPTS, *SHADERS)) <= LARGEST_SCRIPT
+
+
+@pytest.mark.parametrize("url", ["https://x.org/shop", "https://x.org/shop/", "https://x.org/shop/index.html"])
+def test_a_link_to_the_page_is_shown_with_a_picture_of_both_sides(url: str, tmp_path: Path) -> None:
+    page = page_text(true_scene(), Planar(), CAMERAS, "title", sharing=Sharing("A <person>, CC0", url))
+    tags = dict(re.findall(r'<meta property="(og:[^"]+)" content="([^"]*)">', page))
+    assert tags["og:title"] == "title" and tags["og:description"] and tags["og:url"] == url
+    assert tags["og:image"] == "https://x.org/shop/preview.jpg" and "A &lt;person&gt;, CC0" in page
+    write_preview(tmp_path / "preview.jpg", true_scene(), Planar(), CAMERAS)
+    with Image.open(tmp_path / "preview.jpg") as picture:
+        assert picture.size == (int(tags["og:image:width"]), int(tags["og:image:height"])) == (1200, 630)
+        assert min(picture.getpixel((600, 315))) > 250
+
+
+@needs_browser
+def test_the_page_gives_the_frame_that_embeds_it(opened: Browser) -> None:
+    opened.evaluate("document.querySelector('[data-do=embed]').click()")
+    code = opened.evaluate("document.querySelector('#embed textarea').value")
+    assert re.match(r'<iframe src="file:///[^"]*/index.html[^"]*" title="A &#60;tiny> scene &#38; more" ', code)
+    opened.keys("Escape")
+    assert opened.evaluate("document.querySelector('#embed').hidden")
 
 
 def test_names_cannot_end_the_script() -> None:
