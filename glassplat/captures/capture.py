@@ -79,6 +79,7 @@ class Capture:
         random_points: how to place points when `points` is None; None takes the default.
         masks: masks of panes by name of the photograph where the format fixes them; None looks for them by name.
         kept: masks whose black is left out, by name of the photograph, where the format names them.
+        cut_out: transparent pixels of photographs are left out; otherwise a background shows there.
     """
 
     shots: tuple[Shot, ...]
@@ -89,6 +90,7 @@ class Capture:
     random_points: Callable[[], RawPoints] | None = None
     masks: Mapping[str, Path] | None = None
     kept: Mapping[str, Path] | None = None
+    cut_out: bool = False
 
 
 Loader = Callable[[Path], Capture | None]

@@ -255,6 +255,7 @@ def load_colmap(root: Path) -> Capture | None:
         points=_points_or_none(model),
         format_name="COLMAP",
         warnings=_other_models(root, folder),
+        cut_out=True,
     )
 
 

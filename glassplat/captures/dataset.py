@@ -16,7 +16,7 @@ import torch
 from glassplat.captures.axes import axes_evidence
 from glassplat.captures.capture import Capture, Shot
 from glassplat.captures.files import CaptureFiles, read_capture
-from glassplat.captures.masks import PLANES, Polarity
+from glassplat.captures.masks import PLANES, CutOut, Polarity
 from glassplat.captures.transforms import points_in_view
 from glassplat.captures.view import PointCloud, PreparedView, View, ViewOptions, prepare_view
 from glassplat.errors import InputError, first_names, input_checked
@@ -98,7 +98,7 @@ class Dataset:
         warnings: what was assumed or left out, full sentences.
         split: how the test views were chosen.
         measured_points: False if `points` are random ones, which carry no geometry.
-        background: sRGB that is seen through transparent photographs; None where none is transparent.
+        background: sRGB that is seen through transparent photographs; None where none is, or where that is left out.
         planes: panes that the capture gives as rectangles; their masks, if any, only refine them.
         downscale: by how much the photographs were reduced.
         mask_polarity: which value of black-and-white masks was taken for the pane.
@@ -134,7 +134,7 @@ def load_dataset(
     Args:
         root: the capture's folder.
         downscale: photographs are reduced by this factor, at least 1.
-        background: sRGB in [0, 1], seen through transparent pixels.
+        background: sRGB in [0, 1], seen through transparent pixels; those of COLMAP captures are left out instead.
         mask_polarity: which value of black-and-white masks is the pane.
 
     Raises:
@@ -163,12 +163,19 @@ def dataset_of(files: CaptureFiles, *, downscale: float = 1.0, background: Rgb =
     """
     check_downscale(downscale)
     root, capture, shots, masks = files.root, files.capture, files.shots, files.masks
-    options = ViewOptions(downscale, background)
+    transparent = _any_transparent(shots)
+    cut_out = transparent and capture.cut_out
+    shown = background if transparent and not cut_out else None
+    options = ViewOptions(downscale, None if cut_out else background)
     prepared = [
-        prepare_view(shot, masks.masks.get(shot.name), options, ignored=files.ignored.get(shot.name, ()))
+        prepare_view(
+            shot,
+            masks.masks.get(shot.name),
+            options,
+            ignored=(*files.ignored.get(shot.name, ()), *([CutOut(shot.image_path)] if cut_out else ())),
+        )
         for shot in shots
     ]
-    transparent = _any_transparent(shots)
     train, test, split = _split([p.view for p in prepared], capture)
     points, point_warnings = _points(capture, train)
     extent = _extent(train)
@@ -177,7 +184,8 @@ def dataset_of(files: CaptureFiles, *, downscale: float = 1.0, background: Rgb =
     warnings = (
         *capture.warnings,
         *masks.warnings,
-        *_view_warnings(prepared, background if transparent else None),
+        *_view_warnings(prepared, shown),
+        *(["Transparent pixels of the photographs are left out."] if cut_out else ()),
         *point_warnings,
         *_far_off(train, extent),
     )
@@ -193,7 +201,7 @@ def dataset_of(files: CaptureFiles, *, downscale: float = 1.0, background: Rgb =
         warnings=warnings,
         split=split,
         measured_points=measured,
-        background=background if transparent else None,
+        background=shown,
         planes=given_planes(root, [view.camera for view in train]),
         downscale=downscale,
         mask_polarity=files.mask_polarity,

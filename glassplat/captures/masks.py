@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from glassplat.errors import InputError, first_names, input_checked
-from glassplat.files.images import IMAGE_SUFFIXES, SHADES_16, open_image
+from glassplat.files.images import IMAGE_SUFFIXES, SHADES_16, open_image, read_image
 
 HIGHEST_LABEL = 64
 """Grey values up to this one are labels when nothing brighter occurs; no one paints masks for the eye that dark."""
@@ -193,7 +193,30 @@ class KeepMask:
         return (shades < (THRESHOLD if shades.max() > HIGHEST_LABEL else 1)).astype(np.uint8)
 
 
-IgnoredMask = KeepMask | PaneMask
+@dataclass(frozen=True)
+class CutOut:
+    """A photograph whose transparent pixels, those below one half, are left out.
+
+    Attributes:
+        path: the photograph.
+    """
+
+    path: Path
+
+    def labels(self) -> NDArray[np.uint8]:
+        """[H, W] 1 where a pixel is left out.
+
+        Raises:
+            InputError: the file is no image.
+        """
+        with input_checked():
+            pixels = read_image(self.path)
+        return (
+            (pixels[:, :, 3] < THRESHOLD).astype(np.uint8) if pixels.shape[2] == 4 else np.zeros_like(pixels[:, :, 0])
+        )
+
+
+IgnoredMask = CutOut | KeepMask | PaneMask
 """A mask whose `labels()` are above zero on what is not to be learned."""
 
 

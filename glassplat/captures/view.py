@@ -104,11 +104,14 @@ class View:
 
 @dataclass(frozen=True)
 class PhotoFile:
-    """Recipe for reading the pixels of one view; `background` is seen through transparent pixels."""
+    """Recipe for reading the pixels of one view; `background` is seen through transparent pixels.
+
+    Without one, their own colours are.
+    """
 
     path: Path
     pixel_map: PixelMap
-    background: Rgb
+    background: Rgb | None
 
     def __call__(self) -> Tensor:
         """[H, W, 3] uint8 in the pixel grid of the view's camera."""
@@ -147,11 +150,11 @@ class ViewOptions:
 
     Attributes:
         downscale: width and height are divided by it and rounded.
-        background: sRGB in [0, 1], seen through transparent pixels.
+        background: sRGB in [0, 1], seen through transparent pixels; None leaves them their own colours.
     """
 
     downscale: float = 1.0
-    background: Rgb = WHITE
+    background: Rgb | None = WHITE
 
 
 @dataclass(frozen=True)
@@ -228,12 +231,12 @@ def _is_multiple(large: tuple[int, int], small: tuple[int, int]) -> bool:
     )
 
 
-def _opaque(pixels: NDArray[np.uint8], background: Rgb) -> NDArray[np.uint8]:
-    """[H, W, 3] from grey, colour or colour with transparency, over the background."""
+def _opaque(pixels: NDArray[np.uint8], background: Rgb | None) -> NDArray[np.uint8]:
+    """[H, W, 3] from grey, colour or colour with transparency, over the background if there is one."""
     if pixels.shape[2] == 1:
         return np.repeat(pixels, 3, axis=2)
-    if pixels.shape[2] == 3:
-        return np.ascontiguousarray(pixels)
+    if pixels.shape[2] == 3 or background is None:
+        return np.ascontiguousarray(pixels[:, :, :3])
     behind = np.asarray(background, dtype=np.float32) * 255
     opaque = np.empty((*pixels.shape[:2], 3), dtype=np.uint8)
     for row, seen in enumerate(pixels):  # Row by row: as floats a photograph takes four times its memory.

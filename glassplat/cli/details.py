@@ -67,7 +67,7 @@ def _marked(path: Path, dataset: Dataset) -> Finding:
     """Marked panes, and the quality of the marks."""
     finding = Finding()
     if ignoring := sum(view.read_ignored is not None for view in (*dataset.train, *dataset.test)):
-        finding.facts["ignored"] = f"parts of {ignoring} photographs, marked in masks/ or ignore/"
+        finding.facts["ignored"] = f"parts of {ignoring} photographs, by masks or transparency"
     if estimated := sum(normals_path(view.image_path) is not None for view in dataset.train):
         finding.facts["normals"] = f"estimated for {estimated} training photographs; deferred and traced use them"
     annotated = sum(view.is_annotated for view in dataset.train)

@@ -65,8 +65,8 @@ def test_downscaling_averages_area(capture) -> None:
 
 @pytest.mark.parametrize(("background", "behind"), [((1.0, 1.0, 1.0), 255), ((0.0, 0.0, 0.0), 0)])
 def test_transparent_pixels_show_the_background(capture, background, behind: int) -> None:
-    capture.write_colmap()
     capture.write_images("RGBA")
+    capture.write_transforms({"fl_x": 30.0, "fl_y": 30.0, "w": 32, "h": 24, "frames": capture.frames()})
     data = load_dataset(capture.root, background=background)
     view = data.train[0]
     pixels = np.array(Image.open(view.image_path)).astype(float)
@@ -76,6 +76,19 @@ def test_transparent_pixels_show_the_background(capture, background, behind: int
     assert any("transparent pixels" in warning for warning in data.warnings)
 
 
+def test_transparent_pixels_of_colmap_captures_are_left_out(capture) -> None:
+    capture.write_colmap()
+    capture.write_images("RGBA")
+    data = load_dataset(capture.root)
+    for view in (*data.train, *data.test):
+        pixels = np.array(Image.open(view.image_path))
+        assert view.ignored is not None
+        np.testing.assert_array_equal(view.ignored.numpy(), pixels[:, :, 3] < 128)
+        np.testing.assert_array_equal(view.photo.numpy(), pixels[:, :, :3])
+    assert data.background is None
+    assert "Transparent pixels of the photographs are left out." in data.warnings
+
+
 def test_photographs_that_store_an_opaque_alpha_channel_are_opaque(capture) -> None:
     capture.write_colmap()
     for path in sorted((capture.root / "images").iterdir()):
@@ -83,7 +96,7 @@ def test_photographs_that_store_an_opaque_alpha_channel_are_opaque(capture) -> N
         photo.putalpha(255)
         photo.save(path.with_suffix(".png"))
     data = load_dataset(capture.root)
-    assert data.background is None
+    assert data.background is None and all(view.ignored is None for view in data.train)
     assert not any("transparent pixels" in warning for warning in data.warnings)
 
 
