@@ -15,8 +15,8 @@ from torch import Tensor
 
 from benchmarks.kernels import HEIGHT, WIDTH
 from benchmarks.scene import bench_camera, room
+from benchmarks.table import Table
 from benchmarks.timing import Work
-from glassplat.files.writing import Table
 from glassplat.kernels.composite import composite
 from glassplat.kernels.records import Splats
 from glassplat.kernels.tiles import bin_tiles

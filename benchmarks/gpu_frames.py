@@ -13,9 +13,9 @@ from torch import Tensor
 
 from benchmarks.methods import frame_work, step_work, view_of
 from benchmarks.scene import bench_camera, bench_scene, mirroring_scene
+from benchmarks.table import Table
 from benchmarks.timing import Work, interleaved_seconds, paired_ratio
 from glassplat.captures.view import View
-from glassplat.files.writing import Table
 from glassplat.kernels.photometric import photometric
 from glassplat.methods.glossy_recipes import TracedRecipe
 from glassplat.methods.planar_recipe import PlanarRecipe

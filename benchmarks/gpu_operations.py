@@ -15,8 +15,8 @@ from benchmarks.gpu_roofline import Peaks, backward_demand, counts_of, forward_d
 from benchmarks.kernels import backward, batch_of, raw_of, visited_pixels
 from benchmarks.rays import operation_works
 from benchmarks.scene import bench_camera, bench_scene
+from benchmarks.table import Table
 from benchmarks.timing import Work, interleaved_seconds
-from glassplat.files.writing import Table
 from glassplat.kernels.backend.devices import kernels_for
 from glassplat.kernels.composite import composite
 from glassplat.kernels.photometric import photometric

@@ -10,10 +10,10 @@ from typing import Any
 
 from rich.console import Console
 
+from benchmarks.table import Table
 from glassplat.cli.evaluation import evaluate_run
 from glassplat.cli.runs import open_run
 from glassplat.cli.train import Train
-from glassplat.files.writing import Table
 from glassplat.kernels.backend.devices import DeviceName
 from glassplat.methods.planar_recipe import PlanarRecipe
 

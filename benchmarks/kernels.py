@@ -11,8 +11,8 @@ from torch import Tensor
 
 from benchmarks.peak import peak_multiply_adds
 from benchmarks.scene import bench_camera, room
+from benchmarks.table import Table
 from benchmarks.timing import Work, interleaved_seconds, median_seconds, paired_ratio
-from glassplat.files.writing import Table
 from glassplat.kernels import tiles as bin_tiles_module
 from glassplat.kernels.composite import composite
 from glassplat.kernels.composite import reference as composite_twin

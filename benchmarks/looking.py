@@ -17,7 +17,7 @@ from PIL import Image
 
 from benchmarks.methods import doublings, thread_count
 from benchmarks.scene import bench_camera, bench_scene
-from glassplat.files.writing import Table
+from benchmarks.table import Table
 from glassplat.render.planar import Planar
 from glassplat.viewer.drawing import Wish, drawn
 from glassplat.viewer.render_loop import Picture, RenderLoop, RenderThread

@@ -10,9 +10,9 @@ import numba
 import torch
 
 from benchmarks.scene import bench_camera, bench_scene, glossy_scene
+from benchmarks.table import Table
 from benchmarks.timing import Work, interleaved_seconds, median_seconds, paired_ratio
 from glassplat.captures.view import View
-from glassplat.files.writing import Table
 from glassplat.kernels.composite import composite
 from glassplat.kernels.tiles import bin_tiles
 from glassplat.methods.glossy_recipes import DeferredRecipe

@@ -18,9 +18,9 @@ from unittest import mock
 import numba
 import torch
 
+from benchmarks.table import Table
 from glassplat.captures.dataset import load_dataset
 from glassplat.cli.train import SCENE
-from glassplat.files.writing import Table
 from glassplat.kernels.backend.cpu import Kernel
 from glassplat.methods.recipe import RECIPES, photo_background, recipe_of, settled
 from glassplat.training.loop import train

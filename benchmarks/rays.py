@@ -22,9 +22,9 @@ import torch
 from torch import Tensor
 
 from benchmarks.kernels import backward
+from benchmarks.table import Table
 from benchmarks.timing import Work
 from benchmarks.twin import compiled_library
-from glassplat.files.writing import Table
 from glassplat.kernels.records import Bvh, RawGaussians, Rays, Shapes
 from glassplat.kernels.trace import build_bvh, cpu, reach, shapes_of, trace
 from glassplat.kernels.trace.bvh import morton_codes

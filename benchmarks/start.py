@@ -17,8 +17,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from benchmarks.table import Table
 from glassplat.cli.train import SCENE
-from glassplat.files.writing import Table
 
 ROUNDS = 3
 """Of which the median is told, after one that only warms up."""

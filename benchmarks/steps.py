@@ -14,11 +14,11 @@ from typing import Any
 import numba
 
 from benchmarks.methods import doublings, thread_count
+from benchmarks.table import Table
 from benchmarks.timing import clocks_of
 from glassplat.captures.dataset import Dataset, load_dataset
 from glassplat.cli.runs import open_run
 from glassplat.cli.train import SCENE
-from glassplat.files.writing import Table
 from glassplat.methods.recipe import photo_background, settled
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.training.checkpoint import load_checkpoint

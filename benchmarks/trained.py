@@ -10,9 +10,9 @@ from pathlib import Path
 import numba
 
 from benchmarks.methods import doublings, frame_work, thread_count
+from benchmarks.table import Table
 from benchmarks.timing import clocks_of
 from glassplat.cli.runs import StoredRun, open_run
-from glassplat.files.writing import Table
 from glassplat.render.deferred import Deferred
 from glassplat.render.splat import Splat
 

@@ -23,8 +23,8 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.scene import bench_camera, room
+from benchmarks.table import Table
 from benchmarks.timing import Work
-from glassplat.files.writing import Table
 from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.composite.cpu import composite_forward
 from glassplat.kernels.composite.cpu_backward import composite_backward

@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from benchmarks.table import Table
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import View
 from glassplat.cli.runs import StoredRun, open_run
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.evaluate.metrics import quantized
 from glassplat.evaluate.truth import TrueView, load_truth
-from glassplat.files.writing import Table
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 
 BANDS = ("all", "coarse", "fine")

@@ -15,12 +15,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from benchmarks.table import Table
 from glassplat.captures.view import View
 from glassplat.cli.runs import StoredRun, open_run
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.evaluate.metrics import REFLECTIVE, angular_errors_deg
 from glassplat.evaluate.truth import true_surface
-from glassplat.files.writing import Table
 
 EDGES = (-1.0, -0.5, 0.0, 0.5, 1.0)
 """Bounds of the bands: the upward share of the mirrored ray."""

@@ -18,11 +18,11 @@ from pathlib import Path
 
 from torch import Tensor
 
+from benchmarks.table import Table
 from glassplat.captures.dataset import Dataset, load_dataset
 from glassplat.evaluate.metrics import plane_table
 from glassplat.evaluate.truth import GroundTruth, load_truth
 from glassplat.files.ply import read_gaussians
-from glassplat.files.writing import Table
 from glassplat.panes import PlaneFitError
 from glassplat.panes.fit import fit_planes
 

@@ -1,4 +1,4 @@
-"""Files written completely or not at all, the folders for them, and tables as markdown."""
+"""Files written completely or not at all, the folders for them, and the formats of splats."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import importlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from uuid import uuid4
 
@@ -19,8 +18,8 @@ SPLAT_WRITERS = {
     "ply": "glassplat.files.ply:write_gaussians",
     "spz": "glassplat.files.spz:write_spz",
     "glb": "glassplat.files.glb:write_glb",
-    "sog": "glassplat.files.gaussforge:write_forged",
-    "ksplat": "glassplat.files.gaussforge:write_forged",
+    "sog": "glassplat.files.scene_folder:write_forged",
+    "ksplat": "glassplat.files.scene_folder:write_forged",
 }
 """Formats that Gaussians are written in, by suffix: the function `(path, gaussians)` of each, imported when needed."""
 WRITTEN = (*SPLAT_WRITERS, "html")
@@ -148,42 +147,9 @@ def real_path(path: Path) -> Path:
     return Path(os.path.realpath(path))
 
 
-@dataclass
-class Table:
-    """A titled table that is filled row by row."""
-
-    title: str
-    columns: tuple[str, ...]
-    note: str = ""
-    rows: list[tuple[str, ...]] = field(default_factory=list)
-
-    def add(self, *cells: object) -> None:
-        """Adds a row; numbers are shown with three significant digits."""
-        if len(cells) != len(self.columns):
-            raise ValueError(f"a row of {len(cells)} cells for the columns {self.columns}")
-        self.rows.append(tuple(shown(cell) for cell in cells))
-
-    def markdown(self) -> str:
-        """The table as markdown."""
-        lines = [f"### {self.title}", ""]
-        if self.note:
-            lines += [self.note, ""]
-        lines += [_line(self.columns), _line(["---"] * len(self.columns)), *(_line(row) for row in self.rows)]
-        return "\n".join(lines) + "\n"
-
-
-def shown(cell: object) -> str:
-    """A cell's text."""
-    return f"{cell:.3g}" if isinstance(cell, float) else str(cell)
-
-
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
 def scene_source(path: Path) -> Path:
     """The splats in a folder that `glassplat export` wrote, the most exact of its files; any other path as it is."""
     if (path / "recipe.json").is_file():
         return path
-    suffixes = (".ply", ".glb", ".spz", *FORGED_SUFFIXES)
-    return next((file for suffix in suffixes if (file := path / f"scene{suffix}").is_file()), path)
+    kinds = dict.fromkeys(("ply", "glb", *SPLAT_WRITERS))
+    return next((file for kind in kinds if (file := path / f"scene.{kind}").is_file()), path)

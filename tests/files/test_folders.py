@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from glassplat.files.writing import check_folder, make_folder
+from glassplat.files.writing import SPLAT_WRITERS, check_folder, make_folder, scene_source
 
 
 @pytest.mark.parametrize("name", ["new", "new/below/it", "there", "link"])
@@ -42,3 +42,12 @@ def test_a_folder_that_may_not_be_written_is_refused(tmp_path: Path, monkeypatch
     with pytest.raises(PermissionError, match="nothing may be written"):
         make_folder(tmp_path / "new")
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("kind", [*SPLAT_WRITERS, "new"])
+def test_a_folder_that_export_wrote_holds_a_scene_whatever_its_format(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(SPLAT_WRITERS, "new", "somewhere:write")
+    (tmp_path / f"scene.{kind}").touch()
+    assert scene_source(tmp_path) == tmp_path / f"scene.{kind}"
