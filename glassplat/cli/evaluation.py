@@ -30,7 +30,7 @@ from glassplat.render.planar import Planar, with_photographer
 from glassplat.training.checkpoint import recorded_seconds
 
 if TYPE_CHECKING:
-    from glassplat.cli.evaluate import Align, PaneSource
+    from glassplat.cli.scene import Align, PaneSource
 
 
 def pane_regions(dataset: Dataset, source: PaneSource) -> PaneRegions:

@@ -26,6 +26,8 @@ KINDS = f"a capture, photographs, a video, a run, an exported scene, or a splat 
 """What there is to be found."""
 FEW_VIEWS = 20
 """Photographs, below which more are advised."""
+DETAILS = "glassplat.cli.details"
+"""Imported when something is read that takes PyTorch."""
 
 
 @dataclass
@@ -77,8 +79,7 @@ def capture_finding(path: Path) -> Iterator[Finding]:
     """
     files = read_capture(path)
     yield _first_part(files)
-    details = import_held("glassplat.cli.details")
-    yield from details.remaining_parts(files)
+    yield from import_held(DETAILS).remaining_parts(files)
 
 
 def _first_part(files: CaptureFiles) -> Finding:
@@ -156,9 +157,6 @@ def preparation_finding(path: Path) -> Iterator[Finding]:
     yield finding
 
 
-DETAILS = "glassplat.cli.details"
-
-
 def splat_finding(path: Path) -> Iterator[Finding]:
     """A file of Gaussians.
 
@@ -212,9 +210,6 @@ def export_finding(path: Path) -> Iterator[Finding]:
     yield Finding(next=opened)
 
 
-CAPTURE_DETAILS = "glassplat.cli.details"
-
-
 @dataclass(frozen=True)
 class Info:
     """Say what a folder or file is, whether it is healthy, and what to do next.
@@ -241,7 +236,7 @@ class Info:
                 self._tell_facts(part, console)
             whole.add(part)
         if self.page is not None:
-            import_held(CAPTURE_DETAILS).write_capture_page(self.path, self.page)
+            import_held(DETAILS).write_capture_page(self.path, self.page)
         if self.json:
             say(console, json.dumps({"path": str(self.path), **whole.as_json()}, indent=1))
             return

@@ -35,7 +35,7 @@ COMMANDS = {
         "Mark the panes of a capture in the browser: corners in a few photographs, and what stands before them.",
     ),
     "train": Listed("train", "Train", "Train a scene from photographs."),
-    "eval": Listed("evaluate", "Evaluate", "Measure a run on its test views and write comparison sheets."),
+    "eval": Listed("scene", "Evaluate", "Measure a run on its test views and write comparison sheets."),
     "render": Listed(
         "scene", "Render", "Render the layers of a run from its cameras, with its panes as they are or edited."
     ),

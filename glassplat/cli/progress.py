@@ -9,30 +9,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from glassplat.cli.console import say, warn
 from glassplat.prepare.photographs import Note
 from glassplat.prepare.photographs import Progress as Step
-from glassplat.training.messages import (
-    ActionDone,
-    CheckpointWritten,
-    Message,
-    RunBegun,
-    StageEntered,
-    StepDone,
-    Working,
-)
+from glassplat.training import messages
 
 FIRST_PAUSE, LONGEST_PAUSE = 1.0, 10.0
 """Seconds between two lines: at first, so that a newcomer sees that something happens, and in the end."""
@@ -64,7 +47,7 @@ class Display(Protocol):
         """Shows a step."""
         ...
 
-    def work(self, standing: Standing, work: Working) -> None:
+    def work(self, standing: Standing, work: messages.Working) -> None:
         """Shows how far something is that happens between two steps."""
         ...
 
@@ -87,27 +70,27 @@ class TrainingProgress:
         with suppress(OSError):  # A terminal that was closed must not hide why the run ends.
             self._display.stop()
 
-    def show(self, message: Message) -> None:
+    def show(self, message: messages.Message) -> None:
         """Follows a run's messages."""
         standing = self._standing
-        if isinstance(message, RunBegun):
+        if isinstance(message, messages.RunBegun):
             self._begin(message)
-        elif isinstance(message, StageEntered):
+        elif isinstance(message, messages.StageEntered):
             standing.stage = message.stage
             self._say(f"step {message.step}: stage {message.stage}, {_counted(message.counts)}")
-        elif isinstance(message, ActionDone) and not message.action.startswith(FREQUENT):
+        elif isinstance(message, messages.ActionDone) and not message.action.startswith(FREQUENT):
             self._say(f"step {message.step}: {message.action}")
-        elif isinstance(message, Working):
+        elif isinstance(message, messages.Working):
             self._display.work(standing, message)
-        elif isinstance(message, CheckpointWritten):
+        elif isinstance(message, messages.CheckpointWritten):
             standing.saved = message.step
-        elif isinstance(message, StepDone):
+        elif isinstance(message, messages.StepDone):
             standing.step = message.step
             standing.loss = _smoothed(standing.loss, message.loss)
             standing.count = message.counts["primary"] + message.counts["glass"]
             self._display.step(standing)
 
-    def _begin(self, message: RunBegun) -> None:
+    def _begin(self, message: messages.RunBegun) -> None:
         if message.anew:
             warn(self._console, "an earlier run in this folder was begun and never saved; it is replaced")
         if message.step:
@@ -124,19 +107,19 @@ class StepBar:
     """
 
     def __init__(self, console: Console) -> None:
-        columns: list[ProgressColumn] = [
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("loss {task.fields[loss]:.4f}"),
-            TextColumn("{task.fields[count]} Gaussians"),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(compact=True),
+        columns: list[progress.ProgressColumn] = [
+            progress.TextColumn("{task.description}", markup=False),
+            progress.BarColumn(),
+            progress.MofNCompleteColumn(),
+            progress.TextColumn("loss {task.fields[loss]:.4f}"),
+            progress.TextColumn("{task.fields[count]} Gaussians"),
+            progress.TimeElapsedColumn(),
+            progress.TextColumn("left"),
+            progress.TimeRemainingColumn(compact=True),
         ]
         if console.width >= WIDE:
-            columns.append(TextColumn("{task.fields[saved]}"))
-        self._bar = Progress(*columns, console=console, refresh_per_second=4)
+            columns.append(progress.TextColumn("{task.fields[saved]}"))
+        self._bar = progress.Progress(*columns, console=console, refresh_per_second=4)
         self._begun = False
 
     def step(self, standing: Standing) -> None:
@@ -152,7 +135,7 @@ class StepBar:
         task = self._bar.task_ids[0]
         self._bar.update(task, description=standing.stage, completed=standing.step, **fields)  # type: ignore[arg-type]
 
-    def work(self, standing: Standing, work: Working) -> None:
+    def work(self, standing: Standing, work: messages.Working) -> None:
         """Shows the work in the stage's place; before the first step a line, as errors stood below an empty bar."""
         if self._begun:
             self._bar.update(self._bar.task_ids[0], description=f"{work.what} {work.done}/{work.total}")
@@ -187,7 +170,7 @@ class StepLines:
             f"{left}{saved}",
         )
 
-    def work(self, standing: Standing, work: Working) -> None:
+    def work(self, standing: Standing, work: messages.Working) -> None:
         """Shows the work when it is time for a line, or where there will be no other moment for it."""
         if work.total == 1:
             say(self._console, f"step {standing.step}: {work.what}")
@@ -245,14 +228,22 @@ class WorkProgress:
         self._what = ""
         self._begun = self._shown = 0.0
         self._first = 0
-        self._bar: Progress | None = None
-        self._task: TaskID | None = None
+        self._bar: progress.Progress | None = None
+        self._task: progress.TaskID | None = None
 
     def __enter__(self) -> WorkProgress:
         if self._console.is_terminal:
-            columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn())
-            times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(compact=True))
-            self._bar = Progress(*columns, *times, console=self._console, refresh_per_second=4)
+            columns = (
+                progress.TextColumn("{task.description}", markup=False),
+                progress.BarColumn(),
+                progress.MofNCompleteColumn(),
+            )
+            times = (
+                progress.TimeElapsedColumn(),
+                progress.TextColumn("left"),
+                progress.TimeRemainingColumn(compact=True),
+            )
+            self._bar = progress.Progress(*columns, *times, console=self._console, refresh_per_second=4)
             self._bar.start()
         return self
 
@@ -271,7 +262,7 @@ class WorkProgress:
         else:
             self._show_line(message)
 
-    def _show_bar(self, bar: Progress, step: Step) -> None:
+    def _show_bar(self, bar: progress.Progress, step: Step) -> None:
         if step.what != self._what or self._task is None:
             if self._task is not None:
                 bar.remove_task(self._task)

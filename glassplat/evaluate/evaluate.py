@@ -15,25 +15,7 @@ from torch import Tensor
 from glassplat.captures.dataset import Dataset, detached_camera
 from glassplat.captures.view import View, with_ignored_right
 from glassplat.errors import InputError
-from glassplat.evaluate.metrics import (
-    NO_LPIPS,
-    SMALLEST_REGION,
-    Lpips,
-    Outcome,
-    color_corrected,
-    environment_metrics,
-    json_values,
-    learned_environment,
-    load_lpips,
-    missing_panes,
-    plane_table,
-    psnr,
-    quantized,
-    reflection_gain,
-    ssim,
-    surface_metrics,
-    true_environment,
-)
+from glassplat.evaluate import metrics
 from glassplat.evaluate.truth import GroundTruth, TrueSurface, TrueView, load_truth, true_surface
 from glassplat.kernels.photometric import photometric
 from glassplat.render.frame import Frame, Renderer
@@ -163,8 +145,8 @@ def aligned_camera(scene: Scene, renderer: Renderer, view: View, *, steps: int =
 
 MIRROR_STRENGTH = 0.999
 """From this true strength on, nothing is transmitted."""
-ALL_IGNORED = f"all but fewer than {SMALLEST_REGION} pixels are ignored"
-TOO_FEW = f"fewer than {SMALLEST_REGION} pixels show a pane"
+ALL_IGNORED = f"all but fewer than {metrics.SMALLEST_REGION} pixels are ignored"
+TOO_FEW = f"fewer than {metrics.SMALLEST_REGION} pixels show a pane"
 
 SCENE_COLORS, NEIGHBOURS_COLORS = "the scene's own", "mean of the neighbouring photographs, in the order of names"
 """How test views are taken to be exposed."""
@@ -231,7 +213,7 @@ def _nobody(evaluated: EvaluatedView) -> None:
 class _Measurement:
     """Contribution of one view; `reflection` holds rendered and true pane pixels until the gain is known."""
 
-    metrics: dict[str, Outcome]
+    metrics: dict[str, metrics.Outcome]
     seconds: float
     reflection: tuple[Tensor, Tensor] | str
 
@@ -278,7 +260,7 @@ def evaluate(
     if not dataset.test:
         raise InputError(f"{dataset.root} has no test views; expected at least one image to compare with")
     truth = load_truth(dataset.truth)
-    lpips = load_lpips()
+    lpips = metrics.load_lpips()
     regions = regions or (RenderedRegions() if truth is None else TrueRegions())
     # The first frame may wait for the compiler; it must not count.
     timed_render(renderer, scene, dataset.test[0])
@@ -292,19 +274,21 @@ def evaluate(
         shown = in_photograph_colors(frame, exposures, view.name)
         measured = _measure(shown, seconds, view, pane, truth=(truth, true_view), surface=surface, lpips=lpips)
         measurements[view.name] = measured
-        listen(EvaluatedView(view, frame, true_view, surface, json_values(measured.metrics), exposures))
+        listen(EvaluatedView(view, frame, true_view, surface, metrics.json_values(measured.metrics), exposures))
     gain = _add_reflection(measurements.values())
-    per_view = {name: json_values(m.metrics) | {"seconds": m.seconds} for name, m in measurements.items()}
+    per_view = {name: metrics.json_values(m.metrics) | {"seconds": m.seconds} for name, m in measurements.items()}
     results = _description(scene, dataset)
     results["seconds_per_frame"] = statistics.median(m.seconds for m in measurements.values())
-    results |= json_values({"peak_memory_mib": peak_memory_mib()})
-    results |= json_values(_means([m.metrics for m in measurements.values()]))
-    results |= json_values(environment_metrics(learned_environment(scene), true_environment(dataset.root), lpips))
+    results |= metrics.json_values({"peak_memory_mib": peak_memory_mib()})
+    results |= metrics.json_values(_means([m.metrics for m in measurements.values()]))
+    results |= metrics.json_values(
+        metrics.environment_metrics(metrics.learned_environment(scene), metrics.true_environment(dataset.root), lpips)
+    )
     results |= _footnotes(results, lpips, regions, gain)
     marked = regions.planes if isinstance(regions, MarkedRegions) else None
-    results["planes"] = plane_table(scene.planes, truth, dataset.extent, marked)
+    results["planes"] = metrics.plane_table(scene.planes, truth, dataset.extent, marked)
     if len(scene.planes):
-        results["missing_panes"] = missing_panes(scene.planes, truth)
+        results["missing_panes"] = metrics.missing_panes(scene.planes, truth)
     return Evaluation(results, per_view)
 
 
@@ -328,7 +312,7 @@ def timed_render(renderer: Renderer, scene: Scene, view: View) -> tuple[Frame, f
     return frame, seconds
 
 
-def peak_memory_mib() -> Outcome:
+def peak_memory_mib() -> metrics.Outcome:
     """Largest resident size of this process so far, in MiB, or why it is not known."""
     try:
         import resource  # Windows has none.
@@ -346,48 +330,50 @@ def _measure(
     *,
     truth: Truths,
     surface: TrueSurface | None,
-    lpips: Lpips | str,
+    lpips: metrics.Lpips | str,
 ) -> _Measurement:
     """Every metric of one view except the reflection's, which needs all views."""
     image, photo, counted = frame.photographed, view.photo, None if view.ignored is None else ~view.ignored
     if counted is not None:
         image = with_ignored_right(image, view)
         pane = pane if isinstance(pane, str) else pane & counted
-    metrics: dict[str, Outcome] = {
+    measured: dict[str, metrics.Outcome] = {
         "psnr": _counted_psnr(image, photo, counted),
-        "corrected_psnr": _counted_psnr(color_corrected(image, photo, region=counted), photo, counted),
+        "corrected_psnr": _counted_psnr(metrics.color_corrected(image, photo, region=counted), photo, counted),
         "right_half_psnr": _right_half_psnr(image, photo, counted),
-        "ssim": ssim(image, photo),
-        "lpips": NO_LPIPS if isinstance(lpips, str) else lpips(quantized(image), quantized(photo)),
+        "ssim": metrics.ssim(image, photo),
+        "lpips": metrics.NO_LPIPS
+        if isinstance(lpips, str)
+        else lpips(metrics.quantized(image), metrics.quantized(photo)),
         "pane_psnr": pane if isinstance(pane, str) else _region_psnr(image, photo, pane, TOO_FEW),
         "transmission_psnr": _transmission_psnr(frame, *truth),
-        **surface_metrics(frame, photo, surface),
+        **metrics.surface_metrics(frame, photo, surface),
     }
-    return _Measurement(metrics, seconds, _reflection_pixels(frame, *truth))
+    return _Measurement(measured, seconds, _reflection_pixels(frame, *truth))
 
 
-def _counted_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> Outcome:
+def _counted_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> metrics.Outcome:
     """Of the pixels that are not ignored, if any are."""
-    return psnr(image, photo) if counted is None else _region_psnr(image, photo, counted, ALL_IGNORED)
+    return metrics.psnr(image, photo) if counted is None else _region_psnr(image, photo, counted, ALL_IGNORED)
 
 
-def _right_half_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> Outcome:
+def _right_half_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> metrics.Outcome:
     """Of the right half, in the colours that the left half tells (as is done for NeRF in the Wild)."""
     middle = max(photo.shape[1] // 2, 1)
-    corrected = color_corrected(image, photo, slice(0, middle), counted)
+    corrected = metrics.color_corrected(image, photo, slice(0, middle), counted)
     right = slice(middle - 1, None)
     return _counted_psnr(corrected[:, right], photo[:, right], None if counted is None else counted[:, right])
 
 
-def _region_psnr(image: Tensor, target: Tensor, region: Tensor, reason: str) -> Outcome:
-    return psnr(image, target, region) if int(region.sum()) >= SMALLEST_REGION else reason
+def _region_psnr(image: Tensor, target: Tensor, region: Tensor, reason: str) -> metrics.Outcome:
+    return metrics.psnr(image, target, region) if int(region.sum()) >= metrics.SMALLEST_REGION else reason
 
 
-def _transmission_psnr(frame: Frame, truth: GroundTruth | None, true_view: TrueView | None) -> Outcome:
+def _transmission_psnr(frame: Frame, truth: GroundTruth | None, true_view: TrueView | None) -> metrics.Outcome:
     if true_view is None:
         return NO_TRUTH if truth is None else NO_VIEW_TRUTH
     pane = true_view.labels > 0
-    reason = "the pane is a mirror, which transmits nothing" if int(pane.sum()) >= SMALLEST_REGION else TOO_FEW
+    reason = "the pane is a mirror, which transmits nothing" if int(pane.sum()) >= metrics.SMALLEST_REGION else TOO_FEW
     image = frame.layers.get("transmission", frame.rgb)
     return _region_psnr(image, true_view.transmission, pane & (true_view.strength < MIRROR_STRENGTH), reason)
 
@@ -401,7 +387,7 @@ def _reflection_pixels(
     if true_view is None:
         return NO_TRUTH if truth is None else NO_VIEW_TRUTH
     pane = true_view.labels > 0
-    if int(pane.sum()) < SMALLEST_REGION:
+    if int(pane.sum()) < metrics.SMALLEST_REGION:
         return TOO_FEW
     return frame.layers["reflection"][pane], true_view.reflection[pane].to(torch.float32) / 255
 
@@ -410,21 +396,21 @@ def _add_reflection(measurements: Iterable[_Measurement]) -> float | None:
     """Adds `reflection_psnr` to every view's metrics; returns the scene's gain, None without reflections."""
     measurements = list(measurements)
     pairs = [m.reflection for m in measurements if not isinstance(m.reflection, str)]
-    gain = reflection_gain([image for image, _ in pairs], [target for _, target in pairs])
+    gain = metrics.reflection_gain([image for image, _ in pairs], [target for _, target in pairs])
     for measurement in measurements:
         if isinstance(measurement.reflection, str):
             measurement.metrics["reflection_psnr"] = measurement.reflection
         else:
             image, target = measurement.reflection
-            measurement.metrics["reflection_psnr"] = psnr(gain * image, target)
+            measurement.metrics["reflection_psnr"] = metrics.psnr(gain * image, target)
     return gain if pairs else None
 
 
-def _means(per_view: list[dict[str, Outcome]]) -> dict[str, Outcome]:
+def _means(per_view: list[dict[str, metrics.Outcome]]) -> dict[str, metrics.Outcome]:
     """Mean of every metric over the views that have it, or all reasons why none has."""
-    means: dict[str, Outcome] = {}
+    means: dict[str, metrics.Outcome] = {}
     for name in per_view[0]:
-        outcomes = [metrics[name] for metrics in per_view]
+        outcomes = [of_view[name] for of_view in per_view]
         values = [outcome for outcome in outcomes if not isinstance(outcome, str)]
         reasons = dict.fromkeys(outcome for outcome in outcomes if isinstance(outcome, str))
         means[name] = statistics.fmean(values) if values else "; ".join(reasons)
@@ -446,16 +432,16 @@ def _description(scene: Scene, dataset: Dataset) -> dict[str, Any]:
 
 
 def _footnotes(
-    results: Mapping[str, Any], lpips: Lpips | str, regions: PaneRegions, gain: float | None
+    results: Mapping[str, Any], lpips: metrics.Lpips | str, regions: PaneRegions, gain: float | None
 ) -> dict[str, Any]:
     """Footnotes of the metrics: backbone, region, gain."""
     if isinstance(lpips, str):
-        backbone = json_values({"lpips": lpips, "lpips_backbone": lpips})
+        backbone = metrics.json_values({"lpips": lpips, "lpips_backbone": lpips})
     else:
         backbone = {"lpips_backbone": lpips.backbone}
     if results["pane_psnr"] is None:
-        region = json_values({"pane_region": results["pane_psnr_reason"]})
+        region = metrics.json_values({"pane_region": results["pane_psnr_reason"]})
     else:
         region = {"pane_region": regions.source}
     gain_outcome = results["reflection_psnr_reason"] if gain is None else gain
-    return backbone | region | json_values({"reflection_gain": gain_outcome})
+    return backbone | region | metrics.json_values({"reflection_gain": gain_outcome})

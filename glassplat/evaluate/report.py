@@ -14,17 +14,8 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from glassplat.captures.dataset import Dataset
+from glassplat.evaluate import metrics
 from glassplat.evaluate.evaluate import EvaluatedView
-from glassplat.evaluate.metrics import (
-    METRICS,
-    PLANE_COLUMNS,
-    SURFACE_METRICS,
-    Metric,
-    missing_reasons,
-    quantized,
-    shown_metrics,
-    written,
-)
 from glassplat.evaluate.truth import NOTHING_KNOWN, TrueSurface, TrueView
 from glassplat.files.images import flat_picture_names, write_image
 from glassplat.files.writing import atomic_write
@@ -224,7 +215,7 @@ def _panel_size(width: int, height: int) -> tuple[int, int]:
 
 
 def _draw_panel(canvas: Image.Image, panel: Panel, corner: tuple[int, int], size: tuple[int, int]) -> None:
-    picture = Image.fromarray(quantized(panel.image).contiguous().numpy())
+    picture = Image.fromarray(metrics.quantized(panel.image).contiguous().numpy())
     if picture.size != size:
         grows = size[0] > picture.width
         picture = picture.resize(size, Image.Resampling.NEAREST if grows else Image.Resampling.LANCZOS)
@@ -266,7 +257,10 @@ class Uses:
         row = [
             Panel(f"photograph {evaluated.view.name}", photo),
             Panel("without reflections (glassplat dereflect)", plain),
-            Panel("pane as a mirror (glassplat render --as-mirror)", quantized(as_mirror_image(frame, self._blend))),
+            Panel(
+                "pane as a mirror (glassplat render --as-mirror)",
+                metrics.quantized(as_mirror_image(frame, self._blend)),
+            ),
         ]
         self._rows = sorted([*self._rows, (share, row)], key=lambda kept: -kept[0])[:MOST_VIEWS]
 
@@ -369,7 +363,7 @@ def _settings_line(results: Mapping[str, Any]) -> str:
 
 def _cards(results: Mapping[str, Any]) -> str:
     cards = []
-    for name, metric in shown_metrics(results).items():
+    for name, metric in metrics.shown_metrics(results).items():
         told = metric.meaning if results[name] is not None else results.get(f"{name}_reason") or ""
         value = _formatted(results[name], metric.pattern)
         cards.append(f'<div title="{_escaped(told)}"><b>{value}</b><span>{metric.label}</span></div>')
@@ -378,37 +372,39 @@ def _cards(results: Mapping[str, Any]) -> str:
 
 def _missing(results: Mapping[str, Any]) -> str:
     """Reasons for the dashes among the metrics."""
-    metrics = shown_metrics(results)
+    known = metrics.shown_metrics(results)
     lines = [
-        f"<p>Not measured: <b>{_escaped('; '.join(metrics[name].label for name in names))}</b>: {_escaped(reason)}</p>"
-        for reason, names in missing_reasons(results).items()
+        f"<p>Not measured: <b>{_escaped('; '.join(known[name].label for name in names))}</b>: {_escaped(reason)}</p>"
+        for reason, names in metrics.missing_reasons(results).items()
     ]
     return f'<div class="settings">{"".join(lines)}</div>' if lines else ""
 
 
 def _meanings(results: Mapping[str, Any]) -> str:
     """Meanings of the numbers, at the end of the page."""
-    planes = PLANE_COLUMNS if results.get("planes") else {}
-    parts = [f"<dl>{_defined(shown_metrics(results))}</dl>"]
+    planes = metrics.PLANE_COLUMNS if results.get("planes") else {}
+    parts = [f"<dl>{_defined(metrics.shown_metrics(results))}</dl>"]
     if planes:
         parts.append(f"<p>Of each pane:</p><dl>{_defined(planes)}</dl>")
     return f'<section class="meanings"><h2>What the numbers mean</h2>{"".join(parts)}</section>'
 
 
-def _defined(metrics: Mapping[str, Metric]) -> str:
-    return "".join(f"<dt>{_escaped(m.label)}</dt><dd>{_escaped(m.meaning)}</dd>" for m in metrics.values())
+def _defined(known: Mapping[str, metrics.Metric]) -> str:
+    return "".join(f"<dt>{_escaped(m.label)}</dt><dd>{_escaped(m.meaning)}</dd>" for m in known.values())
 
 
 def _plane_table(planes: list[Mapping[str, Any]]) -> str:
     if not planes:
         return ""
-    columns = {n: column for n, column in PLANE_COLUMNS.items() if any(plane.get(n) is not None for plane in planes)}
+    columns = {
+        n: column for n, column in metrics.PLANE_COLUMNS.items() if any(plane.get(n) is not None for plane in planes)
+    }
     rows = [[_formatted(plane.get(name), column.pattern) for name, column in columns.items()] for plane in planes]
     return _table([column.label for column in columns.values()], rows)
 
 
 def _view_table(per_view: Mapping[str, Mapping[str, Any]], sheets: Mapping[str, str]) -> str:
-    columns = METRICS | SURFACE_METRICS
+    columns = metrics.METRICS | metrics.SURFACE_METRICS
     shown = {n: column for n, column in columns.items() if any(row.get(n) is not None for row in per_view.values())}
     rows = [
         [_link(name, sheets), *(_formatted(row.get(metric), column.pattern) for metric, column in shown.items())]
@@ -434,13 +430,15 @@ def _figure(name: str, path: str, description: str) -> str:
     )
 
 
-def _metrics_line(metrics: Mapping[str, Any]) -> str:
-    known = {n: metric for n, metric in (METRICS | SURFACE_METRICS).items() if metrics.get(n) is not None}
-    return "    ".join(f"{metric.label} {_formatted(metrics[n], metric.pattern)}" for n, metric in known.items())
+def _metrics_line(values: Mapping[str, Any]) -> str:
+    known = {
+        n: metric for n, metric in (metrics.METRICS | metrics.SURFACE_METRICS).items() if values.get(n) is not None
+    }
+    return "    ".join(f"{metric.label} {_formatted(values[n], metric.pattern)}" for n, metric in known.items())
 
 
 def _formatted(value: object, pattern: str) -> str:
-    return _escaped(written(value, pattern))
+    return _escaped(metrics.written(value, pattern))
 
 
 def _escaped(value: object) -> str:

@@ -22,23 +22,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from glassplat.files import records
 from glassplat.files.ply import CHANNEL_PREFIXES, is_channel
-from glassplat.files.records import (
-    LARGEST_TEXT,
-    ByName,
-    Choice,
-    Field,
-    Flag,
-    Items,
-    Number,
-    Optional,
-    Text,
-    Whole,
-    checked,
-    parse_json,
-    reading,
-    shown,
-)
 from glassplat.files.writing import atomic_write
 from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.kernels.project.reference import sh_basis
@@ -74,32 +59,35 @@ COMPONENTS: dict[int, str] = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2"
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 MOST_BYTES = 2**32 - 1
 
-INDEX = Whole(0, 2**31)
-ACCESSOR: dict[str, Field] = {
+INDEX = records.Whole(0, 2**31)
+ACCESSOR: dict[str, records.Field] = {
     "bufferView": INDEX,
-    "byteOffset": Optional(Whole(0, MOST_BYTES), 0),
-    "componentType": Choice(tuple(COMPONENTS)),
-    "normalized": Optional(Flag(), False),
-    "count": Whole(1, MOST_BYTES),
-    "type": Choice(tuple(WIDTHS)),
+    "byteOffset": records.Optional(records.Whole(0, MOST_BYTES), 0),
+    "componentType": records.Choice(tuple(COMPONENTS)),
+    "normalized": records.Optional(records.Flag(), False),
+    "count": records.Whole(1, MOST_BYTES),
+    "type": records.Choice(tuple(WIDTHS)),
 }
-VIEW: dict[str, Field] = {
-    "buffer": Whole(0, 0),
-    "byteOffset": Optional(Whole(0, MOST_BYTES), 0),
-    "byteLength": Whole(1, MOST_BYTES),
-    "byteStride": Optional(Whole(4, 252)),
+VIEW: dict[str, records.Field] = {
+    "buffer": records.Whole(0, 0),
+    "byteOffset": records.Optional(records.Whole(0, MOST_BYTES), 0),
+    "byteLength": records.Whole(1, MOST_BYTES),
+    "byteStride": records.Optional(records.Whole(4, 252)),
 }
-NODE: dict[str, Field] = {
-    "mesh": Optional(INDEX),
-    "children": Optional(Items(INDEX), ()),
-    "matrix": Optional(Items(Number(-1e12, 1e12), 16)),
-    "translation": Optional(Items(Number(-1e12, 1e12), 3), (0.0, 0.0, 0.0)),
-    "rotation": Optional(Items(Number(-1.01, 1.01), 4), (0.0, 0.0, 0.0, 1.0)),
-    "scale": Optional(Items(Number(-1e12, 1e12), 3), (1.0, 1.0, 1.0)),
+NODE: dict[str, records.Field] = {
+    "mesh": records.Optional(INDEX),
+    "children": records.Optional(records.Items(INDEX), ()),
+    "matrix": records.Optional(records.Items(records.Number(-1e12, 1e12), 16)),
+    "translation": records.Optional(records.Items(records.Number(-1e12, 1e12), 3), (0.0, 0.0, 0.0)),
+    "rotation": records.Optional(records.Items(records.Number(-1.01, 1.01), 4), (0.0, 0.0, 0.0, 1.0)),
+    "scale": records.Optional(records.Items(records.Number(-1e12, 1e12), 3), (1.0, 1.0, 1.0)),
 }
-PRIMITIVE: dict[str, Field] = {"attributes": ByName(INDEX), "mode": Optional(Whole(0, 6), 4)}
-SCENE: dict[str, Field] = {"nodes": Optional(Items(INDEX), ())}
-ASSET: dict[str, Field] = {"version": Text()}
+PRIMITIVE: dict[str, records.Field] = {
+    "attributes": records.ByName(INDEX),
+    "mode": records.Optional(records.Whole(0, 6), 4),
+}
+SCENE: dict[str, records.Field] = {"nodes": records.Optional(records.Items(INDEX), ())}
+ASSET: dict[str, records.Field] = {"version": records.Text()}
 
 
 class GltfWriter:
@@ -159,15 +147,15 @@ class GltfReader:
             FileNotFoundError: there is no such file.
             ValueError: another kind of file, another version, damaged or cut off, or without a document.
         """
-        with reading(path):
+        with records.reading(path):
             data = path.read_bytes()
         self.path, self.size = path, len(data)
         text, self._buffer = _chunks(data, path)
-        document = parse_json(text, str(path))
+        document = records.parse_json(text, str(path))
         if not isinstance(document, dict):
-            raise ValueError(f"{path} holds {shown(document)}; expected a glTF document")
+            raise ValueError(f"{path} holds {records.shown(document)}; expected a glTF document")
         self.document: dict[str, Any] = document
-        version = checked(document.get("asset"), ASSET, f"asset of {path}")["version"]
+        version = records.checked(document.get("asset"), ASSET, f"asset of {path}")["version"]
         if version.partition(".")[0] != str(VERSION):
             raise ValueError(f"{path} is glTF of version {version}; expected 2.0: export it again")
 
@@ -175,12 +163,12 @@ class GltfReader:
         """The list of that name in the document; empty where there is none."""
         found = self.document.get(kind, [])
         if not isinstance(found, list):
-            raise ValueError(f"{kind} of {self.path} is {shown(found)}; expected a list")
+            raise ValueError(f"{kind} of {self.path} is {records.shown(found)}; expected a list")
         return found
 
-    def entry(self, kind: str, index: int, fields: Mapping[str, Field]) -> dict[str, Any]:
+    def entry(self, kind: str, index: int, fields: Mapping[str, records.Field]) -> dict[str, Any]:
         """The checked fields of one entry of a list."""
-        return checked(self.raw(kind, index), fields, f"entry {index} of {kind} in {self.path}")
+        return records.checked(self.raw(kind, index), fields, f"entry {index} of {kind} in {self.path}")
 
     def raw(self, kind: str, index: int) -> dict[str, Any]:
         """One entry of a list as it is; its extensions are nobody else's to check."""
@@ -229,7 +217,7 @@ def _chunks(data: bytes, path: Path) -> tuple[str, bytes]:
         raise ValueError(f"{path} is a GLB of version {version}; expected 2: export it again")
     size, kind = CHUNK.unpack_from(data, HEADER.size)
     start = HEADER.size + CHUNK.size
-    if announced > len(data) or kind != JSON_CHUNK or not 0 < size <= min(announced - start, LARGEST_TEXT):
+    if announced > len(data) or kind != JSON_CHUNK or not 0 < size <= min(announced - start, records.LARGEST_TEXT):
         raise ValueError(
             f"{path} announces {announced} bytes, {size} of them its document, but has {len(data)}; it is cut off or "
             "damaged"
@@ -359,10 +347,10 @@ POINTS = 0
 ROTATION, SCALE, OPACITY = (f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))
 CHANNEL = "_GLASSPLAT_"
 """glTF leaves names that begin with an underscore to applications."""
-SPLATS: dict[str, Field] = {
-    "kernel": Choice(("ellipse",)),
-    "colorSpace": Optional(Choice(("srgb_rec709_display",)), "srgb_rec709_display"),
-    "projection": Optional(Choice(("perspective",)), "perspective"),
+SPLATS: dict[str, records.Field] = {
+    "kernel": records.Choice(("ellipse",)),
+    "colorSpace": records.Optional(records.Choice(("srgb_rec709_display",)), "srgb_rec709_display"),
+    "projection": records.Optional(records.Choice(("perspective",)), "perspective"),
 }
 """What the renderers here can draw; how a viewer sorts is its own affair."""
 HIGHEST_DEGREE = 3
@@ -414,13 +402,13 @@ def read_glb(path: Path | str) -> Gaussians:
     """
     file = GltfReader(Path(path))
     found: list[Gaussians] = []
-    shown = 0
+    count = 0
     for mesh, placement in _placed_meshes(file):
         for index, primitive in enumerate(_splat_primitives(file, mesh)):
-            shown += file.count(primitive.get("POSITION", 0))
-            if shown > max(PLAIN_COUNT, file.size / BYTES_PER_GAUSSIAN):
+            count += file.count(primitive.get("POSITION", 0))
+            if count > max(PLAIN_COUNT, file.size / BYTES_PER_GAUSSIAN):
                 raise ValueError(
-                    f"{path} shows {shown} Gaussians out of {file.size} bytes; no scene does: it is damaged"
+                    f"{path} shows {count} Gaussians out of {file.size} bytes; no scene does: it is damaged"
                 )
             where = f"primitive {index} of mesh {mesh} in {path}"
             found.append(placed(_read_primitive(file, primitive, where), placement))
@@ -502,12 +490,12 @@ def _splat_primitives(file: GltfReader, mesh: int) -> list[dict[str, int]]:
         raise ValueError(f"{where} has no list of primitives; the file is damaged")
     found = []
     for index, entry in enumerate(primitives):
-        primitive = checked(entry, PRIMITIVE, f"primitive {index} of {where}")
+        primitive = records.checked(entry, PRIMITIVE, f"primitive {index} of {where}")
         extensions = entry.get("extensions")
         if not isinstance(extensions, dict) or EXTENSION not in extensions:
             continue
         splats = extensions[EXTENSION]
-        checked(splats, SPLATS, f"{EXTENSION} of primitive {index} of {where}")
+        records.checked(splats, SPLATS, f"{EXTENSION} of primitive {index} of {where}")
         packed = splats.get("extensions") if isinstance(splats, dict) else None
         if packed or primitive["mode"] != POINTS:
             raise ValueError(f"the splats of {where} are packed by {packed or 'no points'}; expected them as they are")

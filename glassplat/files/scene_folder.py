@@ -1,44 +1,23 @@
-"""Scenes as folders, and splat files of any format."""
+"""Scenes as folders, and splat files of any format; SOG and KSPLAT by way of gaussforge, an extra."""
 
 from __future__ import annotations
 
 import json
 import math
 import os
+import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from glassplat.files.gaussforge import read_forged
+from glassplat.files import records, sidecars
 from glassplat.files.glb import MAGIC, read_glb
 from glassplat.files.ply import is_compressed, read_compressed, read_gaussians, write_gaussians
 from glassplat.files.ply_table import read_table
-from glassplat.files.records import (
-    LARGEST_COORDINATE,
-    Choice,
-    Field,
-    Items,
-    Nullable,
-    Number,
-    Optional,
-    Whole,
-    checked,
-    read_json,
-    reading,
-)
-from glassplat.files.sidecars import (
-    read_environment,
-    read_exposures,
-    read_planes,
-    read_poses,
-    write_environment,
-    write_exposures,
-    write_planes,
-    write_poses,
-)
 from glassplat.files.spz import GZIP, read_spz
 from glassplat.files.writing import FORGED_SUFFIXES, SCENE, SPLAT_SUFFIXES, atomic_write
 from glassplat.scene import SH_ZERO
@@ -53,18 +32,18 @@ FILES = (PRIMARY, GLASS, PLANES, ENVIRONMENT, SURROUNDINGS, EXPOSURES, PHOTOGRAP
 LARGEST_COLOR = 1e6
 LARGEST_LOG = 40.0
 """Of a logarithm: its exponential, squared, fits float32."""
-EXTENT = Number(above=1 / LARGEST_COORDINATE, most=4 * LARGEST_COORDINATE)
+EXTENT = records.Number(above=1 / records.LARGEST_COORDINATE, most=4 * records.LARGEST_COORDINATE)
 """World units; the squares of smaller ones do not fit float32 either."""
-SH_DEGREE = Whole(0, 3)
-DIRECTION = Nullable(Items(Number(-1.001, 1.001), 3))
+SH_DEGREE = records.Whole(0, 3)
+DIRECTION = records.Nullable(records.Items(records.Number(-1.001, 1.001), 3))
 UNIT_TOLERANCE = 1e-3
-HEADER: dict[str, Field] = {
+HEADER: dict[str, records.Field] = {
     "extent": EXTENT,
     "active_sh_degree": SH_DEGREE,
-    "surroundings_sh_degree": Optional(SH_DEGREE),
-    "photographer_sh_degree": Optional(SH_DEGREE),
-    "up": Optional(DIRECTION),
-    "files": Optional(Items(Choice(FILES))),
+    "surroundings_sh_degree": records.Optional(SH_DEGREE),
+    "photographer_sh_degree": records.Optional(SH_DEGREE),
+    "up": records.Optional(DIRECTION),
+    "files": records.Optional(records.Items(records.Choice(FILES))),
 }
 """`files` is what the scene consists of, so that one that is lost is missed; folders of earlier versions lack it."""
 
@@ -84,10 +63,10 @@ def write_scene(folder: Path, scene: Scene) -> None:
     write_gaussians(folder / PRIMARY, scene.primary)
     if len(scene.planes):
         write_gaussians(folder / GLASS, scene.glass)
-        write_planes(folder / PLANES, scene.planes)
+        sidecars.write_planes(folder / PLANES, scene.planes)
         files += [GLASS, PLANES]
     if not scene.environment.is_empty:
-        write_environment(folder / ENVIRONMENT, scene.environment)
+        sidecars.write_environment(folder / ENVIRONMENT, scene.environment)
         files += [ENVIRONMENT]
     header = {"extent": scene.extent, "active_sh_degree": scene.primary.active_sh_degree, "files": files}
     if len(scene.surroundings):
@@ -99,10 +78,10 @@ def write_scene(folder: Path, scene: Scene) -> None:
         header |= {"photographer_sh_degree": scene.photographer.active_sh_degree, "up": scene.up}
         files += [PHOTOGRAPHER]
     if len(scene.exposures):
-        write_exposures(folder / EXPOSURES, scene.exposures)
+        sidecars.write_exposures(folder / EXPOSURES, scene.exposures)
         files += [EXPOSURES]
     if len(scene.poses):
-        write_poses(folder / POSES, scene.poses)
+        sidecars.write_poses(folder / POSES, scene.poses)
         files += [POSES]
     with atomic_write(folder / SCENE) as temporary:
         temporary.write_text(json.dumps(header, indent=2) + "\n", encoding="utf-8")
@@ -114,15 +93,15 @@ def read_scene(folder: Path) -> Scene:
     Raises:
         FileNotFoundError, ValueError: a file is missing, truncated or foreign.
     """
-    header = checked(read_json(folder / SCENE), HEADER, str(folder / SCENE))
+    header = records.checked(records.read_json(folder / SCENE), HEADER, str(folder / SCENE))
     for name in header["files"] or ():
         if not os.path.isfile(folder / name):
             raise FileNotFoundError(f"no {name} in {folder}; {SCENE} says that the scene has one: export it again")
     scene = Scene(_colored(folder, PRIMARY, header["active_sh_degree"]), header["extent"])
     if (folder / PLANES).is_file():
-        scene = replace(scene, glass=_glass(folder / GLASS), planes=read_planes(folder / PLANES))
+        scene = replace(scene, glass=_glass(folder / GLASS), planes=sidecars.read_planes(folder / PLANES))
     if (folder / ENVIRONMENT).is_file():
-        scene = replace(scene, environment=read_environment(folder / ENVIRONMENT))
+        scene = replace(scene, environment=sidecars.read_environment(folder / ENVIRONMENT))
     if (folder / SURROUNDINGS).is_file():
         scene = replace(scene, surroundings=_colored(folder, SURROUNDINGS, header["surroundings_sh_degree"]))
     if (folder / PHOTOGRAPHER).is_file():
@@ -131,9 +110,9 @@ def read_scene(folder: Path) -> Scene:
         )
         scene = replace(scene, photographer=photographer, up=direction(header["up"], str(folder / SCENE)))
     if (folder / EXPOSURES).is_file():
-        scene = replace(scene, exposures=read_exposures(folder / EXPOSURES))
+        scene = replace(scene, exposures=sidecars.read_exposures(folder / EXPOSURES))
     if (folder / POSES).is_file():
-        scene = replace(scene, poses=read_poses(folder / POSES))
+        scene = replace(scene, poses=sidecars.read_poses(folder / POSES))
     return scene
 
 
@@ -209,7 +188,7 @@ def read_splats(path: Path | str) -> Gaussians:
         ValueError: another kind of file, or one that is damaged or cut off.
     """
     path = Path(path)
-    with reading(path), path.open("rb") as stream:
+    with records.reading(path), path.open("rb") as stream:
         head = stream.read(4)
     if head[:3] == b"ply":
         table = read_table(path)
@@ -231,7 +210,12 @@ def drawable(gaussians: Gaussians, path: Path | str) -> tuple[Gaussians, int]:
     Raises:
         ValueError: none of them can.
     """
-    bounds = {"means": LARGEST_COORDINATE, "log_scales": LARGEST_LOG, "sh": LARGEST_COLOR, "quats": LARGEST_COLOR}
+    bounds = {
+        "means": records.LARGEST_COORDINATE,
+        "log_scales": LARGEST_LOG,
+        "sh": LARGEST_COLOR,
+        "quats": LARGEST_COLOR,
+    }
     good = ~torch.isnan(gaussians.logit_opacities) & (gaussians.quats.square().sum(1) > 0)
     for name, most in bounds.items():
         values = gaussians.tensors()[name].flatten(1)
@@ -259,7 +243,7 @@ def _read_rows(path: Path) -> Gaussians:
         raise ValueError(
             f"{path} has {size} bytes; expected {SPLAT_ROW.itemsize} per Gaussian: it is cut off, or no .splat"
         )
-    with reading(path):
+    with records.reading(path):
         rows = np.fromfile(path, dtype=SPLAT_ROW)
     shares = torch.from_numpy(rows["color"].astype(np.float32) / 255)
     scales = torch.from_numpy(rows["scale"].astype(np.float32))
@@ -270,3 +254,53 @@ def _read_rows(path: Path) -> Gaussians:
         logit_opacities=torch.logit(shares[:, 3].clamp(0.5 / 255, 1 - 0.5 / 255)),
         sh=((shares[:, None, :3] - 0.5) / SH_ZERO).contiguous(),
     )
+
+
+def read_forged(path: Path) -> Gaussians:
+    """Reads a .sog (PlayCanvas) or .ksplat (GaussianSplats3D), which are lossy, in the frame of a PLY.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: gaussforge is not installed, or cannot read it.
+    """
+    forge, kind = _forge(path), path.suffix.lower()[1:]
+    with records.reading(path):
+        data = path.read_bytes()
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / "scene.ply"
+        plain.write_bytes(_converted(forge, data, kind, "ply", path))
+        return read_gaussians(plain)
+
+
+def write_forged(path: Path, gaussians: Gaussians) -> None:
+    """Writes a .sog or .ksplat.
+
+    Raises:
+        ValueError: gaussforge is not installed, or cannot write these Gaussians.
+        OSError: the file cannot be written; an older one is unchanged.
+    """
+    forge = _forge(path)
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / "scene.ply"
+        write_gaussians(plain, gaussians)
+        data = _converted(forge, plain.read_bytes(), "ply", path.suffix.lower()[1:], path)
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def _forge(path: Path) -> Any:
+    try:
+        from gaussforge import GaussForge
+    except ImportError as error:
+        raise ValueError(
+            f"{path}: {' and '.join(FORGED_SUFFIXES)} need gaussforge ({error}); pip install 'glassplat[formats]'"
+        ) from error
+    return GaussForge()
+
+
+def _converted(forge: Any, data: bytes, source: str, target: str, path: Path) -> bytes:
+    result = forge.convert(data, source, target)
+    if "data" not in result:
+        raise ValueError(f"gaussforge cannot convert {path} from {source} to {target}: {result.get('error')}")
+    converted: bytes = result["data"]
+    return converted

@@ -19,25 +19,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from glassplat.files import records
 from glassplat.files.images import read_image_float, write_image
-from glassplat.files.records import (
-    COORDINATE,
-    LARGEST_COORDINATE,
-    ByName,
-    Field,
-    Flag,
-    Items,
-    Nullable,
-    Number,
-    Optional,
-    Text,
-    Whole,
-    checked,
-    parse_json,
-    read_json,
-    reading,
-    shown,
-)
 from glassplat.files.writing import atomic_write, make_folder
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 from glassplat.scene.camera import Camera
@@ -91,8 +74,8 @@ def opened_tensors(path: Path, file_format: str, what: str) -> Iterator[TensorsF
         ValueError: the file cannot be read, is truncated or foreign; also if that shows while it is open.
     """
     try:
-        with reading(path), _unicode_name(path) as name, safe_open(name, framework="pt") as file:
-            header = parse_json((file.metadata() or {}).get(HEADER_KEY, "{}"), f"the header of {path}")
+        with records.reading(path), _unicode_name(path) as name, safe_open(name, framework="pt") as file:
+            header = records.parse_json((file.metadata() or {}).get(HEADER_KEY, "{}"), f"the header of {path}")
             if not isinstance(header, dict) or header.get("format") != file_format:
                 found = header.get("format") if isinstance(header, dict) else header
                 raise ValueError(f"{path} has format {found!r}; expected {file_format!r}, as glassplat writes it")
@@ -129,20 +112,20 @@ GLASS_REFLECTANCE = 0.2
 """That learning starts at, where nobody says."""
 LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE = 1e-6, 1.0
 HIGHEST_LABEL = 255
-VECTOR = Items(COORDINATE, 3)
-LOGIT = Number(-1e3, 1e3)
-PLANE: dict[str, Field] = {
-    "label": Whole(1, HIGHEST_LABEL),
-    "mirror": Optional(Flag(), default=False),
+VECTOR = records.Items(records.COORDINATE, 3)
+LOGIT = records.Number(-1e3, 1e3)
+PLANE: dict[str, records.Field] = {
+    "label": records.Whole(1, HIGHEST_LABEL),
+    "mirror": records.Optional(records.Flag(), default=False),
     "center": VECTOR,
     "normal": VECTOR,
     "tangent": VECTOR,
-    "half_sizes": Items(Number(LEAST_HALF_SIZE, LARGEST_COORDINATE), 2),
-    "base_reflectance": Optional(Number(0, 1), default=GLASS_REFLECTANCE),
-    "raw_normal": Optional(VECTOR),
-    "logit_reflectance": Optional(LOGIT),
-    "transmittance": Optional(Items(Number(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE), 3)),
-    "log_transmittance": Optional(Items(LOGIT, 3)),
+    "half_sizes": records.Items(records.Number(LEAST_HALF_SIZE, records.LARGEST_COORDINATE), 2),
+    "base_reflectance": records.Optional(records.Number(0, 1), default=GLASS_REFLECTANCE),
+    "raw_normal": records.Optional(VECTOR),
+    "logit_reflectance": records.Optional(LOGIT),
+    "transmittance": records.Optional(records.Items(records.Number(LEAST_TRANSMITTANCE, LARGEST_TRANSMITTANCE), 3)),
+    "log_transmittance": records.Optional(records.Items(LOGIT, 3)),
 }
 
 
@@ -228,16 +211,16 @@ def _finite(value: Any) -> bool:
 def _load_entries(path: Path) -> list[Any]:
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no planes file at {path}; expected the planes.json of a run")
-    entries = read_json(path)
+    entries = records.read_json(path)
     if not isinstance(entries, list):
-        raise ValueError(f"{path} holds {shown(entries)}; expected a list with one object per plane")
+        raise ValueError(f"{path} holds {records.shown(entries)}; expected a list with one object per plane")
     return entries
 
 
 def _checked_entry(entry: Any, index: int, path: Path) -> dict[str, Any]:
     """One plane whose rectangle has a direction and an area."""
     where = f"plane {index} in {path}"
-    plane = checked(entry, PLANE, where)
+    plane = records.checked(entry, PLANE, where)
     normal, tangent = (torch.tensor(plane[key], dtype=torch.float64) for key in ("normal", "tangent"))
     for key, vector in (("normal", normal), ("tangent", tangent)):
         if float(vector.norm()) < LEAST_LENGTH:
@@ -286,17 +269,17 @@ def _log_transmittance(entry: Mapping[str, Any]) -> Tensor:
 
 
 LARGEST_SIDE = 2**17
-FOCAL = Number(above=0, most=1e9)
-CAMERA: dict[str, Field] = {
-    "img_name": Text(),
-    "width": Whole(1, LARGEST_SIDE),
-    "height": Whole(1, LARGEST_SIDE),
-    "position": Items(COORDINATE, 3),
-    "rotation": Items(Items(Number(-1.01, 1.01), 3), 3),
+FOCAL = records.Number(above=0, most=1e9)
+CAMERA: dict[str, records.Field] = {
+    "img_name": records.Text(),
+    "width": records.Whole(1, LARGEST_SIDE),
+    "height": records.Whole(1, LARGEST_SIDE),
+    "position": records.Items(records.COORDINATE, 3),
+    "rotation": records.Items(records.Items(records.Number(-1.01, 1.01), 3), 3),
     "fx": FOCAL,
     "fy": FOCAL,
-    "cx": Optional(COORDINATE),
-    "cy": Optional(COORDINATE),
+    "cx": records.Optional(records.COORDINATE),
+    "cy": records.Optional(records.COORDINATE),
 }
 LARGEST_SHEAR = 1e-3
 """Of a rotation: how far its rows may be from unit vectors at right angles."""
@@ -325,14 +308,14 @@ def read_cameras(path: Path | str) -> list[tuple[str, Camera]]:
         ValueError: not a list of cameras, a missing or malformed value, or a matrix that is no rotation.
     """
     path = Path(path)
-    entries = read_json(path)
+    entries = records.read_json(path)
     if not isinstance(entries, list):
-        raise ValueError(f"{path} holds {shown(entries)}; expected a list with one object per camera")
+        raise ValueError(f"{path} holds {records.shown(entries)}; expected a list with one object per camera")
     return [_camera(entry, f"camera {index} in {path}") for index, entry in enumerate(entries, start=1)]
 
 
 def _camera(entry: Any, where: str) -> tuple[str, Camera]:
-    values = checked(entry, CAMERA, where)
+    values = records.checked(entry, CAMERA, where)
     rotation = torch.tensor(values["rotation"], dtype=torch.float64).T
     shear = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
     if float(shear) > LARGEST_SHEAR or float(torch.linalg.det(rotation)) < 0:
@@ -367,7 +350,7 @@ def write_by_photograph(path: Path, names: Sequence[str], values: Tensor) -> Non
         temporary.write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
 
 
-def read_by_photograph(path: Path, entry: Field, shape: tuple[int, ...]) -> tuple[tuple[str, ...], Tensor]:
+def read_by_photograph(path: Path, entry: records.Field, shape: tuple[int, ...]) -> tuple[tuple[str, ...], Tensor]:
     """Names of N photographs and the float32 values [N, *shape] that `write_by_photograph` wrote.
 
     Args:
@@ -378,12 +361,12 @@ def read_by_photograph(path: Path, entry: Field, shape: tuple[int, ...]) -> tupl
     Raises:
         FileNotFoundError, ValueError: the file is missing or foreign; says what is wrong.
     """
-    entries = ByName(entry).read(read_json(path), str(path))
+    entries = records.ByName(entry).read(records.read_json(path), str(path))
     return tuple(entries), torch.tensor(list(entries.values()), dtype=torch.float32).reshape(len(entries), *shape)
 
 
 LARGEST_ENTRY = 1e3
-TRANSFORM = Items(Items(Number(-LARGEST_ENTRY, LARGEST_ENTRY), 4), 3)
+TRANSFORM = records.Items(records.Items(records.Number(-LARGEST_ENTRY, LARGEST_ENTRY), 4), 3)
 
 
 def write_exposures(path: Path, exposures: Exposures) -> None:
@@ -402,7 +385,7 @@ def read_exposures(path: Path) -> Exposures:
 
 
 LARGEST_TWIST = 1e2
-TWIST = Items(Number(-LARGEST_TWIST, LARGEST_TWIST), 6)
+TWIST = records.Items(records.Number(-LARGEST_TWIST, LARGEST_TWIST), 6)
 
 
 def write_poses(path: Path, poses: PoseCorrections) -> None:
@@ -464,7 +447,7 @@ def _write(path: Path, lines: list[str]) -> None:
 
 
 FORMAT = "glassplat-environment-1"
-REGION = Nullable(Items(COORDINATE, 4))
+REGION = records.Nullable(records.Items(records.COORDINATE, 4))
 """Centre and radius of the sphere that holds all that mirrors the environment."""
 
 
@@ -488,7 +471,7 @@ def read_environment(path: Path | str) -> Environment:
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no environment at {path}; expected the environment.safetensors of a run")
     with opened_tensors(path, FORMAT, "an environment") as file:
-        region = checked(file.header, {"region": Optional(REGION)}, f"the header of {path}")["region"]
+        region = records.checked(file.header, {"region": records.Optional(REGION)}, f"the header of {path}")["region"]
         raw = file.tensors().get("raw")
     if raw is None or not (raw.is_floating_point() and bool(torch.isfinite(raw).all())):
         raise ValueError(f"{path} holds no tensor `raw` of finite numbers; expected the texels of an environment")

@@ -19,20 +19,11 @@ from torch import Tensor
 
 from glassplat.captures.dataset import Dataset, with_corrected_cameras
 from glassplat.errors import InputError, first_names, input_checked
+from glassplat.files import writing
 from glassplat.files.ply import read_gaussians, write_gaussians
 from glassplat.files.records import read_text
 from glassplat.files.scene_folder import drawable, read_splats
 from glassplat.files.sidecars import read_cameras, read_planes, write_cameras, write_equirect, write_planes
-from glassplat.files.writing import (
-    SPLAT_SUFFIXES,
-    SPLAT_WRITERS,
-    WRITTEN,
-    atomic_write,
-    make_folder,
-    real_path,
-    scene_source,
-    splat_writer,
-)
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.recipe import recipe_to_json, with_background
@@ -391,21 +382,21 @@ def save_model(model: Savable, path: Path, *, overwrite: bool) -> Path:
     kind = path.suffix.lower().removeprefix(".")
     if not kind:
         return save_folder(model, path)
-    if kind not in WRITTEN:
-        endings = ", ".join(f".{known}" for known in WRITTEN)
+    if kind not in writing.WRITTEN:
+        endings = ", ".join(f".{known}" for known in writing.WRITTEN)
         raise InputError(f"{path}: expected a name that ends in {endings}, or a folder's")
-    beside = [path.with_name(name) for name in (PLANES, GLASS, CAMERAS)] if kind in SPLAT_WRITERS else []
+    beside = [path.with_name(name) for name in (PLANES, GLASS, CAMERAS)] if kind in writing.SPLAT_WRITERS else []
     found = [str(target) for target in (path, *beside) if target.exists()]
     if found and not overwrite:
         raise FileExistsError(
             f"{first_names(found)} is already there; nothing was written. Choose another folder, or overwrite=True"
         )
-    make_folder(path.parent)
-    if kind not in SPLAT_WRITERS:
+    writing.make_folder(path.parent)
+    if kind not in writing.SPLAT_WRITERS:
         save_page(model, path, model.name or path.stem)
         return path
     with input_checked():
-        splat_writer(kind)(path, model.scene.primary)
+        writing.splat_writer(kind)(path, model.scene.primary)
     write_beside(path.parent, model.scene)
     if not len(model.scene.planes) and (path.parent / PLANES).exists():
         write_planes(path.parent / PLANES, model.scene.planes)  # Panes of what was there must not be taken for its own.
@@ -450,7 +441,7 @@ def write_environment_files(folder: Path, scene: Scene) -> None:
         "forward": "+x in the middle column, +y left of it",
         "region": environment.region,
     }
-    with atomic_write(folder / ENVIRONMENT) as temporary:
+    with writing.atomic_write(folder / ENVIRONMENT) as temporary:
         temporary.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
 
 
@@ -464,7 +455,7 @@ def write_as_run(folder: Path, model: Savable, source: Path | None) -> None:
         model: what to write.
         source: where the scene was read from, for the record.
     """
-    make_folder(folder)
+    writing.make_folder(folder)
     directory = RunDirectory(folder)
     directory.export(model.scene, step=0)
     write_cameras(folder / CAMERAS, model.cameras.items())
@@ -492,7 +483,7 @@ AXES: dict[str, tuple[int, int, int]] = {
     "x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1),
 }  # fmt: skip
 EXTENT_MARGIN = 1.1
-LOADED = f"a run, a folder of an export, or a splat file ({', '.join(SPLAT_SUFFIXES)})"
+LOADED = f"a run, a folder of an export, or a splat file ({', '.join(writing.SPLAT_SUFFIXES)})"
 """What can be opened."""
 log = logging.getLogger(__name__)
 
@@ -522,7 +513,9 @@ def imported_scene(file: Path, planes_file: Path | None = None, up: Up = "-y") -
         raise InputError(f"{file} holds no Gaussians; expected a trained splat")
     planes = _planes(file, planes_file)
     glass = _glass(
-        file, planes, own=planes_file is None or real_path(planes_file) == real_path(file.with_name("planes.json"))
+        file,
+        planes,
+        own=planes_file is None or writing.real_path(planes_file) == writing.real_path(file.with_name("planes.json")),
     )
     cameras = _cameras(file, gaussians, up)
     scene = Scene(with_intensity(gaussians), extent_of(gaussians, cameras), glass=glass, planes=planes)
@@ -586,7 +579,7 @@ def load(
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"there is nothing at {path}; expected {LOADED}")
-    source = scene_source(path)
+    source = writing.scene_source(path)
     if not source.is_dir():
         model = _from_file(source, device, None if planes is None else Path(planes), up)
         return model if source == path else replace(model, name=path.resolve().name)

@@ -18,16 +18,8 @@ from glassplat.errors import InputError
 from glassplat.files.writing import make_folder
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
 from glassplat.methods.recipe import RECIPES, Recipe, settled
+from glassplat.model import run_directory
 from glassplat.model.model import Model
-from glassplat.model.run_directory import (
-    CHECKPOINT_SECONDS,
-    RunDirectory,
-    RunLog,
-    RunSettings,
-    check_output,
-    open_log,
-    run_lock,
-)
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import train
 from glassplat.training.messages import ActionDone, CheckpointWritten, Message, RunBegun, StepDone, Working
@@ -96,12 +88,12 @@ class Run:
     def __init__(
         self,
         recipe: Any,
-        settings: RunSettings,
-        directory: RunDirectory,
+        settings: run_directory.RunSettings,
+        directory: run_directory.RunDirectory,
         dataset: Dataset,
         *,
         resume: bool = False,
-        checkpoint_every: float = CHECKPOINT_SECONDS,
+        checkpoint_every: float = run_directory.CHECKPOINT_SECONDS,
     ) -> None:
         """Checks what can be known beforehand.
 
@@ -120,7 +112,7 @@ class Run:
         self.recipe = settled(recipe, dataset)
         self._stages = self.recipe.stages(settings.seed, settings.iterations)
         check_length(self._stages, settings.iterations)
-        check_output(directory, resume=resume)
+        run_directory.check_output(directory, resume=resume)
         self._settings, self._directory, self._dataset = settings, directory, dataset
         self._resume, self._every = resume, checkpoint_every
         self._session: TrainingSession | None = None
@@ -151,7 +143,7 @@ class Run:
             yield Working("preparing the first scene", 0, 1)
             self.state = first_state(self.recipe, settings, self._dataset)
         make_folder(directory.path)
-        with run_lock(directory.path):
+        with run_directory.run_lock(directory.path):
             # Another training may have ended here meanwhile.
             anew = directory.is_begun and not self._resume
             if self.state is None:
@@ -159,7 +151,7 @@ class Run:
             else:
                 directory.check_vacant()
                 directory.begin(self.recipe, settings, self._dataset)
-            with open_log(directory.log, self.state.step) as log:
+            with run_directory.open_log(directory.log, self.state.step) as log:
                 self._session = TrainingSession(directory, self.state, log=log, checkpoint_every=self._every)
                 yield from self._session.told(RunBegun(self.state.step, settings.iterations, anew))
                 yield from self._session.trained(self._stages, self._dataset, settings.iterations)
@@ -188,12 +180,14 @@ class Run:
         self._directory.write_refined(self._dataset, self.state.scene)
 
 
-def first_state(recipe: Any, settings: RunSettings, dataset: Dataset) -> TrainState:
+def first_state(recipe: Any, settings: run_directory.RunSettings, dataset: Dataset) -> TrainState:
     """The state from which a fresh run starts."""
     return TrainState(recipe.initialise(dataset), settings.seed, method=recipe.method).to(settings.device)
 
 
-def resumed_state(recipe: Any, settings: RunSettings, directory: RunDirectory) -> TrainState:
+def resumed_state(
+    recipe: Any, settings: run_directory.RunSettings, directory: run_directory.RunDirectory
+) -> TrainState:
     """The checkpoint's state.
 
     Raises:
@@ -217,7 +211,14 @@ def resumed_state(recipe: Any, settings: RunSettings, directory: RunDirectory) -
 class TrainingSession:
     """One stretch of a run: from its beginning or a checkpoint to its end or an interrupt."""
 
-    def __init__(self, directory: RunDirectory, state: TrainState, *, log: RunLog, checkpoint_every: float) -> None:
+    def __init__(
+        self,
+        directory: run_directory.RunDirectory,
+        state: TrainState,
+        *,
+        log: run_directory.RunLog,
+        checkpoint_every: float,
+    ) -> None:
         self._directory, self._state = directory, state
         self._log, self._every = log, checkpoint_every
         self._seconds_before, self._started = state.seconds, time.perf_counter()
@@ -290,7 +291,7 @@ class Training:
         seed: int = 0,
         device: DeviceName = "auto",
         resume: bool = False,
-        checkpoint_every: float = CHECKPOINT_SECONDS,
+        checkpoint_every: float = run_directory.CHECKPOINT_SECONDS,
     ) -> None:
         """Checks what can be known beforehand; nothing is trained or written yet.
 
@@ -313,7 +314,7 @@ class Training:
         chosen = chosen_recipe(recipe)
         root = str(dataset.root.resolve())  # The run may be looked at from another folder than it was started in.
         self.iterations, self._dataset = iterations, dataset
-        self._settings = RunSettings(
+        self._settings = run_directory.RunSettings(
             root, iterations, dataset.downscale, seed, str(chosen_device(device)), dataset.mask_polarity
         )
         self._run: Run | None = None
@@ -328,7 +329,7 @@ class Training:
         self._run = Run(
             chosen,
             self._settings,
-            RunDirectory(Path(output)),
+            run_directory.RunDirectory(Path(output)),
             dataset,
             resume=resume,
             checkpoint_every=checkpoint_every,

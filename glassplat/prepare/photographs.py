@@ -17,17 +17,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps
 
 from glassplat.errors import InputError, first_names
-from glassplat.files.images import (
-    HEIF_SUFFIXES,
-    IMAGE_SUFFIXES,
-    SHADES_16,
-    image_size,
-    opened,
-    picture_paths,
-    read_image,
-    reads_heif,
-    write_image,
-)
+from glassplat.files import images
 from glassplat.files.records import reading
 
 
@@ -149,7 +139,7 @@ def capture_names(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
         counts[name] += 1
         if counts[name] > 1:
             spoken[path] = f"{name}-{counts[name]}"
-    pictures = picture_paths(list(spoken.values()))
+    pictures = images.picture_paths(list(spoken.values()))
     return {path: pictures[name].with_suffix(".jpg").as_posix() for path, name in spoken.items()}
 
 
@@ -174,11 +164,11 @@ def read_photograph(photograph: Photograph) -> NDArray[np.uint8]:
 
 def _upright(path: Path) -> Image.Image:
     """The picture as eight-bit RGB, turned as its EXIF tag says."""
-    with opened(path) as image:
+    with images.opened(path) as image:
         orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
-        if image.mode not in SHADES_16:
+        if image.mode not in images.SHADES_16:
             return ImageOps.exif_transpose(image).convert("RGB")
-    grey = Image.fromarray(read_image(path)[:, :, 0])
+    grey = Image.fromarray(images.read_image(path)[:, :, 0])
     grey.getexif()[ExifTags.Base.Orientation] = orientation
     return ImageOps.exif_transpose(grey).convert("RGB")
 
@@ -200,19 +190,19 @@ def _photograph_paths(folder: Path) -> list[Path]:
             f"({first_names(list(unreadable))}); save them as JPEG and remove these (a telephone does so by itself "
             "with 'most compatible' in the camera's settings). HEIC is read after pip install 'glassplat[heic]'"
         )
-    paths = [path for path in files if path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)]
+    paths = [path for path in files if path.suffix.lower() in (*images.IMAGE_SUFFIXES, *images.HEIF_SUFFIXES)]
     if not paths:
         found = first_names(sorted(path.name for path in files)) or "nothing"
-        raise InputError(f"no photograph in {folder}; expected {', '.join(IMAGE_SUFFIXES)} files, found {found}")
+        raise InputError(f"no photograph in {folder}; expected {', '.join(images.IMAGE_SUFFIXES)} files, found {found}")
     return sorted(paths, key=lambda path: _numbers_as_such(path.relative_to(folder).as_posix()))
 
 
 def _unreadable_kind(path: Path) -> str | None:
     """Kind of a photograph that Pillow cannot read, by its name or first bytes; None for all others."""
     suffix = path.suffix.lower()
-    if suffix in UNREADABLE or (suffix in HEIF_SUFFIXES and not reads_heif()):
+    if suffix in UNREADABLE or (suffix in images.HEIF_SUFFIXES and not images.reads_heif()):
         return suffix[1:].upper()
-    if suffix not in IMAGE_SUFFIXES or reads_heif():
+    if suffix not in images.IMAGE_SUFFIXES or images.reads_heif():
         return None
     try:
         with reading(path), path.open("rb") as file:
@@ -235,8 +225,8 @@ def _numbers_as_such(name: str) -> tuple[tuple[int, int, str], ...]:
 def _examined(path: Path, name: str, max_size: int) -> tuple[Photograph, bytes]:
     """A photograph and a fingerprint of its file; decoded at a small size, which finds files that are cut off."""
     try:
-        size = image_size(path)
-        with opened(path) as image:
+        size = images.image_size(path)
+        with images.opened(path) as image:
             exif = image.getexif()
             sideways = exif.get(ExifTags.Base.Orientation) in SIDEWAYS
             tags = dict(exif) | dict(exif.get_ifd(ExifTags.IFD.Exif))
@@ -321,7 +311,7 @@ def frames_of(video: Path, folder: Path, most: int, listen: Listener) -> list[Pa
     for number, frame in enumerate(_frames(cv2, video) if missing else ()):
         if number in missing:
             listen(Progress("taking photographs from the video", sorted(paths).index(number), len(paths)))
-            write_image(paths[number], frame[:, :, ::-1])
+            images.write_image(paths[number], frame[:, :, ::-1])
     return list(paths.values())
 
 

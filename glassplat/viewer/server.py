@@ -27,14 +27,7 @@ from glassplat.publish.web_page import best_view, surveyed
 from glassplat.render.frame import Renderer
 from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
-from glassplat.viewer.controls import (
-    CleanControls,
-    KeyframeControls,
-    MeasureControls,
-    PaneControls,
-    PhotographControls,
-    survived,
-)
+from glassplat.viewer import controls
 from glassplat.viewer.drawing import ERROR, Shown, Viewpoints, Wish, drawn, edited, error_drawn, matrix_of, point_along
 from glassplat.viewer.render_loop import RenderLoop, RenderThread, check_port
 
@@ -68,15 +61,15 @@ class Client:
         self._handle, self._viewer = handle, viewer
         self._status, self._nearest = "", viewer.first
         self._layer: Any = None
-        self._panes: PaneControls | None = None
-        self._clean: CleanControls | None = None
-        self._measure = MeasureControls(handle)
-        self.keyframes = KeyframeControls(handle, viewer.shown.scene.extent, self.camera)
+        self._panes: controls.PaneControls | None = None
+        self._clean: controls.CleanControls | None = None
+        self._measure = controls.MeasureControls(handle)
+        self.keyframes = controls.KeyframeControls(handle, viewer.shown.scene.extent, self.camera)
         self._failure = ""
         self._waiting: Any = handle.add_notification(*WAITING, loading=True, with_close_button=False)
         self.lay_out()
         self.stand_at(viewer.first)
-        handle.camera.on_update(survived(lambda _: self.ask()))
+        handle.camera.on_update(controls.survived(lambda _: self.ask()))
 
     def show(self, picture: NDArray[np.uint8], is_sharp: bool) -> None:
         """Puts a picture on the screen, and with a sharp one the photograph that is nearest to it."""
@@ -159,17 +152,17 @@ class Client:
         gui.reset()
         self._told = gui.add_markdown(plain(self._status)) if self._viewer.buttons else None
         for name, act in self._viewer.buttons.items():
-            gui.add_button(name).on_click(survived(lambda _, act=act: act()))
+            gui.add_button(name).on_click(controls.survived(lambda _, act=act: act()))
         self._layer = gui.add_dropdown("Layer", layers, initial_value=chosen)
-        self._layer.on_update(survived(lambda _: self.ask()))
+        self._layer.on_update(controls.survived(lambda _: self.ask()))
         panes = shown.scene.planes
         if self._panes is not None:
             self._panes.remove()
-        self._panes = PaneControls(self._handle, panes) if len(panes) else None
+        self._panes = controls.PaneControls(self._handle, panes) if len(panes) else None
         # A scene that is trained changes from step to step.
-        self._clean = None if self._viewer.buttons else CleanControls(gui, shown)
+        self._clean = None if self._viewer.buttons else controls.CleanControls(gui, shown)
         self._measure.lay_out(self.measure)
-        self._photographs = PhotographControls(gui, shown, self._nearest)
+        self._photographs = controls.PhotographControls(gui, shown, self._nearest)
         # Now that all are there: a control may be used as soon as it listens.
         if self._panes is not None:
             self._panes.listen(self.ask)
@@ -192,7 +185,7 @@ class Client:
             except ValueError as error:
                 self._notify("No point", str(error), "red")
 
-        self._viewer.loop.call(survived(work))
+        self._viewer.loop.call(controls.survived(work))
 
     def keep_scene(self, name: str) -> None:
         """Saves the scene as it is edited here, under a new name; says how that went."""
@@ -210,7 +203,7 @@ class Client:
         gui = self._handle.gui
         with gui.add_folder("Edited scene", expand_by_default=False):
             text = gui.add_text("Name", name)
-            gui.add_button("Save as a run").on_click(survived(lambda _: self.keep_scene(text.value)))
+            gui.add_button("Save as a run").on_click(controls.survived(lambda _: self.keep_scene(text.value)))
 
     def _keep(self, write: Callable[[], str]) -> None:
         """Writes in the thread that draws: what is written may need kernels."""
@@ -288,8 +281,8 @@ class Viewer:
         # The error layer asks for the same one with every edit.
         self._photograph = lru_cache(maxsize=2)(self._read_photograph)
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        self._server.on_client_connect(survived(self._connected))
-        self._server.on_client_disconnect(survived(self._gone))
+        self._server.on_client_connect(controls.survived(self._connected))
+        self._server.on_client_disconnect(controls.survived(self._gone))
 
     def __repr__(self) -> str:
         return f"look at {self.address}"
@@ -328,13 +321,13 @@ class Viewer:
         self.shown = replace(self.shown, scene=scene, renderer=renderer)
         if scene.planes.labels != had:
             for client in list(self._clients.values()):
-                survived(client.lay_out)()
+                controls.survived(client.lay_out)()
 
     def refresh(self, status: str = "") -> None:
         """Asks for everybody's picture again, and tells them something."""
         for client in list(self._clients.values()):
-            survived(client.tell)(status)
-            survived(client.ask)()
+            controls.survived(client.tell)(status)
+            controls.survived(client.ask)()
 
     def _connected(self, handle: Any) -> None:
         client = self._clients[handle.client_id] = Client(handle, self)

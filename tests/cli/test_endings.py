@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from glassplat.cli.console import LONGEST_QUOTE
-from glassplat.cli.evaluate import Evaluate
 from glassplat.cli.main import main
+from glassplat.cli.scene import Evaluate
 from glassplat.errors import InputError
 from glassplat.kernels.backend.devices import CudaUnavailableError
 from glassplat.panes import PlaneFitError

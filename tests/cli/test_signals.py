@@ -13,9 +13,8 @@ from pathlib import Path
 import pytest
 
 from glassplat.cli.console import Interrupted, held_signals, raised_signals
-from glassplat.cli.evaluate import Evaluate
 from glassplat.cli.main import main
-from glassplat.cli.scene import Dereflect, Render
+from glassplat.cli.scene import Dereflect, Evaluate, Render
 from glassplat.cli.train import SCENE, Demo, Train
 from glassplat.files.writing import atomic_write
 from glassplat.methods.splat_recipe import SplatRecipe

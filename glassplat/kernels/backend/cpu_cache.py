@@ -24,15 +24,7 @@ from typing import Any
 import numba
 import numpy as np
 from llvmlite import ir
-from numba.core import types
-from numba.core.caching import (
-    CompileResultCacheImpl,
-    FunctionCache,
-    IndexDataCacheFile,
-    InTreeCacheLocator,
-    UserProvidedCacheLocator,
-    UserWideCacheLocator,
-)
+from numba.core import caching, types
 from numba.core.cpu import CPUContext
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic
@@ -42,7 +34,7 @@ log = logging.getLogger("glassplat.kernels")
 REMEDY = "set NUMBA_CACHE_DIR to a folder that can be written and lasts"
 
 
-class UserFolder(UserWideCacheLocator):
+class UserFolder(caching.UserWideCacheLocator):
     """The user's cache folder, if there is one."""
 
     @classmethod
@@ -54,7 +46,7 @@ class UserFolder(UserWideCacheLocator):
         )
 
 
-class TemporaryFolder(InTreeCacheLocator):
+class TemporaryFolder(caching.InTreeCacheLocator):
     """A folder among the temporary files that nobody else can write to, since what is in it will be executed."""
 
     def get_cache_path(self) -> str:
@@ -75,28 +67,34 @@ class TemporaryFolder(InTreeCacheLocator):
         super().ensure_cache_path()
 
 
-class Nowhere(InTreeCacheLocator):
+class Nowhere(caching.InTreeCacheLocator):
     """The folder beside the source when none can be written: kernels are read from it, and saving fails."""
 
     def ensure_cache_path(self) -> None:
         """Leaves everything as it is; whether something can be saved shows when it is."""
 
 
-class KernelFiles(CompileResultCacheImpl):
+class KernelFiles(caching.CompileResultCacheImpl):
     """Files of compiled kernels, in the first folder that can be written."""
 
-    _locator_classes = (UserProvidedCacheLocator, InTreeCacheLocator, UserFolder, TemporaryFolder, Nowhere)
+    _locator_classes = (
+        caching.UserProvidedCacheLocator,
+        caching.InTreeCacheLocator,
+        UserFolder,
+        TemporaryFolder,
+        Nowhere,
+    )
 
-    def files(self, function: Callable[..., Any]) -> list[IndexDataCacheFile]:
+    def files(self, function: Callable[..., Any]) -> list[caching.IndexDataCacheFile]:
         """The kernel's file in every folder, first the one that is written to."""
         folders = [self.locator.get_cache_path()]
         if not numba.config.CACHE_LOCATOR_CLASSES:  # Numba's own way to ask for one folder and no other.
-            kinds = [InTreeCacheLocator, UserFolder]
+            kinds = [caching.InTreeCacheLocator, UserFolder]
             if numba.config.CACHE_DIR:
-                kinds.insert(0, UserProvidedCacheLocator)
+                kinds.insert(0, caching.UserProvidedCacheLocator)
             folders += [kind(function, self.locator._py_file).get_cache_path() for kind in kinds]
         stamp = self.locator.get_source_stamp()
-        return [IndexDataCacheFile(folder, self.filename_base, stamp) for folder in dict.fromkeys(folders)]
+        return [caching.IndexDataCacheFile(folder, self.filename_base, stamp) for folder in dict.fromkeys(folders)]
 
     def remark(self) -> None:
         """Says, once, when kernels are not kept where the user may expect them."""
@@ -108,7 +106,7 @@ class KernelFiles(CompileResultCacheImpl):
                 folder,
                 REMEDY,
             )
-        elif numba.config.CACHE_DIR and not isinstance(self.locator, UserProvidedCacheLocator):
+        elif numba.config.CACHE_DIR and not isinstance(self.locator, caching.UserProvidedCacheLocator):
             _warn_once(
                 "NUMBA_CACHE_DIR is %s, which cannot be written; compiled kernels are kept in %s",
                 numba.config.CACHE_DIR,
@@ -223,7 +221,7 @@ def loading_context() -> CPUContext:
     return CPUContext(cpu_target.typing_context, "cpu")
 
 
-class KernelCache(FunctionCache):
+class KernelCache(caching.FunctionCache):
     """Numba's on-disk cache, under keys that hold across processes, with an announcement of each compilation, and with
     the same kernel in the process that compiles it as in all others.
 
