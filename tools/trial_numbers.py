@@ -60,12 +60,12 @@ def fault_of(work: Callable[[], Any]) -> str:
 def picture(draw: random.Random) -> tuple[str, Callable[[], None]]:
     """A picture of a poisoned scene, or from a poisoned camera."""
     renderer, scene = rendered(draw.choice(METHODS))
-    camera = replace(tiny_capture().train[1].camera)
+    camera, changes = tiny_capture().train[1].camera, dict[str, Any]()
     kind = draw.choice(("scene", "scene", "camera", "inside", "pane", "crowd"))
     if kind == "scene":
         name, scene = poisoned(scene, draw)
     elif kind == "camera":
-        name, camera = poisoned_camera(camera, draw)
+        name, changes = poisoned_camera(camera, draw)
     elif kind == "inside":
         name, camera = "inside", at(scene.primary.means[draw.randrange(len(scene.primary))])
     elif kind == "pane":
@@ -80,7 +80,7 @@ def picture(draw: random.Random) -> tuple[str, Callable[[], None]]:
 
     def work() -> None:
         with torch.no_grad():
-            rgb = renderer(scene, camera).rgb
+            rgb = renderer(scene, replace(camera, **changes)).rgb
         if not bool(torch.isfinite(rgb).all()):
             raise ArithmeticError("the picture is not finite")
 
@@ -112,15 +112,15 @@ def poisoned(scene: Scene, draw: random.Random) -> tuple[str, Scene]:
     return f"{name} {value} x{len(chosen)}", scene.with_parameters({name: changed})
 
 
-def poisoned_camera(camera: Camera, draw: random.Random) -> tuple[str, Camera]:
-    """One value of a camera becomes something else."""
+def poisoned_camera(camera: Camera, draw: random.Random) -> tuple[str, dict[str, Any]]:
+    """Changes of a camera, of one of its values."""
     value = draw.choice(POISON)
     if draw.random() < 0.5:
         pose, row, column = camera.cam_from_world.clone(), draw.randrange(3), draw.randrange(4)
         pose[row, column] = value
-        return f"pose {row} {column} {value}", replace(camera, cam_from_world=pose)
+        return f"pose {row} {column} {value}", {"cam_from_world": pose}
     name = draw.choice(("fx", "fy", "cx", "cy"))
-    return f"{name} {value}", replace(camera, **{name: value})
+    return f"{name} {value}", {name: value}
 
 
 def at(place: torch.Tensor) -> Camera:

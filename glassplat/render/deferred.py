@@ -24,6 +24,7 @@ from glassplat.render.frame import (
     ScreenPass,
     check_colored,
     check_ellipsoids,
+    check_numbers,
     joined_probe,
     joined_splats,
     over_background,
@@ -459,3 +460,6 @@ def check_reflective(scene: Scene) -> None:
             f"the Gaussians have the channels {sorted(scene.primary.channels)}; expected logit_strength, as "
             "`deferred` trains it"
         )
+    check_numbers(
+        {"environment.raw": scene.environment.raw, "logit_strength": scene.primary.channels["logit_strength"]}
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -246,3 +247,17 @@ def check_colored(gaussians: Gaussians) -> None:
     """Raises ValueError where a set that is seen has no colours."""
     if gaussians.max_sh_degree < 0:
         raise ValueError("the Gaussians have no colours; expected f_dc_0 to f_dc_2, as every trained splat has them")
+
+
+def check_numbers(values: Mapping[str, Tensor], most: float = math.inf) -> None:
+    """Refuses values that would leave pixels without a number; those of Gaussians' shapes are culled one by one.
+
+    Values that ask for a gradient are not looked at: a training ends with the loss that is not finite, and its view.
+
+    Raises:
+        ValueError: a value is NaN or infinite, or above `most`; names the tensor.
+    """
+    for name, tensor in values.items():
+        if not tensor.requires_grad and not bool((tensor.isfinite() & (tensor <= most)).all()):
+            limit = "" if most == math.inf else f" of at most {most:g}"
+            raise ValueError(f"{name} holds values that cannot be drawn; expected finite numbers{limit}")

@@ -23,6 +23,7 @@ from glassplat.render.frame import (
     ScreenPass,
     check_colored,
     check_ellipsoids,
+    check_numbers,
     joined_probe,
     joined_splats,
     over_background,
@@ -135,7 +136,12 @@ class Planar:
     tells_mirrored: bool = True
 
     def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
-        """Renders `scene` from `camera`, where the scene's tensors are."""
+        """Renders `scene` from `camera`, where the scene's tensors are.
+
+        Raises:
+            ValueError: an intensity, mark or reflectance cannot be drawn.
+        """
+        check_panes(scene)
         camera = camera.to(scene.primary.means.device)
         rectangles = panes_in_camera(scene.planes, camera)
         first = self._first_pass(scene, camera, rectangles, probed)
@@ -285,6 +291,21 @@ class Planar:
         owners = glass_owners(scene.glass, scene.planes)
         own = own_masks(seen, first.splats, first.marks, owners, (camera.height, camera.width))
         return visibilities(seen, first.mask, own)
+
+
+LARGEST_LOG = 80.0
+"""Of a factor on colours, which is finite in single precision."""
+
+
+def check_panes(scene: Scene) -> None:
+    """Raises ValueError where a value that only panes need cannot be drawn."""
+    check_numbers({"logit_mark": scene.glass.channels["logit_mark"]})
+    if len(scene.planes):
+        logs = {"log_intensity": scene.primary.channels["log_intensity"]}
+        if scene.planes.log_transmittances is not None:
+            logs["log_transmittances"] = scene.planes.log_transmittances
+        check_numbers(logs, LARGEST_LOG)
+        check_numbers({"logit_reflectances": scene.planes.logit_reflectances})
 
 
 @torch.no_grad()

@@ -14,7 +14,15 @@ from glassplat.kernels.records import FLAT, RawGaussians, Rays
 from glassplat.kernels.records import Traced as Found
 from glassplat.kernels.trace import build_bvh, shapes_of, trace
 from glassplat.render.deferred import INVISIBLE, Surface, reflected_rays, seen_surface, view_directions
-from glassplat.render.frame import MEDIAN_DEPTH, NEAR_PER_EXTENT, Frame, SpacePass, check_colored, over_background
+from glassplat.render.frame import (
+    MEDIAN_DEPTH,
+    NEAR_PER_EXTENT,
+    Frame,
+    SpacePass,
+    check_colored,
+    check_numbers,
+    over_background,
+)
 from glassplat.scene import SH_ZERO
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
@@ -229,3 +237,6 @@ def check_mirrored(scene: Scene) -> None:
             f"the Gaussians have the channels {sorted(scene.primary.channels)}; expected logit_strength, as `traced` "
             "trains it"
         )
+    check_numbers(
+        {"environment.raw": scene.environment.raw, "logit_strength": scene.primary.channels["logit_strength"]}
+    )

@@ -122,6 +122,14 @@ class Camera:
     width: int
     height: int
 
+    def __post_init__(self) -> None:
+        lengths = self.fx, self.fy, self.width, self.height
+        if not all(0 < length < math.inf for length in lengths) or not math.isfinite(self.cx + self.cy):
+            raise ValueError(
+                f"a camera of {self.width}x{self.height} pixels with fx={self.fx}, fy={self.fy}, cx={self.cx}, "
+                f"cy={self.cy}; expected finite numbers, sizes and focal lengths above 0"
+            )
+
     @staticmethod
     def look_at(
         eye: Tensor | Sequence[float],

@@ -1,0 +1,67 @@
+"""Values that nobody should give: a renderer says which, or its picture is finite."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from glassplat.render.planar import Planar
+from tests.training.tiny_capture import tiny_capture
+from tools.trial_numbers import METHODS, POISON, rendered
+
+UNDRAWABLE = [
+    ("planar", "primary.log_intensity", (math.nan, math.inf, 1e30, 100.0)),
+    ("planar", "glass.logit_mark", (math.nan,)),
+    ("planar", "planes.logit_reflectances", (math.nan,)),
+    ("deferred", "primary.logit_strength", (math.nan,)),
+    ("deferred", "environment.raw", (math.nan, math.inf, -math.inf)),
+    ("traced", "primary.logit_strength", (math.nan,)),
+]
+
+
+@pytest.mark.parametrize(
+    ("method", "name", "value"), [(m, n, value) for m, n, values in UNDRAWABLE for value in values]
+)
+def test_a_value_that_cannot_be_drawn_is_refused_by_its_name(method: str, name: str, value: float) -> None:
+    renderer, scene = rendered(method)
+    changed = scene.parameters()[name].detach().clone()
+    changed.view(-1)[0] = value
+    with pytest.raises(ValueError, match=name.split(".")[-1]):
+        renderer(scene.with_parameters({name: changed}), tiny_capture().train[1].camera)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_any_other_poison_leaves_a_finite_picture(method: str) -> None:
+    renderer, scene = rendered(method)
+    refused = {name for other, name, _ in UNDRAWABLE if other == method}
+    for name, tensor in scene.parameters().items():
+        if name in refused or not tensor.numel():
+            continue
+        for value in POISON:
+            changed = tensor.detach().clone()
+            changed.view(-1)[0] = value
+            frame = renderer(scene.with_parameters({name: changed}), tiny_capture().train[1].camera)
+            assert bool(torch.isfinite(frame.rgb).all()), (name, value)
+
+
+def test_a_tint_that_cannot_be_drawn_is_refused() -> None:
+    _, scene = rendered("planar")
+    tinted = replace(scene, planes=replace(scene.planes, log_transmittances=torch.full((len(scene.planes), 3), 1e30)))
+    with pytest.raises(ValueError, match="log_transmittances"):
+        Planar()(tinted, tiny_capture().train[1].camera)
+
+
+@pytest.mark.parametrize("name", ["fx", "fy", "width", "height"])
+@pytest.mark.parametrize("value", [0, -1, math.nan, math.inf])
+def test_a_camera_without_a_size_or_a_focal_length_is_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match="expected finite numbers, sizes and focal lengths above 0"):
+        replace(tiny_capture().train[1].camera, **{name: value})
+
+
+@pytest.mark.parametrize("name", ["cx", "cy"])
+def test_a_camera_has_its_middle_somewhere(name: str) -> None:
+    with pytest.raises(ValueError, match="expected finite numbers"):
+        replace(tiny_capture().train[1].camera, **{name: math.nan})
