@@ -113,7 +113,7 @@ class ViewerClient:
     def _learn(self, message: dict[str, Any]) -> None:
         kind = message["type"]
         if kind == "BackgroundImageMessage":
-            self.pictures += 1
+            self.pictures += message["rgb_data"] is not None  # viser says at first that there is none.
         elif kind in CONTROLS:
             self.controls[message["uuid"]] = message
         elif kind == "TransformControlsMessage":

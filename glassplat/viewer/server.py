@@ -174,12 +174,15 @@ class Client:
             self._add_saving(f"{shown.title}-edited")
 
     def measure(self, direction: NDArray[np.float64]) -> None:
-        """Takes the point that is seen in a direction [3], world axes, as an end of what is measured."""
+        """Takes the point that is seen in a direction [3], world axes, as an end of what is measured.
+
+        It is seen from where the camera is now: the thread that draws may take long to come to it.
+        """
+        wish = self.wish()
+        if wish is None:
+            return
 
         def work() -> None:
-            wish = self.wish()
-            if wish is None:
-                return
             try:
                 self._measure.take(point_along(self._viewer.shown.scene, self._viewer.shown.renderer, wish, direction))
             except ValueError as error:

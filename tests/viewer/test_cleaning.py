@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.scene import Scene
 from glassplat.viewer.controls import box_of
 from glassplat.viewer.drawing import Wish, edited, point_along
-from glassplat.viewer.server import Viewer
+from glassplat.viewer.server import Client, Viewer
 from tests.model.test_model import model
 from tests.publish.test_cleaning import wall
 from tests.viewer.free_port import free_port
@@ -54,6 +55,58 @@ def test_a_box_is_six_numbers() -> None:
     assert box_of("0 1 2") is box_of("a b c d e f") is box_of("0 1 2 3 4 nan") is None
 
 
+async def until(holds: Callable[[], bool]) -> None:
+    async with asyncio.timeout(120):
+        while not holds():
+            await asyncio.sleep(0.05)
+
+
+async def stand(client: ViewerClient, inner: Client, place: tuple[float, float, float]) -> None:
+    """Moves the camera, and waits until the server knows."""
+    await client.look(position=place, look_at=(place[0], place[1], place[2] + 1))
+    center = -torch.tensor(place)
+    await until(lambda: (wish := inner.wish()) is not None and torch.equal(wish.cam_from_world[:3, 3], center))
+
+
+async def begin_to_measure(client: ViewerClient, inner: Client) -> None:
+    await client.set("Click two points", True)
+    await until(lambda: inner._measure._is_listening)
+
+
+async def click(client: ViewerClient, aside: float) -> None:
+    await client.send(
+        "ScenePointerMessage",
+        event_type="click",
+        ray_origin=(0.0, 0.0, 0.0),
+        ray_direction=(aside / math.hypot(aside, 1), 0.0, 1 / math.hypot(aside, 1)),
+        screen_pos=((0.5, 0.5),),
+        modifier=None,
+    )
+
+
+def test_a_click_is_seen_from_where_the_camera_was() -> None:
+    viewer = Viewer(shown_of(replace(model(), scene=wall_scene()), {}), "127.0.0.1", free_port())
+
+    async def work() -> None:
+        async with ViewerClient(viewer.address) as client:
+            await client.look()
+            await until(lambda: len(viewer._clients) == 1)
+            (inner,) = viewer._clients.values()
+            await stand(client, inner, (0.0, 0.0, 0.0))
+            await begin_to_measure(client, inner)
+            await click(client, 0.25)
+            await until(lambda: len(viewer.loop._calls) == 1)
+            await stand(client, inner, (0.5, 0.0, 1.0))
+            viewer.start()  # Only now there is a thread that draws.
+            await until(lambda: len(inner._measure._points) == 1)
+            np.testing.assert_allclose(inner._measure._points[0], [0.75, 0.0, 3.0], atol=0.05)
+
+    try:
+        asyncio.run(work())
+    finally:
+        viewer.stop()
+
+
 def test_two_clicks_are_measured_and_floaters_go_and_come_back() -> None:
     viewer = Viewer(shown_of(replace(model(), scene=wall_scene()), {}), "127.0.0.1", free_port())
     viewer.start()
@@ -61,34 +114,20 @@ def test_two_clicks_are_measured_and_floaters_go_and_come_back() -> None:
     async def work() -> None:
         async with ViewerClient(viewer.address) as client:
             await client.picture()
-            await client.look(position=(0.0, 0.0, 0.0), look_at=(0.0, 0.0, 1.0))
-            await client.set("Click two points", True)
             (inner,) = viewer._clients.values()
+            await stand(client, inner, (0.0, 0.0, 0.0))
+            await begin_to_measure(client, inner)
             for aside in (0.25, -0.25):
-                await asyncio.sleep(0.3)
-                await client.send(
-                    "ScenePointerMessage",
-                    event_type="click",
-                    ray_origin=(0.0, 0.0, 0.0),
-                    ray_direction=(aside / math.hypot(aside, 1), 0.0, 1 / math.hypot(aside, 1)),
-                    screen_pos=((0.5, 0.5),),
-                    modifier=None,
-                )
-            async with asyncio.timeout(60):
-                while len(inner._measure._points) < 2:
-                    await asyncio.sleep(0.05)
+                await click(client, aside)
+            await until(lambda: len(inner._measure._points) == 2)
             first, second = inner._measure._points
             assert np.linalg.norm(first - second) == pytest.approx(1.5, abs=0.05)
             assert "--scale" in inner._measure._told.content
             await client.set("Box", "-2 -2 0 0 2 4")
             await client.set("Take floaters out", True)
-            async with asyncio.timeout(60):
-                while inner.wish().kept is None or int(inner.wish().kept.sum()) != 288:
-                    await asyncio.sleep(0.05)
+            await until(lambda: inner.wish().kept is not None and int(inner.wish().kept.sum()) == 288)
             await client.set("Take floaters out", False)
-            async with asyncio.timeout(60):
-                while inner.wish().kept is not None:
-                    await asyncio.sleep(0.05)
+            await until(lambda: inner.wish().kept is None)
 
     try:
         asyncio.run(work())
