@@ -25,6 +25,10 @@ SIGNATURES_OF_OTHERS = {"rasterization"}
 """Functions that take what those of other programs take."""
 LEAST_FILE_LINES = 60
 """A file with fewer needs two importers."""
+MOST_FILES = 180
+"""Of the package; a new one replaces another, or the reason why not is in the commit that raises this."""
+MOST_IMPORT_SHARE = 0.0625
+"""Of the package's lines; viser has 3 %, equinox 5.7 %."""
 MEANINGLESS_NAMES = {"utils", "util", "helpers", "helper", "common", "misc"}
 
 
@@ -227,6 +231,24 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
 def test_no_small_file_serves_a_single_other() -> None:
     found = lonely_files(package_sources())
     assert not found, "\n" + "\n".join(found)
+
+
+def import_share(sources: Mapping[Path, str]) -> float:
+    """Share of the lines that belong to import statements."""
+    lines = imports = 0
+    for source in sources.values():
+        lines += source.count("\n")
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, (ast.Import, ast.ImportFrom)):
+                imports += (node.end_lineno or node.lineno) - node.lineno + 1
+    return imports / lines
+
+
+def test_the_package_has_few_files_and_few_lines_that_import() -> None:
+    sources = package_sources()
+    assert len(sources) <= MOST_FILES
+    assert import_share(sources) <= MOST_IMPORT_SHARE
+    assert import_share({Path("a.py"): "import os\nfrom os import (\n    path,\n)\n\nprint()\n"}) == 4 / 6
 
 
 def test_a_circle_of_late_imports_is_found() -> None:
