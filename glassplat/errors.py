@@ -14,6 +14,18 @@ class UnknownFormatError(InputError):
     """A folder holds no capture of any format that is read."""
 
 
+class RankLostError(RuntimeError):
+    """Another process of a run has ended; what was trained is intact.
+
+    Attributes:
+        ending: label, text and exit code that it ended with; None where it ended without a word.
+    """
+
+    def __init__(self, text: str, ending: tuple[str, str, int] | None = None) -> None:
+        super().__init__(text)
+        self.ending = ending
+
+
 @contextmanager
 def input_checked(where: object = None) -> Iterator[None]:
     """Turns the ValueError of a reader or an edit, whose message says what is wrong, into an InputError.

@@ -34,7 +34,7 @@ from rich.control import Control, ControlType
 from rich.text import Text
 
 from glassplat import __version__
-from glassplat.errors import InputError
+from glassplat.errors import InputError, RankLostError
 
 UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 """Control characters but for tabs and line breaks, and the bytes of a file name that are not text."""
@@ -94,6 +94,11 @@ def plain_streams() -> None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - Until the process ends.
         elif isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+
+
+def silence() -> None:
+    """Says nothing from now on, as ranks do that do not lead: another process speaks for all."""
+    sys.stdout = sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - Until the process ends.
 
 
 def drop_output() -> None:
@@ -254,6 +259,9 @@ class Ending(NamedTuple):
 
 def ending(error: BaseException) -> Ending:
     """The message and the exit code that an error ends a command with; one that nobody foresaw is saved to a file."""
+    if isinstance(error, RankLostError):
+        said = error.ending or ("stopped", str(error), FAILURE_CODE)
+        return Ending("error" if said[0] == "error" else "stopped", *said[1:])
     if isinstance(error, InputError) or is_one_of(error, BAD_INPUT):
         return Ending("error", str(error), BAD_INPUT_CODE)
     if isinstance(error, OSError):

@@ -14,6 +14,8 @@ from contextlib import nullcontext, suppress
 from dataclasses import field, make_dataclass
 from typing import Annotated, Any, NamedTuple, Union
 
+from glassplat.errors import RankLostError
+
 FAILURE_CODE, USAGE_CODE, INTERRUPTED_CODE, UNREAD_CODE = 1, 2, 130, 141
 """The last two as shells report a process that Ctrl-C or a closed pipe ended."""
 DESCRIPTION = "Gaussian splatting for scenes with window panes, showcases and mirrors."
@@ -89,9 +91,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def guarded(arguments: list[str], *, is_program: bool) -> int:
     """Runs a command; whatever happens ends in one readable message and an exit code."""
-    from glassplat.cli.console import complain, drop_output, ending, immediate_end, plain_streams, raised_signals
+    from glassplat.cli.console import (
+        complain,
+        drop_output,
+        ending,
+        immediate_end,
+        plain_streams,
+        raised_signals,
+        silence,
+    )
+    from glassplat.training.ranks import await_leader, leads, tell
 
     plain_streams()
+    is_training = arguments[:1] == ["train"]
+    if is_training and not leads():
+        silence()
     command = None
     with raised_signals() as raised:
         try:
@@ -100,18 +114,24 @@ def guarded(arguments: list[str], *, is_program: bool) -> int:
             run(command)
         except KeyboardInterrupt as stop:
             return interrupted(stop, command)
-        except SystemExit:
+        except SystemExit as end:
+            if is_training and end.code:
+                tell("error", "the options of the command cannot be understood", USAGE_CODE)
             raise
         except BrokenPipeError:
             drop_output()
             return UNREAD_CODE
         except BaseException as error:  # noqa: BLE001 - The last guard: nobody is to read a traceback.
-            if raised:
+            is_lost = isinstance(error, RankLostError)
+            if raised and not is_lost:
                 return interrupted(raised[-1], command)
-            end = ending(error)
+            found = ending(error)
             with suppress(OSError):  # Nobody hears it where the output is full or closed.
-                complain(end.label, end.text)
-            return end.code
+                complain(found.label, found.text)
+            if is_training and not is_lost:
+                tell(*found)
+            await_leader()
+            return found.code
     return 0
 
 

@@ -26,6 +26,7 @@ from glassplat.files.records import parse_json, read_json, read_text
 from glassplat.files.writing import atomic_write, check_folder, make_folder
 from glassplat.options import Downscale, Seed, Several, options_from_json
 from glassplat.training.messages import Message, StepDone, Working
+from glassplat.training.ranks import leads
 
 if TYPE_CHECKING:
     from glassplat.captures.dataset import Dataset
@@ -321,6 +322,8 @@ def check_output(directory: RunDirectory, *, resume: bool) -> None:
         NotADirectoryError: it is a file, or goes through one.
         PermissionError: nothing may be written there.
     """
+    if not leads():
+        return  # Rank 0 writes, and may have begun already.
     check_folder(directory.path)
     check_unlocked(directory.path)
     if resume:
@@ -341,17 +344,21 @@ LOG_EVERY = 10
 class RunLog:
     """Appends messages to an open log."""
 
-    def __init__(self, file: TextIO, path: Path) -> None:
-        self._file, self._path = file, path
+    def __init__(self, file: TextIO, path: Path, step: int = 0) -> None:
+        self._file, self._path, self._step = file, path, step
 
     def write(self, message: Message) -> None:
-        """Appends a message; of the steps, every tenth, and nothing of what happens between two of them.
+        """Appends a message; of the steps the first in every ten iterations, and nothing of work between two.
 
         Raises:
             OSError: the disk is full or fails; names the log.
         """
-        if isinstance(message, Working) or (isinstance(message, StepDone) and message.step % LOG_EVERY):
+        if isinstance(message, Working):
             return
+        if isinstance(message, StepDone):
+            before, self._step = self._step, message.step
+            if message.step // LOG_EVERY == before // LOG_EVERY:
+                return
         try:
             self._file.write(json.dumps({"message": type(message).__name__, **vars(message)}) + "\n")
             self._file.flush()
@@ -370,7 +377,7 @@ def open_log(path: Path, step: int) -> Iterator[RunLog]:
         temporary.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
     file = path.open("a", encoding="utf-8")
     try:
-        yield RunLog(file, path)
+        yield RunLog(file, path, step)
     finally:
         with suppress(OSError):  # Every line was flushed when it was written.
             file.close()

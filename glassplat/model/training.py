@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import threading
 import time
+import zlib
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
+import torch
+
+from glassplat import __version__
 from glassplat.captures.dataset import Dataset, photographs_read
-from glassplat.errors import InputError
+from glassplat.errors import InputError, RankLostError
 from glassplat.files.writing import make_folder
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
-from glassplat.methods.recipe import RECIPES, Recipe, settled
+from glassplat.methods.recipe import RECIPES, Recipe, recipe_to_json, settled
 from glassplat.model import run_directory
 from glassplat.model.model import Model
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import train
 from glassplat.training.messages import ActionDone, CheckpointWritten, Message, RunBegun, StepDone, Working
+from glassplat.training.ranks import Ranks, is_launched, join
 from glassplat.training.stage import Stage, TrainState, check_length
 
 Listener = Callable[[Message], None]
@@ -58,12 +64,15 @@ class StopRequest:
 def stop_on_interrupt() -> Iterator[StopRequest]:
     """Turns the first Ctrl-C, termination or hang-up into a request to stop after the step; a second one interrupts.
 
-    What is ignored stays ignored, as a hang-up is under `nohup`. Only the main thread can be asked.
+    What is ignored stays ignored, as a hang-up is under `nohup`. Only the main thread can be asked. `torchrun` passes
+    on what a scheduler may have sent already; there, a second signal says nothing new.
     """
     request = StopRequest()
 
     def ask(number: int, frame: FrameType | None) -> None:
         if request.requested:
+            if is_launched():
+                return
             request.end()
         request.number, request.answer = number, previous[number]
 
@@ -82,7 +91,7 @@ class Run:
 
     A recipe that names no background gets the one that transparent photographs are laid over; it is recorded. Nothing
     is written before the first scene has been made. Who stops following leaves a checkpoint behind, from which the run
-    can be resumed.
+    can be resumed. Of several ranks the first one makes the scene and writes; the others train along.
     """
 
     def __init__(
@@ -94,6 +103,7 @@ class Run:
         *,
         resume: bool = False,
         checkpoint_every: float = run_directory.CHECKPOINT_SECONDS,
+        ranks: Ranks | None = None,
     ) -> None:
         """Checks what can be known beforehand.
 
@@ -104,6 +114,7 @@ class Run:
             dataset: photographs to fit.
             resume: go on from the checkpoint in `directory`.
             checkpoint_every: seconds from one checkpoint to the next; there is one at the end in any case.
+            ranks: the processes that train together; this one alone if not given.
 
         Raises:
             InputError: the directory is not fit for it (`check_output`), the run is too short for its stages, or as
@@ -115,6 +126,7 @@ class Run:
         run_directory.check_output(directory, resume=resume)
         self._settings, self._directory, self._dataset = settings, directory, dataset
         self._resume, self._every = resume, checkpoint_every
+        self._ranks = ranks or Ranks()
         self._session: TrainingSession | None = None
         self.state: TrainState | None = None
 
@@ -137,7 +149,19 @@ class Run:
             KeyboardInterrupt: the user stopped the run; the checkpoint is written.
             TrainingDivergedError: training cannot go on; the last checkpoint stays.
             OSError: the disk is full or fails; the last checkpoint stays.
+            RankLostError: another rank has ended; the checkpoint is written.
         """
+        self._ranks.check_alike(traits(self.recipe, self._settings, self._dataset) | {"resume": self._resume})
+        yield from self._leading() if self._ranks.leads else self._following()
+        self._ranks.exchange()  # The others stay until the leader has written the scene.
+
+    def _following(self) -> Generator[Message, None, None]:
+        """Trains along, and writes nothing."""
+        self.state = self._ranks.shared(self.state, self._settings.device)
+        self._session = TrainingSession(self.state, self._ranks)
+        yield from self._session.trained(self._stages, self._dataset, self._settings.iterations)
+
+    def _leading(self) -> Generator[Message, None, None]:
         directory, settings = self._directory, self._settings
         if not self._resume:
             yield Working("preparing the first scene", 0, 1)
@@ -151,8 +175,9 @@ class Run:
             else:
                 directory.check_vacant()
                 directory.begin(self.recipe, settings, self._dataset)
+            self.state = self._ranks.shared(self.state, settings.device)
             with run_directory.open_log(directory.log, self.state.step) as log:
-                self._session = TrainingSession(directory, self.state, log=log, checkpoint_every=self._every)
+                self._session = TrainingSession(self.state, self._ranks, Record(directory.checkpoint, log, self._every))
                 yield from self._session.told(RunBegun(self.state.step, settings.iterations, anew))
                 yield from self._session.trained(self._stages, self._dataset, settings.iterations)
             self._export()
@@ -208,42 +233,82 @@ def resumed_state(
     return state.to(settings.device)
 
 
+def traits(recipe: Any, settings: run_directory.RunSettings, dataset: Dataset) -> dict[str, object]:
+    """The options, versions and capture of a run, which must be the same on every rank; only its folder may differ."""
+    views = (*dataset.train, *dataset.test)
+    shapes = [(v.name, v.camera.intrinsics.tolist(), v.camera.cam_from_world.tolist(), v.is_annotated) for v in views]
+    sizes = [view.image_path.stat().st_size if view.image_path.is_file() else 0 for view in views]
+    contents = zlib.crc32(repr((shapes, sizes)).encode(), zlib.crc32(dataset.points.positions.numpy().tobytes()))
+    of_settings = {name: value for name, value in vars(settings).items() if name not in ("data", "device")}
+    return {
+        "version": __version__,
+        "version of PyTorch": torch.__version__,
+        "capture": f"{len(views)} photographs and {len(dataset.points)} points ({contents:08x})",
+        "device": settings.device.partition(":")[0],
+        "method": recipe.method,
+        **of_settings,
+        **dict(_values(json.loads(recipe_to_json(recipe)), "")),
+    }
+
+
+def _values(options: Any, name: str) -> Iterator[tuple[str, object]]:
+    """Every value of nested options by its dotted name."""
+    if isinstance(options, dict):
+        for key, inner in options.items():
+            yield from _values(inner, f"{name}.{key}" if name else key)
+    else:
+        yield name, options
+
+
+class Record(NamedTuple):
+    """Files that the leader writes while it trains: a checkpoint every so many seconds, and the log."""
+
+    checkpoint: Path
+    log: run_directory.RunLog
+    every: float
+
+
 class TrainingSession:
     """One stretch of a run: from its beginning or a checkpoint to its end or an interrupt."""
 
-    def __init__(
-        self,
-        directory: run_directory.RunDirectory,
-        state: TrainState,
-        *,
-        log: run_directory.RunLog,
-        checkpoint_every: float,
-    ) -> None:
-        self._directory, self._state = directory, state
-        self._log, self._every = log, checkpoint_every
+    def __init__(self, state: TrainState, ranks: Ranks, record: Record | None = None) -> None:
+        self._state, self._ranks, self._record = state, ranks, record
         self._seconds_before, self._started = state.seconds, time.perf_counter()
         self._saved = self._started
         self._stop = StopRequest()
 
     def trained(self, stages: tuple[Stage, ...], dataset: Dataset, iterations: int) -> Generator[Message, None, None]:
         """Trains to the end, or raises KeyboardInterrupt after the step in which the user asks for it."""
+        is_whole = False
         with stop_on_interrupt() as self._stop, photographs_read(dataset) as check_photographs:
-            for message in train(stages, dataset, self._state, iterations):
-                check_photographs()
-                yield from self.told(message)
-                if not isinstance(message, StepDone):
-                    continue
-                is_last = message.step == iterations
-                if self._stop.requested or is_last or time.perf_counter() - self._saved >= self._every:
+            self._ranks.asked = lambda: self._stop.requested
+            try:
+                for message in train(stages, dataset, self._state, iterations, ranks=self._ranks):
+                    check_photographs()
+                    yield from self.told(message)
+                    is_whole = isinstance(message, StepDone | ActionDone)
+                    if isinstance(message, StepDone):
+                        yield from self._saved_in_time(message, iterations)
+            except RankLostError:
+                if is_whole:
                     self.save()
-                    yield from self.told(CheckpointWritten(message.step))
-                if self._stop.requested and not is_last:
-                    self._stop.end()
+                raise
+
+    def _saved_in_time(self, message: StepDone, iterations: int) -> Generator[Message, None, None]:
+        """Writes a checkpoint where it is time for one, and ends training where it was asked to end."""
+        is_last, is_ending = message.step == iterations, self._ranks.is_ending
+        is_time = self._record is not None and time.perf_counter() - self._saved >= self._record.every
+        if is_ending or is_last or is_time:
+            self.save()
+            yield from self.told(CheckpointWritten(message.step))
+        if is_ending and not is_last:
+            self._stop.end()
 
     def told(self, message: Message) -> Generator[Message, None, None]:
         """Passes a message on; should nobody be there any more to hear it, what was trained is saved first."""
         try:
-            self._log.write(message)
+            if self._record is not None:
+                self._record.log.write(message)
             yield message
         except BaseException as error:
             if isinstance(message, StepDone | ActionDone):
@@ -258,9 +323,10 @@ class TrainingSession:
         return self._stop.requested
 
     def save(self) -> None:
-        """Writes a checkpoint; the state must not be in the middle of a change."""
+        """Writes a checkpoint, if this process is to; the state must not be in the middle of a change."""
         self._state.seconds = self._seconds_before + time.perf_counter() - self._started
-        save_checkpoint(self._directory.checkpoint, self._state)
+        if self._record is not None:
+            save_checkpoint(self._record.checkpoint, self._state)
         self._saved = time.perf_counter()
 
 
@@ -272,6 +338,7 @@ class Training:
                 case glassplat.StepDone(step=step, loss=loss):
                     print(step, loss)
 
+    Started by `torchrun`, several processes train together, one view of each step for each.
     Between two messages, from the first `StepDone` on, `model` is the scene as trained so far. With an `output` the run
     is written as `glassplat train` writes it, `for` may be left with `break`, Ctrl-C ends it after a step, and either
     way `resume=True` goes on. Without one, everything stays in memory.
@@ -312,6 +379,7 @@ class Training:
                 short for its stages; or the photographs lie over another background than the recipe's.
         """
         chosen = chosen_recipe(recipe)
+        self._ranks = join()
         root = str(dataset.root.resolve())  # The run may be looked at from another folder than it was started in.
         self.iterations, self._dataset = iterations, dataset
         self._settings = run_directory.RunSettings(
@@ -333,6 +401,7 @@ class Training:
             dataset,
             resume=resume,
             checkpoint_every=checkpoint_every,
+            ranks=self._ranks,
         )
         self.recipe = self._run.recipe
 
@@ -344,6 +413,7 @@ class Training:
             KeyboardInterrupt: the user stopped the run.
             TrainingDivergedError: training cannot go on.
             OSError: the disk is full or fails.
+            RankLostError: another process that `torchrun` started has ended.
         """
         return self._in_memory() if self._run is None else self._run.messages()
 
@@ -409,10 +479,12 @@ class Training:
         self._run.save()
 
     def _in_memory(self) -> Generator[Message, None, None]:
+        self._ranks.check_alike(traits(self.recipe, self._settings, self._dataset))
         if self._state is None:
             yield Working("preparing the first scene", 0, 1)
-            self._state = first_state(self.recipe, self._settings, self._dataset)
-        yield from train(self._stages, self._dataset, self._state, self.iterations)
+            first = first_state(self.recipe, self._settings, self._dataset) if self._ranks.leads else None
+            self._state = self._ranks.shared(first, self._settings.device)
+        yield from train(self._stages, self._dataset, self._state, self.iterations, ranks=self._ranks)
 
 
 def chosen_recipe(recipe: str | Recipe) -> Any:

@@ -234,7 +234,7 @@ class AddNoise:
 
     Attributes:
         densifier: holds how strong the noise is, and what it reaches.
-        rate: learning rate of the positions, which the noise follows.
+        rate: learning rate of the positions, which the noise follows; as that, it grows with the views of a step.
     """
 
     densifier: McmcDensify
@@ -243,7 +243,7 @@ class AddNoise:
     def __call__(self, state: TrainState, clock: Clock, visible: Tensor | None) -> None:
         """Edits `state`."""
         primary, extent = state.scene.primary, state.scene.extent
-        rate = self.rate.at(clock.progress, 1.0, clock.iterations)
+        rate = self.rate.at(clock.progress, 1.0, clock.iterations) * math.sqrt(clock.batch)
         offsets = sgld_noise(self.densifier, primary, rate=rate, extent=extent, generator=state.generator("explore"))
         if visible is not None and self.densifier.reach == "shown":
             offsets *= visible[:, None]

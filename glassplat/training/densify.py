@@ -328,6 +328,17 @@ class ScreenStatistics:
             total += added
 
     @property
+    def sums(self) -> tuple[Tensor, Tensor, Tensor]:
+        """All statistics that add up over views; the largest radius does not."""
+        return self.gradient_sum, self.pull_sum, self.view_count
+
+    def include(self, other: ScreenStatistics) -> None:
+        """Adds what other views have shown of the same Gaussians, in place."""
+        for total, added in zip(self.sums, other.sums, strict=True):
+            total += added
+        torch.maximum(self.max_radius, other.max_radius, out=self.max_radius)
+
+    @property
     def mean_gradient(self) -> Tensor:
         """[N] mean gradient norm over the views that saw the Gaussian, direct ones if there are any; 0 if none did."""
         return self._mean(self.gradient_sum)

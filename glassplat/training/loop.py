@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from glassplat.scene.camera import constant
 from glassplat.scene.scene import Scene
 from glassplat.training.densify import ScreenStatistics
 from glassplat.training.messages import ActionDone, Message, StageEntered, StepDone
+from glassplat.training.ranks import Ranks
 from glassplat.training.stage import Clock, Stage, TrainState, carried_out, rate_tensor, stage_starts
 
 
@@ -48,7 +50,30 @@ class Differentiated(NamedTuple):
     visible: Tensor | None
 
 
-def train(stages: tuple[Stage, ...], dataset: Dataset, state: TrainState, iterations: int) -> Iterator[Message]:
+class Step(NamedTuple):
+    """Losses, gradients and statistics of all views of a step, whichever rank has rendered them.
+
+    Attributes:
+        losses: of each view.
+        gradients: means over the views.
+        statistics: what the step adds to those of the state; empty where it is there already.
+        visible: [N] bool, which primary Gaussians any view showed; None if that is not known.
+    """
+
+    losses: list[dict[str, float]]
+    gradients: dict[str, Tensor]
+    statistics: dict[str, ScreenStatistics]
+    visible: Tensor | None
+
+
+def train(
+    stages: tuple[Stage, ...],
+    dataset: Dataset,
+    state: TrainState,
+    iterations: int,
+    *,
+    ranks: Ranks | None = None,
+) -> Iterator[Message]:
     """Trains until `iterations`, from wherever `state` stands.
 
     `state` is edited in place and is consistent whenever `StepDone` or an `ActionDone` after it is out, so a consumer
@@ -58,7 +83,8 @@ def train(stages: tuple[Stage, ...], dataset: Dataset, state: TrainState, iterat
         stages: the recipe's stages.
         dataset: photographs to fit.
         state: initial or resumed state.
-        iterations: length of the whole run, over which all schedules stretch.
+        iterations: length of the whole run in views, over which all schedules stretch.
+        ranks: the processes that train together, all with the same state; this one alone if not given.
 
     Yields:
         `StageEntered`, `StepDone`, `ActionDone` and `Working` messages.
@@ -66,7 +92,9 @@ def train(stages: tuple[Stage, ...], dataset: Dataset, state: TrainState, iterat
     Raises:
         TrainingDivergedError: a loss is not finite; names the term, the step and the view.
         NoGaussiansError: nothing is left, or nothing is in sight of any view.
+        RankLostError: another rank has ended; the state is that after the last `StepDone`, or `ActionDone` after it.
     """
+    ranks = ranks or Ranks()
     check_population(state)
     visibility = VisibilityCheck(len(dataset.train))
     starts = stage_starts(stages, iterations)
@@ -76,36 +104,109 @@ def train(stages: tuple[Stage, ...], dataset: Dataset, state: TrainState, iterat
         if state.step == start:
             if stage.setup is not None:
                 yield from carried_out(stage.setup(state, with_corrected_cameras(dataset, state.scene)))
+                ranks.settle(state)
             yield StageEntered(state.step, stage.name, counts_of(state.scene))
         while state.step < end:
-            yield from advance(stage, dataset, state, iterations, visibility)
+            views = scheduled_views(dataset, state, min(ranks.batch, end - state.step))
+            yield from advance(stage, dataset, state, iterations, views, ranks, visibility)
 
 
 def advance(
-    stage: Stage, dataset: Dataset, state: TrainState, iterations: int, visibility: VisibilityCheck
+    stage: Stage,
+    dataset: Dataset,
+    state: TrainState,
+    iterations: int,
+    views: Sequence[View],
+    ranks: Ranks,
+    visibility: VisibilityCheck,
 ) -> Iterator[Message]:
-    """One optimisation step and the actions that are due after it."""
-    view = scheduled_view(dataset, state)
-    result = differentiate(stage, state.scene, view, probed=state.step < stage.densify_until * iterations)
-    check_losses(result.losses, state.step + 1, view)
-    visibility.note(result.visible, state.step)
-    update(stage, state, result.gradients, iterations)
-    collect_statistics(state, result.screen, view)
-    collect_in_space(state, result)
-    state.step += 1
-    clock = Clock(state.step, iterations, len(dataset.train))
+    """One optimisation step of some views, and the actions that are due after it."""
+    found = step_of(stage, state, views, ranks, probed=state.step < stage.densify_until * iterations)
+    visibility.note(found.visible, state.step, len(views))
+    update(stage, state, found.gradients, iterations, views=len(views))
+    for part, added in found.statistics.items():
+        statistics_of(state.statistics, part, len(added.max_radius), added.max_radius.device).include(added)
+    clocks = [
+        Clock(step + 1, iterations, len(dataset.train), batch=len(views))
+        for step in range(state.step, state.step + len(views))
+    ]
+    state.step += len(views)
     for post_step in stage.post_steps:
-        post_step(state, clock, result.visible)
+        post_step(state, clocks[-1], found.visible)
     done = []
-    for action in stage.actions:
+    for clock, action in itertools.product(clocks, stage.actions):
         if not action.due(clock):
             continue
         if (yield from carried_out(action.apply(state, with_corrected_cameras(dataset, state.scene), clock))):
             done.append(action)
     check_population(state)
-    yield StepDone(state.step, view.name, sum(result.losses.values()), result.losses, counts_of(state.scene))
+    losses = mean_losses(found.losses)
+    names = ", ".join(view.name for view in views)
+    yield StepDone(state.step, names, sum(losses.values()), losses, counts_of(state.scene))
     for action in done:
         yield ActionDone(state.step, action.name, counts_of(state.scene))
+    if done:
+        ranks.settle(state)
+
+
+def step_of(stage: Stage, state: TrainState, views: Sequence[View], ranks: Ranks, *, probed: bool) -> Step:
+    """Differentiate the views of a step, of which this rank renders its own; the scene is not changed yet."""
+    own = views[ranks.rank :: ranks.count]
+    results = [differentiate(stage, state.scene, view, probed=probed) for view in own]
+    if len(views) == ranks.count == 1:
+        check_losses(results[0].losses, state.step + 1, views[0])
+        collect(state.statistics, results[0], views[0])
+        return Step([results[0].losses], results[0].gradients, {}, results[0].visible)
+    statistics: dict[str, ScreenStatistics] = {}
+    for view, result in zip(own, results, strict=True):
+        collect(statistics, result, view)
+    told = ranks.exchange((list(statistics), [(r.losses, set(r.gradients), r.visible is None) for r in results]))
+    # Rank r has the views r, r + count, ...
+    of_views = [told[i % ranks.count][1][i // ranks.count] for i in range(len(views))]
+    for number, (view, (losses, _, _)) in enumerate(zip(views, of_views, strict=True), 1):
+        check_losses(losses, state.step + number, view)
+    parts = dict.fromkeys(part for known, _ in told for part in known)
+    names = [name for name in state.scene.parameters() if any(name in learning for _, learning, _ in of_views)]
+    step = totals(state.scene, results, {part: statistics.get(part) for part in parts}, names, ranks)
+    gradients = {name: gradient / len(views) for name, gradient in step.gradients.items()}
+    is_known = not any(unknown for _, _, unknown in of_views)
+    return Step([losses for losses, _, _ in of_views], gradients, step.statistics, step.visible if is_known else None)
+
+
+def totals(
+    scene: Scene,
+    results: Sequence[Differentiated],
+    statistics: Mapping[str, ScreenStatistics | None],
+    names: Sequence[str],
+    ranks: Ranks,
+) -> Step:
+    """The sums over all ranks of gradients and statistics, of the parameters and parts named."""
+    parameters, sets = scene.parameters(), scene.gaussian_sets()
+    gradients = [sum_of([r.gradients[n] for r in results if n in r.gradients], parameters[n]) for n in names]
+    empty = {part: ScreenStatistics.zeros(len(sets[part]), device=sets[part].means.device) for part in statistics}
+    known = [of_part or empty[part] for part, of_part in statistics.items()]
+    shown = torch.zeros_like(scene.primary.logit_opacities)
+    for result in results:
+        shown = shown if result.visible is None else torch.maximum(shown, result.visible.to(shown.dtype))
+    sums = ranks.summed([*gradients, *(total for one in known for total in one.sums)])
+    *radii, shown = ranks.largest([*(one.max_radius for one in known), shown])
+    of_parts = iter(sums[len(names) :])
+    found = {
+        part: ScreenStatistics(next(of_parts), next(of_parts), next(of_parts), radius)
+        for part, radius in zip(statistics, radii, strict=True)
+    }
+    return Step([], dict(zip(names, sums[: len(names)], strict=True)), found, shown > 0)
+
+
+def sum_of(gradients: Sequence[Tensor], parameter: Tensor) -> Tensor:
+    """The sum of a parameter's gradients over some views, of which there may be none."""
+    return sum(gradients[1:], gradients[0]) if gradients else torch.zeros_like(parameter)
+
+
+def mean_losses(losses: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Every term's mean over the views of a step; one that does not apply to a view adds nothing there."""
+    names = dict.fromkeys(name for of_view in losses for name in of_view)
+    return {name: sum(of_view.get(name, 0.0) for of_view in losses) / len(losses) for name in names}
 
 
 def check_losses(losses: Mapping[str, float], step: int, view: View) -> None:
@@ -135,33 +236,34 @@ class VisibilityCheck:
     """
 
     def __init__(self, views: int) -> None:
-        self._views, self._watched = views, 0
+        self._views, self._watched, self._pass = views, 0, -1
         self._seen: Tensor | bool = False
 
-    def note(self, visible: Tensor | None, step: int) -> None:
-        """Notes what the view of a step showed.
+    def note(self, visible: Tensor | None, step: int, count: int = 1) -> None:
+        """Notes what the views of a step showed.
 
         Args:
-            visible: [N] bool, which primary Gaussians it showed; None if that is not known.
+            visible: [N] bool, which primary Gaussians they showed; None if that is not known.
             step: iterations done before it, from which follows where a pass begins.
+            count: of the views.
 
         Raises:
             NoGaussiansError: no view of a whole pass showed any.
         """
-        if step % self._views == 0:
-            self._watched, self._seen = 0, False
-        self._watched += 1
+        if step // self._views != self._pass:
+            self._watched, self._seen, self._pass = 0, False, step // self._views
+        self._watched += count
         self._seen = self._seen | (True if visible is None else visible.any())
-        if self._watched == self._views and not bool(self._seen):
+        if self._watched >= self._views and not bool(self._seen):
             raise NoGaussiansError(
-                f"none of the {self._views} training views shows a Gaussian, up to step {step + 1}. {WHERE_TO_LOOK}"
+                f"none of the {self._views} training views shows a Gaussian, up to step {step + count}. {WHERE_TO_LOOK}"
             )
 
 
-def scheduled_view(dataset: Dataset, state: TrainState) -> View:
-    """The view of this step: every view once per pass, in an order drawn anew for each pass."""
-    number, position = divmod(state.step, len(dataset.train))
-    return dataset.train[order_of_views(len(dataset.train), state.seed, number)[position]]
+def scheduled_views(dataset: Dataset, state: TrainState, count: int) -> list[View]:
+    """The views of this step: every view once per pass, in an order drawn anew for each pass."""
+    places = (divmod(step, len(dataset.train)) for step in range(state.step, state.step + count))
+    return [dataset.train[order_of_views(len(dataset.train), state.seed, n)[position]] for n, position in places]
 
 
 @lru_cache(maxsize=8)
@@ -214,37 +316,37 @@ def loss_terms(stage: Stage, frame: Frame, view: View, scene: Scene) -> tuple[di
     return terms, constant(weights, frame.rgb.dtype, frame.rgb.device)
 
 
-def update(stage: Stage, state: TrainState, gradients: Mapping[str, Tensor], iterations: int) -> None:
-    """Steps the optimiser at the stage's learning rates."""
+def update(
+    stage: Stage, state: TrainState, gradients: Mapping[str, Tensor], iterations: int, *, views: int = 1
+) -> None:
+    """Steps the optimiser at the stage's learning rates, with the mean gradients of so many views."""
     parameters = state.scene.parameters()
     progress = state.step / iterations
     extent = state.scene.extent
     rates = {n: rate_tensor(stage.rates[n], parameters[n], progress, extent, iterations) for n in gradients}
-    state.optimizer.step(parameters, gradients, rates)
+    state.optimizer.step(parameters, gradients, rates, views=views)
 
 
-def collect_statistics(state: TrainState, screen: list[tuple[ScreenPass, Tensor, Tensor]], view: View) -> None:
-    """Adds the step's screen gradients to the statistics that densification reads."""
+def collect(statistics: dict[str, ScreenStatistics], result: Differentiated, view: View) -> None:
+    """Adds a view's gradients on screen, and in space of what rays met, to the statistics that densification reads."""
     size = view.camera.width, view.camera.height
-    for record, v_means, v_probe in screen:
-        known = statistics_of(state, record.part, v_means.shape[1], v_means.device)
+    for record, v_means, v_probe in result.screen:
+        known = statistics_of(statistics, record.part, v_means.shape[1], v_means.device)
         known.add(Views(v_means, v_probe, record.radii, *size, record.weight, record.direct))
-
-
-def collect_in_space(state: TrainState, result: Differentiated) -> None:
-    """Adds the step's gradients in space, of what rays met, to the statistics that densification reads."""
-    for record in result.space:
-        gradient = result.gradients.get(f"{record.part}.means")
+    for met in result.space:
+        gradient = result.gradients.get(f"{met.part}.means")
         if gradient is not None:
-            known = statistics_of(state, record.part, gradient.shape[0], gradient.device)
-            known.add_in_space(gradient, record.distances)
+            known = statistics_of(statistics, met.part, gradient.shape[0], gradient.device)
+            known.add_in_space(gradient, met.distances)
 
 
-def statistics_of(state: TrainState, part: str, count: int, device: torch.device) -> ScreenStatistics:
+def statistics_of(
+    statistics: dict[str, ScreenStatistics], part: str, count: int, device: torch.device
+) -> ScreenStatistics:
     """Statistics of a part of the scene; empty ones for so many Gaussians where none exist."""
-    if part not in state.statistics:
-        state.statistics[part] = ScreenStatistics.zeros(count, device=device)
-    return state.statistics[part]
+    if part not in statistics:
+        statistics[part] = ScreenStatistics.zeros(count, device=device)
+    return statistics[part]
 
 
 def counts_of(scene: Scene) -> dict[str, int]:

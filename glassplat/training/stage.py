@@ -32,7 +32,7 @@ class Optimizer:
     Attributes:
         moments: first and second moment of each parameter.
         updates: how often each parameter was stepped, for the bias correction.
-        paused: for how many more steps a parameter is left as it is.
+        paused: for how many more views a parameter is left as it is.
         hurried: by what the rate of a parameter is multiplied from now on; 1 where nothing is said.
     """
 
@@ -42,11 +42,21 @@ class Optimizer:
     hurried: dict[str, float] = field(default_factory=dict)
 
     def step(
-        self, parameters: Mapping[str, Tensor], gradients: Mapping[str, Tensor], rates: Mapping[str, float | Tensor]
+        self,
+        parameters: Mapping[str, Tensor],
+        gradients: Mapping[str, Tensor],
+        rates: Mapping[str, float | Tensor],
+        *,
+        views: int = 1,
     ) -> None:
-        """Updates `parameters` in place for every name in `gradients`."""
-        learning = [name for name in gradients if parameters[name].numel() > 0 and not self._waits(name)]
-        adam([self._update(name, parameters[name], gradients[name], rates[name]) for name in learning])
+        """Updates `parameters` in place for every name in `gradients`, which are means over so many views.
+
+        The rates are those of a step of one view. They grow by the root of the number of views: as far as so many steps
+        would lead whose gradients agree on nothing.
+        """
+        learning = [name for name in gradients if parameters[name].numel() > 0 and not self._waits(name, views)]
+        factor = math.sqrt(views)
+        adam([self._update(name, parameters[name], gradients[name], rates[name] * factor) for name in learning])
 
     def _update(self, name: str, parameter: Tensor, gradient: Tensor, rate: float | Tensor) -> Update:
         """The next step of a parameter; counts it."""
@@ -54,11 +64,11 @@ class Optimizer:
         self.updates[name] = self.updates.get(name, 0) + 1
         return Update(parameter, gradient, *moments, lr=rate * self.hurried.get(name, 1.0), step=self.updates[name])
 
-    def _waits(self, name: str) -> bool:
-        """Return whether a parameter is paused; counts the step."""
+    def _waits(self, name: str, views: int) -> bool:
+        """Return whether a parameter is paused; counts the views of the step."""
         left = self.paused.get(name, 0)
         if left:
-            self.paused[name] = left - 1
+            self.paused[name] = max(left - views, 0)
         return left > 0
 
     def moments_of(self, name: str, parameter: Tensor) -> tuple[Tensor, Tensor]:
@@ -135,14 +145,16 @@ class Clock:
     """Position in a run.
 
     Attributes:
-        step: iterations done so far, counting the current one.
+        step: iterations done so far, counting the current one; each is one view.
         iterations: length of the whole run.
         views: number of training views.
+        batch: views of the step that was taken.
     """
 
     step: int
     iterations: int
     views: int
+    batch: int = 1
 
     @property
     def progress(self) -> float:

@@ -1,0 +1,268 @@
+"""Training by several processes, which `torchrun` starts on one machine or many.
+
+Every process, a rank, holds the whole scene and renders one view of each step. Gradients, statistics and what the views
+show are added up, so that all take the same step and make the same edits. Rank 0, the leader, writes, shows progress
+and answers errors; the others are silent.
+
+PyTorch carries what the ranks tell each other: tensors on GPUs by NCCL, everything else by Gloo. Whatever they do
+together begins with an `exchange`, in which a rank that has failed says so instead; nobody waits for it in vain.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from datetime import timedelta
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from glassplat.errors import InputError, RankLostError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from glassplat.training.stage import TrainState
+
+LONGEST_WAIT = timedelta(minutes=10)
+"""For a rank that lives and does not answer: it may save a large scene, compile kernels, or be paused in the viewer.
+One that dies is missed at once."""
+LOST = (
+    "another process of the run has ended without a word, or its machine does not answer ({}); repeat the command with "
+    "--resume to go on from the last checkpoint"
+)
+LONGEST_QUOTE = 150
+
+
+def is_launched() -> bool:
+    """Return whether `torchrun` started this process as one of several."""
+    return "TORCHELASTIC_RUN_ID" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1
+
+
+def leads() -> bool:
+    """Return whether this process writes and talks: it is alone, or rank 0."""
+    return not is_launched() or os.environ.get("RANK", "0") == "0"
+
+
+class Said(NamedTuple):
+    """Part of one rank in an exchange: its value, whether it was asked to end, or how it has failed."""
+
+    value: Any = None
+    is_asked: bool = False
+    failure: tuple[str, str, int] | None = None
+
+
+class Ranks:
+    """The processes of a run, as seen from one of them.
+
+    Attributes:
+        rank: number of this one.
+        count: how many there are.
+        batch: views of a step, rank r has the views r, r + count, ... of them; one for each rank unless said otherwise.
+        asked: tells whether this process was asked to end.
+    """
+
+    def __init__(self, rank: int = 0, count: int = 1, batch: int | None = None) -> None:
+        self.rank, self.count = rank, count
+        self.batch = count if batch is None else batch
+        self.asked: Callable[[], bool] = lambda: False
+        self._is_ending = False
+
+    @property
+    def leads(self) -> bool:
+        """Return whether this is the process that writes."""
+        return self.rank == 0
+
+    @property
+    def is_ending(self) -> bool:
+        """Return whether any process was asked to end; all say the same after the same exchange."""
+        return self.asked() if self.count == 1 else self._is_ending
+
+    def exchange(self, value: Any = None) -> list[Any]:
+        """The values of all ranks, in their order.
+
+        Raises:
+            RankLostError: one has failed, or has ended without a word.
+        """
+        if self.count == 1:
+            return [value]
+        said = self._gathered(Said(value, self.asked()))
+        failed = next((rank for rank, one in enumerate(said) if one.failure is not None), None)
+        if failed is not None:
+            _hold_termination()
+            label, text, code = said[failed].failure
+            raise RankLostError(f"rank {failed}: {text}", (label, f"rank {failed}: {text}", code))
+        self._is_ending = any(one.is_asked for one in said)
+        return [one.value for one in said]
+
+    def _gathered(self, said: Said) -> list[Any]:
+        import torch.distributed as dist
+
+        everything: list[Any] = [None] * self.count
+        with _others_needed():
+            dist.all_gather_object(everything, said)
+        return everything
+
+    def summed(self, tensors: Sequence[Tensor]) -> list[Tensor]:
+        """The sums over all ranks, of tensors of one type and device; call after an exchange."""
+        return self._reduced(tensors, "SUM")
+
+    def largest(self, tensors: Sequence[Tensor]) -> list[Tensor]:
+        """The largest values over all ranks, of tensors of one type and device; call after an exchange."""
+        return self._reduced(tensors, "MAX")
+
+    def _reduced(self, tensors: Sequence[Tensor], operation: str) -> list[Tensor]:
+        if self.count == 1 or not tensors:
+            return list(tensors)
+        import torch
+        import torch.distributed as dist
+
+        # One message instead of dozens, each of which would cost its own delay.
+        flat = torch.cat([tensor.detach().reshape(-1) for tensor in tensors])
+        with _others_needed():
+            dist.all_reduce(flat, getattr(dist.ReduceOp, operation))
+        parts = flat.split([tensor.numel() for tensor in tensors])
+        return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
+
+    def shared(self, state: TrainState | None, device: str) -> TrainState:
+        """The leader's state, on this rank's device; the others need none of their own."""
+        if self.count > 1:
+            import torch.distributed as dist
+
+            self.exchange()
+            sent = [state.to("cpu") if self.leads and state is not None else None]
+            with _others_needed():
+                dist.broadcast_object_list(sent, src=0)
+            if not self.leads and sent[0] is not None:
+                state = sent[0].to(device)
+        assert state is not None
+        return state
+
+    def settle(self, state: TrainState) -> None:
+        """Sees to it that all have the same state after an edit, to the bit: where not, the leader's.
+
+        All draw the same numbers, but machines of different kinds round differently, and some sums of GPUs do so each
+        time.
+        """
+        if self.count > 1 and len(set(self.exchange(fingerprint(state)))) > 1:
+            vars(state).update(vars(self.shared(state, str(state.scene.primary.means.device))))
+
+    def check_alike(self, traits: Mapping[str, object]) -> None:
+        """Refuses ranks that were not started alike.
+
+        Args:
+            traits: what has to be the same everywhere, by what it is called.
+
+        Raises:
+            InputError: something differs; says what, and on which rank.
+        """
+        first, *others = self.exchange(dict(traits))
+        for rank, other in enumerate(others, 1):
+            for name in first.keys() | other.keys():
+                if first.get(name) != other.get(name):
+                    raise InputError(
+                        f"rank {rank} has {other.get(name)} as {name}, rank 0 has {first.get(name)}; expected the same "
+                        "version, capture and options on every machine"
+                    )
+
+
+def fingerprint(state: TrainState) -> int:
+    """A number that changes with any bit of what is trained, of its moments, and of what edits remember."""
+    import torch
+
+    tensors = state.scene.parameters() | {f"mean {name}": mean for name, mean in state.means.items()}
+    for name, (first, second) in state.optimizer.moments.items():
+        tensors |= {f"first {name}": first, f"second {name}": second}
+    whole = {2: torch.int16, 4: torch.int32, 8: torch.int64}
+    sums = {
+        name: (tuple(t.shape), int(t.detach().contiguous().view(whole[t.element_size()]).sum(dtype=torch.int64)))
+        for name, t in tensors.items()
+    }
+    optimizer = state.optimizer
+    return zlib.crc32(repr((sums, state.records, optimizer.paused, optimizer.hurried, optimizer.updates)).encode())
+
+
+def join() -> Ranks:
+    """The processes that `torchrun` started with this one; this one alone if it did not.
+
+    Each takes the GPU of its number on its machine, and on the CPU as many threads as PyTorch has been given.
+
+    Raises:
+        RankLostError: the others cannot be reached.
+    """
+    if not is_launched():
+        return Ranks()
+    import torch.distributed as dist
+
+    if not dist.is_initialized():
+        _take_gpu()
+        _take_threads()
+        with _others_needed():
+            dist.init_process_group(_backend(), timeout=LONGEST_WAIT)
+    return Ranks(dist.get_rank(), dist.get_world_size())
+
+
+def tell(label: str, text: str, code: int) -> None:
+    """Tells the other ranks how this one has failed, in place of the next exchange; waits until the leader has ended.
+
+    Without others it does nothing. The leader returns at once, and has the last word.
+    """
+    if not is_launched():
+        return
+    with suppress(RankLostError):
+        ranks = join()
+        ranks._gathered(Said(failure=(label, text, code)))
+    await_leader()
+
+
+def await_leader() -> None:
+    """Waits until the leader has ended: `torchrun` gives all others little time once the first has."""
+    if leads():
+        return
+    with suppress(RankLostError):
+        ranks = join()
+        while True:
+            ranks._gathered(Said())
+
+
+@contextmanager
+def _others_needed() -> Iterator[None]:
+    """Turns what PyTorch raises where another rank has gone into a RankLostError."""
+    try:
+        yield
+    except (RuntimeError, ValueError) as error:
+        if isinstance(error, RankLostError | InputError):
+            raise
+        _hold_termination()
+        raise RankLostError(LOST.format(str(error).partition("\n")[0][:LONGEST_QUOTE])) from error
+
+
+def _hold_termination() -> None:
+    """Lets the process save and say why it ends: `torchrun`, which terminates it meanwhile, waits for 30 seconds."""
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+
+
+def _backend() -> str:
+    import torch
+    import torch.distributed as dist
+
+    return "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and dist.is_nccl_available() else "gloo"
+
+
+def _take_threads() -> None:
+    """Gives Numba as many threads as PyTorch: `torchrun` speaks of OpenMP's alone."""
+    import numba
+    import torch
+
+    if "NUMBA_NUM_THREADS" not in os.environ:
+        numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
+
+
+def _take_gpu() -> None:
+    """Shows this process only the GPU of its number; before anything asks for one."""
+    number = int(os.environ.get("LOCAL_RANK", "0"))
+    known = os.environ.get("CUDA_VISIBLE_DEVICES")
+    names = known.split(",") if known else None
+    os.environ["CUDA_VISIBLE_DEVICES"] = str(number) if names is None else ",".join(names[number : number + 1])

@@ -1,0 +1,59 @@
+"""One of several processes that train the tiny capture together; `torchrun` starts it, and it writes what it has."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from glassplat.methods.recipe import RECIPES
+from glassplat.training.checkpoint import save_checkpoint
+from glassplat.training.loop import train
+from glassplat.training.messages import ActionDone, StepDone
+from glassplat.training.ranks import Ranks, join
+from glassplat.training.stage import Stage, TrainState
+from tests.training.test_trainer import planar_stages
+from tests.training.tiny_capture import tiny_capture
+
+ROOT = Path(__file__).parents[2]
+
+
+def stages_of(name: str) -> tuple[Stage, ...]:
+    """Stages in which every kind of edit comes up within a few steps."""
+    if name == "planar":
+        return planar_stages()
+    return RECIPES["splat"](sh_degree=1, strategy="mcmc").stages(seed=0)
+
+
+def trained(name: str, ranks: Ranks, iterations: int) -> tuple[TrainState, list[StepDone | ActionDone]]:
+    """The state after so many iterations, and what happened."""
+    state = TrainState(RECIPES["splat"](sh_degree=1).initialise(tiny_capture()), seed=0)
+    messages = train(stages_of(name), tiny_capture(), state, iterations, ranks=ranks)
+    return state, [message for message in messages if isinstance(message, StepDone | ActionDone)]
+
+
+def losses_of(messages: list[StepDone | ActionDone]) -> list[float]:
+    """The loss of every step."""
+    return [message.loss for message in messages if isinstance(message, StepDone)]
+
+
+def torchrun(count: int, *arguments: str, timeout: float = 240) -> subprocess.CompletedProcess[str]:
+    """Runs `python -m ARGUMENTS` in so many processes."""
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}", "-m"]
+    return subprocess.run(
+        [*command, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=timeout, check=False
+    )
+
+
+def main() -> None:
+    """Trains as one of the ranks."""
+    name, iterations, folder = sys.argv[1:]
+    ranks = join()
+    state, messages = trained(name, ranks, int(iterations))
+    save_checkpoint(Path(folder) / f"{ranks.rank}.safetensors", state)
+    (Path(folder) / f"{ranks.rank}.json").write_text(json.dumps(losses_of(messages)))
+
+
+if __name__ == "__main__":
+    main()

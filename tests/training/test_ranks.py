@@ -1,0 +1,245 @@
+"""Several ranks train as one that accumulates their views, and end together."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import torch
+
+from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.training.checkpoint import load_checkpoint
+from glassplat.training.messages import ActionDone, StepDone
+from glassplat.training.ranks import Ranks
+from glassplat.training.stage import Clock, Optimizer, TrainState
+from tests.training.rank_process import ROOT, losses_of, stages_of, torchrun, trained
+from tests.training.tiny_capture import tiny_capture, write_tiny_capture
+
+ITERATIONS = 40
+LONGEST = 240
+"""Seconds for what takes a few on an idle machine."""
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny_capture(tmp_path_factory.mktemp("capture") / "tiny")
+
+
+def train_arguments(capture: Path, output: Path, *more: str, iterations: int = ITERATIONS) -> list[str]:
+    common = ["--data", str(capture), "--output", str(output), "--device", "cpu", "--iterations", str(iterations)]
+    return ["glassplat", "train", "splat", *common, *more]
+
+
+@contextmanager
+def running(count: int, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """`torchrun` at work, which does not outlive the context."""
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}", "-m"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    with subprocess.Popen([*command, *arguments], cwd=ROOT, **pipes) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+
+
+def ranks_of(process: subprocess.Popen[str]) -> list[int]:
+    """The processes that `torchrun` has started, rank by rank."""
+    found = {}
+    for number in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
+        for entry in Path(f"/proc/{number}/environ").read_bytes().split(b"\0"):
+            if entry.startswith(b"RANK="):
+                found[int(entry.removeprefix(b"RANK="))] = int(number)
+    return [found[rank] for rank in sorted(found)]
+
+
+def wait_for(path: Path, process: subprocess.Popen[str]) -> None:
+    """Waits until a file is there."""
+    end = time.monotonic() + LONGEST
+    while not path.is_file():
+        assert process.poll() is None, ended(process)
+        assert time.monotonic() < end, f"{path} never came"
+        time.sleep(0.05)
+
+
+def ended(process: subprocess.Popen[str]) -> str:
+    """What a process says until it ends."""
+    text, _ = process.communicate(timeout=LONGEST)
+    return text
+
+
+def started_apart(arguments: list[str], of_rank_1: list[str]) -> list[subprocess.CompletedProcess[str]]:
+    """Two ranks as two machines would start them, the second one with further arguments."""
+    with socket.socket() as found:
+        found.bind(("localhost", 0))
+        port = str(found.getsockname()[1])
+    where = {"MASTER_ADDR": "localhost", "MASTER_PORT": port, "WORLD_SIZE": "2", "TORCHELASTIC_RUN_ID": "test"}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-m", *arguments, *more],
+            cwd=ROOT,
+            env=os.environ | where | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
+            **pipes,
+        )
+        for rank, more in enumerate(([], of_rank_1))
+    ]
+    spoken = [process.communicate(timeout=LONGEST) for process in processes]
+    return [subprocess.CompletedProcess(p.args, p.returncode, *said) for p, said in zip(processes, spoken, strict=True)]
+
+
+def said(done: subprocess.CompletedProcess[str]) -> list[str]:
+    """Lines on standard error that are ours; `torchrun` has its own to say."""
+    return [line for line in done.stderr.splitlines() if line.startswith(("error:", "stopped:", "usage:"))]
+
+
+@pytest.mark.parametrize(("name", "count"), [("planar", 2), ("planar", 3), ("mcmc", 2)])
+def test_ranks_agree_with_one_process_that_accumulates_their_views(name: str, count: int, tmp_path: Path) -> None:
+    done = torchrun(count, "tests.training.rank_process", name, str(ITERATIONS), str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    first, *others = (load_checkpoint(tmp_path / f"{rank}.safetensors") for rank in range(count))
+    alone, messages = trained(name, Ranks(batch=count), ITERATIONS)
+    assert any(isinstance(message, ActionDone) for message in messages)
+    assert first.step == alone.step == ITERATIONS
+    losses = [json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(count)]
+    assert losses[0] == pytest.approx(losses_of(messages), rel=2e-3)
+    assert all(of_rank == losses[0] for of_rank in losses)
+    for tensor_name, expected in alone.scene.parameters().items():
+        found = first.scene.parameters()[tensor_name]
+        assert found.shape == expected.shape, tensor_name
+        assert all(torch.equal(other.scene.parameters()[tensor_name], found) for other in others), tensor_name
+    for part, statistics in alone.statistics.items():
+        assert torch.allclose(first.statistics[part].view_count, statistics.view_count), part
+        assert torch.allclose(first.statistics[part].gradient_sum, statistics.gradient_sum, rtol=1e-2), part
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_gradients_of_ranks_are_the_means_over_their_views(count: int, tmp_path: Path) -> None:
+    """Moments are linear in the gradients; Adam makes a whole step of a gradient that is rounding alone."""
+    done = torchrun(count, "tests.training.rank_process", "planar", str(count), str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    found = load_checkpoint(tmp_path / "0.safetensors").optimizer
+    expected = trained("planar", Ranks(batch=count), count)[0].optimizer
+    assert found.updates == expected.updates
+    for name, (first, _) in expected.moments.items():
+        assert float((found.moments[name][0] - first).norm()) <= 1e-5 * float(first.norm()) + 1e-9, name
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_a_pass_shows_every_view_once_and_a_stage_ends_where_it_would_alone(count: int) -> None:
+    state, messages = trained("planar", Ranks(batch=count), 30)
+    steps = [message for message in messages if isinstance(message, StepDone)]
+    names = [name for step in steps for name in step.view.split(", ")]
+    assert len(names) == state.step == 30
+    for begin in range(0, 30, 6):
+        assert set(Counter(names[begin : begin + 6]).values()) == {1}
+    assert {6, 15, 30} <= {step.step for step in steps}  # The stages have shares of 0.2, 0.3 and 0.5.
+
+
+@pytest.mark.parametrize("count", [2, 3, 7])
+def test_no_action_is_missed_where_steps_go_over_its_moment(count: int) -> None:
+    alone, together = (
+        [m.action for m in trained("planar", Ranks(batch=batch), 60)[1] if isinstance(m, ActionDone)]
+        for batch in (1, count)
+    )
+    assert Counter(together) == Counter(alone)
+
+
+def test_learning_rates_grow_by_the_root_of_the_views_and_pauses_count_views() -> None:
+    moved = []
+    for views in (1, 4):
+        parameters, optimizer = {"a": torch.zeros(3)}, Optimizer(paused={"b": 5})
+        optimizer.step(parameters, {"a": torch.ones(3)}, {"a": 0.1}, views=views)
+        moved.append(parameters["a"])
+        optimizer.step({"b": torch.zeros(1)}, {"b": torch.ones(1)}, {"b": 0.1}, views=views)
+        assert optimizer.paused["b"] == 5 - views
+    assert torch.allclose(moved[1], 2 * moved[0])
+
+
+def test_noise_grows_as_the_rate_that_it_follows() -> None:
+    *_, explore, _ = stages_of("mcmc")[0].post_steps
+    moved = []
+    for batch in (1, 4):
+        state = TrainState(SplatRecipe(sh_degree=1).initialise(tiny_capture()), seed=0)
+        before = state.scene.primary.means.clone()
+        explore(state, Clock(10, 100, 6, batch=batch), None)
+        moved.append(state.scene.primary.means - before)
+    assert torch.allclose(moved[1], 2 * moved[0], rtol=1e-2, atol=1e-6)
+
+
+def test_one_process_of_torchrun_learns_the_same_bits_as_without(capture: Path, tmp_path: Path) -> None:
+    done = torchrun(1, *train_arguments(capture, tmp_path / "torchrun"))
+    assert done.returncode == 0, done.stderr
+    command = [sys.executable, "-m", *train_arguments(capture, tmp_path / "plain")]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=120)
+    files = [tmp_path / run / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply" for run in ("torchrun", "plain")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+
+
+def test_a_run_that_is_asked_to_end_goes_on_with_another_number_of_ranks(capture: Path, tmp_path: Path) -> None:
+    arguments = train_arguments(capture, tmp_path / "run", "--checkpoint-every", "0.01", iterations=100_000)
+    checkpoint, steps = tmp_path / "run" / "checkpoint.safetensors", [0]
+    for count, more in ((2, []), (3, ["--resume"])):
+        with running(count, *arguments, *more) as process:
+            wait_for(tmp_path / "run" / "log.jsonl", process)
+            while not checkpoint.is_file() or load_checkpoint(checkpoint).step <= steps[-1]:
+                assert process.poll() is None, ended(process)
+            os.kill(ranks_of(process)[1], signal.SIGTERM)
+            text = ended(process)
+        assert "repeat the command with --resume" in text
+        steps.append(load_checkpoint(checkpoint).step)
+    assert steps[1] % 2 == 0
+    assert (steps[2] - steps[1]) % 3 == 0
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_the_death_of_a_rank_ends_the_others_with_one_message(rank: int, capture: Path, tmp_path: Path) -> None:
+    arguments = train_arguments(capture, tmp_path / "run", "--checkpoint-every", "0.01", iterations=100_000)
+    with running(2, *arguments) as process:
+        wait_for(tmp_path / "run" / "checkpoint.safetensors", process)
+        killed = time.monotonic()
+        os.kill(ranks_of(process)[rank], signal.SIGKILL)
+        text = ended(process)
+        assert time.monotonic() - killed < 60
+    assert process.returncode == 1
+    ours = [line for line in text.splitlines() if line.startswith(("stopped:", "error:"))]
+    assert len(ours) == (0 if rank == 0 else 1), text  # Of rank 0 `torchrun` tells.
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.safetensors").step > 0
+
+
+@pytest.mark.parametrize(
+    ("of_rank_1", "expected"),
+    [
+        (["--seed", "1"], "error: rank 1 has 1 as seed, rank 0 has 0"),
+        (["--sh-degree", "2"], "error: rank 1 has 2 as sh_degree, rank 0 has 3"),
+        (["--data", "/nowhere"], "error: rank 1: "),
+        (["--downscale", "0.5"], "error: rank 1: "),
+        (["--no-such-option"], "error: rank 1: the options of the command cannot be understood"),
+    ],
+)
+def test_ranks_that_disagree_end_with_one_message_of_rank_0(
+    of_rank_1: list[str], expected: str, capture: Path, tmp_path: Path
+) -> None:
+    done = started_apart(train_arguments(capture, tmp_path / "run"), of_rank_1)
+    assert [process.returncode for process in done] == [2, 2]
+    assert expected in done[0].stderr
+    assert len(said(done[0])) == 1
+    assert done[1].stderr == done[1].stdout == ""
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_stands_in_the_way_of_rank_0_ends_all(capture: Path, tmp_path: Path) -> None:
+    (tmp_path / "run").write_text("in the way")
+    done = started_apart(train_arguments(capture, tmp_path / "run"), [])
+    assert [process.returncode for process in done] == [2, 2]
+    assert len(said(done[0])) == 1
+    assert done[1].stderr == ""
