@@ -408,10 +408,10 @@ def save_page(model: Savable, path: Path, title: str, *, sharing: Sharing = PRIV
     """Writes the page that shows a model with live panes in any browser.
 
     Raises:
-        InputError: it shows only what `planar` and `splat` render of ellipsoids.
+        InputError: it shows no `deferred` scene that shades every Gaussian.
     """
     if model.renderer.page_settings() is None:
-        raise InputError(f"the page shows planar and splat scenes, not {model.recipe.method} ones of this kind")
+        raise InputError(f"the page does not show {model.recipe.method} scenes of this kind: it shades pixels")
     with input_checked():
         write_page(path, model.scene, model.renderer, tuple(model.cameras.items()), title, sharing=sharing)
 

@@ -26,8 +26,10 @@ from torch import Tensor
 
 from glassplat.files.spz import FLIP, spz_bytes
 from glassplat.files.writing import atomic_write
+from glassplat.kernels.environment import cube_lookup
 from glassplat.render.frame import NEAR_PER_EXTENT, Renderer
 from glassplat.render.panes import glass_owners, nearest_hits, panes_in_camera
+from glassplat.render.traced import traced_colors
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
@@ -156,12 +158,16 @@ SCRIPTS = (
     "pace.js", "display.js", "main.js",
 )  # fmt: skip
 SHADERS = ("texels.glsl", "screen.vert", "project.frag", "splat.vert", "splat.frag", "compose.frag", "copy.frag")
+CUBE_SIZE = 128
+"""Texels along a side of what glossy things mirror."""
 MOST_VIEWS = 400
 MOST_PANES = 16
 """The page orders the panes of every pixel by hand."""
 POSTER_WIDTH, POSTER_QUALITY = 640, 70
 LEAST_OPACITY = 1 / 255
 DESCRIPTION = "Look around, take the reflections off the glass, or turn it into a mirror."
+DESCRIPTIONS = ("Look around a scene of Gaussians.", "Look around, and take the reflections off what shines.")
+"""Of scenes without panes: matte ones, and those with glossy things."""
 PREVIEW = "preview.jpg"
 PREVIEW_WIDTH, PREVIEW_HEIGHT = 1200, 630
 """What the programs that preview links ask for, pixels."""
@@ -223,7 +229,7 @@ def write_page(
     Args:
         path: the HTML file.
         scene: what to show.
-        renderer: how; a `Planar` or a `Splat`.
+        renderer: how; not a `Deferred` that shades every Gaussian.
         cameras: of the photographs, by name; at least one. People may look round near them.
         title: of the page.
         sharing: what it says of its origin and address.
@@ -248,7 +254,7 @@ def page_text(
     """Text of the page."""
     settings = renderer.page_settings()
     if settings is None:
-        raise ValueError(f"a page cannot show what {type(renderer).__name__} renders; expected a planar or a splat run")
+        raise ValueError(f"a page cannot show what this {type(renderer).__name__} renders: it shades every Gaussian")
     if not cameras or len(scene.planes) > MOST_PANES:
         raise ValueError(
             f"there are {len(cameras)} cameras and {len(scene.planes)} panes; expected at least one camera and at most "
@@ -257,7 +263,9 @@ def page_text(
     poster_view = best_view(scene.planes, [camera for _, camera in cameras])
     poster = jpeg(renderer(scene, poster_camera(cameras[poster_view][1])).rgb)
     scene = replace(scene, primary=drawn(scene.primary), glass=drawn(scene.glass)).to("cpu")
-    channel, channel_range = channel_bytes(scene)
+    mirrored = settings.get("mirrored")
+    cube = b"" if mirrored is None else cube_bytes(scene, settings)
+    channel, channel_range = channel_bytes(scene) if mirrored is None else (strength_bytes(scene), [0.0, 0.0])
     description = described(scene, settings, cameras, poster_view)
     count = len(scene.planes)
     subtitle = f"{len(scene.primary):,} Gaussians" + (f" · {count} pane{'s' if count > 1 else ''}" if count else "")
@@ -268,7 +276,7 @@ def page_text(
         {
             "title": html.escape(title),
             "subtitle": html.escape(subtitle),
-            "description": html.escape(DESCRIPTION if count else "Look around a scene of Gaussians."),
+            "description": html.escape(DESCRIPTION if count else DESCRIPTIONS[mirrored is not None]),
             "credit": html.escape(sharing.credit),
             "preview": preview_tags(sharing.url),
             "style": asset("style.css"),
@@ -277,6 +285,7 @@ def page_text(
             "primary": in_base64(spz_bytes(replace(scene.primary, channels={}))),
             "glass": in_base64(spz_bytes(glass)),
             "channel": in_base64(gzip.compress(channel, 9, mtime=0)),
+            "cube": in_base64(gzip.compress(cube, 9, mtime=0)),
             "shaders": in_script({name: asset(name) for name in SHADERS}),
             "script": "\n".join(asset(name) for name in SCRIPTS),
         },
@@ -347,6 +356,39 @@ def channel_bytes(scene: Scene) -> tuple[bytes, list[float]]:
     owners = glass_owners(scene.glass, scene.planes) if len(scene.planes) else torch.zeros(len(scene.glass))
     parts = [part.to(torch.uint8).numpy().tobytes() for part in (intensities, marks, owners)]
     return b"".join(parts), [low, step]
+
+
+def strength_bytes(scene: Scene) -> bytes:
+    """The strength of the reflection of each Gaussian, one byte each."""
+    strengths = torch.round(255 * torch.sigmoid(scene.primary.channels["logit_strength"]))
+    return strengths.to(torch.uint8).numpy().tobytes()
+
+
+def cube_bytes(scene: Scene, settings: Mapping[str, Any]) -> bytes:
+    """The light that glossy things mirror: six faces [S, S, 3] sRGB in the order and the axes of WebGL's cube maps.
+
+    Near surroundings are those that the middle of the glossy things sees.
+    """
+    near, environment = settings["mirrored"] == "near", scene.environment
+    size = CUBE_SIZE if near else min(environment.size, CUBE_SIZE)
+    directions = cube_directions(size).reshape(-1, 3) * torch.tensor(FLIP)
+    if near and len(scene.surroundings):
+        weights = torch.sigmoid(scene.primary.logit_opacities) * torch.sigmoid(scene.primary.channels["logit_strength"])
+        middle = (weights[:, None] * scene.primary.means).sum(0) / weights.sum()
+        origins = middle.expand_as(directions).contiguous()
+        colors = traced_colors(scene, origins, directions, NEAR_PER_EXTENT * scene.extent, settings["background"])
+    else:
+        colors = torch.sigmoid(cube_lookup(environment.raw, directions))
+    return torch.round(255 * colors.clamp(0, 1)).to(torch.uint8).numpy().tobytes()
+
+
+def cube_directions(size: int) -> Tensor:
+    """Directions [6, S, S, 3] of the texels of a cube map, in the order and the axes of WebGL."""
+    centers = (2 * torch.arange(size) + 1) / size - 1
+    t, s = torch.meshgrid(centers, centers, indexing="ij")
+    one = torch.ones_like(s)
+    faces = [(one, -t, -s), (-one, -t, s), (s, one, t), (s, -one, -t), (s, -t, one), (-s, -t, -one)]
+    return torch.stack([torch.stack(face, dim=-1) for face in faces])
 
 
 def described(

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -329,6 +330,11 @@ def view_directions(camera: Camera) -> Tensor:
     return ray_grid(camera.intrinsics.to(rotation), camera.width, camera.height) @ rotation
 
 
+def page_settings(background: tuple[float, float, float], mirrored: str) -> dict[str, Any]:
+    """Settings with which the web page shades surfaces; `mirrored` says whether what they mirror is distant or near."""
+    return {"background": background, "fresnel": "none", "blend": "srgb", "intensity": False, "mirrored": mirrored}
+
+
 INVISIBLE = 1 / 512
 """A pixel that reflects less changes by at most half a step of eight bits, from black to white."""
 
@@ -393,8 +399,11 @@ class Deferred:
         """The renderer, also of `environment` where that is among the layers."""
         return replace(self, environment=self.environment or "environment" in layers)
 
-    def page_settings(self) -> None:
-        """None: the web page knows no environment."""
+    def page_settings(self) -> Mapping[str, Any] | None:
+        """Settings for the web page, which shades pixels and looks up distant light."""
+        if self.shading != "deferred":
+            return None
+        return page_settings(self.background, "distant")
 
     def _channels_of(self, gaussians: Gaussians, camera: Camera, projected: Projected) -> Tensor:
         """[N, D] what each Gaussian adds to the image: as `shade_environment` reads it, then depth, if asked for."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +14,14 @@ from glassplat.kernels.environment import cube_lookup
 from glassplat.kernels.records import FLAT, RawGaussians, Rays
 from glassplat.kernels.records import Traced as Found
 from glassplat.kernels.trace import build_bvh, shapes_of, trace
-from glassplat.render.deferred import INVISIBLE, Surface, reflected_rays, seen_surface, view_directions
+from glassplat.render.deferred import (
+    INVISIBLE,
+    Surface,
+    page_settings,
+    reflected_rays,
+    seen_surface,
+    view_directions,
+)
 from glassplat.render.frame import (
     MEDIAN_DEPTH,
     NEAR_PER_EXTENT,
@@ -128,8 +136,9 @@ class Traced:
         """The renderer, also of `surroundings` where that is among the layers."""
         return replace(self, surroundings=self.surroundings or "surroundings" in layers)
 
-    def page_settings(self) -> None:
-        """None: the web page knows no surroundings."""
+    def page_settings(self) -> Mapping[str, Any]:
+        """Settings for the web page, which looks up the surroundings as they are seen from the middle of the things."""
+        return page_settings(self.background, "near")
 
     def _elsewhere(self, scene: Scene, camera: Camera, surface: Surface, chosen: Tensor) -> tuple[Tensor, Tensor]:
         """[H, W, 3] what pixels mirror where no ray is traced, and [H, W] which ones mirror anything."""

@@ -11,6 +11,11 @@ uniform float reflectances[PANES];
 uniform vec3 transmittances[PANES];
 uniform bool present[PANES];
 #endif
+#ifdef SHINY
+uniform sampler2D strengths, normals;
+uniform samplerCube surroundings;
+uniform mat3 camFromWorld;
+#endif
 uniform vec4 intrinsics;
 uniform vec2 size, used, usedByMirrors;  // of the canvas; what part of the textures is drawn
 uniform vec3 background;
@@ -101,6 +106,14 @@ void main() {
     mask = maskOf(farthest);
     for (int k = 0; k < PANES; k++) if (k == farthest) depths[k] = FAR;
   }
+#endif
+#ifdef SHINY
+  // 3DGS-DR, Eq. 3.
+  vec3 ray = normalize(vec3((pixel - intrinsics.zw) / intrinsics.xy, 1.0)) * camFromWorld, normal = texture(normals, at).xyz;
+  vec3 light = texture(surroundings, reflect(ray, normal / max(length(normal), 1e-6))).rgb;
+  mirror = vec4(light, texture(strengths, at).r);
+  if (mirror.a < 1.0 / 512.0) mirror = vec4(0.0);
+  seen = mix(behind, light, mirror.a);
 #endif
   int layer = pixel.x < divider ? layers.x : layers.y;
   shown = vec4(clamp(layerOf(layer, seen, behind, mirror, mask), 0.0, 1.0), 1.0);

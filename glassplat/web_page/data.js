@@ -77,7 +77,7 @@ function texturesOf(primary, glass, channel) {
 
 async function loadedScene() {
   const scene = JSON.parse(document.getElementById('scene').textContent);
-  const [primary, glass, channel] = await Promise.all(['primary', 'glass', 'channel'].map(async (id) => inflated(packedBytes(id))));
+  const [primary, glass, channel, cube] = await Promise.all(['primary', 'glass', 'channel', 'cube'].map(async (id) => inflated(packedBytes(id))));
   const parts = [sectionsOf(primary), sectionsOf(glass)];
-  return { ...scene, firstGlass: parts[0].count, degree: parts[0].degree, ...texturesOf(...parts, channel) };
+  return { ...scene, cube, firstGlass: parts[0].count, degree: parts[0].degree, ...texturesOf(...parts, channel) };
 }

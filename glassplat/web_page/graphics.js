@@ -62,6 +62,20 @@ function makeGraphics(canvas) {
     return texture;
   }
 
+  // Six faces of sRGB bytes.
+  function cube(bytes) {
+    const side = Math.sqrt(bytes.length / 18), face = bytes.length / 6, texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_CUBE_MAP, texture);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    for (let k = 0; k < 6; k++) {
+      const part = bytes.subarray(k * face, (k + 1) * face);
+      gl.texImage2D(gl.TEXTURE_CUBE_MAP_POSITIVE_X + k, 0, gl.RGB8, side, side, 0, gl.RGB, gl.UNSIGNED_BYTE, part);
+    }
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 4);
+    filtered(gl.TEXTURE_CUBE_MAP, gl.LINEAR);
+    return texture;
+  }
+
   function framebuffer(attachments) {
     const made = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, made);
@@ -104,5 +118,5 @@ function makeGraphics(canvas) {
     };
   }
 
-  return { gl, isSoftware, formats, program, dataTexture, image, framebuffer, rectangles, use, fence };
+  return { gl, isSoftware, formats, program, dataTexture, image, cube, framebuffer, rectangles, use, fence };
 }

@@ -140,6 +140,8 @@ function makePanel(scene, navigation, changed) {
   }
 
   body.classList.toggle('panes', scene.panes.length > 0);
+  body.classList.toggle('shiny', Boolean(scene.mirrored));
+  if (scene.mirrored) document.querySelector('[data-set="layer=without_panes"]').textContent = 'Without reflections';
   if (scene.panes.length > 1) {
     const chip = (value, label) => `<button data-set="pane=${value}">${label}</button>`;
     element('panes').innerHTML = chip('all', 'All') + scene.panes.map((pane, k) => chip(k, pane.label)).join('');

@@ -12,7 +12,7 @@ uniform vec4 clipPlane;      // keeps where clipPlane . (x, 1) > 0
 uniform float near;
 uniform vec2 channelRange;   // lowest value and step of the primary splats' channel, a logarithm
 uniform float faintest;     // coverage below this is left out
-uniform bool mirrored;
+uniform bool mirrored, shiny;
 
 layout(location = 0) out uvec4 place;
 layout(location = 1) out uvec4 look;
@@ -34,6 +34,15 @@ mat3 rotationOf(uint packed) {
     1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
     2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
     2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
+}
+
+int shortest(vec3 s) { return s.x <= s.y && s.x <= s.z ? 0 : s.y <= s.z ? 1 : 2; }
+
+// A unit vector on an octahedron.
+uint octahedral(vec3 n) {
+  n /= abs(n.x) + abs(n.y) + abs(n.z);
+  vec2 signs = vec2(n.x < 0.0 ? -1.0 : 1.0, n.y < 0.0 ? -1.0 : 1.0);
+  return packSnorm2x16(n.z < 0.0 ? (1.0 - abs(n.yx)) * signs : n.xy);
 }
 
 uvec4 stored[3];
@@ -78,9 +87,12 @@ void main() {
 
   uvec2 shape = texelFetch(shapes, texel(index), 0).xy;
   vec4 scaleBytes = bytesOf(shape.y);
-  mat3 axes = rotationOf(shape.x);
+  mat3 rotation = rotationOf(shape.x), axes = rotation;
   vec3 scales = exp(scaleBytes.xyz / 16.0 - 10.0);
   axes = mat3(axes[0] * scales.x, axes[1] * scales.y, axes[2] * scales.z);
+  // The shortest axis of a shiny splat, turned to the camera.
+  vec3 facing = transpose(camFromWorld) * inCamera, normal = rotation[shortest(scaleBytes.xyz)];
+  normal *= dot(normal, facing) > 0.0 ? -1.0 : 1.0;
   vec2 tangents = inCamera.xy / inCamera.z;
   vec2 margin = MARGIN * size;
   vec2 held = clamp(tangents, -(intrinsics.zw + margin) / intrinsics.xy, (size - intrinsics.zw + margin) / intrinsics.xy);
@@ -109,9 +121,9 @@ void main() {
   if (!isGlass) {
     seen = 0.5 + 0.28209479 * (color.rgb - 0.5) / 0.15;
     if (degree > 0) seen += viewDependent(index, normalize(mean - eye));
-    channel = mirrored ? exp(channelRange.x + channelRange.y * scaleBytes.w) : 0.0;
+    if (!shiny) channel = mirrored ? exp(channelRange.x + channelRange.y * scaleBytes.w) : 0.0;
   }
   seen = max(seen, 0.0);
   place = uvec4(floatBitsToUint(center), packHalf2x16(major), packHalf2x16(minor));
-  look = uvec4(packHalf2x16(seen.rg), packHalf2x16(vec2(seen.b, color.a)), packHalf2x16(vec2(channel, reach)), 0u);
+  look = uvec4(packHalf2x16(seen.rg), packHalf2x16(vec2(seen.b, color.a)), packHalf2x16(vec2(channel, reach)), shiny ? octahedral(normal) : 0u);
 }

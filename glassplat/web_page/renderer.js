@@ -5,15 +5,15 @@ const LAYERS = { rgb: 0, without_panes: 1, reflection: 2, strength: 3, mask: 4 }
 
 function makeRenderer(canvas, scene) {
   const graphics = makeGraphics(canvas), { gl, formats, use, isSoftware } = graphics;
-  const panes = scene.panes, rows = texelRows(scene.total);
+  const shiny = Boolean(scene.mirrored), panes = scene.panes, rows = texelRows(scene.total);
   const splatProgram = (constants) => graphics.program('splat.vert', null, 'splat.frag', constants);
   const programs = {
     project: graphics.program('screen.vert', 'texels.glsl', 'project.frag'),
-    direct: splatProgram({ COLORED: 1, CHANNELED: 0 }),
+    direct: splatProgram(shiny ? { COLORED: 1, CHANNELED: 1, SHINY: 1 } : { COLORED: 1, CHANNELED: 0 }),
     mask: splatProgram({ COLORED: 0, CHANNELED: 1 }),
     mirrored: splatProgram({ COLORED: 1, CHANNELED: scene.intensity ? 1 : 0 }),
     copy: graphics.program('screen.vert', null, 'copy.frag'),
-    compose: graphics.program('screen.vert', null, 'compose.frag', { PANES: panes.length }),
+    compose: graphics.program('screen.vert', null, 'compose.frag', { PANES: panes.length, ...(shiny && { SHINY: 1 }) }),
   };
   const inputs = {
     places: graphics.dataTexture(gl.RGBA32UI, gl.RGBA_INTEGER, scene.places, 4),
@@ -26,6 +26,7 @@ function makeRenderer(canvas, scene) {
   // As camerasToSort() has them.
   const orders = { direct: newOrder(), masks: panes.map(newOrder), mirrored: panes.map(newOrder) };
   const ordered = [orders.direct, ...orders.masks, ...orders.mirrored];
+  const cube = shiny && graphics.cube(scene.cube);
   const rectangles = graphics.rectangles(scene.total), empty = gl.createVertexArray();
   let targets = null;
 
@@ -37,12 +38,12 @@ function makeRenderer(canvas, scene) {
     }
     canvas.width = width;
     canvas.height = height;
-    const textures = [[formats[4]], [formats[1], panes.length], [formats[4], panes.length], [formats[1], panes.length], [gl.RGBA8]]
+    const textures = [[formats[4]], [formats[1], panes.length], [formats[4], panes.length], [formats[1], panes.length], [gl.RGBA8], ...(shiny ? [[formats[1]], [formats[4]]] : [])]
       .map(([format, layers]) => graphics.image(width, height, format, layers));
-    const [image, masks, reflections, gains, small] = textures;
+    const [image, masks, reflections, gains, small, ...surface] = textures;
     targets = {
-      width, height, textures, image, masks, reflections, gains, small,
-      direct: graphics.framebuffer([[image]]),
+      width, height, textures, image, masks, reflections, gains, small, surface,
+      direct: graphics.framebuffer([[image], ...surface.map((texture) => [texture])]),
       covered: panes.map((_, k) => graphics.framebuffer([[masks, k]])),
       mirrored: panes.map((_, k) => graphics.framebuffer([[reflections, k], ...(scene.intensity ? [[gains, k]] : [])])),
       coarse: graphics.framebuffer([[small]]),
@@ -71,6 +72,7 @@ function makeRenderer(canvas, scene) {
     gl.uniform2fv(at('channelRange'), scene.channelRange);
     gl.uniform1f(at('faintest'), faintest);
     gl.uniform1i(at('mirrored'), side ? 1 : 0);
+    gl.uniform1i(at('shiny'), shiny ? 1 : 0);
     gl.bindVertexArray(empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
@@ -99,7 +101,9 @@ function makeRenderer(canvas, scene) {
     const at = use(programs.compose, [
       ['image', gl.TEXTURE_2D, targets.image],
       ...(panes.length ? ['masks', 'reflections', 'gains'].map((name) => [name, gl.TEXTURE_2D_ARRAY, targets[name]]) : []),
+      ...(shiny ? [['strengths', gl.TEXTURE_2D, targets.surface[0]], ['normals', gl.TEXTURE_2D, targets.surface[1]], ['surroundings', gl.TEXTURE_CUBE_MAP, cube]] : []),
     ]);
+    if (shiny) gl.uniformMatrix3fv(at('camFromWorld'), true, view.pose.rotation);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
     gl.viewport(0, 0, ...size);
     if (panes.length) {

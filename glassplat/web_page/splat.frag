@@ -3,11 +3,16 @@ precision highp float;
 in vec2 along;
 flat in vec4 shade;
 flat in float channel;
+flat in vec3 normal;
 #if COLORED
 layout(location = 0) out vec4 color;
 #endif
 #if CHANNELED
 layout(location = COLORED) out vec4 sum;
+#endif
+
+#ifdef SHINY
+layout(location = 2) out vec4 normals;
 #endif
 
 void main() {
@@ -18,5 +23,8 @@ void main() {
 #endif
 #if CHANNELED
   sum = vec4(channel * alpha, 0.0, 0.0, alpha);
+#endif
+#ifdef SHINY
+  normals = vec4(normal * alpha, alpha);
 #endif
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,18 +14,23 @@ from PIL import Image
 
 from glassplat.evaluate.metrics import psnr
 from glassplat.publish.web_page import SCRIPTS, SHADERS, Sharing, asset, filled, page_text, write_page, write_preview
+from glassplat.render.deferred import Deferred
+from glassplat.render.frame import Renderer
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
+from glassplat.render.traced import Traced
 from glassplat.scene.camera import Camera
-from glassplat.scene.scene import Scene, as_mirrors, without_glass
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Environment, Scene, as_mirrors, without_glass
 from tests.browser_needed import needs_browser
-from tests.render.tiny_scene import in_single_precision, joined, pane, showcase
+from tests.render.test_deferred import glossy as glossy_scene
+from tests.render.tiny_scene import camera_at, in_single_precision, joined, pane, showcase
 from tests.training.tiny_capture import tiny_capture, true_scene
 from tools.browser import Browser
 from tools.page_likeness import picture, pixels_of
 
 CAMERAS = [(view.name, view.camera) for view in tiny_capture().train]
-LARGEST_SCRIPT = 68 * 1024
+LARGEST_SCRIPT = 72 * 1024
 
 
 def likeness(browser: Browser, scene: Scene, renderer: Planar | Splat, camera: Camera, layer: str = "rgb") -> float:
@@ -285,6 +291,48 @@ def test_panes_behind_panes_and_scenes_without_any(tmp_path: Path) -> None:
             for _, camera in CAMERAS[:2]:
                 assert likeness(browser, scene, renderer, camera) > 36
             assert browser.complaints() == []
+
+
+def shining(mirrored: str) -> tuple[Scene, Renderer]:
+    """Things of some thickness that shine, among distant light or, far enough to look distant, near things."""
+    scene = in_single_precision(glossy_scene(0.6, size=8))
+    scene = replace(scene, environment=Environment(scene.environment.raw.float()))
+    flat = scene.primary.log_scales + torch.tensor([0.5, 0.5, -2.0])
+    primary = scene.primary.with_tensors({"log_scales": flat})
+    if mirrored == "distant":
+        return replace(scene, primary=primary), Deferred()
+    generator = torch.Generator().manual_seed(1)
+    away = torch.nn.functional.normalize(torch.randn(40, 3, generator=generator), dim=1)
+    around = Gaussians(
+        means=200 * away,
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(40, 1),
+        log_scales=torch.full((40, 3), math.log(30.0)),
+        logit_opacities=torch.full((40,), 3.0),
+        sh=torch.rand(40, 1, 3, generator=generator) * 3 - 1.5,
+        channels={},
+    )
+    return replace(scene, primary=primary, surroundings=around), Traced()
+
+
+@needs_browser
+@pytest.mark.parametrize("mirrored", ["distant", "near"])
+def test_what_shines_mirrors_what_surrounds_it(mirrored: str, tmp_path: Path) -> None:
+    scene, renderer = shining(mirrored)
+    poses = [camera_at(x, y, 0.0) for x, y in ((0.1, -0.2), (-0.4, 0.3))]
+    cameras = [(f"{k}.png", replace(at, cam_from_world=at.cam_from_world.float())) for k, at in enumerate(poses)]
+    write_page(tmp_path / "index.html", scene, renderer, cameras, "Shining")
+    with Browser(tmp_path / "index.html", 320, 240) as browser:
+        for _, camera in cameras:
+            large = camera.resized(8 * camera.width, 8 * camera.height)
+            for layer, truth in (("rgb", "rgb"), ("without_panes", "base"), ("strength", "strength")):
+                frame = renderer(scene, large)
+                image = frame.rgb if truth == "rgb" else frame.layers[truth]
+                image = image if image.dim() == 3 else image[..., None].expand(-1, -1, 3)
+                found = psnr(picture(browser, large, layer), image.float().clamp(0, 1))
+                assert found > 34, (layer, found)
+        shown = browser.evaluate("[...document.querySelectorAll('#dock button')].filter((b) => b.offsetParent).length")
+        assert shown == 5, "four layers and the comparison"
+        assert browser.complaints() == []
 
 
 def test_the_page_is_one_file_of_little_script() -> None:
