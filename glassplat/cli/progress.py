@@ -24,13 +24,17 @@ SPEED_SECONDS = 60.0
 SMOOTHING = 0.98
 WIDE = 110
 """Columns of a terminal from which on the last checkpoint has room in the bar."""
+FORECAST_STEPS, FORECAST_SECONDS = 10, 5.0
+"""After so many steps and seconds the whole run is forecast; the first step, which may compile, does not count."""
+LONG_SECONDS = 600.0
+"""A run from which on it is worth saying what would make it shorter."""
 FREQUENT = ("densify", "grow")
 """Actions of which nobody wants to read each time, by how their names begin."""
 
 
 @dataclass
 class Standing:
-    """Progress of a training; `loss` is smoothed, `saved` the step of the last checkpoint."""
+    """Progress of a training; `loss` is smoothed, `saved` the step of the last checkpoint, `left` the time left."""
 
     iterations: int
     step: int = 0
@@ -38,6 +42,101 @@ class Standing:
     loss: float = 0.0
     count: int = 0
     saved: int | None = None
+    left: str = ""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Lengths and typical costs of a run's stages, known before it begins.
+
+    Attributes:
+        ends: last step of each stage.
+        costs: typical seconds of a step in each, in any unit; the speed of one stage tells that of the next by them.
+        shortcuts: what would make the run shorter, as the end of a sentence; nothing if empty.
+    """
+
+    ends: tuple[int, ...]
+    costs: tuple[float, ...]
+    shortcuts: str = ""
+
+    @property
+    def iterations(self) -> int:
+        """Length of the run."""
+        return self.ends[-1]
+
+    def work(self, step: int) -> float:
+        """Work of all steps up to one, in the unit of the costs."""
+        total, begin = 0.0, 0
+        for end, cost in zip(self.ends, self.costs, strict=True):
+            total += cost * max(min(step, end) - begin, 0)
+            begin = end
+        return total
+
+    def cost(self, step: int) -> float:
+        """Cost of a step."""
+        return self.work(step) - self.work(step - 1)
+
+
+class Pace:
+    """The speed of this sitting over its last minute, and the time left by it."""
+
+    def __init__(self, plan: Plan, clock: Callable[[], float] = time.monotonic) -> None:
+        self._plan, self._clock = plan, clock
+        self._passed: deque[tuple[float, int]] = deque()
+        self._is_forecast = False
+
+    def step(self, number: int) -> None:
+        """Notes a step, now and then."""
+        now = self._clock()
+        if not self._passed or now - self._passed[-1][0] >= FIRST_PAUSE:
+            self._passed.append((now, number))
+        while len(self._passed) > 2 and now - self._passed[1][0] > SPEED_SECONDS:
+            self._passed.popleft()
+
+    def seconds_left(self, number: int) -> float | None:
+        """Seconds from a step to the end of the run; None where the speed is not known yet."""
+        plan = self._plan
+        seconds, steps = self._since_first(number)
+        if not steps or seconds <= 0:
+            return None
+        speed = seconds / (plan.work(number) - plan.work(number - steps))
+        return speed * (plan.work(plan.iterations) - plan.work(number))
+
+    def left(self, number: int) -> str:
+        """The time left, in words."""
+        seconds = self.seconds_left(number)
+        return "time left is not known yet" if seconds is None else f"{in_words(seconds)} left"
+
+    def forecast(self, number: int) -> str | None:
+        """Sentence on the whole run's time and what would make it shorter: once, as soon as it is known."""
+        seconds, steps = self._since_first(number)
+        if self._is_forecast or steps < FORECAST_STEPS or seconds < FORECAST_SECONDS:
+            return None
+        self._is_forecast = True
+        return _forecast(self._plan, number, seconds / steps, self.seconds_left(number) or 0.0)
+
+    def _since_first(self, number: int) -> tuple[float, int]:
+        """Seconds and steps since the first one that is remembered."""
+        if not self._passed:
+            return 0.0, 0
+        since, first = self._passed[0]
+        return self._clock() - since, number - first
+
+
+def _forecast(plan: Plan, number: int, seconds: float, left: float) -> str:
+    """The forecast, from the seconds of a step and those left."""
+    later = [
+        f"{_brief(seconds * cost / plan.cost(number))} from step {end} on"
+        for end, before, cost in zip(plan.ends, plan.costs, plan.costs[1:], strict=False)
+        if end >= number and cost != before
+    ]
+    steps = ", about ".join([f"{_brief(seconds)} a step", *later])
+    shorter = f"; {plan.shortcuts}" if plan.shortcuts and left >= LONG_SECONDS else ""
+    return f"about {in_words(left)} for {plan.iterations - number} steps ({steps}){shorter}"
+
+
+def _brief(seconds: float) -> str:
+    return f"{seconds:.2f} s" if seconds >= 0.1 else f"{1000 * seconds:.0f} ms"
 
 
 class Display(Protocol):
@@ -59,9 +158,10 @@ class Display(Protocol):
 class TrainingProgress:
     """Shows a run's messages; a context, so that a bar ends with the run."""
 
-    def __init__(self, console: Console, iterations: int) -> None:
-        self._console, self._standing = console, Standing(iterations)
-        self._display: Display = StepBar(console) if console.is_terminal else StepLines(console)
+    def __init__(self, console: Console, plan: Plan, clock: Callable[[], float] = time.monotonic) -> None:
+        self._console, self._standing = console, Standing(plan.iterations)
+        self._pace = Pace(plan, clock)
+        self._display: Display = StepBar(console) if console.is_terminal else StepLines(console, clock)
 
     def __enter__(self) -> TrainingProgress:
         return self
@@ -88,6 +188,10 @@ class TrainingProgress:
             standing.step = message.step
             standing.loss = _smoothed(standing.loss, message.loss)
             standing.count = message.counts["primary"] + message.counts["glass"]
+            self._pace.step(message.step)
+            standing.left = self._pace.left(message.step)
+            if forecast := self._pace.forecast(message.step):
+                self._say(forecast)
             self._display.step(standing)
 
     def _begin(self, message: messages.RunBegun) -> None:
@@ -114,8 +218,7 @@ class StepBar:
             progress.TextColumn("loss {task.fields[loss]:.4f}"),
             progress.TextColumn("{task.fields[count]} Gaussians"),
             progress.TimeElapsedColumn(),
-            progress.TextColumn("left"),
-            progress.TimeRemainingColumn(compact=True),
+            progress.TextColumn("{task.fields[left]}"),
         ]
         if console.width >= WIDE:
             columns.append(progress.TextColumn("{task.fields[saved]}"))
@@ -126,12 +229,12 @@ class StepBar:
         """Shows a step."""
         if not self._begun:
             # The speed is that of this sitting, not of the steps before it.
-            fields = {"loss": standing.loss, "count": standing.count, "saved": ""}
+            fields = {"loss": standing.loss, "count": standing.count, "left": standing.left, "saved": ""}
             self._bar.add_task(standing.stage, total=standing.iterations, completed=standing.step - 1, **fields)  # type: ignore[arg-type]
             self._bar.start()
             self._begun = True
         saved = "" if standing.saved is None else f"saved at {standing.saved}"
-        fields = {"loss": standing.loss, "count": standing.count, "saved": saved}
+        fields = {"loss": standing.loss, "count": standing.count, "left": standing.left, "saved": saved}
         task = self._bar.task_ids[0]
         self._bar.update(task, description=standing.stage, completed=standing.step, **fields)  # type: ignore[arg-type]
 
@@ -154,20 +257,16 @@ class StepLines:
     def __init__(self, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
         self._console, self._clock = console, clock
         self._pause, self._shown_at = FIRST_PAUSE, clock()
-        self._passed: deque[tuple[float, int]] = deque()
 
     def step(self, standing: Standing) -> None:
         """Shows a step, if it is time for a line."""
-        if not self._passed:
-            self._passed.append((self._clock(), standing.step))
         if not self._is_time():
             return
         saved = "" if standing.saved is None else f", saved at step {standing.saved}"
-        left = self._left(standing)
         say(
             self._console,
             f"step {standing.step} of {standing.iterations}: loss {standing.loss:.4f}, {standing.count} Gaussians, "
-            f"{left}{saved}",
+            f"{standing.left}{saved}",
         )
 
     def work(self, standing: Standing, work: messages.Working) -> None:
@@ -186,17 +285,6 @@ class StepLines:
             return False
         self._shown_at, self._pause = now, min(2 * self._pause, LONGEST_PAUSE)
         return True
-
-    def _left(self, standing: Standing) -> str:
-        """The time left at the speed of the last minute."""
-        now = self._clock()
-        self._passed.append((now, standing.step))
-        while len(self._passed) > 2 and now - self._passed[1][0] > SPEED_SECONDS:
-            self._passed.popleft()
-        since, first = self._passed[0]
-        if standing.step == first:
-            return "time left is not known yet"
-        return f"{in_words((now - since) / (standing.step - first) * (standing.iterations - standing.step))} left"
 
 
 def in_words(seconds: float) -> str:

@@ -16,7 +16,7 @@ from glassplat.captures.dataset import TEST_EVERY, Dataset, dataset_of, load_dat
 from glassplat.captures.view import PointCloud, View
 from glassplat.cli.console import counted, say, warn
 from glassplat.cli.places import chosen_views
-from glassplat.cli.progress import TrainingProgress
+from glassplat.cli.progress import Plan, TrainingProgress
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.images import picture_paths
 from glassplat.files.sidecars import read_cameras
@@ -27,6 +27,7 @@ from glassplat.model.training import Listener, Training
 from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
 from glassplat.training.messages import Message
+from glassplat.training.stage import stage_starts
 from glassplat.viewer.server import Viewer
 
 if TYPE_CHECKING:
@@ -157,7 +158,8 @@ def train(asked: Train[Any], console: Console) -> None:
         resume=asked.resume,
         checkpoint_every=asked.checkpoint_every,
     )
-    with TrainingProgress(console, asked.iterations) as progress, _watched(asked, training, dataset, console) as watch:
+    plan = plan_of(asked)
+    with TrainingProgress(console, plan) as progress, _watched(asked, training, dataset, console) as watch:
 
         def listen(message: Message) -> None:
             progress.show(message)
@@ -170,6 +172,31 @@ def train(asked: Train[Any], console: Console) -> None:
         f"{len(scene.primary)} Gaussians, {counted(len(scene.planes), 'pane')} -> {asked.output}",
     )
     say(console, f"next: glassplat eval {asked.output}")
+
+
+STEP_COSTS = {"Planar": 2.6, "Deferred": 1.2, "Traced": 9.0}
+"""Seconds of a step with a renderer, in those of a step of `splat`; measured on two cores (docs/performance.md)."""
+USUAL_ITERATIONS = 7000
+"""What the pages of the methods recommend."""
+
+
+def plan_of(asked: Train[Any]) -> Plan:
+    """Lengths and typical costs of a run's stages, and what would make it shorter."""
+    stages = asked.recipe.stages(asked.seed, asked.iterations)
+    costs = tuple(STEP_COSTS.get(type(stage.renderer).__name__, 1.0) for stage in stages)
+    return Plan(tuple(stage_starts(stages, asked.iterations)[1:]), costs, shortcuts(asked))
+
+
+def shortcuts(asked: Train[Any]) -> str:
+    """Ways to make a run shorter, as the end of a sentence."""
+    ways = [f"--downscale {2 * asked.downscale:g}, a quarter of the pixels"]
+    if asked.iterations > USUAL_ITERATIONS:
+        ways.append(f"--iterations {USUAL_ITERATIONS}")
+    if asked.recipe.method == "traced":
+        ways.append("--least-strength 0.1")
+    if asked.settings().device == "cpu":
+        ways.append("an NVIDIA GPU")
+    return f"shorter with {', or '.join(ways)}"
 
 
 @contextmanager

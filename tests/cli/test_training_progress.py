@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,8 +13,10 @@ from rich.console import Console
 
 from glassplat.cli import progress as training_progress
 from glassplat.cli.main import main
-from glassplat.cli.progress import FIRST_PAUSE, LONGEST_PAUSE, StepLines, TrainingProgress, in_words
-from glassplat.cli.train import SCENE
+from glassplat.cli.progress import FIRST_PAUSE, LONGEST_PAUSE, Plan, TrainingProgress, in_words
+from glassplat.cli.runs import STEP_COSTS, plan_of
+from glassplat.cli.train import SCENE, Train
+from glassplat.methods.recipe import RECIPES, recipe_of
 from glassplat.training.messages import (
     ActionDone,
     CheckpointWritten,
@@ -25,6 +28,7 @@ from glassplat.training.messages import (
 )
 from tests.training.tiny_capture import write_tiny_capture
 
+PLAN = Plan((1000,), (1.0,))
 COUNTS = {"primary": 1000, "glass": 20, "planes": 1}
 BUSY = [Working("looking for Gaussians that no view needs", done, 40) for done in range(40)]
 
@@ -42,20 +46,19 @@ class FakeClock:
         return self.now
 
 
-def lines_of(messages: list[Message], seconds: float, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def lines_of(messages: Iterable[Message], seconds: float, plan: Plan = PLAN) -> list[str]:
     """What is written to a file while messages come at a distance in time."""
     clock, file = FakeClock(), io.StringIO()
-    monkeypatch.setattr(training_progress, "StepLines", lambda console: StepLines(console, clock))
-    with TrainingProgress(Console(file=file, width=40), 1000) as progress:
+    with TrainingProgress(Console(file=file, width=40), plan, clock) as progress:
         for message in messages:
             progress.show(message)
             clock.now += seconds
     return file.getvalue().splitlines()
 
 
-def test_lines_come_soon_at_first_and_then_every_few_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    lines = lines_of([step(number) for number in range(1, 101)], 0.5, monkeypatch)
-    shown = [int(line.split()[1]) for line in lines]
+def test_lines_come_soon_at_first_and_then_every_few_seconds() -> None:
+    lines = lines_of([step(number) for number in range(1, 101)], 0.5)
+    shown = [int(line.split()[1]) for line in lines if line.startswith("step")]
     pauses = [0.5 * (later - earlier) for earlier, later in pairwise(shown)]
     assert shown[0] == 1 + FIRST_PAUSE / 0.5
     assert pauses == [2.0, 4.0, 8.0, *[LONGEST_PAUSE] * 3]
@@ -63,33 +66,66 @@ def test_lines_come_soon_at_first_and_then_every_few_seconds(monkeypatch: pytest
     assert lines[-1] == f"step {shown[-1]} of 1000: loss 0.2500, 1020 Gaussians, {left} left"
 
 
-def test_the_time_left_is_that_of_this_sitting_and_its_last_minute(monkeypatch: pytest.MonkeyPatch) -> None:
-    lines = lines_of([RunBegun(899, 1000), *(step(number) for number in range(900, 1000))], 6.0, monkeypatch)
+def test_the_time_left_is_that_of_this_sitting_and_its_last_minute() -> None:
+    lines = lines_of([RunBegun(899, 1000), *(step(number) for number in range(900, 1000))], 6.0)
     assert lines[0] == "going on from step 899 of 1000"
     assert lines[-1].endswith(f"{in_words(6 * (1000 - int(lines[-1].split()[1])))} left")
 
 
-def test_what_takes_long_between_steps_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
-    lines = lines_of([Working("fitting planes to the masks", 0, 1), step(7), *BUSY], 1.0, monkeypatch)
+def test_how_long_a_run_takes_is_said_once_and_counts_the_dearer_steps_to_come() -> None:
+    plan = Plan((250, 1000), (1.0, 9.0), "shorter with an NVIDIA GPU")
+    steps = [step(number) for number in range(1, 31)]
+    forecasts = [line for line in lines_of(steps, 1.0, plan) if line.startswith("about")]
+    left = in_words(250 - 11 + 9 * 750)
+    assert forecasts == [
+        f"about {left} for 989 steps (1.00 s a step, about 9.00 s from step 250 on); shorter with an NVIDIA GPU"
+    ]
+    assert lines_of(steps, 0.01, plan) == []
+    assert lines_of(steps[:8], 1.0, plan)[-1].startswith("step 8")
+
+
+def test_a_short_run_needs_no_advice() -> None:
+    lines = lines_of([step(number) for number in range(1, 31)], 0.5, Plan((1000,), (1.0,), "shorter with a GPU"))
+    assert [line for line in lines if line.startswith("about")] == ["about 8 min for 989 steps (0.50 s a step)"]
+
+
+def test_the_time_left_of_a_cheap_stage_counts_what_the_next_one_costs() -> None:
+    plan = Plan((250, 1000), (1.0, 9.0))
+    assert lines_of([step(number) for number in range(1, 31)], 1.0, plan)[-1].endswith(f"{in_words(224 + 6750)} left")
+    assert lines_of([step(number) for number in range(900, 931)], 9.0, plan)[-1].endswith(f"{in_words(9 * 70)} left")
+
+
+@pytest.mark.parametrize("method", RECIPES)
+def test_every_method_has_a_plan(method: str, tmp_path: Path) -> None:
+    run = Train(recipe_of(method), tmp_path, tmp_path / "run", 30_000, device="cpu")
+    plan = plan_of(run)
+    assert plan.iterations == 30_000
+    assert max(plan.costs) == STEP_COSTS.get(method.title(), 1.0)
+    assert "--downscale 2, a quarter of the pixels, or --iterations 7000" in plan.shortcuts
+    assert plan.shortcuts.endswith("or an NVIDIA GPU")
+
+
+def test_what_takes_long_between_steps_is_shown() -> None:
+    lines = lines_of([Working("fitting planes to the masks", 0, 1), step(7), *BUSY], 1.0)
     assert lines[0] == "step 0: fitting planes to the masks"
     busy = [line for line in lines if "no view needs" in line]
     assert len(busy) >= 3
     assert all(re.fullmatch(r"step 7: looking for .* needs, \d+ of 40 done", line) for line in busy)
 
 
-def test_what_is_quick_between_steps_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert lines_of([step(1), *BUSY], 0.01, monkeypatch) == []
+def test_what_is_quick_between_steps_is_not() -> None:
+    assert lines_of([step(1), *BUSY], 0.01) == []
 
 
-def test_a_checkpoint_is_named_in_the_next_line_and_makes_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_checkpoint_is_named_in_the_next_line_and_makes_none() -> None:
     messages: list[Message] = [CheckpointWritten(3), *(step(number) for number in range(4, 10))]
-    lines = lines_of(messages, 1.0, monkeypatch)
+    lines = lines_of(messages, 1.0)
     assert lines and all(line.endswith("left, saved at step 3") or "not known yet" in line for line in lines)
 
 
-def test_events_are_lines_but_for_frequent_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_events_are_lines_but_for_frequent_ones() -> None:
     actions = [ActionDone(5, name, COUNTS) for name in ("densify primary", "grow SH", "reset opacity")]
-    lines = lines_of([RunBegun(0, 1000, anew=True), StageEntered(0, "1 [stage]", COUNTS), *actions], 0.0, monkeypatch)
+    lines = lines_of([RunBegun(0, 1000, anew=True), StageEntered(0, "1 [stage]", COUNTS), *actions], 0.0)
     assert lines == [
         "warning: an earlier run in this folder was begun and never saved; it is replaced",
         "step 0: stage 1 [stage], 1000 primary, 20 glass, 1 planes",
@@ -102,7 +138,7 @@ def terminal(messages: list[Message], error: Exception | None = None) -> str:
     file = io.StringIO()
     console = Console(file=file, force_terminal=True, width=150, color_system=None)
     try:
-        with TrainingProgress(console, 1000) as progress:
+        with TrainingProgress(console, PLAN) as progress:
             for message in messages:
                 progress.show(message)
             if error is not None:
@@ -136,7 +172,7 @@ def test_a_closed_terminal_does_not_hide_why_a_run_ends() -> None:
     file = Closed()
     with (
         pytest.raises(KeyboardInterrupt),
-        TrainingProgress(Console(file=file, force_terminal=True), 1000) as progress,
+        TrainingProgress(Console(file=file, force_terminal=True), PLAN) as progress,
     ):
         progress.show(step(1))
         file.is_closed = True
