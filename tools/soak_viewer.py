@@ -1,10 +1,11 @@
 """Many clients that click at random look at a scene for long: does memory stay flat, does everybody get pictures?
 
-    python -m tools.soak_viewer RUN --clients 50 --minutes 120 [--pause 0.25]
+    python -m tools.soak_viewer RUN --clients 50 --minutes 120 [--deaf 2] [--pause 0.25]
 
 Starts `glassplat view` in a process of its own and speaks viser's protocol, as browsers do: cameras that move, every
-control that the page has, panes that are dragged, connections that are cut. At the end all clients rest, and each has
-to get a picture. Memory is that of the viewer's process; its slope is fitted to the second half of the time.
+control that the page has, panes that are dragged, connections that are cut. Deaf ones ask for pictures and never fetch
+any. At the end all clients rest, and each that hears has to get a picture. Memory is that of the viewer's process; its
+slope is fitted to the second half of the time.
 """
 
 from __future__ import annotations
@@ -53,8 +54,9 @@ class Count:
 class Looker:
     """One client that does what people do, and some things that they do not."""
 
-    def __init__(self, address: str, seed: int, pause: float, count: Count) -> None:
+    def __init__(self, address: str, seed: int, pause: float, count: Count, *, is_deaf: bool = False) -> None:
         self._address, self._random, self._pause, self._count = address, random.Random(seed), pause, count
+        self.is_deaf = is_deaf
         self._angle, self._size = self._random.uniform(0, 6.28), self._random.choice(SIZES)
         self.rests, self.pictures = False, 0
 
@@ -65,6 +67,8 @@ class Looker:
                 async with ViewerClient(self._address) as client:
                     self._count.connections += 1
                     before = client.pictures
+                    if self.is_deaf:
+                        client.stop_hearing()
                     try:
                         await self._look(client)
                         await self._act(client)
@@ -159,25 +163,28 @@ def resident_mib(pid: int) -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-async def soak(run: Path, clients: int, minutes: float, *, pause: float = 0.25, say: Any = print) -> Soaked:
-    """Starts a viewer and its clients, waits, and ends them all."""
+async def soak(
+    run: Path, clients: int, minutes: float, *, deaf: int = 0, pause: float = 0.25, say: Any = print
+) -> Soaked:
+    """Starts a viewer and its clients, of which some are deaf, waits, and ends them all."""
     port, count = free_port(), Count()
     with tempfile.TemporaryDirectory() as kept, tempfile.TemporaryFile("w+") as log:
         command = ["-m", "glassplat", "view", str(run), "--port", str(port), "--output", kept]
         viewer = await asyncio.create_subprocess_exec(sys.executable, *command, stdout=log, stderr=log)
         try:
             address = await printed_address(log, viewer)
-            browsers = [Looker(address, seed, pause, count) for seed in range(clients)]
+            browsers = [Looker(address, seed, pause, count, is_deaf=seed < deaf) for seed in range(clients)]
             tasks = [asyncio.create_task(browser.live()) for browser in browsers]
             samples = await sampled(viewer.pid, 60 * minutes, count, say)
             for browser in browsers:
                 browser.rests = True
             begun = time.monotonic()
             await asyncio.sleep(4 * pause)
-            while any(not one.pictures for one in browsers) and time.monotonic() - begun < LAST_PICTURE:
+            hearing = [browser for browser in browsers if not browser.is_deaf]
+            while any(not one.pictures for one in hearing) and time.monotonic() - begun < LAST_PICTURE:
                 await asyncio.sleep(0.5)
             seconds = time.monotonic() - begun
-            missing = sum(not one.pictures for one in browsers)
+            missing = sum(not one.pictures for one in hearing)
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
@@ -201,11 +208,11 @@ async def printed_address(log: IO[str], viewer: asyncio.subprocess.Process) -> s
 
 
 async def sampled(pid: int, seconds: float, count: Count, say: Any) -> list[tuple[float, float]]:
-    """Memory over time, with a line ten times on the way."""
+    """Memory over time, with a line each minute."""
     begun, samples, said = time.monotonic(), list[tuple[float, float]](), 0
     while (now := time.monotonic() - begun) < seconds:
         samples.append((now, resident_mib(pid)))
-        if now >= said * seconds / 10:
+        if now >= 60 * said:
             said += 1
             say(
                 f"{now / 60:6.1f} min {samples[-1][1]:7.0f} MiB {count.pictures:8d} pictures {count.actions:8d} actions"
@@ -220,16 +227,25 @@ def main() -> int:
     parser.add_argument("run", type=Path)
     parser.add_argument("--clients", type=int, default=50)
     parser.add_argument("--minutes", type=float, default=120)
+    parser.add_argument("--deaf", type=int, default=0, help="of the clients, how many never fetch a picture")
     parser.add_argument("--pause", type=float, default=0.25, help="mean seconds between two actions of a client")
     options = parser.parse_args()
     found = asyncio.run(
-        soak(options.run, options.clients, options.minutes, pause=options.pause, say=partial(print, flush=True))
+        soak(
+            options.run,
+            options.clients,
+            options.minutes,
+            deaf=options.deaf,
+            pause=options.pause,
+            say=partial(print, flush=True),
+        )
     )
     first, last = found.samples[len(found.samples) // 2][1], found.samples[-1][1]
     print(
         f"{found.count.connections} connections, {found.count.actions} actions, {found.count.pictures} pictures; "
         f"half-way {first:.0f} MiB, at the end {last:.0f}, slope {found.slope:+.1f} MiB/h; all at rest: "
-        f"{found.without_picture} of {options.clients} without a picture after {found.seconds_to_last:.1f} s"
+        f"{found.without_picture} of {options.clients - options.deaf} without a picture after "
+        f"{found.seconds_to_last:.1f} s"
     )
     for line, times in Counter([*found.complaints, *found.count.refused]).most_common(MOST_TOLD):
         print(f"{times} times: {line}")

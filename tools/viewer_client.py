@@ -71,6 +71,10 @@ class ViewerClient:
         await asyncio.gather(self._hearing, return_exceptions=True)
         await self.connection.close()
 
+    def stop_hearing(self) -> None:
+        """Reads nothing from now on, so that what the server sends piles up."""
+        self._hearing.cancel()
+
     async def send(self, kind: str, **fields: Any) -> None:
         """One message."""
         await self.connection.send(msgspec.msgpack.encode({"type": kind, **fields}))
