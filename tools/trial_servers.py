@@ -1,8 +1,8 @@
 """Strangers and nonsense at `view` and `annotate`: nobody gets in, nothing is written, and the next client is served.
 
 The servers run in this process. After every case a client with the link has to be served, nothing may have been printed
-with a traceback, and the marks of the capture are what they were. The first case is a capture whose photographs have
-names that are HTML, through training, `eval` and `export`.
+with a traceback, and the marks of the capture are what they were. The first case are photographs and captures with
+names that are HTML, through `prepare`, training, `eval` and `export`.
 """
 
 from __future__ import annotations
@@ -27,11 +27,14 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from glassplat.access import cookie_name
 from glassplat.annotate.server import AnnotationServer
 from glassplat.annotate.session import opened_session
+from glassplat.files.images import write_image
+from glassplat.prepare.report_page import PAGE
 from glassplat.render.planar import Planar
 from glassplat.viewer.drawing import Shown
 from glassplat.viewer.gate import LARGEST_MESSAGE, MESSAGES
 from glassplat.viewer.server import Viewer
 from tests.annotate.conftest import write_room
+from tests.prepare.conftest import copy_photographs
 from tests.training.tiny_capture import tiny_capture, true_scene, write_tiny_capture
 from tests.viewer.free_port import free_port
 from tools.trial import Case
@@ -68,21 +71,36 @@ def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
 
 
 def names_fault(place: Path) -> str:
-    """Fault of pages about a photograph that is called HTML."""
-    data = write_tiny_capture(place / "capture")
+    """Fault of pages about photographs and a capture that are called HTML."""
+    data = write_tiny_capture(place / HTML)
     for folder in ("images", "panes"):
-        (data / folder / "0.png").rename(data / folder / HTML)
+        for path in sorted((data / folder).iterdir()):
+            path.rename(path.with_name(HTML + path.name))
     file = data / "transforms.json"
-    file.write_text(file.read_text().replace("images/0.png", f"images/{HTML}"))
+    file.write_text(file.read_text().replace("images/", f"images/{HTML}"))
     out = place / "run"
-    told = [run(["train", "splat", "--data", data, "--output", out, "--iterations", "3", "--device", "cpu"])]
+    prepared = place / f"{HTML} prepared"
+    told = [run(["prepare", oddly_named(place / "photographs"), "--output", prepared])]
+    told += [run(["train", "splat", "--data", data, "--output", out, "--iterations", "3", "--device", "cpu"])]
     told += [
         run(["eval", out, "--device", "cpu"]),
         run(["export", out, "--output", place / "exported", "--device", "cpu"]),
     ]
     faults = [one.fault() or ("" if one.code == 0 else one.output[-300:]) for one in told]
-    faults += [f"{path} has the name as HTML" for path in place.rglob("*.html") if "<img src=x on" in path.read_text()]
+    pages = {path: path.read_text() for path in place.rglob("*.html")}
+    faults += [f"{path} has the name as HTML" for path, text in pages.items() if "<img src=x on" in text]
+    reports = prepared / PAGE, out / "index.html"
+    faults += [f"{path} does not have the name" for path in reports if "&lt;img src=x" not in pages.get(path, "")]
     return "; ".join(fault for fault in faults if fault)
+
+
+def oddly_named(folder: Path) -> Path:
+    """Photographs with names that are HTML, one of which shows nothing and cannot be placed."""
+    copy_photographs(folder)
+    for path in sorted(folder.iterdir()):
+        path.rename(path.with_name(f"{HTML} {path.name}"))
+    write_image(folder / f"lost {HTML}", torch.full((96, 128, 3), 0.5))
+    return folder
 
 
 @contextmanager
@@ -193,7 +211,7 @@ async def long(viewer: Viewer, draw: random.Random) -> str:
 async def slow(viewer: Viewer, draw: random.Random) -> str:
     """A client that asks for much, reads nothing, and is cut off."""
     async with ViewerClient(viewer.address) as client:
-        client._hearing.cancel()
+        client.stop_hearing()
         for step in range(30):
             await client.look(position=(0.0, 0.0, -2.0 + 0.01 * step), image_width=1920, image_height=1080)
         await asyncio.sleep(draw.uniform(0, 1))
