@@ -12,14 +12,11 @@ import pytest
 import torch
 from PIL import Image
 
-from glassplat.captures.dataset import Dataset, load_dataset
+from glassplat.captures.dataset import load_dataset
 from glassplat.captures.view import View
 from glassplat.errors import InputError
 from glassplat.evaluate.evaluate import evaluate
 from glassplat.files.sidecars import write_planes
-from glassplat.methods.planar_recipe import PlanarRecipe
-from glassplat.methods.splat_recipe import SplatRecipe
-from glassplat.model.training import Training
 from glassplat.panes.material import compared_region, reduced_photograph
 from glassplat.render.frame import Frame
 from glassplat.render.planar import Planar
@@ -162,38 +159,6 @@ def test_what_masks_leave_out_has_no_gradient(tmp_path: Path) -> None:
     image = torch.rand(28, 40, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
     (gradient,) = torch.autograd.grad(PhotometricLoss(0.2)(Frame(image), view, true_scene()), image)
     assert not bool(gradient[DROPPED].any()) and bool(gradient[~DROPPED].any(dim=1).all())
-
-
-def redness(data: Dataset) -> float:
-    """Mean red over green in the renders of `splat`, trained for a moment, where photographs were painted red."""
-    model = Training(data, SplatRecipe(), iterations=500, device="cpu").run()
-    images = [model.image(view.name)[DROPPED] for view in data.train]
-    return float(torch.cat([image[:, 0] - image[:, 1] for image in images]).mean())
-
-
-def test_splat_learns_nothing_of_what_is_black_in_masks_as_brush_has_them(tmp_path: Path) -> None:
-    root = write_tiny_capture(tmp_path / "capture")
-    shutil.rmtree(root / "panes")
-    clean = redness(load_dataset(root))
-    for path in sorted((root / "images").iterdir()):
-        pixels = np.array(Image.open(path))
-        pixels[KEPT == 0] = (255, 0, 0)
-        Image.fromarray(pixels).save(path)
-    painted = redness(load_dataset(root))
-    for path in sorted((root / "images").iterdir()):
-        write_shades(root / "masks" / f"{path.name}.png", KEPT)
-    masked = redness(load_dataset(root))
-    assert painted - clean > 0.1 and abs(masked - clean) < 0.1 * (painted - clean), (clean, painted, masked)
-
-
-def test_planar_learns_from_a_capture_of_earlier_versions_as_before(tmp_path: Path) -> None:
-    root = write_tiny_capture(tmp_path / "capture")
-    now = Training(load_dataset(root), PlanarRecipe(), iterations=16, device="cpu").run().scene
-    (root / "panes").rename(root / "masks")
-    before = Training(load_dataset(root), PlanarRecipe(), iterations=16, device="cpu").run().scene
-    assert len(now.planes) == 1
-    for name, tensor in now.parameters().items():
-        assert torch.equal(tensor, before.parameters()[name]), name
 
 
 def test_masks_that_belong_to_no_photograph_are_refused(tmp_path: Path) -> None:
