@@ -91,25 +91,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def guarded(arguments: list[str], *, is_program: bool) -> int:
     """Runs a command; whatever happens ends in one readable message and an exit code."""
-    from glassplat.cli.console import (
-        complain,
-        drop_output,
-        ending,
-        immediate_end,
-        plain_streams,
-        raised_signals,
-        silence,
-    )
+    from glassplat.cli import console
     from glassplat.training.ranks import await_leader, leads, tell
 
-    plain_streams()
+    console.plain_streams()
     is_training = arguments[:1] == ["train"]
     if is_training and not leads():
-        silence()
+        console.silence()
     command = None
-    with raised_signals() as raised:
+    with console.raised_signals() as raised:
         try:
-            with immediate_end() if is_program else nullcontext():
+            with console.immediate_end() if is_program else nullcontext():
                 command = readied(arguments)
             run(command)
         except KeyboardInterrupt as stop:
@@ -119,15 +111,15 @@ def guarded(arguments: list[str], *, is_program: bool) -> int:
                 tell("error", "the options of the command cannot be understood", USAGE_CODE)
             raise
         except BrokenPipeError:
-            drop_output()
+            console.drop_output()
             return UNREAD_CODE
         except BaseException as error:  # noqa: BLE001 - The last guard: nobody is to read a traceback.
             is_lost = isinstance(error, RankLostError)
             if raised and not is_lost:
                 return interrupted(raised[-1], command)
-            found = ending(error)
+            found = console.ending(error)
             with suppress(OSError):  # Nobody hears it where the output is full or closed.
-                complain(found.label, found.text)
+                console.complain(found.label, found.text)
             if is_training and not is_lost:
                 tell(*found)
             await_leader()
