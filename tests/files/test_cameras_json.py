@@ -1,5 +1,4 @@
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -33,7 +32,8 @@ def test_cameras_come_back(tmp_path: Path) -> None:
     (name, first), (other, _) = read_cameras(tmp_path / "cameras.json")
     assert (name, other) == ("a.jpg", "b.jpg")
     torch.testing.assert_close(first.cam_from_world, pose, atol=1e-6, rtol=0)
-    assert replace(first, cam_from_world=pose) == replace(camera, cam_from_world=pose)
+    names = ("fx", "fy", "cx", "cy", "width", "height")  # From Python 3.13 on, cameras cannot be compared as a whole.
+    assert [getattr(first, name) for name in names] == [getattr(camera, name) for name in names]
 
 
 @pytest.mark.parametrize(
