@@ -18,7 +18,7 @@ from glassplat.captures.capture import Capture, Shot
 from glassplat.captures.files import CaptureFiles, read_capture
 from glassplat.captures.masks import PLANES, CutOut, Polarity
 from glassplat.captures.transforms import points_in_view
-from glassplat.captures.view import PointCloud, PreparedView, View, ViewOptions, prepare_view
+from glassplat.captures.view import GIGABYTE, Memory, PointCloud, PreparedView, View, ViewOptions, prepare_view
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.images import is_transparent
 from glassplat.files.records import LARGEST_COORDINATE
@@ -119,6 +119,11 @@ class Dataset:
     downscale: float = 1.0
     mask_polarity: Polarity = "auto"
 
+    @property
+    def photograph_bytes(self) -> int:
+        """Memory that all training photographs take."""
+        return sum(3 * view.camera.width * view.camera.height for view in self.train)
+
     def __repr__(self) -> str:
         return (
             f"Dataset({str(self.root)!r}: {len(self.train)} training and {len(self.test)} test views, "
@@ -127,7 +132,12 @@ class Dataset:
 
 
 def load_dataset(
-    root: Path | str, *, downscale: float = 1.0, background: Rgb = WHITE, mask_polarity: Polarity = "auto"
+    root: Path | str,
+    *,
+    downscale: float = 1.0,
+    background: Rgb = WHITE,
+    mask_polarity: Polarity = "auto",
+    memory: float | None = None,
 ) -> Dataset:
     """Read a capture: COLMAP, Mirror-NeRF, or transforms.json in any of its dialects; photographs are read later.
 
@@ -136,13 +146,15 @@ def load_dataset(
         downscale: photographs are reduced by this factor, at least 1.
         background: sRGB in [0, 1], seen through transparent pixels; those of COLMAP captures are left out instead.
         mask_polarity: which value of black-and-white masks is the pane.
+        memory: gigabytes of photographs that stay in memory; a quarter of what the machine has if not given.
 
     Raises:
         FileNotFoundError: no such folder.
         InputError: a format that is not known, or a capture that cannot be used; the message says why.
     """
     check_downscale(downscale)
-    return dataset_of(read_capture(root, mask_polarity=mask_polarity), downscale=downscale, background=background)
+    files = read_capture(root, mask_polarity=mask_polarity)
+    return dataset_of(files, downscale=downscale, background=background, memory=memory)
 
 
 def check_downscale(downscale: float) -> None:
@@ -155,7 +167,9 @@ def check_downscale(downscale: float) -> None:
         raise InputError(f"downscale is {downscale}; expected a number of at least 1")
 
 
-def dataset_of(files: CaptureFiles, *, downscale: float = 1.0, background: Rgb = WHITE) -> Dataset:
+def dataset_of(
+    files: CaptureFiles, *, downscale: float = 1.0, background: Rgb = WHITE, memory: float | None = None
+) -> Dataset:
     """Make a `Dataset`, as `load_dataset` does, of a capture whose folder was read.
 
     Raises:
@@ -176,7 +190,7 @@ def dataset_of(files: CaptureFiles, *, downscale: float = 1.0, background: Rgb =
         )
         for shot in shots
     ]
-    train, test, split = _split([p.view for p in prepared], capture)
+    train, test, split = _split(_in_one_memory([p.view for p in prepared], memory), capture)
     points, point_warnings = _points(capture, train)
     extent = _extent(train)
     measured = capture.points is not None
@@ -206,6 +220,13 @@ def dataset_of(files: CaptureFiles, *, downscale: float = 1.0, background: Rgb =
         downscale=downscale,
         mask_polarity=files.mask_polarity,
     )
+
+
+def _in_one_memory(views: list[View], gigabytes: float | None) -> list[View]:
+    """The views, which share a memory of a budget; the machine's share if none is given."""
+    largest = max((view.camera.width * view.camera.height for view in views), default=0)
+    shared = Memory(None if gigabytes is None else gigabytes * GIGABYTE, largest=largest)
+    return [replace(view, memory=shared) for view in views]
 
 
 def _check_axes(train: tuple[View, ...], points: PointCloud | None, format_name: str) -> None:
@@ -322,10 +343,11 @@ def detached_camera(camera: Camera) -> Camera:
 
 @contextmanager
 def photographs_read(dataset: Dataset) -> Iterator[Callable[[], None]]:
-    """Reads all photographs in a thread as long as the context lasts, one after the other.
+    """Reads photographs in a thread as long as the context lasts, one after the other.
 
     Those for testing come first: nothing else would read them before training has ended. They are forgotten again;
-    training photographs stay in memory, where training wants them anyway.
+    training photographs are read as long as there is room in memory, where training wants them anyway. The others are
+    read ahead of their step.
 
     Yields:
         A function that does nothing, or raises the InputError of a photograph that could not be read.
@@ -350,6 +372,6 @@ def _read(dataset: Dataset, stop: Event) -> None:
             return
         view.read_photo()
     for view in dataset.train:
-        if stop.is_set():
+        if stop.is_set() or view.memory.is_full:
             return
         _ = view.photo

@@ -2,15 +2,24 @@
 
 Estimated normals are those that networks for single photographs write: x to the right, y up, z towards the camera; in a
 PNG of 8 or 16 bits (n + 1) / 2, in an NPY file [H, W, 3] of floats the vectors themselves.
+
+Pixels stay in memory up to a budget, and are read ahead of the step that needs them. What is read first stays as long
+as there is room: every pass over the views comes to each of them once, so that what was used last is not more likely to
+be used again. A small part of the budget holds what was read ahead for the next steps, and gives the oldest of it up.
 """
 
 from __future__ import annotations
 
+import math
+import os
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 import torch
@@ -36,6 +45,158 @@ from glassplat.scene.camera import Camera, moved
 LEAST_SIDE = 8
 """Pixels along the side of a photograph that was reduced; below that are no edges to tell panes or details by."""
 
+GIGABYTE = 1e9
+SHARE = 0.25
+"""Share of the machine's memory that photographs take unless told otherwise."""
+UNKNOWN = 8 * GIGABYTE
+"""Memory of a machine that does not say how much it has."""
+MOST_AHEAD = 8
+"""Views that are read ahead, at the most: a step is rarely as short as an eighth of what reading takes."""
+AHEAD_SHARE = 0.25
+"""Share of the budget for what is read ahead, at the most, whatever the number of views."""
+PIXEL_BYTES = 5
+"""Of a view: three of the photograph, one of the panes, one of what is left out."""
+MOST_THREADS = 4
+LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
+"""Files that say how much a container may take."""
+
+
+class Source:
+    """Pixels that can be read again: by whom, and what becomes of them; the same for the same reader.
+
+    Attributes:
+        is_mask: what is read counts where it is above zero.
+    """
+
+    def __init__(self, reader: Callable[[], Tensor], *, is_mask: bool = False) -> None:
+        self._reader, self.is_mask = reader, is_mask
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Source) and self._reader is other._reader
+
+    def __hash__(self) -> int:
+        return id(self._reader)
+
+    def read(self) -> Tensor:
+        """The pixels, from their file."""
+        return self._reader() > 0 if self.is_mask else self._reader()
+
+
+class Memory:
+    """Pixels that were read; may be asked by several threads at once.
+
+    Attributes:
+        budget: bytes, of all pixels together. What a single step needs is read even where it is more.
+        ahead: views that are worth reading ahead.
+    """
+
+    def __init__(self, budget: float | None = None, *, largest: int = 0) -> None:
+        """Holds nothing yet.
+
+        Args:
+            budget: bytes; a share of the machine's memory if not given.
+            largest: pixels of the largest view.
+        """
+        self.budget = default_budget() if budget is None else budget
+        view = max(largest * PIXEL_BYTES, 1)
+        self.ahead = int(max(min(self.budget * AHEAD_SHARE / view - 1, MOST_AHEAD), 1))
+        self._room = self.budget - (self.ahead + 1) * view
+        self._passing_room = (self.ahead + 1) * view
+        self._resident: dict[Source, Tensor] = {}
+        self._passing: OrderedDict[Source, Tensor] = OrderedDict()
+        self._passing_bytes = 0
+        self._pending: dict[Source, Future[Tensor]] = {}
+        self._lock = Lock()
+
+    @property
+    def is_full(self) -> bool:
+        """Return whether something had to be kept for a few steps only, because there is no more room."""
+        return bool(self._passing)
+
+    def get(self, source: Source) -> Tensor:
+        """The pixels of a source, read now unless they are there or on their way.
+
+        Raises:
+            InputError: they cannot be read.
+        """
+        with self._lock:
+            found = self._found(source)
+            if found is not None:
+                return found
+            future = self._pending.get(source)
+            is_mine = future is None
+            if future is None:
+                future = self._pending[source] = Future()
+        if is_mine:
+            self._read(source, future)
+        return future.result()
+
+    def read_ahead(self, source: Source) -> None:
+        """Has a thread read what will be asked for soon; what fails is read again, and raised, when it is asked for."""
+        with self._lock:
+            if source in self._pending or self._found(source) is not None:
+                return
+            future = self._pending[source] = Future()
+        reading_threads().submit(self._read, source, future)
+
+    def _found(self, source: Source) -> Tensor | None:
+        if source in self._resident:
+            return self._resident[source]
+        if source in self._passing:
+            self._passing.move_to_end(source)
+            return self._passing[source]
+        return None
+
+    def _read(self, source: Source, future: Future[Tensor]) -> None:
+        try:
+            pixels = source.read()
+        except BaseException as error:  # noqa: BLE001 - Raised where the pixels are asked for.
+            with self._lock:
+                del self._pending[source]
+            future.set_exception(error)
+            return
+        with self._lock:
+            del self._pending[source]
+            self._keep(source, pixels)
+        future.set_result(pixels)
+
+    def _keep(self, source: Source, pixels: Tensor) -> None:
+        size = pixels.numel() * pixels.element_size()
+        if size <= self._room:
+            self._room -= size
+            self._resident[source] = pixels
+            return
+        self._passing[source] = pixels
+        self._passing_bytes += size
+        while self._passing_bytes > self._passing_room and len(self._passing) > 1:
+            _, oldest = self._passing.popitem(last=False)
+            self._passing_bytes -= oldest.numel() * oldest.element_size()
+
+
+@cache
+def reading_threads() -> ThreadPoolExecutor:
+    """The threads that read ahead, for all captures together; they sleep where nothing is to be read."""
+    return ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS), thread_name_prefix="photographs")
+
+
+def default_budget() -> float:
+    """Bytes for photographs: a share of the machine's memory, or of what a container may take, for each process."""
+    return SHARE * machine_memory() / max(int(os.environ.get("LOCAL_WORLD_SIZE", "1")), 1)
+
+
+def machine_memory() -> float:
+    """Bytes of memory that the machine has, or that a container may take of it."""
+    try:
+        whole = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, ValueError, OSError):  # Windows has no such question.
+        whole = UNKNOWN
+    for path in LIMITS:
+        try:
+            whole = min(whole, float(path.read_text()))
+        except (OSError, ValueError):  # No such file, or it says `max`.
+            continue
+    return whole
+
 
 @dataclass(frozen=True)
 class View:
@@ -48,6 +209,7 @@ class View:
         read_photo: returns `photo`.
         read_pane_labels: returns `pane_labels`; None where the view is not annotated.
         read_ignored: returns `ignored`; None where all pixels count.
+        memory: holds what was read, for all views of a capture.
     """
 
     name: str
@@ -56,34 +218,37 @@ class View:
     read_photo: Callable[[], Tensor]
     read_pane_labels: Callable[[], Tensor] | None = None
     read_ignored: Callable[[], Tensor] | None = None
-    _read: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
+    memory: Memory = field(default_factory=lambda: Memory(math.inf), repr=False, compare=False)
 
     def __repr__(self) -> str:
         return f"View({self.name!r}, {self.camera})"
 
     @property
     def photo(self) -> Tensor:
-        """[H, W, 3] uint8 sRGB, undistorted and reduced; stays in memory once read.
-
-        Threads may ask at once: without a lock, which `cached_property` has for all views together, none waits for the
-        photograph of another.
+        """[H, W, 3] uint8 sRGB, undistorted and reduced; stays in memory once read, as long as there is room.
 
         Raises:
             InputError: the file cannot be read; names it.
         """
-        if "photo" not in self._read:
-            self._read["photo"] = self.read_photo()
-        return self._read["photo"]
+        return self.memory.get(Source(self.read_photo))
 
-    @cached_property
+    @property
     def pane_labels(self) -> Tensor | None:
         """[H, W] uint8 pane label per pixel, 0 for no pane; None where the view is not annotated."""
-        return None if self.read_pane_labels is None else self.read_pane_labels()
+        return None if self.read_pane_labels is None else self.memory.get(Source(self.read_pane_labels))
 
-    @cached_property
+    @property
     def ignored(self) -> Tensor | None:
         """[H, W] bool, the pixels that show what is not to be learned or measured; None where there are none."""
-        return None if self.read_ignored is None else self.read_ignored() > 0
+        return None if self.read_ignored is None else self.memory.get(Source(self.read_ignored, is_mask=True))
+
+    def read_ahead(self) -> None:
+        """Has threads read what training on the view will ask for."""
+        self.memory.read_ahead(Source(self.read_photo))
+        if self.read_pane_labels is not None:
+            self.memory.read_ahead(Source(self.read_pane_labels))
+        if self.read_ignored is not None:
+            self.memory.read_ahead(Source(self.read_ignored, is_mask=True))
 
     @property
     def is_annotated(self) -> bool:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from glassplat.access import is_local
 from glassplat.captures.dataset import TEST_EVERY, Dataset, dataset_of, load_dataset, with_corrected_cameras
-from glassplat.captures.view import PointCloud, View
+from glassplat.captures.view import GIGABYTE, PointCloud, View
 from glassplat.cli.console import counted, say, warn
 from glassplat.cli.places import chosen_views
 from glassplat.cli.progress import Plan, TrainingProgress
@@ -146,7 +146,9 @@ def photographs_of(dataset: Dataset) -> list[Path]:
 def train(asked: Train[Any], console: Console) -> None:
     """Trains, with a progress bar or lines."""
     check_output(RunDirectory(asked.output), resume=asked.resume)
-    dataset = dataset_of(asked.files, downscale=asked.downscale, background=photo_background(asked.recipe))
+    dataset = dataset_of(
+        asked.files, downscale=asked.downscale, background=photo_background(asked.recipe), memory=asked.memory
+    )
     describe(dataset, console)
     training = Training(
         dataset,
@@ -227,5 +229,12 @@ def describe(dataset: Dataset, console: Console) -> None:
         f"{len(dataset.points.positions)} points, {counted(annotated, 'annotated view')} with "
         f"{counted(len(dataset.pane_labels), 'pane')}{given}",
     )
+    needed, room = dataset.photograph_bytes, dataset.train[0].memory.budget
+    if needed > room:
+        say(
+            console,
+            f"the training photographs take {needed / GIGABYTE:.1f} GB: {room / GIGABYTE:.1f} GB stay in memory "
+            "(--memory), the others are read ahead of their steps",
+        )
     for warning in dataset.warnings:
         warn(console, warning)

@@ -49,6 +49,8 @@ class Train(Generic[RecipeKind]):
         resume: go on with the run in `output`.
         mask_polarity: which value of black-and-white masks is the pane.
         checkpoint_every: seconds from one checkpoint to the next; an end or an interrupt writes one in any case.
+        memory: gigabytes of photographs that stay in memory, a quarter of the machine's by default; what does not fit
+            is read ahead of its step.
         config: a recipe.json to begin from.
         view: look at it in the browser meanwhile.
     """
@@ -64,6 +66,7 @@ class Train(Generic[RecipeKind]):
     mask_polarity: Polarity = "auto"
     checkpoint_every: Positive = CHECKPOINT_SECONDS
     preset: Preset = "glassplat"
+    memory: Positive | None = None
     config: Path | None = None
     view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
 

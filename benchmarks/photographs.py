@@ -1,0 +1,129 @@
+"""Memory of a training whose photographs do not fit, and what it loses by reading them again.
+
+    python -m benchmarks.photographs PHOTOS --count 3000 --memory 3 --seconds 240
+
+It repeats the photographs of a folder, by links in a temporary one, from places on a circle; what is learned from them
+means nothing. The first half of the time, in which memory fills, is left out of the shares.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import math
+import resource
+import tempfile
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from torch import Tensor
+
+from glassplat.captures.dataset import load_dataset, photographs_read
+from glassplat.captures.view import Memory, PointCloud, Source
+from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.training.loop import train
+from glassplat.training.messages import StepDone
+from glassplat.training.stage import TrainState
+
+READ = 10
+POINTS = 5_000
+"""Few, so that a step is as short as it may be."""
+
+
+class Waited(Memory):
+    """A memory that adds up the seconds for which training has waited; other threads may wait."""
+
+    seconds = 0.0
+
+    def get(self, source: Source) -> Tensor:
+        """The pixels, as ever."""
+        begun = time.perf_counter()
+        found = super().get(source)
+        if threading.current_thread() is threading.main_thread():
+            self.seconds += time.perf_counter() - begun
+        return found
+
+
+def resident_gigabytes() -> float:
+    """Memory that the process holds now."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e9
+
+
+def write_capture(photographs: list[Path], count: int, folder: Path) -> None:
+    """A capture of so many photographs, which look at the middle of a circle."""
+    (folder / "images").mkdir()
+    frames = []
+    for number, source in zip(range(count), itertools.cycle(photographs), strict=False):
+        name = f"images/{number:05d}{source.suffix}"
+        (folder / name).symlink_to(source.resolve())
+        angle = 2 * math.pi * number / count
+        turn = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn, turn @ (0, 0, 4)
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    width, height = Image.open(photographs[0]).size
+    lens = {"fl_x": width, "fl_y": width, "cx": width / 2, "cy": height / 2, "w": width, "h": height}
+    (folder / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
+
+
+def measure(folder: Path, memory: float, seconds: float) -> None:
+    """Trains for a while and prints a line ten times, and the shares at the end."""
+    dataset = load_dataset(folder)
+    camera = dataset.train[0].camera
+    known = Waited(memory * 1e9, largest=camera.width * camera.height)
+    train_views, test_views = (tuple(replace(v, memory=known) for v in vs) for vs in (dataset.train, dataset.test))
+    points = PointCloud(dataset.points.positions[:POINTS], dataset.points.colors[:POINTS])
+    dataset = replace(dataset, train=train_views, test=test_views, points=points)
+    print(f"{len(dataset.train)} photographs take {dataset.photograph_bytes / 1e9:.1f} GB, {memory:g} GB may stay")
+    recipe = SplatRecipe(sh_degree=1)
+    state = TrainState(recipe.initialise(dataset), seed=0)
+    begun, told = time.perf_counter(), 0
+    first: tuple[int, float, float, float] | None = None
+    with photographs_read(dataset) as check:
+        for message in train(recipe.stages(0), dataset, state, 1_000_000):
+            check()
+            if not isinstance(message, StepDone):
+                continue
+            passed = time.perf_counter() - begun
+            if first is None and passed > seconds / 2:
+                first = message.step, passed, known.seconds, time.thread_time()
+            if passed > (told + 1) * seconds / 10:
+                told += 1
+                print(f"{passed:5.0f} s, step {message.step}: {resident_gigabytes():.2f} GB", flush=True)
+            if passed > seconds:
+                break
+    assert first is not None
+    step, since, waited, computed = first
+    steps, wall = message.step - step, passed - since
+    share = (known.seconds - waited) / wall
+    print(f"{wall / steps * 1e3:.0f} ms a step, {100 * share:.2f} % of it waiting for photographs")
+    computed, begun = time.thread_time() - computed, time.thread_time()
+    for view in dataset.train[:READ]:
+        view.read_photo()
+    reading = (time.thread_time() - begun) / READ
+    print(f"a core takes {computed / steps * 1e3:.0f} ms for a step, {reading * 1e3:.0f} ms to read a photograph")
+    print(f"at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")
+
+
+def main() -> None:
+    """Measures one capture."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("photographs", type=Path, help="folder of photographs of one size, or of such folders")
+    parser.add_argument("--count", type=int, default=3000, help="photographs of the capture")
+    parser.add_argument("--memory", type=float, default=3.0, help="gigabytes of photographs that may stay in memory")
+    parser.add_argument("--seconds", type=float, default=240.0, help="length of the training")
+    arguments = parser.parse_args()
+    found = sorted(path for path in arguments.photographs.rglob("*") if path.suffix.lower() in (".jpg", ".png"))
+    with tempfile.TemporaryDirectory() as folder:
+        write_capture(found, arguments.count, Path(folder))
+        measure(Path(folder), arguments.memory, arguments.seconds)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,133 @@
+"""Photographs stay in memory up to a budget, and are read ahead of their step beyond it."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from threading import Event, Thread
+
+import pytest
+import torch
+
+from glassplat.captures.dataset import load_dataset
+from glassplat.captures.view import MOST_AHEAD, Memory, Source, default_budget, machine_memory
+from glassplat.errors import InputError
+from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.scene.scene import Scene
+from glassplat.training.loop import train
+from glassplat.training.messages import StepDone
+from glassplat.training.stage import TrainState
+
+SIZE = 100
+"""Pixels of the test's photographs, of three bytes each."""
+WHOLE = 3 * SIZE
+
+
+class Files:
+    """Readers of numbered photographs, which count how often each is read."""
+
+    def __init__(self, count: int) -> None:
+        self.times: Counter[int] = Counter()
+        self.sources = [Source(self._reader(number)) for number in range(count)]
+
+    def _reader(self, number: int):
+        def read() -> torch.Tensor:
+            self.times[number] += 1
+            return torch.full((SIZE, 3), number, dtype=torch.uint8)
+
+        return read
+
+
+def test_what_fits_is_read_once() -> None:
+    files, memory = Files(10), Memory(math.inf, largest=SIZE)
+    for _ in range(3):
+        assert [int(memory.get(source)[0, 0]) for source in files.sources] == list(range(10))
+    assert set(files.times.values()) == {1}
+    assert not memory.is_full
+
+
+def test_a_share_stays_where_not_all_fits_and_memory_is_bounded() -> None:
+    files, memory = Files(100), Memory(60 * WHOLE, largest=SIZE)
+    for _ in range(3):
+        for source in files.sources:
+            memory.get(source)
+        held = [*memory._resident.values(), *memory._passing.values()]
+        assert sum(tensor.numel() for tensor in held) <= memory.budget
+    assert memory.is_full
+    assert sum(times == 1 for times in files.times.values()) >= 40
+
+
+def test_a_step_reads_what_it_needs_also_where_there_is_no_room() -> None:
+    files, memory = Files(4), Memory(1, largest=SIZE)
+    assert [int(memory.get(source)[0, 0]) for source in files.sources] == [0, 1, 2, 3]
+    assert memory.get(files.sources[3]) is memory.get(files.sources[3])
+    assert len(memory._passing) <= 3
+    assert memory.ahead == 1
+    assert Memory(math.inf).ahead == MOST_AHEAD
+
+
+def test_reading_ahead_saves_the_wait_and_two_who_ask_read_once() -> None:
+    files, memory, gate = Files(1), Memory(math.inf), Event()
+    slow = Source(lambda: gate.wait(30) and torch.zeros(1))
+    memory.read_ahead(slow)
+    asking = Thread(target=lambda: memory.get(slow))
+    asking.start()
+    gate.set()
+    asking.join()
+    assert memory.get(slow) is memory.get(slow)
+    memory.read_ahead(files.sources[0])
+    memory.get(files.sources[0])
+    memory.read_ahead(files.sources[0])
+    assert files.times == {0: 1}
+
+
+def test_what_cannot_be_read_is_an_error_where_it_is_asked_for_and_not_before() -> None:
+    def broken() -> torch.Tensor:
+        raise InputError("cut off")
+
+    memory = Memory(math.inf)
+    for _ in range(2):
+        memory.read_ahead(Source(broken))
+        with pytest.raises(InputError, match="cut off"):
+            memory.get(Source(broken))
+
+
+def test_another_reader_of_a_view_of_the_same_name_is_another_photograph(capture) -> None:
+    capture.write_colmap()
+    view = load_dataset(capture.root).train[0]
+    other = replace(view, read_photo=lambda: torch.zeros_like(view.photo))
+    assert view.photo.any()
+    assert not other.photo.any()
+
+
+def test_the_machine_has_memory_and_processes_share_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert machine_memory() > 1e8
+    whole = default_budget()
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
+    assert default_budget() == whole / 4
+
+
+def test_a_container_may_take_less_than_the_machine_has(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "limit").write_text("1000000\n")
+    (tmp_path / "none").write_text("max\n")
+    monkeypatch.setattr("glassplat.captures.view.LIMITS", (tmp_path / "none", tmp_path / "limit", tmp_path / "gone"))
+    assert machine_memory() == 1e6
+
+
+def trained_scene(root: Path, memory: float | None) -> Scene:
+    dataset = load_dataset(root, memory=memory)
+    recipe = SplatRecipe(sh_degree=0)
+    state = TrainState(recipe.initialise(dataset), seed=0)
+    names = [m.view for m in train(recipe.stages(0), dataset, state, 20) if isinstance(m, StepDone)]
+    assert len(names) == 20
+    assert dataset.train[0].memory.is_full == (memory is not None)
+    return state.scene
+
+
+def test_a_capture_that_does_not_fit_trains_to_the_same_bits(capture) -> None:
+    capture.write_colmap()
+    roomy, tight = (trained_scene(capture.root, memory) for memory in (None, 1e-6))
+    for name, tensor in roomy.parameters().items():
+        assert torch.equal(tensor, tight.parameters()[name]), name
