@@ -48,9 +48,8 @@ class Train(Generic[RecipeKind]):
         device: where to train; auto takes an NVIDIA GPU where one can be used.
         resume: go on with the run in `output`.
         mask_polarity: which value of black-and-white masks is the pane.
-        checkpoint_every: seconds from one checkpoint to the next; an end or an interrupt writes one in any case.
-        memory: gigabytes of photographs that stay in memory, a quarter of the machine's by default; what does not fit
-            is read ahead of its step.
+        checkpoint_every: seconds between checkpoints.
+        memory: gigabytes for photographs.
         config: a recipe.json to begin from.
         view: look at it in the browser meanwhile.
     """
