@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.utils.weak import WeakIdKeyDictionary
 
 from glassplat.errors import InputError
 from glassplat.kernels.project import GradientSum, project
@@ -249,15 +250,25 @@ def check_colored(gaussians: Gaussians) -> None:
         raise ValueError("the Gaussians have no colours; expected f_dc_0 to f_dc_2, as every trained splat has them")
 
 
+_sound: WeakIdKeyDictionary = WeakIdKeyDictionary()
+"""Tensors that `check_numbers` has found right: the version of their values, and the largest one that was allowed."""
+
+
 def check_numbers(values: Mapping[str, Tensor], most: float = math.inf) -> None:
     """Refuses values that would leave pixels without a number; those of Gaussians' shapes are culled one by one.
 
     Values that ask for a gradient are not looked at: a training ends with the loss that is not finite, and its view.
+    Others are looked at once until they change, as each look makes the processor wait for the GPU.
 
     Raises:
         ValueError: a value is NaN or infinite, or above `most`; names the tensor.
     """
     for name, tensor in values.items():
-        if not tensor.requires_grad and not bool((tensor.isfinite() & (tensor <= most)).all()):
+        mark = None if tensor.is_inference() else (tensor._version, most)
+        if tensor.requires_grad or (mark is not None and _sound.get(tensor) == mark):
+            continue
+        if bool((tensor.isfinite() & (tensor <= most)).all()):
+            _sound[tensor] = mark
+        else:
             limit = "" if most == math.inf else f" of at most {most:g}"
             raise ValueError(f"{name} holds values that cannot be drawn; expected finite numbers{limit}")

@@ -44,7 +44,7 @@ REQUIRED_KEYS = {
 @pytest.fixture(autouse=True)
 def _no_lpips(monkeypatch: pytest.MonkeyPatch) -> None:
     """Results must not depend on what this machine happens to have."""
-    monkeypatch.setattr("glassplat.evaluate.evaluate.load_lpips", lambda: "no LPIPS: install it")
+    monkeypatch.setattr("glassplat.evaluate.metrics.load_lpips", lambda: "no LPIPS: install it")
 
 
 def test_results_are_json_and_complete(case) -> None:
@@ -219,7 +219,7 @@ def test_lpips_is_taken_with_its_backbone(case, monkeypatch: pytest.MonkeyPatch)
             assert image.dtype == target.dtype == torch.uint8
             return 0.25
 
-    monkeypatch.setattr("glassplat.evaluate.evaluate.load_lpips", Constant)
+    monkeypatch.setattr("glassplat.evaluate.metrics.load_lpips", Constant)
     results = evaluate(case.scene, case.renderer, case.dataset).results
     assert (results["lpips"], results["lpips_backbone"]) == (0.25, "alex")
 

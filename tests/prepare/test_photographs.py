@@ -10,7 +10,6 @@ import pytest
 from PIL import ExifTags, Image
 
 from glassplat.errors import InputError
-from glassplat.prepare import photographs
 from glassplat.prepare.photographs import Photograph, capture_names, photographs_in, read_photograph
 from tests.prepare.conftest import Heard
 
@@ -196,7 +195,7 @@ def nothing(folder: Path) -> None:
 def test_what_cannot_be_used_is_named(
     spoil: object, expected: str, tmp_path: Path, heard: Heard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(photographs, "reads_heif", lambda: False)
+    monkeypatch.setattr("glassplat.files.images.reads_heif", lambda: False)
     folder = three(tmp_path / "in")
     spoil(folder)  # type: ignore[operator]
     with pytest.raises(InputError, match=expected):

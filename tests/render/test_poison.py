@@ -47,6 +47,17 @@ def test_any_other_poison_leaves_a_finite_picture(method: str) -> None:
             assert bool(torch.isfinite(frame.rgb).all()), (name, value)
 
 
+def test_a_value_that_is_spoilt_after_it_was_drawn_is_refused() -> None:
+    renderer, scene = rendered("planar")
+    camera = tiny_capture().train[1].camera
+    changed = scene.primary.channels["log_intensity"].detach().clone()
+    scene = scene.with_parameters({"primary.log_intensity": changed})
+    renderer(scene, camera)
+    scene.primary.channels["log_intensity"].view(-1)[0] = math.inf
+    with pytest.raises(ValueError, match="log_intensity"):
+        renderer(scene, camera)
+
+
 def test_a_tint_that_cannot_be_drawn_is_refused() -> None:
     _, scene = rendered("planar")
     tinted = replace(scene, planes=replace(scene.planes, log_transmittances=torch.full((len(scene.planes), 3), 1e30)))
