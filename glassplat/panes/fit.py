@@ -35,8 +35,8 @@ from glassplat.panes.search import (
     tilt_uncertainty,
 )
 from glassplat.scene import logit
-from glassplat.scene.camera import Camera
-from glassplat.scene.panes import Planes
+from glassplat.scene.camera import Camera, NumpyCamera
+from glassplat.scene.panes import Planes, linked_groups
 
 Array = NDArray[np.float64]
 log = logging.getLogger("glassplat.panes")
@@ -286,15 +286,13 @@ def _loss(pane: _Found, plane: FramedPlanes) -> float:
 
 def _neighbours(found: Sequence[_Found]) -> list[list[int]]:
     """Labels of panes with trusted planes that may lie in one surface, directly or by way of third ones."""
-    groups: list[list[_Found]] = []
-    for pane in (pane for pane in found if pane.fault is None):
-        near = [group for group in groups if any(_may_share(pane, other) for other in group)]
-        groups = [group for group in groups if group not in near] + [[*(p for group in near for p in group), pane]]
-    return [[pane.label for pane in group] for group in groups if len(group) > 1]
+    panes = {pane.label: pane for pane in found if pane.fault is None}
 
+    def may_share(one: int, other: int) -> bool:
+        first, second = panes[one], panes[other]
+        return in_one_surface(first.plane, second.plane, (first.evidence, second.evidence))
 
-def _may_share(one: _Found, other: _Found) -> bool:
-    return in_one_surface(one.plane, other.plane, (one.evidence, other.evidence))
+    return [group for group in linked_groups(list(panes), may_share) if len(group) > 1]
 
 
 def _joint(panes: Sequence[_Found], seed: int) -> list[_Found]:
@@ -335,6 +333,8 @@ def _finished(pane: _Found, options: PlaneFit, unmarked: Sequence[tuple[str, Cam
 
 MOST_NAMED = 3
 """Photographs that a refusal names."""
+WELL_INSIDE = 0.2
+"""Share of the image's sides between them and the middle of a pane that a photograph shows well."""
 
 
 def _worth_marking(views: Sequence[PaneView], unmarked: Sequence[tuple[str, Camera]]) -> str:
@@ -342,18 +342,14 @@ def _worth_marking(views: Sequence[PaneView], unmarked: Sequence[tuple[str, Came
     middle = _seen_middle(views)
     eyes = [view.center for view in views]
     names: list[str] = []
-    held = [(name, _eye(camera)) for name, camera in unmarked if _shows(camera, middle)]
+    cameras = [(name, NumpyCamera.of(camera)) for name, camera in unmarked]
+    held = [(name, camera.center) for name, camera in cameras if camera.holds(middle, margin=-WELL_INSIDE)]
     while held and len(names) < MOST_NAMED:
         apart = [min(_turn(middle, eye, other) for other in eyes) for _, eye in held]
         name, eye = held.pop(int(np.argmax(apart)))
         names.append(name)
         eyes.append(eye)
     return f": {', '.join(names)} should show it well" if names else ""
-
-
-def _eye(camera: Camera) -> Array:
-    eye: Array = camera.center.detach().cpu().double().numpy()
-    return eye
 
 
 def _seen_middle(views: Sequence[PaneView]) -> Array:
@@ -366,15 +362,6 @@ def _seen_middle(views: Sequence[PaneView]) -> Array:
         system = system + across
         right = right + across @ view.center
     return np.asarray(np.linalg.lstsq(system, right, rcond=None)[0])
-
-
-def _shows(camera: Camera, point: Array) -> bool:
-    """Return whether a point lies well inside of a camera's image."""
-    x, y, z = (camera.cam_from_world[:3] @ camera.cam_from_world.new_tensor([*point, 1.0])).tolist()
-    if z <= 0:
-        return False
-    column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    return 0.2 < column / camera.width < 0.8 and 0.2 < row / camera.height < 0.8
 
 
 def _turn(middle: Array, eye: Array, other: Array) -> float:

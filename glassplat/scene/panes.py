@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -190,13 +190,19 @@ def coplanar_groups(planes: Planes, rows: Sequence[int]) -> list[list[int]]:
     Returns:
         Every row in one group, the groups in the order of their first rows.
     """
-    groups: list[list[int]] = []
-    for row in rows:
-        near = [group for group in groups if any(_coplanar(planes, row, other) for other in group)]
-        joined = [*(other for group in near for other in group), row]
-        groups = sorted([*(group for group in groups if group not in near), joined], key=min)
+    groups = linked_groups(rows, lambda one, other: _coplanar(planes, one, other))
     areas = planes.half_sizes.prod(dim=1)
     return [sorted(group, key=lambda row: (-float(areas[row]), row)) for group in groups]
+
+
+def linked_groups(rows: Sequence[int], are_linked: Callable[[int, int], bool]) -> list[list[int]]:
+    """Groups of rows that are linked, directly or by way of third ones, in the order of their smallest rows."""
+    groups: list[list[int]] = []
+    for row in rows:
+        near = [group for group in groups if any(are_linked(row, other) for other in group)]
+        joined = [*(other for group in near for other in group), row]
+        groups = sorted([*(group for group in groups if group not in near), joined], key=min)
+    return groups
 
 
 def _coplanar(planes: Planes, one: int, other: int) -> bool:
