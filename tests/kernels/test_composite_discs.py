@@ -88,7 +88,7 @@ def with_gradients(case: Case, function: Callable[..., BlendedDiscs]) -> dict[st
     """Outputs and, for random cotangents, the gradients of all inputs."""
     inputs = [tensor.detach().clone().requires_grad_() for tensor in case.inputs()]
     outputs = case.with_inputs(*inputs)(function)
-    cotangents = [draw(*o.shape, seed=20 + i).to(o.dtype) for i, o in enumerate(outputs)]
+    cotangents = [draw(*o.shape, seed=20 + i).to(o) for i, o in enumerate(outputs)]
     # Distances of inverse depths are small: so that a mistake in them shows beside the rest.
     cotangents[4] = 100 * cotangents[4]
     # The twin does not touch inputs that reach no pixel; the added zero gives them a gradient of zero.

@@ -49,7 +49,7 @@ def with_gradients(function: Callable[..., Traced], gaussians: RawGaussians, ray
     own, own_rays = RawGaussians(*leaves[:5]), Rays(*leaves[5:])
     found = function(own, own_rays, bvh_of(own), sh_degree=degree, near=0.05)
     generator = torch.Generator().manual_seed(3)
-    weights = [torch.randn(x.shape, generator=generator, dtype=torch.float64).to(x.dtype) for x in found[:3]]
+    weights = [torch.randn(x.shape, generator=generator, dtype=torch.float64).to(x) for x in found[:3]]
     total = torch.stack([(weight * value).sum() for weight, value in zip(weights, found, strict=False)]).sum()
     return [*(x.detach() for x in found), *torch.autograd.grad(total, leaves)]
 

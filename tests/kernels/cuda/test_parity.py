@@ -175,6 +175,10 @@ def check_composite(splats: Splats, glass: int, mean: bool | None, size: Size) -
     channels = draw(cameras, count, 4, seed=11).to(dtype).requires_grad_()
     marks = draw(cameras, glass, seed=12).to(dtype).sigmoid().requires_grad_()
     where = draw(cameras, *reversed(size), seed=13).to(dtype).clamp(min=0)
+    if mean is not None:
+        # Where one splat alone is blended, it lies at the mean, and rounding decides on which side.
+        everywhere = Deviation(3, torch.ones_like(where), mean)
+        where = where * (blended(splats, channels, marks, None, everywhere, False, size)[3].detach() > 1e-6)
     probe = torch.zeros(cameras, count, 2, dtype=dtype, requires_grad=True)
     own_splats, own_channels, own_marks, own_probe = map(on_device, (splats, channels, marks, probe))
     request = None if mean is None else Deviation(3, where, mean)
