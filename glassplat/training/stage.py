@@ -55,14 +55,16 @@ class Optimizer:
         would lead whose gradients agree on nothing.
         """
         learning = [name for name in gradients if parameters[name].numel() > 0 and not self._waits(name, views)]
-        factor = math.sqrt(views)
-        adam([self._update(name, parameters[name], gradients[name], rates[name] * factor) for name in learning])
+        adam(
+            [self._update(name, parameters[name], gradients[name], rates[name], math.sqrt(views)) for name in learning]
+        )
 
-    def _update(self, name: str, parameter: Tensor, gradient: Tensor, rate: float | Tensor) -> Update:
-        """The next step of a parameter; counts it."""
+    def _update(self, name: str, parameter: Tensor, gradient: Tensor, rate: float | Tensor, factor: float) -> Update:
+        """The next step of a parameter, at so many times its rate; counts it."""
         moments = self.moments_of(name, parameter)
         self.updates[name] = self.updates.get(name, 0) + 1
-        return Update(parameter, gradient, *moments, lr=rate * self.hurried.get(name, 1.0), step=self.updates[name])
+        factor *= self.hurried.get(name, 1.0)
+        return Update(parameter, gradient, *moments, lr=rate if factor == 1 else rate * factor, step=self.updates[name])
 
     def _waits(self, name: str, views: int) -> bool:
         """Return whether a parameter is paused; counts the views of the step."""

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from functools import cache
 
-import torch
 from numba import cuda
 from torch import Tensor
 
@@ -21,12 +20,12 @@ def adam(flat: Sequence[Update], betas: tuple[float, float], eps: float) -> None
     """As `glassplat.kernels.adam.cpu.adam`."""
     for update in flat:
         parameter, lr, (step_correction, root) = update.parameter, update.lr, update.corrections(betas)
-        rates, rate = None, 0.0
+        # As few small operations as can be: each costs more than the step of a small parameter.
+        rates, rate = None, step_correction
         if isinstance(lr, Tensor):
-            in_double = lr.detach().to(parameter.device, torch.float64)
-            rates = (in_double * step_correction).to(parameter.dtype).contiguous()
+            rates = lr.detach().to(parameter.device, parameter.dtype).contiguous()
         else:
-            rate = lr * step_correction
+            rate *= lr
         adam_step(REAL_OF[parameter.dtype])(
             blocks_for(parameter.numel(), THREADS), THREADS, *update[:4], rates, rate,
             betas[0], betas[1], 1 - betas[0], 1 - betas[1], root, eps,
@@ -35,7 +34,7 @@ def adam(flat: Sequence[Update], betas: tuple[float, float], eps: float) -> None
 
 @cache
 def adam_step(real: type) -> Kernel:
-    """Updates flat arrays in place; `rates` holds one step size for each column, or `rate` is that of all."""
+    """Updates flat arrays in place; `rate` is the step size, times that of the column in `rates`."""
 
     @kernel("adam", real, "real1 real1 real1 real1 real1 real real real real real real real")
     def step(
@@ -48,7 +47,7 @@ def adam_step(real: type) -> Kernel:
         mean = beta_1 * first[i] + gain_1 * g
         square = beta_2 * second[i] + gain_2 * g * g
         first[i], second[i] = mean, square
-        step_size = rates[i % rates.size] if rates.size > 0 else rate
+        step_size = rate * rates[i % rates.size] if rates.size > 0 else rate
         parameter[i] -= step_size * mean / (math.sqrt(square) * second_scale + eps)
 
     return step

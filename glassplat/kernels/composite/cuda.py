@@ -67,7 +67,9 @@ def composite(
     """As `glassplat.kernels.composite.cpu.composite`."""
     real, (_, count, num_channels) = REAL_OF[channels.dtype], channels.shape
     shape, tiles = (bins.num_cameras, bins.height, bins.width), len(bins.active)
-    image, alpha, mask = (channels.new_zeros(s) for s in ((*shape, num_channels), shape, shape))
+    # Where all tiles are active, every pixel is written.
+    new = channels.new_empty if tiles == len(bins.tile_offsets) - 1 else channels.new_zeros
+    image, alpha, mask = (new(s) for s in ((*shape, num_channels), shape, shape))
     deviated, center, lean = (channels.new_zeros(shape if deviation else (0, 0, 0)) for _ in range(3))
     buckets = len(bins.pair_splats) // BUCKET + tiles if needs_gradients else 0
     planes = num_channels + (1 if num_primary == count else 3)

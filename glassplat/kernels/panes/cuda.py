@@ -15,11 +15,7 @@ from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.images import color_space_maths
 from glassplat.kernels.maths.pane import pane_maths
-from glassplat.kernels.panes.reference import layer_slopes
 from glassplat.kernels.records import REAL_OF, TILE, PaneHits
-
-# Of slopes, a few operations on an image, the definition is fast enough.
-__all__ = ["blend_panes", "blend_panes_gradients", "layer_slopes", "pane_hits"]
 
 PIXELS = TILE * TILE
 
@@ -34,31 +30,25 @@ def pane_hits(
     index = torch.empty(height, width, dtype=torch.int32, device=centers.device)
     depth = centers.new_empty(height, width)
     tiles = torch.zeros(count, rows, columns, dtype=torch.bool, device=centers.device)
-    shown_columns, shown_rows = (tiles.new_zeros(count, size) for size in (width, height))
+    reaches = torch.zeros(count, 4, dtype=torch.int32, device=centers.device)
     before = (None, None) if beyond is None else (beyond.pane, beyond.depth)
-    outputs = (index, depth, tiles, shown_columns, shown_rows)
-    pane_hits_forward(real)(rows * columns, PIXELS, *inputs, mask, *before, *outputs)
-    left, right = _edges(shown_columns)
-    top, bottom = _edges(shown_rows)
-    return PaneHits(index, depth, tiles, torch.stack([left, top, right, bottom], dim=1).to(centers.dtype))
-
-
-def _edges(shown: Tensor) -> tuple[Tensor, Tensor]:
-    """First and one-past-last true entry of each row [K, n]; 0 and 0 where there is none."""
-    count, flags = shown.shape[1], shown.to(torch.int32)
-    last = count - flags.flip(1).argmax(1)
-    return flags.argmax(1), torch.where(shown.any(1), last, 0)
+    pane_hits_forward(real)(rows * columns, PIXELS, *inputs, mask, *before, index, depth, tiles, reaches)
+    windows = centers.new_empty(count, 4)
+    windows_of(real)(blocks_for(count, THREADS), THREADS, reaches, width, height, windows)
+    return PaneHits(index, depth, tiles, windows)
 
 
 @cache
 def pane_hits_forward(real: type) -> Kernel:
-    """Fills the index and the depth, and marks tiles, columns and rows in which a pane is shown."""
+    """Fills the index and the depth, and marks the tiles in which a pane is shown and how far that reaches.
+
+    A pane reaches so many pixels from the image's right, lower, left and upper border; 0 where it is not shown.
+    """
     half, one, zero, far = real(0.5), real(1.0), real(0.0), real(np.inf)
 
-    @kernel("pane_hits", real, "real2 real2 real3 real2 real1 real2 int2 real2 int2 real2 bool3 bool2 bool2")
+    @kernel("pane_hits", real, "real2 real2 real3 real2 real1 real2 int2 real2 int2 real2 bool3 int2")
     def forward(
-        centers, normals, axes, half_sizes, intrinsics, mask, before, depth_before,
-        index, depth_of, tiles, shown_columns, shown_rows,
+        centers, normals, axes, half_sizes, intrinsics, mask, before, depth_before, index, depth_of, tiles, reaches,
     ):  # fmt: skip
         height, width = index.shape
         tile_columns = (width + TILE - 1) // TILE
@@ -89,13 +79,33 @@ def pane_hits_forward(real: type) -> Kernel:
         if hit >= 0 and (mask.size == 0 or mask[row, column] > zero):
             # Many threads may write here, all of them the same.
             tiles[hit, tile_row, tile_column] = True
-            shown_columns[hit, column] = True
-            shown_rows[hit, row] = True
+            cuda.atomic.max(reaches, (hit, 0), np.int32(width - column))
+            cuda.atomic.max(reaches, (hit, 1), np.int32(height - row))
+            cuda.atomic.max(reaches, (hit, 2), np.int32(column + 1))
+            cuda.atomic.max(reaches, (hit, 3), np.int32(row + 1))
 
     return forward
 
 
 THREADS = 128
+
+
+@cache
+def windows_of(real: type) -> Kernel:
+    """Left, top, right and bottom edge of what each pane shows; all 0 where that is nothing."""
+
+    @kernel("pane_windows", real, "int2 int int real2")
+    def fill(reaches, width, height, windows):
+        k = cuda.grid(1)
+        if k < windows.shape[0]:
+            shown = reaches[k, 2] > 0
+            windows[k, 0] = real(np.int32(width - reaches[k, 0] if shown else 0))
+            windows[k, 1] = real(np.int32(height - reaches[k, 1] if shown else 0))
+            windows[k, 2], windows[k, 3] = real(reaches[k, 2]), real(reaches[k, 3])
+
+    return fill
+
+
 INPUTS = "real3 real2 real4 real2 real1 int2 real1 int bool bool"
 
 
@@ -239,3 +249,45 @@ def blend_panes_backward(real: type) -> Kernel:
         shares[row, column, 3] = v_raw * by_base
 
     return backward
+
+
+def layer_slopes(
+    strength: Tensor, transmission: Tensor, reflection: Tensor, where: Tensor, *, linear: bool
+) -> tuple[Tensor, Tensor]:
+    """As `glassplat.kernels.panes.cpu.layer_slopes`."""
+    through, mirrored = torch.empty_like(strength), torch.empty_like(strength)
+    layer_slopes_kernel(REAL_OF[strength.dtype])(
+        blocks_for(strength.numel(), THREADS), THREADS, strength, transmission, reflection, where, linear,
+        through, mirrored,
+    )  # fmt: skip
+    return through, mirrored
+
+
+@cache
+def layer_slopes_kernel(real: type) -> Kernel:
+    """Fills both images [H, W], a pixel for each thread."""
+    linear_of, linear_slope, encoded, encoded_slope = color_space_maths(real)
+    zero, one, third = real(0.0), real(1.0), real(1.0 / 3.0)
+
+    @kernel("layer_slopes", real, "real2 real3 real3 bool2 bool real2 real2")
+    def slopes(strength, transmission, reflection, where, linear, through, mirrored):
+        height, width = strength.shape
+        i = cuda.grid(1)
+        if i >= height * width:
+            return
+        row, x = i // width, i % width
+        if not where[row, x]:
+            through[row, x], mirrored[row, x] = one, zero
+            return
+        share, t, r = strength[row, x], transmission[row, x], reflection[row, x]
+        behind, mirror_image = (t[0] + t[1] + t[2]) * third, (r[0] + r[1] + r[2]) * third
+        by_behind, by_mirror_image = one - share, share
+        if linear:
+            lit, bright = linear_of(behind), linear_of(mirror_image)
+            light = lit + share * (bright - lit)
+            slope = encoded_slope(light, encoded(light))
+            by_behind *= slope * linear_slope(behind, lit)
+            by_mirror_image *= slope * linear_slope(mirror_image, bright)
+        through[row, x], mirrored[row, x] = by_behind, by_mirror_image
+
+    return slopes

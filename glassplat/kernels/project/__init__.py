@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -38,15 +39,19 @@ def projection_inputs(
     clip_planes = cameras.clip_planes
     if clip_planes is None:
         clip_planes = gaussians.means.new_empty(0, 4)
-    windows = _whole_images(cameras) if cameras.windows is None else cameras.windows
+    windows = cameras.windows
+    if windows is None:
+        poses = cameras.cam_from_world
+        windows = _whole_images(poses.shape[0], cameras.width, cameras.height, poses.dtype, poses.device)
     return (*gaussians, cameras.cam_from_world, cameras.intrinsics, clip_planes, windows)
 
 
-def _whole_images(cameras: CameraBatch) -> Tensor:
-    """Windows of all pixels, filled in on the device: numbers that came from here would make it wait."""
-    windows = cameras.cam_from_world.new_zeros(cameras.cam_from_world.shape[0], 4)
-    windows[:, 2].fill_(cameras.width)
-    windows[:, 3].fill_(cameras.height)
+@lru_cache(maxsize=64)
+def _whole_images(count: int, width: int, height: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Windows of all pixels, the same tensor at every call; filled on the device, as copying numbers makes it wait."""
+    windows = torch.zeros(count, 4, dtype=dtype, device=device)
+    windows[:, 2].fill_(width)
+    windows[:, 3].fill_(height)
     return windows
 
 

@@ -58,8 +58,7 @@ def project_gradients(
     known: list[Tensor] | None = None,
 ) -> tuple[list[Tensor], Tensor]:  # fmt: skip
     """As `glassplat.kernels.project.cpu.project_gradients`."""
-    # Zeroing it all at once is faster than one Gaussian at a time.
-    found = [torch.zeros_like(tensor) for tensor in inputs[:5]] if known is None else known
+    found = _zeros_like(inputs[:5]) if known is None else known
     lens = _lenses(inputs[5], inputs[6], width, height)
     return _gradients(project_backward, inputs, lens, degree, (*seen, *cotangents), needs_camera, found)
 
@@ -69,9 +68,15 @@ def project_discs_gradients(
     *, seen: tuple[Tensor, Tensor], cotangents: Sequence[Tensor], needs_camera: bool,
 ) -> tuple[list[Tensor], Tensor]:  # fmt: skip
     """As `glassplat.kernels.project.cpu.project_discs_gradients`."""
-    found = [torch.zeros_like(tensor) for tensor in inputs[:5]]
+    found = _zeros_like(inputs[:5])
     lens = _lenses(inputs[5], inputs[6], width, height)
     return _gradients(project_discs_backward, inputs, lens, degree, (*seen, *cotangents), needs_camera, found)
+
+
+def _zeros_like(tensors: Sequence[Tensor]) -> list[Tensor]:
+    """Zeros of these shapes, all filled at once."""
+    parts = tensors[0].new_zeros(sum(tensor.numel() for tensor in tensors)).split([t.numel() for t in tensors])
+    return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
 
 
 def _outputs(inputs: Sequence[Tensor], widths: tuple[tuple[int, ...], ...]) -> tuple[Tensor, ...]:

@@ -37,12 +37,13 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
     count_tiles(real)(
         blocks_for(count, THREADS), THREADS, *shapes, radii, active_tiles, per_camera, width, height, counts
     )
-    offsets = torch.zeros(2, count + 1, dtype=torch.int64, device=device)
-    torch.cumsum(counts, 1, out=offsets[:, 1:])
-    splat_offsets, span_offsets = offsets
+    offsets = torch.zeros(2 * count + 1, dtype=torch.int64, device=device)
+    # One sum over both rows: torch gives each row of a matrix to a single block of threads.
+    torch.cumsum(counts.view(-1), 0, out=offsets[1:])
+    splat_offsets, span_offsets = offsets[: count + 1], offsets[count:] - offsets[count]
     active, num_active = _active(active_tiles, num_tiles, device)
     # The one thing that the program asks of the GPU, and waits for.
-    num_pairs, num_spans, num_active = torch.cat([offsets[:, -1], num_active]).tolist()
+    num_pairs, num_spans, num_active = torch.stack([splat_offsets[-1], span_offsets[-1], num_active]).tolist()
     check_pair_count(num_pairs)
     spans = torch.empty(num_spans, 3, dtype=torch.int32, device=device)
     list_spans(real)(
@@ -67,15 +68,15 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
 
 
 def _active(active_tiles: Tensor | None, num_tiles: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """The active tiles in order, in the front of a longer list, and how many they are [1]."""
+    """The active tiles in order, in the front of a longer list, and how many they are."""
     every = torch.arange(num_tiles, dtype=torch.int32, device=device)
     if active_tiles is None:
-        return every, torch.full((1,), num_tiles, device=device)
+        return every, torch.full((), num_tiles, device=device)
     flags = active_tiles.flatten()
     counted = flags.cumsum(0)
     # All that are not active are written to the place behind the last.
     places = torch.where(flags, counted - 1, num_tiles)
-    return every.new_empty(num_tiles + 1).scatter_(0, places, every), flags.sum()[None]
+    return every.new_empty(num_tiles + 1).scatter_(0, places, every), flags.sum()
 
 
 def _sequence(depths: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:

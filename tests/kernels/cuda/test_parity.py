@@ -266,6 +266,18 @@ def test_pane_hits(masked: bool, dtype: torch.dtype) -> None:
         close(value, want)
 
 
+@pytest.mark.parametrize("linear", [False, True])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_layer_slopes(linear: bool, dtype: torch.dtype) -> None:
+    strength = draw(HEIGHT, WIDTH, seed=1).to(dtype).sigmoid()
+    layers = [1.2 * draw(HEIGHT, WIDTH, 3, seed=seed).to(dtype).sigmoid() - 0.1 for seed in (2, 3)]
+    where = draw(HEIGHT, WIDTH, seed=4) > 0
+    own = (tensor.to(DEVICE) for tensor in (strength, *layers, where))
+    found = panes_operation.layer_slopes(*own, linear=linear)
+    for value, want in zip(found, panes_twin.layer_slopes(strength, *layers, where, linear=linear), strict=True):
+        close(value, want)
+
+
 def test_no_pane_is_hit_where_there_is_none() -> None:
     panes, intrinsics = two_panes(torch.float64)
     none = Panes(*(tensor[:0].to(DEVICE) for tensor in panes))

@@ -15,9 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from glassplat.kernels.backend import devices
 from glassplat.kernels.loss_terms import _EnergyInTorch, gradient_conflict_in_torch
-from glassplat.kernels.panes.reference import layer_slopes
 from glassplat.kernels.screen_statistics import add_views_in_torch
-from glassplat.render import planar
 from glassplat.scene import camera
 from glassplat.training import densify, losses
 
@@ -116,6 +114,5 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch, waits: Waits) -> None:
     # The operations that are PyTorch's own on a GPU.
     monkeypatch.setattr(losses, "shared_edges", gradient_conflict_in_torch)
     monkeypatch.setattr(losses, "harmonic_energy", _EnergyInTorch.apply)
-    monkeypatch.setattr(planar, "layer_slopes", layer_slopes)
     monkeypatch.setattr(densify, "add_views", add_views_in_torch)
     monkeypatch.setattr(camera, "waits", lambda device: True)
