@@ -12,6 +12,7 @@ from numba import prange
 from torch import Tensor
 
 from glassplat.kernels.backend.cpu import Kernel, kernel
+from glassplat.kernels.backend.devices import kernels_for
 from glassplat.kernels.records import REAL_OF, check_tensors
 
 CHUNK = 1024
@@ -70,9 +71,9 @@ def add_views(sums: Sums, views: Views) -> None:
     if isinstance(views.weight, Tensor):
         expected["weight"] = (views.weight, (cameras, count) if views.weight.dim() else ())
     check_tensors(expected)
-    if sums.max_radius.device.type != "cpu":
-        # On a GPU these few sums over Gaussians are no bottleneck, so that there they stay PyTorch's.
-        add_views_in_torch(sums, views)
+    device = sums.max_radius.device
+    if device.type != "cpu":
+        kernels_for("project", device).add_views(sums, views)
         return
     real = REAL_OF[sums.max_radius.dtype]
     weight = np.ascontiguousarray(np.atleast_2d(views.weight), real)

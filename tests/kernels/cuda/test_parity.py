@@ -30,6 +30,7 @@ from glassplat.kernels.panes import reference as panes_twin
 from glassplat.kernels.photometric import reference as photometric_twin
 from glassplat.kernels.project import reference as project_twin
 from glassplat.kernels.records import CameraBatch, Deviation, Panes, RawGaussians, Splats
+from glassplat.kernels.screen_statistics import Sums, Views, add_views_in_torch
 from glassplat.kernels.tiles import reference as tiles_twin
 from tests.kernels.cuda.agreement import (
     DEVICE,
@@ -263,6 +264,27 @@ def test_pane_hits(masked: bool, dtype: torch.dtype) -> None:
     expected = panes_twin.pane_hits(panes, intrinsics, WIDTH, HEIGHT, mask, beyond=expected)
     assert bool((expected.pane >= 0).any())
     for value, want in zip(further, expected, strict=True):
+        close(value, want)
+
+
+@pytest.mark.parametrize("weight", ["number", "scalar", "each"])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_screen_statistics(weight: str, dtype: torch.dtype) -> None:
+    cameras, count = 2, many(9, 3000)
+    v_means, v_probe, radii = (draw(cameras, count, 2, seed=seed).to(dtype) for seed in (1, 2, 3))
+    weights = {
+        "number": 0.7,
+        "scalar": torch.tensor(0.7, dtype=dtype),
+        "each": draw(cameras, count, seed=4).to(dtype).sigmoid(),
+    }
+    expected = Sums(*torch.zeros(3, 2, count, dtype=dtype), torch.zeros(count, dtype=dtype))
+    found = on_device(expected)
+    for direct in (True, False):
+        views = Views(v_means, v_probe, radii, 40, 30, weights[weight], direct)
+        # In the simulator, tensors on the "device" are the CPU's, whose kernel the operation would take.
+        kernels_for("project", DEVICE).add_views(found, on_device(views))
+        add_views_in_torch(expected, views)
+    for value, want in zip(found, expected, strict=True):
         close(value, want)
 
 

@@ -111,7 +111,7 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch, waits: Waits) -> None:
         return SimpleNamespace(**{name: run(name) for name, value in vars(module).items() if callable(value)})
 
     monkeypatch.setattr(devices, "_module", counted)
-    # The operations that are PyTorch's own on a GPU.
+    # The operations that are PyTorch's own on a GPU, and one whose kernel is not asked for on a CPU.
     monkeypatch.setattr(losses, "shared_edges", gradient_conflict_in_torch)
     monkeypatch.setattr(losses, "harmonic_energy", _EnergyInTorch.apply)
     monkeypatch.setattr(densify, "add_views", add_views_in_torch)
