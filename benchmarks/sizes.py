@@ -45,7 +45,7 @@ Works = dict[str, Callable[[], Any]]
 
 
 def works_of(count: int, device: torch.device, folder: Path) -> tuple[Works, Works]:
-    """What is repeated, and what is done once, in the order of the table."""
+    """Work that is repeated, and work that is done once, in the order of the table."""
     camera = bench_camera(WIDTH, HEIGHT).to(device)
     scene = bench_scene(count, 1, 0.5, bench_camera(WIDTH, HEIGHT)).to(device)
     view, state = view_of(camera), TrainState(scene, seed=0)
