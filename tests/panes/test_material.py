@@ -14,6 +14,7 @@ from glassplat.captures.view import View
 from glassplat.panes.material import (
     FEWEST_PIXELS,
     LEAST_SHARE,
+    MIRROR_CORRELATION,
     REDUCED_WIDTH,
     WINDOW,
     about_local_mean,
@@ -60,6 +61,18 @@ def test_a_mirror_is_found_and_glass_is_not(base_reflectance: float, expected: t
     views = photographs(scene_with(base_reflectance))
     unknown = scene_with(0.2)
     assert mirror_labels(unknown, views) == expected
+
+
+def test_glass_before_darkness_is_no_mirror() -> None:
+    # sRGB is steep where it is dark: an eighth of the light looks like four tenths of the brightness.
+    scene = scene_with(0.15)
+    before = scene.primary.means[:, 2] < scene.planes.centers[0, 2]
+    dark = replace(scene, primary=scene.primary.select(before))
+    views = photographs(dark)
+    found = judged_pane(dark, 1, photographs_of(dark, views))
+    assert found.like.correlation > MIRROR_CORRELATION
+    assert found.like.slope == pytest.approx(0.15, abs=0.05)
+    assert not found.is_mirror
 
 
 def test_an_exposure_does_not_turn_a_mirror_into_glass() -> None:
