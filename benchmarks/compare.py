@@ -7,6 +7,12 @@
 Every run is `glassplat train` and `glassplat eval` in a process of its own, in OUTPUT/SCENE/NAME-seedN. Repeat the
 command to go on after an interrupt: finished runs are skipped, begun ones go on from their checkpoint. A run that fails
 does not stop the others. The tables are printed and kept in OUTPUT/tables.md, with all results in OUTPUT/results.json.
+
+Several of these commands may share one OUTPUT, on one machine or many: each run is claimed by a lock on its folder,
+which ends with the process, so that nothing is done twice and what a dead one leaves is taken up by the next. Under
+Slurm:
+
+    sbatch --array 0-7 --wrap 'python -m benchmarks.compare rooms/* --task $SLURM_ARRAY_TASK_ID --of 8'
 """
 
 from __future__ import annotations
@@ -26,8 +32,17 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from filelock import FileLock, Timeout
+
+from glassplat.errors import InputError
+from glassplat.files.writing import atomic_write
+from glassplat.model.run_directory import check_unlocked
+
 BASELINE = "splat"
 COMMAND, LOG, RESULTS = "command.json", "output.log", "results.json"
+CLAIM, FAILED = "claim.lock", "failed.txt"
+PATIENCE = 2.0
+"""Seconds after which what others do is looked at again."""
 
 
 class Column(NamedTuple):
@@ -110,6 +125,29 @@ class Run:
                 "another --output, or move the run away"
             )
 
+    def claimed(self) -> FileLock | None:
+        """The lock on this run; None while another process, or a training that it left behind, works on it."""
+        self.directory.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(self.directory / CLAIM, blocking=False, mode=0o666)
+        try:
+            lock.acquire()
+        except Timeout:
+            return None
+        try:
+            check_unlocked(self.directory)
+        except InputError:
+            lock.release()
+            return None
+        return lock
+
+    def failed_since(self, moment: float) -> str | None:
+        """Why it has failed after a moment, in seconds since the epoch; None if it has not."""
+        file = self.directory / FAILED
+        try:
+            return file.read_text(encoding="utf-8") if file.stat().st_mtime >= moment else None
+        except FileNotFoundError:
+            return None
+
     def start(self) -> subprocess.Popen[bytes]:
         """Begins the training, or goes on with it."""
         self.directory.mkdir(parents=True, exist_ok=True)
@@ -189,35 +227,66 @@ def scene_names(captures: Sequence[Path]) -> list[str]:
     return ["-".join(part.strip("/") for part in path.parts[-depth:]) for path in folders]
 
 
-def execute(runs: Sequence[Run], jobs: int, after_each: Callable[[], object]) -> list[str]:
-    """Trains and evaluates what is not finished, `jobs` at a time; returns why runs failed."""
-    waiting = deque(run for run in runs if run.results() is None)
+class Working(NamedTuple):
+    """A run that this process works on: the command, since when, its process and the lock on the run."""
+
+    command: str
+    since: float
+    process: subprocess.Popen[bytes]
+    lock: FileLock
+
+
+def execute(runs: Sequence[Run], jobs: int, after_each: Callable[[], object], first: int = 0) -> list[str]:
+    """Trains and evaluates what is not finished, `jobs` at a time; returns why runs failed, here or elsewhere.
+
+    Args:
+        runs: all of them; other processes may work on the same ones.
+        jobs: how many at a time.
+        after_each: called when one is finished.
+        first: number of the run to begin with, so that processes that start together take different ones.
+    """
+    begun, failures = time.time(), []
+    waiting = deque(run for run in (*runs[first:], *runs[:first]) if run.results() is None)
     print(f"{len(runs) - len(waiting)} of {len(runs)} runs are finished", flush=True)
-    running: dict[Run, tuple[str, float, subprocess.Popen[bytes]]] = {}
-    failures: list[str] = []
+    running: dict[Run, Working] = {}
     try:
         while waiting or running:
-            while waiting and len(running) < jobs:
+            for _ in range(len(waiting)):
+                if len(running) == jobs:
+                    break
                 run = waiting.popleft()
-                running[run] = ("train", time.monotonic(), run.start())
-            time.sleep(0.1)
-            for run, (command, since, process) in list(running.items()):
-                if (code := process.poll()) is None:
+                if run.results() is not None:
+                    continue
+                if (failure := run.failed_since(begun)) is not None:
+                    failures.append(failure)
+                elif (lock := run.claimed()) is None:
+                    waiting.append(run)
+                elif run.results() is not None:
+                    lock.release()  # Another process has just finished it.
+                else:
+                    running[run] = Working("train", time.monotonic(), run.start(), lock)
+            time.sleep(0.1 if running else PATIENCE if waiting else 0)
+            for run, work in list(running.items()):
+                if (code := work.process.poll()) is None:
+                    continue
+                if code == 0 and work.command == "train":
+                    running[run] = work._replace(command="eval", process=run.evaluate())
                     continue
                 del running[run]
                 if code:
-                    failures.append(f"{run.title}: {command} ended with {code}: {run.said()}")
+                    failures.append(f"{run.title}: {work.command} ended with {code}: {run.said()}")
+                    (run.directory / FAILED).write_text(failures[-1], encoding="utf-8")
                     print(f"failed: {failures[-1]}", flush=True)
-                elif command == "train":
-                    running[run] = ("eval", since, run.evaluate())
                 else:
-                    print(f"{run.title}: {described(run, time.monotonic() - since)}", flush=True)
+                    print(f"{run.title}: {described(run, time.monotonic() - work.since)}", flush=True)
                     after_each()
+                work.lock.release()
     finally:
-        for _, _, process in running.values():
-            process.terminate()  # As Ctrl-C would: a checkpoint is written.
-        for _, _, process in running.values():
-            process.wait()
+        for work in running.values():
+            work.process.terminate()  # As Ctrl-C would: a checkpoint is written.
+        for work in running.values():
+            work.process.wait()
+            work.lock.release()
     return failures
 
 
@@ -357,8 +426,9 @@ def write_tables(output: Path, runs: Sequence[Run]) -> str:
         return "nothing is finished"
     text = tables({(run.scene, run.name, run.seed): values_of(results) for run, results in finished})
     kept = [{"scene": r.scene, "name": r.name, "train": r.train} | results for r, results in finished]
-    (output / RESULTS).write_text(json.dumps(kept, indent=2) + "\n", encoding="utf-8")
-    (output / "tables.md").write_text(text, encoding="utf-8")
+    for name, content in ((RESULTS, json.dumps(kept, indent=2) + "\n"), ("tables.md", text)):
+        with atomic_write(output / name) as temporary:
+            temporary.write_text(content, encoding="utf-8")
     return text
 
 
@@ -375,15 +445,21 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--options", default="", help='of every training, such as "--downscale 2"')
     parser.add_argument("--output", type=Path, default=Path("runs/compare"))
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time; set NUMBA_NUM_THREADS with it")
+    parser.add_argument("--task", type=int, default=0, help="number of this process among those that share the output")
+    parser.add_argument("--of", type=int, default=1, help="how many they are")
     parser.add_argument("--table", action="store_true", help="only write the tables of what is finished")
-    return parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
+    if not 0 <= options.task < options.of:
+        parser.error(f"--task is {options.task}, of {options.of}; expected a number from 0 on, below --of")
+    return options
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs what is missing and prints the tables; returns the exit code."""
     options = parsed(arguments)
     runs = planned_runs(options)
-    failures = [] if options.table else execute(runs, options.jobs, lambda: write_tables(options.output, runs))
+    first = options.task * len(runs) // options.of
+    failures = [] if options.table else execute(runs, options.jobs, lambda: write_tables(options.output, runs), first)
     print(write_tables(options.output, runs))
     for failure in failures:
         print(f"failed: {failure}", file=sys.stderr)

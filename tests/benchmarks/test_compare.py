@@ -3,12 +3,28 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from benchmarks import compare
-from benchmarks.compare import COLUMNS, Measured, compared, main, named_options, parsed, planned_runs, tables, values_of
+from benchmarks.compare import (
+    COLUMNS,
+    FAILED,
+    RESULTS,
+    Measured,
+    compared,
+    main,
+    named_options,
+    parsed,
+    planned_runs,
+    tables,
+    values_of,
+)
 from tests.training.tiny_capture import write_tiny_capture
 
 
@@ -47,6 +63,57 @@ def test_runs_are_trained_and_evaluated_once_and_failures_stop_no_other(
     assert "1 of 1 runs are finished" in capsys.readouterr().out
     with pytest.raises(SystemExit, match=r"holds a run of `splat --data .* --iterations 8`"):
         main([*arguments, "--iterations", "9"])
+
+
+def test_processes_that_share_an_output_do_nothing_twice_and_take_up_what_a_dead_one_leaves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a", "b", "c", "d"):
+        (tmp_path / name).mkdir()
+    scenes = [str(tmp_path / name) for name in ("a", "b", "c", "d")]
+    arguments = [*scenes, "--methods", "splat", "--output", str(tmp_path / "runs")]
+    begun: list[str] = []
+
+    def work(run: compare.Run, command: str, *_: str) -> subprocess.Popen[bytes]:
+        begun.append(f"{run.scene} {command}")
+        script = "import sys, pathlib; pathlib.Path(sys.argv[1]).write_text('{\"psnr\": 1.0}')"
+        return subprocess.Popen(
+            [sys.executable, "-c", script if command == "eval" else "", str(run.directory / RESULTS)]
+        )
+
+    monkeypatch.setattr(compare.Run, "_glassplat", work)
+    monkeypatch.setattr(compare, "PATIENCE", 0.01)
+    runs = planned_runs(parsed(arguments))
+    dead, finished = runs[1].claimed(), runs[3].claimed()
+    assert dead is not None and finished is not None and runs[1].claimed() is None
+
+    def elsewhere() -> None:
+        """The other process finishes one of its two runs, and dies in the other."""
+        if len(begun) == 4:
+            (runs[3].directory / RESULTS).write_text('{"psnr": 2.0}')
+            finished.release()
+            dead.release()
+
+    assert compare.execute(runs, 1, elsewhere, first=2) == []
+    assert begun == ["c train", "c eval", "a train", "a eval", "b train", "b eval"]
+    assert main(arguments) == 0 and len(begun) == 6
+
+
+def test_a_failure_elsewhere_is_told_and_not_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "room").mkdir()
+    (run,) = planned_runs(parsed([str(tmp_path / "room"), "--methods", "splat", "--output", str(tmp_path / "runs")]))
+    run.directory.mkdir(parents=True)
+    monkeypatch.setattr(compare.Run, "start", lambda run: pytest.fail("begun again"))
+    (run.directory / FAILED).write_text("room: train ended with 2")
+    os.utime(run.directory / FAILED, (time.time() + 60, time.time() + 60))
+    assert compare.execute([run], 1, lambda: None) == ["room: train ended with 2"]
+    assert run.failed_since(time.time() + 120) is None
+
+
+def test_a_task_is_one_of_so_many(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main([str(tmp_path), "--task", "3", "--of", "3"])
+    assert "--task is 3, of 3; expected a number from 0 on, below --of" in capsys.readouterr().err
 
 
 def kept(folder: Path) -> dict:
