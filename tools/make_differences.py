@@ -68,6 +68,7 @@ REASONS: dict[str, dict[str, str]] = {
         "detect_mirrors": "Nobody has to name the mirrors.",
         "fixed_mirrors": "R0 falls, and the mirror becomes a window.",
         "seed_reflections": "Captures from the front show the room in the glass only.",
+        "turn_reflections": "What the first stage built behind glass would stay there, and R0 too low.",
         "weights.intensity": "R0 and a(u) are nearly one factor.",
         "moving_mean": "The mean depth follows the photographs.",
         "perturbation.stop": "What was perturbed has time to settle.",

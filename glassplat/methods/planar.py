@@ -20,6 +20,7 @@ from glassplat.panes.material import (
     judged_pane,
     mirrored_coverage,
     photographs_of,
+    reflections_behind,
     virtual_points,
 )
 from glassplat.render.planar import Planar
@@ -208,15 +209,54 @@ def reflects_little(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> W
 
 def turn_virtual_scene_round(state: TrainState, dataset: Dataset, mirrors: Planes) -> None:
     """Moves what the first stage built behind a mirror, or several in one plane, to where it really is, in front."""
-    primary, moments = state.scene.primary, state.optimizer.moments
-    virtual = virtual_points(primary.means, mirrors, [view.camera for view in dataset.train])
-    if not bool(virtual.any()):
-        return
-    turned = mirrored_gaussians(primary.select(virtual), mirrors.centers[0], mirrors.normals[0])
-    primary, moments = apply_edit(primary, moments, keep(~virtual))
-    primary, state.optimizer.moments = append(primary, moments, turned)
-    state.scene = replace(state.scene, primary=primary)
-    log.info("%d Gaussians behind %s moved to the front", int(virtual.sum()), named(mirrors, "mirror"))
+    virtual = virtual_points(state.scene.primary.means, mirrors, [view.camera for view in dataset.train])
+    if moved := turn_round(state, virtual, mirrors):
+        log.info("%d Gaussians behind %s moved to the front", moved, named(mirrors, "mirror"))
+
+
+TURN_AFTER = 0.005
+"""Share of a run after the beginning of joint optimisation at which reflections behind glass are turned round: before
+the first reset of opacities. A second and a third time take things that are really there."""
+
+
+@dataclass(frozen=True)
+class TurnReflections:
+    """Moves what was built behind panes of glass, for what they mirror, to where that is, in front; see lab/layers.md.
+
+    Attributes:
+        moment: share of the run at which to do it.
+    """
+
+    moment: float
+    name: str = "turn reflections"
+
+    def due(self, clock: Clock) -> bool:
+        """Return whether to act after this step."""
+        return clock.is_at((self.moment,))
+
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
+        """Edits `state`, if there is anything to edit, and tells how far it is."""
+        cameras = [view.camera for view in dataset.train]
+        of_glass, moved = surfaces(state.scene.planes, mirrors=False), 0
+        for done, panes in enumerate(of_glass):
+            yield Working(f"looking behind {named(panes, 'pane')} for what it mirrors", done, len(of_glass))
+            moved += turn_round(state, reflections_behind(state.scene, panes, cameras), panes)
+        if moved:
+            state.statistics.pop("primary", None)
+            log.info("%d Gaussians behind glass moved to the front", moved)
+        return moved > 0
+
+
+def turn_round(state: TrainState, virtual: Tensor, panes: Planes) -> int:
+    """Mirrors some primary Gaussians at panes in one plane; returns how many."""
+    count = int(virtual.sum())
+    if count:
+        primary, moments = state.scene.primary, state.optimizer.moments
+        turned = mirrored_gaussians(primary.select(virtual), panes.centers[0], panes.normals[0])
+        primary, moments = apply_edit(primary, moments, keep(~virtual))
+        primary, state.optimizer.moments = append(primary, moments, turned)
+        state.scene = replace(state.scene, primary=primary)
+    return count
 
 
 def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
@@ -352,6 +392,7 @@ def _joint(recipe: PlanarRecipe, share: float) -> Stage:
         | recipe.plane_rates.of(recipe.plane_rates.joint_factor)
         | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {}),
         actions=(
+            *_turns(recipe),
             *population.edits,
             GrowSh(Every(recipe.rhythm.sh)),
             Densify(recipe.densify, part="glass"),
@@ -388,6 +429,11 @@ def planar_population(recipe: PlanarRecipe) -> Population:
 def _early_resets(recipe: PlanarRecipe, population: Population) -> tuple[ResetOpacity, ...]:
     """The resets of the first two stages, if there are to be any."""
     return population.resets if recipe.early_resets else ()
+
+
+def _turns(recipe: PlanarRecipe) -> tuple[TurnReflections, ...]:
+    """The turning round of reflections behind glass, if there is to be any."""
+    return (TurnReflections(_joint_start(recipe) + TURN_AFTER),) if recipe.turn_reflections else ()
 
 
 def _clearing(recipe: PlanarRecipe) -> tuple[ResetOpacity, ...]:

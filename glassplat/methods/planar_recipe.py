@@ -96,6 +96,7 @@ class PlanarRecipe:
         fixed_mirrors: mirrors keep their reflectance, and what the first stage built behind them moves to their front;
             if not, they only start at that reflectance, as in the paper.
         seed_reflections: start what no photograph shows directly from the virtual points behind the panes.
+        turn_reflections: move what was built behind glass, for what that mirrors, to its front in the joint stage.
         tint: panes may be tinted: each learns what share of red, green and blue light gets through (not in the paper).
         tint_weight: of the mean square of the logarithm of that share in the objective.
         glass_count: glass Gaussians placed on each pane.
@@ -136,6 +137,7 @@ class PlanarRecipe:
     detect_mirrors: Annotated[bool, ESSENTIAL] = True
     fixed_mirrors: Internal[bool] = True
     seed_reflections: Internal[bool] = True
+    turn_reflections: Internal[bool] = True
     tint: bool = False
     tint_weight: NotNegative = 0.01
     glass_count: Annotated[int, Range(1, 1_000_000)] = 1000
@@ -167,6 +169,7 @@ class PlanarRecipe:
             detect_mirrors=False,
             fixed_mirrors=False,
             seed_reflections=False,
+            turn_reflections=False,
             weights=ReflectionWeights(intensity=0.0),
             moving_mean=True,
             perturbation=Perturbation(stop=29 / 30, bounds=(1e-6, 1 - 1e-6)),

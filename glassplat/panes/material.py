@@ -1,4 +1,4 @@
-"""The first glass Gaussians, mirrors told from glass, and the virtual scene behind a mirror."""
+"""The first glass Gaussians, mirrors told from glass, and the virtual scene behind mirrors and glass."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from torch.quasirandom import SobolEngine
 from glassplat.captures.view import View
 from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.render.planar import Planar
+from glassplat.render.splat import Splat
 from glassplat.scene import logit
-from glassplat.scene.camera import Camera
+from glassplat.scene.camera import Camera, mirror_matrices
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes, crosses_pane, in_image
 from glassplat.scene.scene import Scene
@@ -426,3 +427,57 @@ def virtual_points(points: Tensor, mirrors: Planes, cameras: Sequence[Camera]) -
         held += inside
         through += inside & crosses_pane(points, mirrors, camera.center)
     return through > (1 - MOST_SEEN_DIRECTLY) * held
+
+
+HIDDEN = 1.1
+"""Depth beyond the mean one of its pixel, as a ratio, at which a Gaussian is seen through what should hide it."""
+OPEN = 0.85
+"""Depth up to which, as a ratio to the mean one of its pixel, a view shows that nothing is there."""
+
+
+@torch.no_grad()
+def reflections_behind(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Tensor:
+    """[N] bool: which primary Gaussians stand behind glass for what it mirrors.
+
+    Before a pane reflects, what it mirrors is built where it seems to be, and stays there as long as it explains the
+    photographs as well. Most of it seems to be farther away than what is really there, and shows through that. So a
+    Gaussian is meant if most views hold it behind the panes, and most of those in which these are not hidden hold it
+    beyond the mean depth; and if its mirror image is possible, and not in a place that views look straight through.
+
+    Args:
+        scene: with panes or without.
+        panes: of glass, all in one plane.
+        cameras: the training views.
+    """
+    means = scene.primary.means
+    (mirror,) = mirror_matrices(panes.centers[:1], panes.normals[:1])
+    images = means @ mirror[:3, :3].T + mirror[:3, 3]
+    held, through, shown, hidden, direct, vacant = means.new_zeros(6, len(means))
+    for camera in (camera.to(means.device) for camera in cameras):
+        depth = Splat()(scene, camera).layers["depth"]
+        ratio, inside = relative_depths(means, camera, depth)
+        crossing = inside & crosses_pane(means, panes, camera.center)
+        held += inside
+        through += crossing
+        surface = camera.center + (means - camera.center) / ratio[:, None]
+        crossing &= crosses_pane(surface, panes, camera.center)
+        shown += crossing
+        hidden += crossing & (ratio > HIDDEN)
+        ratio, inside = relative_depths(images, camera, depth)
+        looking = inside & ~crosses_pane(images, panes, camera.center)
+        direct += looking
+        vacant += looking & (ratio < OPEN)
+    virtual = (through > (1 - MOST_SEEN_DIRECTLY) * held) & (hidden > 0.5 * shown)
+    return virtual & (vacant <= 0.5 * direct)
+
+
+def relative_depths(points: Tensor, camera: Camera, depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Depths [N] of points over those in an image [H, W] at their pixels, and [N] bool which lie in the image.
+
+    The ratio is 1 where the image holds nothing.
+    """
+    pixels, depths = camera.project(points)
+    column = pixels[:, 0].nan_to_num().clamp(0, camera.width - 1).long()
+    row = pixels[:, 1].nan_to_num().clamp(0, camera.height - 1).long()
+    there = depth[row, column]
+    return torch.where(there > 0, depths / there, 1), in_image(points, camera)

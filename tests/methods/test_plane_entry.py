@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 
-from glassplat.methods.planar import seed_reflection, surfaces, turn_virtual_scene_round
+from glassplat.captures.view import PointCloud
+from glassplat.methods.planar import TurnReflections, seed_reflection, surfaces, turn_virtual_scene_round
 from glassplat.panes.fit import with_mirrors
-from glassplat.panes.material import virtual_points
+from glassplat.panes.material import reflections_behind, virtual_points
 from glassplat.scene.camera import mirror_matrices
+from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
-from glassplat.training.stage import TrainState
-from tests.render.tiny_scene import in_single_precision, joined, pane, showcase
+from glassplat.training.densify import gaussians_from_points
+from glassplat.training.stage import Clock, TrainState
+from tests.render.tiny_scene import camera_at, concatenated, in_single_precision, joined, pane, showcase
 from tests.training.progress_of import finished
 from tests.training.tiny_capture import tiny_capture, true_scene
 
@@ -114,3 +119,39 @@ def test_mirrors_are_named_and_start_at_their_reflectance() -> None:
     found = with_mirrors(planes, (2, 7), 0.99)
     assert found.mirrors == (2,)
     torch.testing.assert_close(found.base_reflectances, torch.tensor([0.3, 0.99]))
+
+
+def wall(depth: float) -> Gaussians:
+    """An opaque wall across the view at this depth."""
+    places = torch.linspace(-2.5, 2.5, 26)
+    means = torch.cartesian_prod(places, places, torch.tensor([depth]))
+    return solid(means, -1.8)
+
+
+def solid(means: torch.Tensor, log_scale: float = -3.0) -> Gaussians:
+    """Grey, opaque balls."""
+    points = PointCloud(means, torch.full_like(means, 128).to(torch.uint8))
+    gaussians = gaussians_from_points(points, sh_degree=0, opacity=0.99)
+    return gaussians.with_tensors({"means": means, "log_scales": torch.full((len(means), 3), log_scale)})
+
+
+def test_what_shows_through_a_wall_behind_glass_is_a_reflection_unless_its_place_in_front_is_seen_to_be_empty() -> None:
+    tilted = in_single_precision(showcase(pane(2.0, half=0.8)))
+    planes = replace(tilted.planes, centers=torch.tensor([[0.0, 0, 2]]), raw_normals=torch.tensor([[0.0, 0, -1]]))
+    far, near, before = (torch.tensor([place]) for place in ((0.05, 0.0, 6.0), (0.05, 0.0, 3.8), (0.75, 0.0, 1.0)))
+    primary = concatenated(wall(3.0), solid(far), solid(near), solid(before))
+    scene = replace(tilted, primary=primary, planes=planes)
+    places = (camera_at(x, 0, -0.3) for x in (-0.2, 0.2))
+    cameras = [replace(camera, cam_from_world=camera.cam_from_world.float()) for camera in places]
+    found = reflections_behind(scene, planes, cameras)
+    # Mirrored, the far one stands behind the cameras, and the near one before them, where they look through.
+    assert found.nonzero().flatten().tolist() == [len(primary) - 3]
+
+    state = state_of(scene)
+    dataset: Any = SimpleNamespace(train=[SimpleNamespace(camera=camera) for camera in cameras])
+    action = TurnReflections(0.25)
+    assert action.due(Clock(25, 100, 1)) and not action.due(Clock(26, 100, 1))
+    assert finished(action.apply(state, dataset, Clock(25, 100, 1)))
+    torch.testing.assert_close(state.scene.primary.means[-1], torch.tensor([0.05, 0.0, -2.0]))
+    assert len(state.scene.primary) == len(primary)
+    assert not finished(action.apply(state, dataset, Clock(25, 100, 1)))
