@@ -141,7 +141,7 @@ class Run:
         return lock
 
     def failed_since(self, moment: float) -> str | None:
-        """Why it has failed after a moment, in seconds since the epoch; None if it has not."""
+        """The reason of a failure after a moment, in seconds since the epoch; None without one."""
         file = self.directory / FAILED
         try:
             return file.read_text(encoding="utf-8") if file.stat().st_mtime >= moment else None
