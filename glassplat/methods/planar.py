@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ from glassplat.options import BLACK
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.fit import fit_planes, with_mirrors
 from glassplat.panes.material import (
+    SLOPE_AMONG_GLASS,
     JudgedPane,
     glass_gaussians,
     judged_pane,
@@ -110,7 +111,7 @@ class PaneSetup:
         given = Planes.empty() if dataset.planes is None else dataset.planes
         untold = [label for label in scene.planes.labels if label not in given.labels]
         judged = yield from judged_panes(scene, dataset, untold)
-        alike = [label for label, found in judged.items() if found.is_mirror]
+        alike = mirrors_among(scene.planes, judged)
         mirrors = tuple(dict.fromkeys((*given.mirrors, *(self.fit.mirror_labels or alike))))
         log.info("mirrors among the panes: %s", ", ".join(map(str, mirrors)) or "none")
         aligned = [judged[label].pane for label in alike if label in mirrors]
@@ -180,6 +181,17 @@ def judged_panes(
         yield Working("telling mirrors from glass", done, len(labels))
         judged[label] = judged_pane(scene, label, photographs)
     return judged
+
+
+def mirrors_among(planes: Planes, judged: Mapping[int, JudgedPane]) -> list[int]:
+    """Labels of the panes that are mirrors, those in a front of glass only if they are so beyond doubt."""
+    alike = {label for label, found in judged.items() if found.is_mirror}
+    rows = [row for row, label in enumerate(planes.labels) if label in judged]
+    for group in coplanar_groups(planes, rows):
+        labels = {planes.labels[row] for row in group}
+        if any(judged[label].is_known for label in labels - alike):
+            alike -= {label for label in labels if judged[label].like.slope < SLOPE_AMONG_GLASS}
+    return [label for label in judged if label in alike]
 
 
 def surfaces(planes: Planes, *, mirrors: bool) -> list[Planes]:

@@ -115,6 +115,8 @@ MIRROR_SLOPE, MIRROR_CORRELATION = 0.35, 0.3
 """Above both an aligned pane is taken for a mirror. In linear radiance the slope was at most 0.20 of 15 panes of glass
 in ten captures, a dark television among them, and 0.74 and more of four mirrors. In sRGB, whose curve is steep where it
 is dark, the television came to 0.35 and 0.38."""
+SLOPE_AMONG_GLASS = 0.6
+"""The same where a pane in its plane is glass: one of a front came to 0.42, of 16 % of it."""
 LEAST_COVERAGE = 0.95
 """Coverage of the mirrored image from which a pixel counts; a rough first scene has holes, which are no dark things."""
 WINDOW = 0.15
@@ -163,10 +165,14 @@ class JudgedPane(NamedTuple):
     shown: int
 
     @property
+    def is_known(self) -> bool:
+        """Return whether enough is known of what it would mirror."""
+        return self.compared >= FEWEST_PIXELS and self.compared >= LEAST_SHARE * self.shown
+
+    @property
     def is_mirror(self) -> bool:
-        """Return whether it is one, as far as enough is known of what it would mirror."""
-        is_known = self.compared >= FEWEST_PIXELS and self.compared >= LEAST_SHARE * self.shown
-        return is_known and self.like.is_mirror
+        """Return whether it is one, as far as enough is known."""
+        return self.is_known and self.like.is_mirror
 
 
 class Photograph(NamedTuple):

@@ -6,12 +6,13 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 import torch
 
 from glassplat.captures.view import PointCloud
-from glassplat.methods.planar import TurnReflections, seed_reflection, surfaces, turn_virtual_scene_round
+from glassplat.methods.planar import TurnReflections, mirrors_among, seed_reflection, surfaces, turn_virtual_scene_round
 from glassplat.panes.fit import with_mirrors
-from glassplat.panes.material import reflections_behind, virtual_points
+from glassplat.panes.material import JudgedPane, Likeness, reflections_behind, virtual_points
 from glassplat.scene.camera import mirror_matrices
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
@@ -155,3 +156,16 @@ def test_what_shows_through_a_wall_behind_glass_is_a_reflection_unless_its_place
     torch.testing.assert_close(state.scene.primary.means[-1], torch.tensor([0.05, 0.0, -2.0]))
     assert len(state.scene.primary) == len(primary)
     assert not finished(action.apply(state, dataset, Clock(25, 100, 1)))
+
+
+@pytest.mark.parametrize(("slope", "expected"), [(0.42, []), (0.75, [2])])
+def test_a_pane_of_a_glass_front_is_a_mirror_only_beyond_doubt(slope: float, expected: list[int]) -> None:
+    one, other = pane(2.0, half=0.4), pane(2.0, half=0.4, label=2)
+    beside = replace(other, centers=one.centers + one.axes()[0])
+    planes = joined(one, beside)
+    glass = JudgedPane(one, Likeness(0.14, 0.2), 5000, 8000)
+    alike = JudgedPane(beside, Likeness(slope, 0.5), 5000, 8000)
+    assert mirrors_among(planes, {1: glass, 2: alike}) == expected
+    unknown = glass._replace(compared=10)
+    assert mirrors_among(planes, {1: unknown, 2: alike}) == [2]
+    assert mirrors_among(planes, {2: alike}) == [2]
