@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def guarded(arguments: list[str], *, is_program: bool) -> int:
     """Runs a command; whatever happens ends in one readable message and an exit code."""
     from glassplat.cli import console
-    from glassplat.training.ranks import await_leader, leads, tell
+    from glassplat.training.ranks import await_leader, leads, leave, tell
 
     console.plain_streams()
     is_training = arguments[:1] == ["train"]
@@ -123,6 +123,8 @@ def guarded(arguments: list[str], *, is_program: bool) -> int:
             if is_training and not is_lost:
                 tell(*found)
             await_leader()
+            if is_program:
+                leave(found.code)
             return found.code
     return 0
 
