@@ -113,8 +113,8 @@ log = logging.getLogger("glassplat.panes")
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 MIRROR_SLOPE, MIRROR_CORRELATION = 0.35, 0.3
 """Above both an aligned pane is taken for a mirror. In linear radiance the slope was at most 0.20 of 15 panes of glass
-in ten captures, a dark television among them, and 0.74 and more of four mirrors. In sRGB, whose curve is steep where it
-is dark, the television came to 0.35 and 0.38."""
+in ten captures, a dark television among them, and 0.52 and more of seven mirrors whose planes masks had found. In sRGB,
+whose curve is steep where it is dark, the television came to 0.35 and 0.38."""
 SLOPE_AMONG_GLASS = 0.6
 """The same where a pane in its plane is glass: one of a front came to 0.42, of 16 % of it."""
 LEAST_COVERAGE = 0.95
@@ -458,23 +458,19 @@ def reflections_behind(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -
     means = scene.primary.means
     (mirror,) = mirror_matrices(panes.centers[:1], panes.normals[:1])
     images = means @ mirror[:3, :3].T + mirror[:3, 3]
-    held, through, shown, hidden, direct, vacant = means.new_zeros(6, len(means))
+    shown, hidden, direct, vacant = means.new_zeros(4, len(means))
     for camera in (camera.to(means.device) for camera in cameras):
         depth = Splat()(scene, camera).layers["depth"]
         ratio, inside = relative_depths(means, camera, depth)
-        crossing = inside & crosses_pane(means, panes, camera.center)
-        held += inside
-        through += crossing
         surface = camera.center + (means - camera.center) / ratio[:, None]
-        crossing &= crosses_pane(surface, panes, camera.center)
+        crossing = inside & crosses_pane(means, panes, camera.center) & crosses_pane(surface, panes, camera.center)
         shown += crossing
         hidden += crossing & (ratio > HIDDEN)
         ratio, inside = relative_depths(images, camera, depth)
         looking = inside & ~crosses_pane(images, panes, camera.center)
         direct += looking
         vacant += looking & (ratio < OPEN)
-    virtual = (through > (1 - MOST_SEEN_DIRECTLY) * held) & (hidden > 0.5 * shown)
-    return virtual & (vacant <= 0.5 * direct)
+    return virtual_points(means, panes, cameras) & (hidden > 0.5 * shown) & (vacant <= 0.5 * direct)
 
 
 def relative_depths(points: Tensor, camera: Camera, depth: Tensor) -> tuple[Tensor, Tensor]:
