@@ -60,9 +60,7 @@ def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
     for module in ("runs", "evaluation", "writing", "details"):  # What takes long is imported before processes fork.
         importlib.import_module(f"glassplat.cli.{module}")
     data = place / "capture"
-    writer = get_context("fork").Process(target=write_tiny_capture, args=(data,))  # No kernel may run in this process.
-    writer.start()
-    writer.join()
+    made_apart(write_tiny_capture, data)
 
     @cache
     def whole(method: str) -> Whole:
@@ -74,6 +72,13 @@ def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
         folder = place / str(number)
         yield Case(f"{number} {method} {kind.__name__}", kind(draw, whole(method), folder))
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def made_apart(write: Callable[[Path], object], folder: Path) -> None:
+    """Write a folder in a copy of this process, in which no tensor may be computed: threads do not survive a fork."""
+    writer = get_context("fork").Process(target=write, args=(folder,))
+    writer.start()
+    writer.join()
 
 
 def training(whole: Whole, folder: Path, *more: str) -> Sequence[str | Path]:
@@ -255,7 +260,8 @@ def written(draw: random.Random, whole: Whole, folder: Path) -> str:
 def marked(draw: random.Random, whole: Whole, folder: Path) -> str:
     """Two programs save marks of one capture, and are killed or out of disk: what was saved is there."""
     with small_disk(folder, 1 << 20) as change:
-        room = write_room(folder / "room")
+        room = folder / "room"
+        made_apart(write_room, room)
         used = sum(path.stat().st_size + 4096 for path in room.rglob("*")) // 1024
         if draw.random() < 0.5:
             change(f"size={used + draw.choice((0, 4, 8, 16))}k")
