@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import io
 import logging
+import re
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
@@ -36,6 +37,8 @@ LARGEST_WINDOW = 16_384
 LEAST_TURN, MOST_TURN = 1e-3, 1e3
 """Length of a quaternion."""
 POSITION, TURN = Items(COORDINATE, 3), Items(Number(-MOST_TURN, MOST_TURN), 4)
+PAGE_PATH = re.compile(r"/|(/[\w@+-][\w@+.,-]{0,199}){1,8}", re.ASCII)
+"""Path of a file of viser's page: no part begins with a dot, and nothing is escaped."""
 HEADERS = {"X-Frame-Options": "DENY", "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
 _SERVE = threading.Lock()
 logger = logging.getLogger(__name__)
@@ -130,7 +133,9 @@ def admission(access: Access, page: Callable[..., Any] | None) -> Callable[[Serv
         except RefusedError as refused:
             return replied(refused.status, {"Content-Type": "text/plain; charset=utf-8"}, str(refused))
         if entry is not None:
-            return replied(HTTPStatus.SEE_OTHER, entry)
+            return replied(HTTPStatus.OK, entry)
+        if PAGE_PATH.fullmatch(request.path.partition("?")[0]) is None:  # viser 1.0 follows `..` out of its folder.
+            return replied(HTTPStatus.NOT_FOUND, {}, "there is no such page")
         response = None if page is None else page(connection, request)
         if isinstance(response, Response):
             for name, value in HEADERS.items():

@@ -6,14 +6,19 @@ import asyncio
 import math
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import msgspec
 import pytest
 import torch
 import viser
+from websockets.datastructures import Headers
 from websockets.exceptions import InvalidStatus
+from websockets.http11 import Request
 
+from glassplat.access import cookie_name
 from glassplat.errors import InputError
 from glassplat.viewer import gate
 from glassplat.viewer.gate import LARGEST_MESSAGE, MESSAGES, understood
@@ -77,13 +82,37 @@ def test_the_page_needs_the_key_which_leaves_the_address(viewer: Viewer) -> None
     assert page(viewer.address)[0] == 403
     assert page(viewer.address, "/?key=guessed")[0] == 403
     status, headers, _ = page(viewer.address, f"/?key={viewer.access.key}")
-    assert status == 303 and headers["Location"] == "/"
+    assert status == 200 and headers["Refresh"] == "0; url=/"
     assert "HttpOnly" in headers["Set-Cookie"] and "SameSite=Strict" in headers["Set-Cookie"]
     cookie = headers["Set-Cookie"].split(";")[0]
     status, headers, body = page(viewer.address, Cookie=cookie)
     assert status == 200 and b"<html" in body and headers["X-Frame-Options"] == "DENY"
     assert page(viewer.address, Cookie=cookie, Host="evil.example")[0] == 403
     assert page(viewer.address, Cookie=cookie, Origin="http://evil.example")[0] == 403
+
+
+PATHS_OUT = (
+    "/../x", "/a/../../etc/passwd", "/%2e%2e/x", "/..%2fx", "/a\\..\\x", "//etc/passwd", "/.ssh", "etc", "",
+    "/" + 999 * "a",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("path", PATHS_OUT)
+def test_no_path_leads_out_of_the_page_s_folder(path: str, viewer: Viewer) -> None:
+    """viser 1.0 follows every path that it is asked for."""
+    asked: list[Request] = []
+    answer = gate.admission(viewer.access, lambda connection, request: asked.append(request))
+    cookie = f"{cookie_name('localhost:80')}={viewer.access.key}"
+    refused = answer(None, Request(path, Headers({"Host": "localhost:80", "Cookie": cookie})))
+    assert not asked and refused.status_code == 404
+
+
+def test_every_file_of_the_page_is_served(viewer: Viewer) -> None:
+    root = Path(viser.__file__).parent / "client" / "build"
+    cookie = f"{cookie_name(urlsplit(viewer.address).netloc)}={viewer.access.key}"
+    for file in root.rglob("*.*"):
+        path = f"/{file.relative_to(root).as_posix()}?v=1"
+        assert not file.is_file() or page(viewer.address, path, Cookie=cookie)[0] == 200, path
 
 
 def test_others_may_look_by_any_name_where_the_host_says_so() -> None:
