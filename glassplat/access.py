@@ -92,7 +92,8 @@ class Access:
                 HTTPStatus.FORBIDDEN, "the key is that of another session; take the address that was printed"
             )
         cookie = f"{cookie_name(host)}={self.key}; HttpOnly; SameSite=Strict; Path=/"
-        return {"Set-Cookie": cookie, "Location": "/"}
+        # No redirection: where the link stood on another page, a browser would follow that without the cookie.
+        return {"Set-Cookie": cookie, "Refresh": "0; url=/"}
 
     def _is_key(self, given: str) -> bool:
         return secrets.compare_digest(given.encode("utf-8", "surrogateescape"), self.key.encode())

@@ -163,7 +163,7 @@ class PageHandler(BaseHTTPRequestHandler):
     def _send_page(self) -> None:
         entry = self.server.access.entry(self.path, self._host)
         if entry is not None:
-            self._send(b"", "text/plain", HTTPStatus.SEE_OTHER, entry)
+            self._send(b"", "text/plain", HTTPStatus.OK, entry)
             return
         self._check_key()
         self._send((resources.files("glassplat.annotate") / "page" / "index.html").read_bytes(), "text/html")

@@ -6,8 +6,10 @@ import os
 import sys
 import time
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import mkstemp
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -67,14 +69,31 @@ def photographs_of(run: Path) -> dict[str, Callable[[], Tensor]]:
 def serve_marking(command: Annotate, console: Console) -> None:
     """Serves the page until it is closed, or Ctrl-C."""
     session = opened_session(command.capture)
-    with AnnotationServer(session, command.port) as server:
+    with AnnotationServer(session, command.port) as server, ExitStack() as until_the_end:
         port = server.server_address[1]
         say(console, f"{len(session.views)} photographs; the page is at {server.address}")
         say(console, f"over SSH, first: ssh -L {port}:127.0.0.1:{port} HOST; Ctrl-C ends, and nothing is lost")
         if command.open_browser and has_screen():
-            webbrowser.open(server.address)
+            until_the_end.enter_context(opened_in_browser(server.address, session.root))
         server.serve_forever(poll_interval=0.2)
     say(console, f"next: glassplat train planar --data {command.capture} --output RUN")
+
+
+@contextmanager
+def opened_in_browser(address: str, folder: Path) -> Iterator[None]:
+    """Open an address through a file in a folder that leads there, which only this user can read.
+
+    All users of a computer can see what a browser is started with, and the address holds the key.
+    """
+    descriptor, name = mkstemp(dir=folder, prefix="marking-", suffix=".html")
+    page = Path(name).absolute()
+    try:
+        with open(descriptor, "w", encoding="utf-8") as text:
+            print(f'<meta http-equiv="refresh" content="0; url={address}">', file=text)
+        webbrowser.open(page.as_uri())
+        yield
+    finally:
+        page.unlink(missing_ok=True)
 
 
 def has_screen() -> bool:

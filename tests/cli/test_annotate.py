@@ -1,12 +1,25 @@
-"""What `glassplat annotate` refuses."""
+"""What `glassplat annotate` refuses, and how its page is opened."""
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 import pytest
 
+from glassplat.annotate.server import AnnotationServer
 from glassplat.cli.main import main
+from tests.annotate.conftest import serving, write_room
+from tests.browser_needed import needs_browser
+from tools.browser import Browser, wait_until
+
+
+@pytest.fixture
+def room(tmp_path: Path) -> Path:
+    return write_room(tmp_path / "room")
 
 
 def test_a_folder_that_is_no_capture_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -15,3 +28,40 @@ def test_a_folder_that_is_no_capture_is_refused(tmp_path: Path, capsys: pytest.C
     told = " ".join((said.out + said.err).split())
     assert code == 2
     assert "nothing" in told and "Traceback" not in told
+
+
+def served(room: Path, monkeypatch: pytest.MonkeyPatch, opened: Callable[[str, AnnotationServer], None]) -> None:
+    """Runs the command where there is a screen; its browser is a function of what it is started with."""
+
+    def serve(server: AnnotationServer, poll_interval: float) -> None:
+        opened(asked[0], server)
+
+    asked: list[str] = []
+    monkeypatch.setattr("glassplat.cli.serving.has_screen", lambda: True)
+    monkeypatch.setattr("webbrowser.open", asked.append)
+    monkeypatch.setattr(AnnotationServer, "serve_forever", serve)
+    assert main(["annotate", str(room), "--port", "0"]) == 0
+
+
+def test_what_the_browser_is_started_with_lets_nobody_in(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All users of a computer can see it."""
+
+    def opened(address: str, server: AnnotationServer) -> None:
+        assert server.access.key not in address
+        page = Path(url2pathname(urlsplit(address).path))
+        assert server.address in page.read_text()
+        assert sys.platform == "win32" or page.stat().st_mode & 0o077 == 0
+
+    before = {path.name for path in room.iterdir()}
+    served(room, monkeypatch, opened)
+    assert {path.name for path in room.iterdir()} <= before | {"annotations.json"}
+
+
+@needs_browser
+def test_the_link_may_stand_on_another_page(room: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    with serving(room) as server:
+        page.write_text(f'<meta http-equiv="refresh" content="0; url={server.address}">')
+        with Browser(page, query="") as browser:
+            wait_until(lambda: "corners" in browser.evaluate("document.body?.innerText ?? ''"), "the page")
+            assert server.access.key not in browser.evaluate("location.href")
