@@ -275,6 +275,8 @@ class TrainingSession:
         self._state, self._ranks, self._record = state, ranks, record
         self._seconds_before, self._started = state.seconds, time.perf_counter()
         self._saved = self._started
+        self._stepped: float | None = None  # The first step may compile kernels, and says nothing of the next.
+        self._longest = self._writing = 0.0
         self._stop = StopRequest()
 
     def trained(self, stages: tuple[Stage, ...], dataset: Dataset, iterations: int) -> Generator[Message, None, None]:
@@ -297,12 +299,24 @@ class TrainingSession:
     def _saved_in_time(self, message: StepDone, iterations: int) -> Generator[Message, None, None]:
         """Writes a checkpoint where it is time for one, and ends training where it was asked to end."""
         is_last, is_ending = message.step == iterations, self._ranks.is_ending
-        is_time = self._record is not None and time.perf_counter() - self._saved >= self._record.every
+        is_time = self._record is not None and self._is_time(self._record.every)
         if is_ending or is_last or is_time:
             self.save()
             yield from self.told(CheckpointWritten(message.step))
         if is_ending and not is_last:
             self._stop.end()
+        self._stepped = time.perf_counter()
+
+    def _is_time(self, every: float) -> bool:
+        """Return whether a checkpoint that is written after the next step would come later than every so many seconds.
+
+        The longest step so far is expected, with what is edited before it, and the time that the last checkpoint took;
+        both together no longer than half of the time, so that checkpoints become twice as frequent at most.
+        """
+        now = time.perf_counter()
+        if self._stepped is not None:
+            self._longest = max(self._longest, now - self._stepped)
+        return now - self._saved + min(self._longest + self._writing, every / 2) >= every
 
     def told(self, message: Message) -> Generator[Message, None, None]:
         """Passes a message on; should nobody be there any more to hear it, what was trained is saved first."""
@@ -324,10 +338,11 @@ class TrainingSession:
 
     def save(self) -> None:
         """Writes a checkpoint, if this process is to; the state must not be in the middle of a change."""
-        self._state.seconds = self._seconds_before + time.perf_counter() - self._started
+        self._saved = time.perf_counter()  # Before it is written: what is trained from now on is not in it.
+        self._state.seconds = self._seconds_before + self._saved - self._started
         if self._record is not None:
             save_checkpoint(self._record.checkpoint, self._state)
-        self._saved = time.perf_counter()
+        self._writing = time.perf_counter() - self._saved
 
 
 class Training:

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -23,13 +24,16 @@ from glassplat.errors import InputError
 from glassplat.methods.planar_recipe import PlanarRecipe, ReflectionWeights
 from glassplat.methods.recipe import recipe_from_json, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
-from glassplat.model.run_directory import RunDirectory, RunSettings
-from glassplat.model.training import Run
+from glassplat.model import training
+from glassplat.model.run_directory import CHECKPOINT_SECONDS, RunDirectory, RunSettings
+from glassplat.model.training import Record, Run, TrainingSession
 from glassplat.panes import PlaneFitError
 from glassplat.scene.scene import Scene
 from glassplat.training.checkpoint import load_checkpoint, recorded_seconds, save_checkpoint
 from glassplat.training.messages import CheckpointWritten, Message, RunBegun, StepDone, Working
-from tests.training.tiny_capture import tiny_capture, write_tiny_capture
+from glassplat.training.ranks import Ranks
+from glassplat.training.stage import TrainState
+from tests.training.tiny_capture import tiny_capture, true_scene, write_tiny_capture
 
 SETTINGS = RunSettings("tiny", iterations=12)
 RECIPE = SplatRecipe(sh_degree=1)
@@ -114,6 +118,26 @@ def test_checkpoints_come_by_time_and_are_told(tmp_path: Path) -> None:
     assert [m.step for m in once if isinstance(m, CheckpointWritten)] == [12]
     log = RunDirectory(tmp_path / "once").log.read_text()
     assert '"CheckpointWritten"' in log and '"Working"' not in log
+
+
+def test_never_are_more_than_two_minutes_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps, what is edited between them and the writing take their time, too."""
+    now, kept = 0.0, [0.0]
+
+    def write(path: Path, state: Any) -> None:
+        nonlocal now
+        begun, now = now, now + 9.0
+        assert now - kept[-1] <= CHECKPOINT_SECONDS <= 120
+        kept.append(begun)
+
+    monkeypatch.setattr(training, "time", SimpleNamespace(perf_counter=lambda: now))
+    monkeypatch.setattr(training, "save_checkpoint", write)
+    log: Any = SimpleNamespace(write=lambda message: None)
+    session = TrainingSession(TrainState(true_scene(), 0), Ranks(), Record(Path("checkpoint"), log, CHECKPOINT_SECONDS))
+    for step in range(1, 300):
+        now += 31.0 if step % 10 == 0 else 4.0
+        list(session._saved_in_time(StepDone(step, "a", 0.0, {}, {}), 1000))
+    assert len(kept) > 10
 
 
 def test_a_run_says_from_where_it_goes_on(tmp_path: Path) -> None:
