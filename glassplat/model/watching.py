@@ -159,7 +159,7 @@ class WatchedTraining:
                 try:
                     self._training.save()
                     told = "saved"
-                except OSError as error:  # The training does not end by a click.
+                except Exception as error:  # noqa: BLE001 - Whatever it is, the training does not end by a click.
                     told = f"not saved: {error}"
                 viewer.refresh(f"{self._status(message)}, {told}")
             if self._is_paused and not viewer.loop.serve():

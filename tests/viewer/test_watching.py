@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import socket
 import threading
@@ -10,16 +11,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from glassplat import Training
+from glassplat.access import Access
 from glassplat.cli.main import main
 from glassplat.methods.glossy_recipes import DeferredRecipe
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.watching import WatchedTraining, renderer_now
 from glassplat.render.splat import Splat
 from glassplat.training.messages import Message
+from glassplat.viewer import gate
 from glassplat.viewer.render_loop import vacant_port
 from glassplat.viewer.server import Viewer
 from tests.browser_needed import needs_browser
@@ -28,6 +32,7 @@ from tests.training.tiny_capture import tiny_capture, write_tiny_capture
 from tests.viewer.free_port import free_port
 from tests.viewer.test_server import eventually
 from tools.browser import Browser
+from tools.viewer_client import ViewerClient
 
 
 class EnoughError(Exception):
@@ -101,7 +106,55 @@ def test_a_training_is_drawn_paused_and_saved_while_it_goes_on(tmp_path: Path) -
             eventually(lambda: found.training.step > at)
 
 
-def test_a_training_that_nobody_watches_says_where_to_look(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("is_guarded", [True, False])
+def test_a_camera_without_a_field_of_view_ends_no_training(
+    is_guarded: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is not heard; and it would end its picture only, should the gate let it through."""
+    if not is_guarded:
+        monkeypatch.setattr(gate, "understood", lambda data: data)
+
+    async def look(viewer: Viewer) -> None:
+        async with ViewerClient(viewer.address) as client:
+            await client.picture()
+            await client.look(fov=0.0)
+            await asyncio.sleep(0.5)
+            await client.picture()
+
+    with watch(tmp_path / "run") as found:
+        eventually(lambda: bool(found.viewers))
+        asyncio.run(look(found.viewers[0]))
+        at = found.training.step
+        eventually(lambda: found.training.step > at + 5 or not found.thread.is_alive())
+        assert found.thread.is_alive()
+
+
+def test_a_save_that_fails_ends_no_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def save() -> None:
+        raise RuntimeError("no memory")
+
+    told: list[str] = []
+    with watch(tmp_path / "run") as found:
+        eventually(lambda: bool(found.viewers))
+        monkeypatch.setattr(found.training, "save", save)
+        monkeypatch.setattr(found.viewers[0], "refresh", told.append)
+        found.viewers[0].buttons["save"]()
+        eventually(lambda: bool(told) or not found.thread.is_alive())
+        at = found.training.step
+        eventually(lambda: found.training.step > at or not found.thread.is_alive())
+        assert found.thread.is_alive() and "not saved: no memory" in told[0]
+
+
+def test_a_training_that_nobody_watches_says_where_to_look(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    serve, hosts = gate.guarded_server, list[str]()
+
+    def served(access: Access, *, host: str, port: int, title: str) -> Any:
+        hosts.append(host)
+        return serve(access, host=host, port=port, title=title)
+
+    monkeypatch.setattr(gate, "guarded_server", served)
     data = write_tiny_capture(tmp_path / "data")
     options = ["--data", str(data), "--output", str(tmp_path / "run"), "--iterations", "5", "--device", "cpu"]
     with socket.socket() as taken:
@@ -110,6 +163,7 @@ def test_a_training_that_nobody_watches_says_where_to_look(tmp_path: Path, capsy
         assert main(["train", "splat", *options, "--view"]) == 0
     found = re.search(r"look at http://localhost:(\d+)", capsys.readouterr().out)
     assert found is not None and int(found[1]) > first
+    assert hosts == ["127.0.0.1"]
 
 
 def test_a_scene_that_lacks_what_its_method_mirrors_is_drawn_plainly() -> None:
