@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 import glassplat
+from glassplat.access import is_local
 from glassplat.cli.main import main
+from glassplat.cli.scene import View
+from glassplat.cli.serving import keeper
 from glassplat.errors import InputError
 from glassplat.files.sidecars import read_cameras
 from glassplat.model.watching import KeptBeside
@@ -64,6 +68,15 @@ def test_no_name_leads_out_of_the_folder(name: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be a name"):
         keeper.keep_keyframes(CAMERAS, name)
     assert not [*tmp_path.iterdir()]
+
+
+def test_who_looks_from_another_machine_saves_nothing_unless_a_folder_is_named(tmp_path: Path) -> None:
+    here = View(tmp_path / "scene")
+    elsewhere = replace(here, host="0.0.0.0")
+    assert is_local(here.host) and keeper(here, model()) is not None
+    assert keeper(elsewhere, model()) is None
+    assert keeper(replace(elsewhere, host="192.168.1.2"), model()) is None
+    assert keeper(replace(elsewhere, output=tmp_path), model()) is not None
 
 
 def test_keyframes_are_what_a_film_is_made_of(tmp_path: Path) -> None:
