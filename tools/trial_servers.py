@@ -14,7 +14,8 @@ import random
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -65,9 +66,24 @@ def cases(seed: int, cases: int, place: Path) -> Iterator[Case]:
     draw = random.Random(seed)
     root = write_room(place / "room")
     with viewed() as viewer, annotated(root) as annotation:
-        for number in range(1, cases):
-            what, fault = at_view(viewer, draw, number) if number % 2 else at_annotate(annotation, draw)
+        for name, port in (("view", viewer.port), ("annotate", int(annotation.server_address[1]))):
+            yield Case(f"{name} from elsewhere", elsewhere_fault(port))
+        for number in range(3, cases):
+            what, fault = at_view(viewer, draw, number) if number % 2 else at_annotate(annotation, draw, number)
             yield Case(f"{number} {what}", fault)
+
+
+def elsewhere_fault(port: int) -> str:
+    """Fault of a server that listens on an address of this computer by which others reach it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # Sends nothing; says which address others would see.
+        except OSError:
+            return ""  # No others.
+        address = probe.getsockname()[0]
+    with suppress(OSError), socket.create_connection((address, port), timeout=20):
+        return f"listens at {address}"
+    return ""
 
 
 def names_fault(place: Path) -> str:
@@ -135,8 +151,8 @@ def annotated(root: Path) -> Iterator[AnnotationServer]:
 def at_view(viewer: Viewer, draw: random.Random, number: int) -> tuple[str, str]:
     """One case at the viewer, and what is wrong with how it ended."""
     kind = draw.choice(("stranger", "messages", "messages", "long", "slow", "garbage"))
-    if number in (1, 3):
-        kind = "many" if number == 1 else "silent"
+    if number in (3, 5):
+        kind = "many" if number == 3 else "silent"
     errors, there = sys.stderr, io.StringIO()
     sys.stderr = there
     try:
@@ -242,8 +258,10 @@ async def silent(viewer: Viewer, draw: random.Random) -> str:
 
 
 async def garbage(viewer: Viewer, draw: random.Random) -> str:
-    """A request that is none."""
-    return answered_well(viewer.port, request(draw, viewer.port, ""))
+    """A request that is none, with the key or without."""
+    has_key = draw.random() < 0.5
+    cookie = f"{cookie_name(f'localhost:{viewer.port}')}={viewer.access.key}" if has_key else ""
+    return answered_well(viewer.port, request(draw, viewer.port, cookie), let_in=has_key)
 
 
 VIEWED = {
@@ -252,8 +270,10 @@ VIEWED = {
 }  # fmt: skip
 
 
-def at_annotate(server: AnnotationServer, draw: random.Random) -> tuple[str, str]:
+def at_annotate(server: AnnotationServer, draw: random.Random, number: int) -> tuple[str, str]:
     """One case at the page for marking: with the key, or without, and what is wrong with how it ended."""
+    if number in (4, 6):
+        return f"annotate {'many' if number == 4 else 'silent'}", many_annotating(server, is_silent=number == 6)
     file = server.session.root / "annotations.json"
     before = file.read_bytes() if file.is_file() else b""
     port = int(server.server_address[1])
@@ -264,11 +284,7 @@ def at_annotate(server: AnnotationServer, draw: random.Random) -> tuple[str, str
     try:
         sent = request(draw, port, cookie)
         fault = answered_well(port, sent, let_in=has_key)
-        status, _, body = page(
-            server.address, "/capture", Cookie=f"{cookie_name(urlsplit(server.address).netloc)}={server.access.key}"
-        )
-        if status != 200 or "views" not in json.loads(body):
-            fault = fault or f"afterwards /capture answers {status}"
+        fault = fault or capture_fault(server)
     except Exception as error:  # noqa: BLE001 - Whatever it is, the next client was not served.
         fault = f"{type(error).__name__}: {error}"
     finally:
@@ -281,6 +297,29 @@ def at_annotate(server: AnnotationServer, draw: random.Random) -> tuple[str, str
     return f"annotate {'with' if has_key else 'without'} key {sent[:60]!r}", fault or (
         printed if "Traceback" in printed else ""
     )
+
+
+def capture_fault(server: AnnotationServer) -> str:
+    """Fault of what a page with the key is told about the capture."""
+    cookie = f"{cookie_name(urlsplit(server.address).netloc)}={server.access.key}"
+    status, _, body = page(server.address, "/capture", Cookie=cookie)
+    return "" if status == 200 and "views" in json.loads(body) else f"/capture answers {status}"
+
+
+def many_annotating(server: AnnotationServer, *, is_silent: bool) -> str:
+    """A hundred pages at once, or one while a hundred connections have begun a save and say no more."""
+    host, port = "127.0.0.1", int(server.server_address[1])
+    cookie = f"{cookie_name(f'{host}:{port}')}={server.access.key}"
+    begun = f"POST /document HTTP/1.1\r\nHost: {host}:{port}\r\nOrigin: http://{host}:{port}\r\nCookie: {cookie}\r\n"
+    with ExitStack() as connections, ThreadPoolExecutor(MANY) as pool:
+        for _ in range(MANY * is_silent):
+            silent = connections.enter_context(socket.create_connection((host, port), timeout=20))
+            silent.sendall(f"{begun}Content-Length: 8000000\r\n\r\n{{".encode())
+        try:
+            faults = list(pool.map(lambda _: capture_fault(server), range(1 if is_silent else MANY)))
+        except Exception as error:  # noqa: BLE001 - Whatever it is, somebody was not served.
+            return f"{type(error).__name__}: {error}"
+    return next(filter(None, faults), "")
 
 
 def request(draw: random.Random, port: int, cookie: str) -> bytes:
@@ -306,6 +345,8 @@ def answered_well(port: int, sent: bytes, *, let_in: bool = False) -> str:
         while part := connection.recv(65536):
             answer += part
         status = answer.split(b" ")[1:2]
+        if b"root:" in answer:
+            return "was answered with a file from elsewhere"
         if status and status[0] in (b"200", b"101", b"303") and not let_in:
             return f"was answered: {answer[:100]!r}"
         if status and status[0] == b"500":
