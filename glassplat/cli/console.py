@@ -163,10 +163,11 @@ def code_of(stop: KeyboardInterrupt) -> int:
 
 
 @contextmanager
-def raised_signals() -> Iterator[list[Interrupted]]:
+def raised_signals(*, is_program: bool = False) -> Iterator[list[Interrupted]]:
     """Turns the signals into `Interrupted`, raised where the command is, so that half-written files are removed.
 
-    Gives the list of those raised: a library that is interrupted may end with an error of its own.
+    Gives the list of those raised: a library that is interrupted may end with an error of its own. Where the process
+    ends after the command, a later signal ends it at once, not with a traceback of what it was tidying up.
     """
     raised: list[Interrupted] = []
 
@@ -174,7 +175,7 @@ def raised_signals() -> Iterator[list[Interrupted]]:
         raised.append(Interrupted(number))
         raise raised[-1]
 
-    with _answered(stop):
+    with _answered(stop, afterwards=signal.SIG_DFL if is_program else None):
         yield raised
 
 
@@ -206,8 +207,13 @@ def held_signals() -> Iterator[None]:
 
 
 @contextmanager
-def _answered(answer: signal._HANDLER) -> Iterator[None]:
-    """Has the signals answered, but for those that the process was told to ignore, as by `nohup`."""
+def _answered(answer: signal._HANDLER, afterwards: signal._HANDLER = None) -> Iterator[None]:
+    """Has the signals answered, but for those that the process was told to ignore, as by `nohup`.
+
+    Args:
+        answer: to a signal in this context.
+        afterwards: from then on; None for what it was before.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield  # Only the main thread may say how signals are answered.
         return
@@ -220,7 +226,7 @@ def _answered(answer: signal._HANDLER) -> Iterator[None]:
         yield
     finally:
         for number in heard:
-            signal.signal(number, before[number])
+            signal.signal(number, before[number] if afterwards is None else afterwards)
 
 
 BAD_INPUT_CODE, FAILURE_CODE = 2, 1

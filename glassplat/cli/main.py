@@ -99,7 +99,7 @@ def guarded(arguments: list[str], *, is_program: bool) -> int:
     if is_training and not leads():
         console.silence()
     command = None
-    with console.raised_signals() as raised:
+    with console.raised_signals(is_program=is_program) as raised:
         try:
             with console.immediate_end() if is_program else nullcontext():
                 command = readied(arguments)

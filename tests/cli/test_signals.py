@@ -34,6 +34,14 @@ sys.argv = ["glassplat", *{arguments!r}]
 from glassplat.cli.main import main
 sys.exit(main())
 """
+SIGNALLED_AT_THE_END = """
+import atexit, os, signal, sys
+
+atexit.register(os.kill, os.getpid(), signal.SIGINT)
+sys.argv = ["glassplat", "--version"]
+from glassplat.cli.main import main
+sys.exit(main())
+"""
 PYCOLMAP_TERMINATED = """
 import os, signal, time
 from glassplat.captures.colmap_library import pycolmap
@@ -83,6 +91,12 @@ def test_a_signal_among_the_imports_of_a_command_at_work_is_one_line() -> None:
     script = SIGNALLED_WHILE_IMPORTING.format(name="torch._C", signal="SIGTERM", arguments=["info", str(SCENE)])
     code, out, said = ended(script)
     assert (code, said) == (CODES["SIGTERM"], "terminated; nothing was changed\n") and "a capture" in out
+
+
+def test_a_signal_after_the_command_ends_the_process_without_a_traceback() -> None:
+    """As the second of two Ctrl-C, while libraries tidy up."""
+    code, out, said = ended(SIGNALLED_AT_THE_END)
+    assert (code, said) == (-signal.SIGINT, "") and out.startswith("glassplat ")
 
 
 def test_loading_pycolmap_leaves_termination_as_it_was() -> None:
