@@ -9,15 +9,17 @@ import stat
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from functools import cache
 from pathlib import Path
 
 from tests.cli.tiny_run import write_run
 from tools.trial import Case
-from tools.trial_process import run, small_disk
+from tools.trial_process import ROOT, run, small_disk
 
 KINDS = ("home", "locale", "name", "cache", "two", "threads", "columns", "temporary")
 ONE_CACHE = {"NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator"}
 """Kernels come from NUMBA_CACHE_DIR alone, not from where they lie ready."""
+DAMAGED, MOST_FILLINGS = 3, 4
 LOCALES = ("C", "POSIX", "tr_TR.UTF-8", "de_DE.ISO-8859-1", "C.UTF-8", "nonsense", "")
 NAMES = ("a b", "a\nb", "\N{GRINNING FACE}", "[bold]x[/bold]", "-x", "a'b\"c", "%s{0}", "é" * 80, "a\tb", "\udcff")
 
@@ -70,12 +72,13 @@ def machine(kind: str, draw: random.Random, folder: Path, scene: Path) -> tuple[
         return what, known, place
     elif kind == "cache":
         what = draw.choice(("cut", "garbage", "empty", "read-only", "a file"))
-        damaged_cache(what, draw, kernels / "cache")
+        damaged_cache(what, draw, kernels / "cache", scene)
         known.update(NUMBA_CACHE_DIR=str(kernels / "cache"))
         if what in ("cut", "garbage", "empty"):
             known.update(ONE_CACHE)
     elif kind == "two":
-        what = "a fresh cache"
+        what = "missing"
+        damaged_cache(what, draw, kernels, scene)
         known.update(ONE_CACHE, NUMBA_CACHE_DIR=str(kernels))
     elif kind == "threads":
         what = draw.choice(("1", "2", "3", "7"))
@@ -89,26 +92,35 @@ def machine(kind: str, draw: random.Random, folder: Path, scene: Path) -> tuple[
     return what, known, scene
 
 
-def damaged_cache(what: str, draw: random.Random, kernels: Path) -> None:
-    """A cache that was filled by us, and then damaged."""
+def damaged_cache(what: str, draw: random.Random, kernels: Path, scene: Path) -> None:
+    """A cache that was filled by us, and then damaged: few files, where what they hold is compiled again."""
     if what == "a file":
         kernels.write_text("x")
         return
-    shared = kernels.parent.parent.parent / "filled"
-    if not shared.exists():
-        scene = shared.with_name("run")
-        run(
-            ["render", scene, "--output", shared.with_name("filling"), "--device", "cpu"],
-            environment=dict(os.environ) | {"NUMBA_CACHE_DIR": str(shared)} | ONE_CACHE,
-        )
-    shutil.copytree(shared, kernels)
-    files = [path for path in kernels.rglob("*") if path.is_file()]
-    for path in files if what == "empty" else draw.sample(files, max(1, len(files) // 2)):
+    shutil.copytree(filled_cache(scene), kernels)
+    files = sorted(path for path in kernels.rglob("*") if path.is_file())
+    for path in draw.sample(files, len(files) // 2 if what == "read-only" else min(DAMAGED, len(files))):
         data = path.read_bytes()
-        if what == "garbage":
+        if what == "missing":
+            path.unlink()
+        elif what == "garbage":
             path.write_bytes(draw.randbytes(len(data)))
         elif what != "read-only" or draw.random() < 0.5:  # Half of what cannot be written is cut short as well.
             path.write_bytes(b"" if what == "empty" else data[: draw.randrange(len(data) + 1)])
+
+
+@cache
+def filled_cache(scene: Path) -> Path:
+    """A cache with all kernels that a render of a scene needs, which is kept for the next trial: it takes minutes."""
+    folder = ROOT / "runs" / "trial" / "kernels"
+    environment = dict(os.environ) | {"NUMBA_CACHE_DIR": str(folder)} | ONE_CACHE
+    for _ in range(MOST_FILLINGS):
+        ended = run(
+            ["render", scene, "--output", scene.with_name("filling"), "--device", "cpu"], environment=environment
+        )
+        if ended.code == 0:
+            return folder
+    raise RuntimeError(f"no cache can be filled: {ended.output[-500:]}")
 
 
 def tried(environment: Mapping[str, str], scene: Path, folder: Path, truth: dict[str, bytes], *, twice: bool) -> str:
