@@ -207,7 +207,7 @@ def held_signals() -> Iterator[None]:
 
 
 @contextmanager
-def _answered(answer: signal._HANDLER, afterwards: signal._HANDLER = None) -> Iterator[None]:
+def _answered(answer: signal._HANDLER, afterwards: signal._HANDLER | None = None) -> Iterator[None]:
     """Has the signals answered, but for those that the process was told to ignore, as by `nohup`.
 
     Args:
