@@ -20,7 +20,7 @@ LOWEST := build/lowest
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make demo     train both methods on the bundled showcase and say where the pictures are"
+	@echo "make demo     train both methods on the bundled shop window and say where the pictures are"
 	@echo "make test     style, types and tests, as the continuous integration runs them"
 	@echo "make portable only the tests of what differs between systems: files, captures, scenes, commands"
 	@echo "make lowest   the same with the lowest version of every dependency"

@@ -52,7 +52,7 @@ def parsed() -> argparse.Namespace:
     """Parse the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.gpu", description=__doc__)
     parser.add_argument("--count", type=int, default=COUNT, help="Gaussians of the timings")
-    parser.add_argument("--data", type=Path, default=DATA, help="capture to train on; the bundled showcase by default")
+    parser.add_argument("--data", type=Path, default=DATA, help="capture to train on; the bundled one by default")
     parser.add_argument(
         "--iterations", type=int, default=ITERATIONS, help="length of the training run; 0 trains nothing"
     )

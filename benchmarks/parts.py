@@ -20,7 +20,7 @@ import torch
 
 from benchmarks.table import Table
 from glassplat.captures.dataset import load_dataset
-from glassplat.cli.train import SCENE
+from glassplat.cli.train import DEMO_DOWNSCALE, SCENE
 from glassplat.kernels.backend.cpu import Kernel
 from glassplat.methods.recipe import RECIPES, photo_background, recipe_of, settled
 from glassplat.training.loop import train
@@ -100,13 +100,14 @@ def main() -> None:
     """Trains, measures and prints."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.parts", description=__doc__)
     parser.add_argument("method", choices=list(RECIPES))
-    parser.add_argument("--data", type=Path, default=SCENE, help="capture; the bundled showcase unless given")
+    parser.add_argument("--data", type=Path, default=SCENE, help="capture; the bundled one unless given")
+    parser.add_argument("--downscale", type=float, default=DEMO_DOWNSCALE, help="shrinks photographs by this factor")
     parser.add_argument("--iterations", type=int, default=3000, help="length of the run")
     arguments = parser.parse_args()
     numba.set_num_threads(1)
     torch.set_num_threads(1)
     recipe = recipe_of(arguments.method)
-    dataset = load_dataset(arguments.data, background=photo_background(recipe))
+    dataset = load_dataset(arguments.data, downscale=arguments.downscale, background=photo_background(recipe))
     recipe = settled(recipe, dataset)
     state = TrainState(recipe.initialise(dataset), seed=0)
     stages = recipe.stages(state.seed, arguments.iterations)

@@ -12,7 +12,7 @@ import glassplat
 DEMO = Path(glassplat.__file__).parent / "demo_scene"
 
 
-def main(data: Path = DEMO, output: Path = Path("runs/place"), iterations: int = 3000, downscale: float = 1) -> None:
+def main(data: Path = DEMO, output: Path = Path("runs/place"), iterations: int = 3000, downscale: float = 3.2) -> None:
     dataset = glassplat.load_dataset(data, downscale=downscale)
     print(
         f"{len(dataset.train)} photographs to learn from, {len(dataset.test)} to test with, panes {dataset.pane_labels}"

@@ -14,7 +14,7 @@ import glassplat
 DEMO = Path(glassplat.__file__).parent / "demo_scene"
 
 
-def main(run: tyro.conf.Positional[Path], data: Path = DEMO, downscale: float = 1, steps: int = 50) -> None:
+def main(run: tyro.conf.Positional[Path], data: Path = DEMO, downscale: float = 3.2, steps: int = 50) -> None:
     model = glassplat.load(run)
     view = glassplat.load_dataset(data, downscale=downscale).train[0]
     photo = view.photo.to(model.scene.primary.means) / 255

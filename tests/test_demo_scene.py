@@ -33,7 +33,7 @@ def test_every_picture_has_the_size_of_the_camera() -> None:
     _, model, width, height, *_ = (SCENE / "sparse/0/cameras.txt").read_text().split()
     assert model == "PINHOLE"
     pictures = [path for path in SCENE.rglob("*") if path.suffix in (".jpg", ".png")]
-    assert len(pictures) == 96 + 8 + 4 * len(TEST_NAMES)
+    assert len(pictures) == 64 + 8 + 4 * len(TEST_NAMES)
     assert {pixels(path).shape[:2] for path in pictures} == {(int(height), int(width))}
 
 
@@ -53,21 +53,28 @@ def test_the_truth_covers_exactly_the_test_views_and_the_masks_only_training_vie
     assert json.loads((SCENE / "gt/planes.json").read_text())[0]["label"] == 1
 
 
+def blocks(picture: np.ndarray) -> np.ndarray:
+    """Mean of each block of 4x4 pixels, in which errors of JPEG cancel."""
+    height, width = (side // 4 for side in picture.shape[:2])
+    return picture.reshape(height, 4, width, 4, -1).mean(axis=(1, 3))
+
+
 @pytest.mark.parametrize("name", TEST_NAMES)
 def test_the_layers_add_up_to_the_photograph(name: str) -> None:
-    pane = pixels(SCENE / f"gt/strength/{name}_pane.png") > 0
+    pane = blocks(pixels(SCENE / f"gt/strength/{name}_pane.png"))[..., 0] == 1
     photograph, transmission, reflection = (
-        linear_from_srgb(pixels(path))
+        blocks(linear_from_srgb(pixels(path)))
         for path in (
             SCENE / f"images/{name}.jpg",
-            SCENE / f"gt/trans/{name}.png",
-            SCENE / f"gt/refl/{name}.png",
+            SCENE / f"gt/trans/{name}.jpg",
+            SCENE / f"gt/refl/{name}.jpg",
         )
     )
-    strength = pixels(SCENE / f"gt/strength/{name}.png")[..., None] / 65535.0
+    strength = blocks(pixels(SCENE / f"gt/strength/{name}.png")) / 65535.0
     composed = (1 - strength) * transmission + strength * reflection
-    exposed = pane & (pixels(SCENE / f"gt/refl/{name}.png").max(axis=-1) < 250)
-    difference = np.abs(composed - photograph)[exposed]
-    # Two of the views look away from the pane: then there is nothing to compare, and nothing may be claimed.
+    # Pictures hold nothing brighter than white.
+    exposed = pane & (reflection.max(axis=-1) < 0.9) & (transmission.max(axis=-1) < 0.9)
+    # Views that look away from the pane have nothing to compare, and nothing may be claimed.
     assert exposed.any() or not pane.any()
-    assert difference.size == 0 or difference.mean() < 0.007
+    difference = np.abs(composed - photograph)[exposed]
+    assert difference.size == 0 or difference.mean() < 0.005

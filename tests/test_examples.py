@@ -37,7 +37,7 @@ def said_by(example: str, *options: str, folder: Path) -> str:
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder in which the first example was run."""
     folder = tmp_path_factory.mktemp("place")
-    said = said_by("1_train.py", "--iterations", "60", "--downscale", "4", folder=folder)
+    said = said_by("1_train.py", "--iterations", "60", "--downscale", "12", folder=folder)
     assert "panes (1,)" in said and "stage" in said and re.search(r"PSNR \d\d\.\d\d dB .*\d dB over the panes", said)
     return folder
 
@@ -63,7 +63,7 @@ def test_panes_are_edited(place: Path) -> None:
 
 
 def test_gradients_lead_back(place: Path) -> None:
-    said = said_by("4_gradients.py", "runs/place", "--downscale", "4", "--steps", "21", folder=place)
+    said = said_by("4_gradients.py", "runs/place", "--downscale", "12", "--steps", "21", folder=place)
     losses = [float(number) for number in re.findall(r"loss (0\.\d+)", said)]
     assert losses[-1] < losses[0]
 

@@ -1,33 +1,47 @@
-"""Makes the bundled demo scene: a capture with ground truth, shrunk by a whole factor.
+"""Makes the bundled demo scene: a shop window full of curiosities, in which a sunlit street is mirrored.
 
-Pictures are averaged in linear radiance, as a camera with larger pixels would see them, so that
-photograph = (1 - strength) * transmission + strength * reflection still holds after shrinking.
+    pip install -e '.[scenes]'
+    python -m tools.make_demo_scene --output glassplat/demo_scene
 
-    python tools/make_demo_scene.py --source CAPTURE --output glassplat/demo_scene
+Everything is matte and lit by path tracing, so that it shines alike in all directions and pictures have no noise. A
+photograph is (1 - strength) * transmission + strength * reflection in linear radiance, with Fresnel's law for a thin
+pane. `tools/demo_things.py` has the shapes, `tools/demo_paint.py` what is painted on them, `tools/demo_light.py` the
+light.
 """
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Callable
+import json
+import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import tyro
+from numpy.typing import NDArray
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
-TEST_EVERY = 8
+from tools.demo_things import BOTTOM, LEFT, RIGHT, TOP
+from tools.make_pane_scene import POINT_NOISE, TEST_EVERY, VIRTUAL_IN_GLASS, whole_labels
+from tools.make_scenes import as_bytes, srgb_from_linear
+from tools.pane_tracer import Array, reflectance
+
 MOST_BYTES = 8_000_000
-JPEG_QUALITY = 92
-
-Shrink = Callable[[np.ndarray, int], np.ndarray]
+FOCAL_PER_WIDTH = 0.9
+AWAY_EVERY = 6
+"""Every so many views look away from the pane, at the street."""
+EXPOSURE = 1.2
+PHOTOGRAPH, LAYER = 83, 93
+"""JPEG qualities."""
 
 README = """\
 # The demo scene
 
-A showcase behind glass in a bright room: {views} path-traced views of {width}x{height} pixels, made for this project
-and licensed with it (Apache-2.0). It shows the layout that `glassplat train` reads:
+A shop window full of curiosities, in which a sunlit street is mirrored: {views} views of {width}x{height} pixels, with
+path-traced light. Shapes, pictures and light were made for this project, by `tools/make_demo_scene.py`, and are
+licensed with it (Apache-2.0). It shows the layout that `glassplat train` reads:
 
 | | |
 |---|---|
@@ -35,138 +49,206 @@ and licensed with it (Apache-2.0). It shows the layout that `glassplat train` re
 | `sparse/0/` | the COLMAP text model: cameras, poses, points |
 | `panes/` | the pane in {masks} of the views; a pixel is the label of its pane, 0 where there is none |
 | `gt/` | the exact layers of the test views, every {every}th by name; used by `eval` only, a real capture has none |
-
-Made by `tools/make_demo_scene.py` from a larger rendering of the same scene.
 """
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Shrinks a capture to the size of a demo."""
+    """Lights and photographs the scene."""
 
-    source: Path
-    """Capture directory with images/, panes/, sparse/0/ as COLMAP text, and gt/."""
     output: Path
-    """Directory to write; must not exist yet."""
-    factor: int = 2
-    """How many pixels of the source, along each axis, become one."""
+    """Folder to write; must not exist yet."""
+    width: int = 640
+    """Of the photographs, pixels; heights are three quarters of it."""
+    views: int = 64
+    """Photographs; every eighth is a test view."""
+    masks: int = 8
+    """Annotated training views."""
+    points: int = 6000
+    """Sparse points."""
+    paths: int = 200
+    """Of light, to each corner of a triangle."""
+    rays: int = 3
+    """For each pixel and axis."""
+    light: Path | None = None
+    """File that keeps the light, to photograph the same scene again."""
 
 
-def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
-    """sRGB values in [0, 1] of linear radiance in [0, 1]."""
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+class Traced(Protocol):
+    """Results of rays; see `tools.demo_light.Seen`."""
+
+    radiance: Array
+    transmission: Array
+    reflection: Array
+    strength: Array
+    label: NDArray[np.uint8]
+    distance: Array
+    to_pane: Array
 
 
-def linear_from_srgb(srgb: np.ndarray) -> np.ndarray:
-    """Linear radiance in [0, 1] of sRGB values in [0, 1]."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+class Lit(Protocol):
+    """What rays are traced through; see `tools.demo_light.LitScene`."""
+
+    def seen(self, origins: Array, directions: Array) -> Traced:
+        """Results of rays [N, 3] with unit directions."""
+        ...
 
 
-def blocks(pixels: np.ndarray, factor: int) -> np.ndarray:
-    """[H, W, ...] as [H / factor, W / factor, factor * factor, ...]: the source pixels of every new pixel.
-
-    Raises:
-        ValueError: a side is not a multiple of `factor`.
-    """
-    height, width = pixels.shape[:2]
-    if height % factor or width % factor:
-        raise ValueError(
-            f"an image of {width}x{height} cannot be shrunk by {factor}; choose a factor that divides both"
-        )
-    split = pixels.reshape(height // factor, factor, width // factor, factor, *pixels.shape[2:])
-    return np.moveaxis(split, 1, 2).reshape(height // factor, width // factor, factor * factor, *pixels.shape[2:])
-
-
-def shrink_picture(pixels: np.ndarray, factor: int) -> np.ndarray:
-    """A [H, W, 3] uint8 sRGB picture, averaged in linear radiance."""
-    linear = blocks(linear_from_srgb(pixels / 255.0), factor).mean(axis=2)
-    return np.round(srgb_from_linear(linear) * 255.0).astype(np.uint8)
-
-
-def shrink_strength(pixels: np.ndarray, factor: int) -> np.ndarray:
-    """A [H, W] uint16 map of the Fresnel strength, averaged."""
-    return np.round(blocks(pixels, factor).mean(axis=2)).astype(np.uint16)
+def camera_poses(views: int) -> list[Array]:
+    """Camera-to-world [4, 4] of all views: x right, y down, z forward."""
+    generator, made = np.random.default_rng(4), []
+    for number in range(views):
+        side = 2 * ((number * 0.618) % 1) - 1
+        if number % AWAY_EVERY == AWAY_EVERY - 1:
+            place = np.array([1.6 * side, -generator.uniform(0.5, 1.6), generator.uniform(1.3, 1.7)])
+            target = np.array([3.2 * side + generator.uniform(-1.5, 1.5), -8.2, generator.uniform(1.2, 2.6)])
+        else:
+            place = np.array([1.9 * side, -generator.uniform(1.25, 2.9), generator.uniform(1.05, 1.75)])
+            target = np.array([generator.uniform(-0.5, 0.5) + 0.25 * side, 0.35, generator.uniform(1.1, 1.35)])
+        forward = (target - place) / np.linalg.norm(target - place)
+        right = np.cross(forward, [0, 0, 1])
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+        pose[:3, 3] = place
+        made.append(pose)
+    return made
 
 
-def shrink_pane(labels: np.ndarray, factor: int) -> np.ndarray:
-    """[H, W] labels of fully covered pixels: a new pixel is covered when all of its source pixels are."""
-    parts = blocks(labels, factor)
-    return np.where(parts.min(axis=2) == parts.max(axis=2), parts[:, :, 0], 0).astype(np.uint8)
-
-
-def shrink_mask(labels: np.ndarray, factor: int) -> np.ndarray:
-    """[H, W] annotated labels, the nearest source pixel of each new one."""
-    return labels[factor // 2 :: factor, factor // 2 :: factor]
-
-
-def convert(source: Path, target: Path, shrink: Shrink, *, factor: int) -> None:
-    """Reads one picture, shrinks it and writes it under the same name."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with Image.open(source) as picture:
-        small = Image.fromarray(shrink(np.array(picture), factor))
-    if target.suffix == ".jpg":
-        # Colours keep their full resolution: the reflections differ from the background in colour.
-        small.save(target, quality=JPEG_QUALITY, subsampling=0, optimize=True)
-    else:
-        small.save(target, optimize=True)
-
-
-def convert_pictures(source: Path, output: Path, factor: int) -> None:
-    """Shrinks the photographs, the masks and the ground truth."""
-    shrinks: dict[str, Shrink] = {
-        "images": shrink_picture,
-        "panes": shrink_mask,
-        "gt/trans": shrink_picture,
-        "gt/refl": shrink_picture,
+def view(lit: Lit, pose: Array, width: int, rays: int) -> dict[str, Array]:
+    """Layers of a view, [H, W, ...] each, averaged over the rays of each pixel."""
+    height, focal = width * 3 // 4, FOCAL_PER_WIDTH * width
+    fine = (np.arange(rays) + 0.5) / rays
+    x, y, dx, dy = np.meshgrid(np.arange(width), np.arange(height), fine, fine, indexing="xy")
+    axes = [(x + dx - width / 2) / focal, (y + dy - height / 2) / focal, np.ones_like(dx)]
+    directions = np.stack(axes, axis=-1).reshape(-1, 3)
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True) @ pose[:3, :3].T
+    seen = lit.seen(np.broadcast_to(pose[:3, 3], directions.shape), directions)
+    labels = seen.label.reshape(height, width, rays**2)
+    layers = {
+        name: getattr(seen, name).reshape(height, width, rays**2, -1).mean(axis=2)
+        for name in ("radiance", "transmission", "reflection", "strength")
     }
-    for folder, shrink in shrinks.items():
-        for picture in sorted((source / folder).iterdir()):
-            convert(picture, output / folder / picture.name, shrink, factor=factor)
-    for picture in sorted((source / "gt/strength").iterdir()):
-        shrink = shrink_pane if picture.stem.endswith("_pane") else shrink_strength
-        convert(picture, output / "gt/strength" / picture.name, shrink, factor=factor)
-    shutil.copyfile(source / "gt/planes.json", output / "gt/planes.json")
+    # Of rays that meet no pane, a pixel at its edge has nothing to show.
+    layers["reflection"] /= np.maximum((labels > 0).mean(axis=2), 1e-9)[..., None]
+    return layers | {"label": labels[:, :, rays**2 // 2], "whole": whole_labels(labels)}
 
 
-def shrink_camera(line: str, factor: int) -> str:
-    """One line of cameras.txt: a PINHOLE camera over the smaller pixel grid."""
-    number, model, width, height, *intrinsics = line.split()
-    if model != "PINHOLE":
-        raise ValueError(f"camera {number} is a {model}; expected PINHOLE, so undistort the capture first")
-    scaled = [f"{float(value) / factor:.6f}" for value in intrinsics]
-    return " ".join([number, model, str(int(width) // factor), str(int(height) // factor), *scaled])
+def picture(linear: Array) -> Image.Image:
+    """A picture [H, W, 3] of radiance; brighter than white is white."""
+    return Image.fromarray(as_bytes(srgb_from_linear(np.clip(linear, 0, 1))))
 
 
-def convert_model(source: Path, output: Path, factor: int) -> None:
-    """Scales the intrinsics; poses and points stay as they are."""
-    output.mkdir(parents=True)
-    lines = [line for line in (source / "cameras.txt").read_text().splitlines() if line and not line.startswith("#")]
-    (output / "cameras.txt").write_text("".join(shrink_camera(line, factor) + "\n" for line in lines))
-    for name in ("images.txt", "points3D.txt"):
-        shutil.copyfile(source / name, output / name)
+def save_jpeg(path: Path, linear: Array, quality: int) -> None:
+    """Writes a picture in the full resolution of its colours, by which reflections differ from what is behind."""
+    picture(linear).save(path, quality=quality, subsampling=0, optimize=True)
 
 
-def write_readme(output: Path) -> None:
-    """Says what the scene is and who may use it."""
-    images = sorted((output / "images").iterdir())
-    with Image.open(images[0]) as picture:
-        width, height = picture.size
-    masks = len(list((output / "panes").iterdir()))
-    text = README.format(views=len(images), width=width, height=height, masks=masks, every=TEST_EVERY)
-    (output / "README.md").write_text(text)
+def annotated_views(layers: list[Array], masks: int) -> set[int]:
+    """Numbers of the training views that get a mask, evenly among those that show a good part of the pane."""
+    shown = [n for n, label in enumerate(layers) if n % TEST_EVERY and label.mean() > 0.15]
+    return {shown[index] for index in np.linspace(0, len(shown) - 1, masks).astype(int)}
+
+
+def sparse_points(lit: Lit, poses: list[Array], count: int) -> tuple[Array, NDArray[np.uint8]]:
+    """Positions and colours [P, 3] of points that random rays meet, some of them mirrored, as structure from motion."""
+    generator = np.random.default_rng(0)
+    eyes = np.stack(poses)[generator.integers(len(poses), size=count)]
+    rays = np.concatenate([generator.uniform(-0.55, 0.55, (count, 2)) * [1, 0.75], np.ones((count, 1))], axis=1)
+    directions = np.einsum("nij,nj->ni", eyes[:, :3, :3], rays)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = eyes[:, :3, 3]
+    seen = lit.seen(origins, directions)
+    colors, length = seen.transmission.copy(), seen.distance.copy()
+    virtual = (seen.label > 0) & (generator.random(count) < VIRTUAL_IN_GLASS)
+    place = origins[virtual] + seen.to_pane[virtual, None] * directions[virtual]
+    beyond = lit.seen(place - [0, 1e-4, 0], directions[virtual] * [1, -1, 1])
+    # Straight on behind the pane, as far as the light has come.
+    colors[virtual], length[virtual] = beyond.transmission, seen.to_pane[virtual] + beyond.distance
+    kept = np.isfinite(length)
+    positions = origins[kept] + length[kept, None] * directions[kept]
+    noise = generator.normal(scale=POINT_NOISE, size=positions.shape)
+    return positions + noise, as_bytes(srgb_from_linear(np.clip(colors[kept], 0, 1)))
+
+
+def write_model(folder: Path, lit: Lit, poses: list[Array], arguments: Arguments) -> None:
+    """Writes the COLMAP text model."""
+    width, height, focal = arguments.width, arguments.width * 3 // 4, FOCAL_PER_WIDTH * arguments.width
+    folder.mkdir(parents=True)
+    (folder / "cameras.txt").write_text(f"1 PINHOLE {width} {height} {focal} {focal} {width / 2} {height / 2}\n")
+    lines = []
+    for number, pose in enumerate(poses):
+        inverse = np.linalg.inv(pose)
+        x, y, z, w = Rotation.from_matrix(inverse[:3, :3]).as_quat()
+        values = " ".join(f"{value:.9f}" for value in (w, x, y, z, *inverse[:3, 3]))
+        lines.append(f"{number + 1} {values} 1 {number:04d}.jpg\n\n")
+    (folder / "images.txt").write_text("".join(lines))
+    positions, colors = sparse_points(lit, poses, arguments.points)
+    rows = zip(positions.tolist(), colors.tolist(), strict=True)
+    (folder / "points3D.txt").write_text(
+        "".join(
+            f"{n + 1} {x:.5f} {y:.5f} {z:.5f} {red} {green} {blue} 0.5\n"
+            for n, ((x, y, z), (red, green, blue)) in enumerate(rows)
+        )
+    )
+
+
+def write_truth(folder: Path, name: str, layers: dict[str, Array]) -> None:
+    """Writes the layers of a test view, how much the pane reflects, and where it is."""
+    save_jpeg(folder / "trans" / f"{name}.jpg", layers["transmission"], LAYER)
+    save_jpeg(folder / "refl" / f"{name}.jpg", layers["reflection"], LAYER)
+    strength = np.round(65535 * layers["strength"][..., 0]).astype(np.uint16)
+    Image.fromarray(strength).save(folder / "strength" / f"{name}.png", optimize=True)
+    Image.fromarray(layers["whole"]).save(folder / "strength" / f"{name}_pane.png", optimize=True)
+
+
+def write_plane(path: Path) -> None:
+    """Writes the true pane."""
+    from tools.demo_light import REFRACTION
+
+    entry = {
+        "label": 1,
+        "center": [(LEFT + RIGHT) / 2, 0.0, (BOTTOM + TOP) / 2],
+        "normal": [0.0, -1.0, 0.0],
+        "half_u": [(RIGHT - LEFT) / 2, 0.0, 0.0],
+        "half_v": [0.0, 0.0, (TOP - BOTTOM) / 2],
+        "mirror": False,
+        "base_reflectance": float(reflectance(1.0, REFRACTION)),
+    }
+    path.write_text(json.dumps([entry], indent=1) + "\n")
 
 
 def main(arguments: Arguments) -> None:
-    """Writes the small scene and refuses one that is too large to bundle."""
-    if arguments.output.exists():
-        raise FileExistsError(f"{arguments.output} exists; expected a new directory, so remove it first")
-    convert_model(arguments.source / "sparse/0", arguments.output / "sparse/0", arguments.factor)
-    convert_pictures(arguments.source, arguments.output, arguments.factor)
-    write_readme(arguments.output)
-    size = sum(file.stat().st_size for file in arguments.output.rglob("*") if file.is_file())
-    if size > MOST_BYTES:
-        raise ValueError(f"the scene takes {size} bytes where {MOST_BYTES} are the most; choose a larger --factor")
-    print(f"{arguments.output}: {size / 1e6:.1f} MB")
+    """Makes the scene, and refuses one that is too large to bundle."""
+    from tools.demo_light import LitScene
+
+    folder = arguments.output
+    if folder.exists():
+        raise FileExistsError(f"{folder} exists; expected a new folder, so remove it first")
+    lit = LitScene(arguments.paths, EXPOSURE, arguments.light)
+    poses, begun = camera_poses(arguments.views), time.monotonic()
+    for part in ("images", "panes", "gt/trans", "gt/refl", "gt/strength"):
+        (folder / part).mkdir(parents=True)
+    labels = []
+    for number, pose in enumerate(poses):
+        layers = view(lit, pose, arguments.width, arguments.rays)
+        save_jpeg(folder / "images" / f"{number:04d}.jpg", layers["radiance"], PHOTOGRAPH)
+        labels.append(layers["label"])
+        if number % TEST_EVERY == 0:
+            write_truth(folder / "gt", f"{number:04d}", layers)
+        print(f"\rviews {number + 1}/{len(poses)}, {time.monotonic() - begun:.0f} s ", end="", flush=True)
+    print()
+    for number in annotated_views(labels, arguments.masks):
+        Image.fromarray(labels[number]).save(folder / "panes" / f"{number:04d}.png", optimize=True)
+    write_model(folder / "sparse/0", lit, poses, arguments)
+    write_plane(folder / "gt/planes.json")
+    size = {"width": arguments.width, "height": arguments.width * 3 // 4}
+    counts = {"views": arguments.views, "masks": arguments.masks, "every": TEST_EVERY}
+    (folder / "README.md").write_text(README.format(**size, **counts))
+    total = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    print(f"{folder}: {total / 1e6:.1f} MB")
+    if total > MOST_BYTES:
+        raise ValueError(f"the scene takes {total} bytes where {MOST_BYTES} are the most; choose a smaller --width")
 
 
 if __name__ == "__main__":

@@ -24,8 +24,7 @@ from PIL import Image
 from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import Rotation
 
-from tools.make_demo_scene import TEST_EVERY, srgb_from_linear
-from tools.make_scenes import as_bytes
+from tools.make_scenes import as_bytes, srgb_from_linear
 from tools.pane_draws import PREVIEW, DrawnPlace, draw_place
 from tools.pane_places import (
     case_place,
@@ -40,6 +39,7 @@ from tools.pane_places import (
 from tools.pane_things import FOCAL_PER_WIDTH, SUBPIXELS, Box, Pane, Place, SecondPane
 from tools.pane_tracer import Array, Seen
 
+TEST_EVERY = 8
 POINT_NOISE = 0.005
 """Standard deviation of the sparse points about the surfaces, world units."""
 GAP = 0.02

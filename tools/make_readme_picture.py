@@ -1,6 +1,6 @@
 """The README's picture: one test view of a finished `planar` or `deferred` run, taken apart.
 
-python tools/make_readme_picture.py RUN --view 0016.jpg --output docs/images/showcase.png
+python tools/make_readme_picture.py RUN --view 0016.jpg --output docs/images/window.png
 
 With `--output sway.json` it writes cameras that sway before that view instead, for the moving picture:
 

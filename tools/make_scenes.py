@@ -26,7 +26,6 @@ from glassplat.captures.transforms import points_in_box
 from glassplat.captures.view import FOLDER
 from glassplat.files.ply_table import write_table
 from tools.estimated_normals import estimated_normals
-from tools.make_demo_scene import srgb_from_linear
 from tools.scene_draws import MATTE, Body, DrawnScene, draw_scene
 from tools.scene_environment import make_environment
 from tools.scene_near import NEAR_SCENES, NearScene, near_scene
@@ -284,6 +283,16 @@ def visible_surfaces(studio: Studio, pose: Array) -> tuple[Array, Array]:
 def pixel_means(values: Array, size: int) -> Array:
     """Means [size, size, D] over the subpixels of every pixel, from rows of subpixels [size^2 SUBPIXELS^2, D]."""
     return values.reshape(size, SUBPIXELS, size, SUBPIXELS, -1).mean(axis=(1, 3))
+
+
+def srgb_from_linear(linear: Array) -> Array:
+    """sRGB values in [0, 1] of linear radiance in [0, 1]."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def linear_from_srgb(srgb: Array) -> Array:
+    """Linear radiance in [0, 1] of sRGB values in [0, 1]."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def as_bytes(unit: Array) -> NDArray[np.uint8]:

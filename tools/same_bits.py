@@ -178,8 +178,8 @@ def make_scenes(folder: Path) -> None:
         (folder / "ignored.part").rename(folder / "ignored")
 
 
-def shrink(source: Path, target: Path, factor: int = 4) -> None:
-    """Copies a COLMAP text capture with photographs and masks of a quarter of the size, and every third point."""
+def shrink(source: Path, target: Path, factor: int = 10) -> None:
+    """Copies a COLMAP text capture with photographs and masks of a tenth of the size, and every third point."""
     shutil.copytree(source, target, ignore=shutil.ignore_patterns("gt"))
     for path in [*target.glob("images/*"), *target.glob("panes/*"), *target.glob("masks/*")]:
         image = Image.open(path)

@@ -64,7 +64,7 @@ COMMANDS = {
     "demo": Listed(
         "train",
         "Demo",
-        "Train planar and splat on the bundled showcase and compare them; goes on where it was interrupted.",
+        "Train planar and splat on the bundled shop window and compare them; goes on where it was interrupted.",
     ),
 }
 

@@ -93,8 +93,8 @@ class GroundTruth:
         """
         stem = Path(image_name).stem
         paths = {
-            "transmission": self.folder / "trans" / f"{stem}.png",
-            "reflection": self.folder / "refl" / f"{stem}.png",
+            "transmission": _png_or_jpeg(self.folder / "trans" / stem),
+            "reflection": _png_or_jpeg(self.folder / "refl" / stem),
             "strength": self.folder / "strength" / f"{stem}.png",
             "labels": self.folder / "strength" / f"{stem}_pane.png",
         }
@@ -113,6 +113,12 @@ class GroundTruth:
                 strength=torch.from_numpy(resized_float(read_image_float(paths["strength"])[..., 0], size)),
                 labels=torch.from_numpy(_resized_labels(read_image(paths["labels"])[..., 0], size)),
             )
+
+
+def _png_or_jpeg(stem: Path) -> Path:
+    """Path of a picture: the JPEG of that name if there is one, else the PNG."""
+    jpeg = stem.with_name(f"{stem.name}.jpg")
+    return jpeg if jpeg.is_file() else stem.with_name(f"{stem.name}.png")
 
 
 def load_truth(folder: Path | None) -> GroundTruth | None:

@@ -23,7 +23,7 @@ PLANE_KEYS = {
 
 
 def train(method: str, output: Path, *options: str) -> int:
-    return main(["train", method, "--data", str(SCENE), "--output", str(output), "--downscale", "4", *options])
+    return main(["train", method, "--data", str(SCENE), "--output", str(output), "--downscale", "12", *options])
 
 
 @pytest.mark.parametrize("method", ["splat", "planar"])
@@ -65,7 +65,7 @@ def test_a_run_is_not_overwritten_and_resumes_only_as_it_was_started(
 
 def test_a_run_finds_its_capture_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(SCENE.parent)
-    options = ["--data", SCENE.name, "--output", str(tmp_path / "run"), "--downscale", "4", "--iterations", "3"]
+    options = ["--data", SCENE.name, "--output", str(tmp_path / "run"), "--downscale", "12", "--iterations", "3"]
     assert main(["train", "splat", *options]) == 0
     monkeypatch.chdir(tmp_path)
     assert main(["render", "run", "--layers", "rgb", "--output", "out"]) == 0
@@ -106,7 +106,7 @@ def test_bad_input_ends_with_one_message(tmp_path: Path, capsys: pytest.CaptureF
 def test_planar_without_masks_says_what_to_annotate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capture = tmp_path / "capture"
     shutil.copytree(SCENE, capture, ignore=shutil.ignore_patterns("panes", "gt"))
-    options = ["--output", str(tmp_path / "run"), "--downscale", "4", "--iterations", "20"]
+    options = ["--output", str(tmp_path / "run"), "--downscale", "12", "--iterations", "20"]
     words = ("error:", "has no masks of panes", "capture/panes", "`glassplat train splat` needs none")
     fails_with(["train", "planar", "--data", str(capture), *options], capsys, *words)
     assert not (tmp_path / "run").exists()

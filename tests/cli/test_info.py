@@ -59,7 +59,7 @@ def test_estimated_normals_are_counted(tmp_path: Path, capsys: pytest.CaptureFix
 def test_photographs_are_to_be_prepared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(SCENE / "images", tmp_path / "photographs")
     found = told(tmp_path / "photographs", capsys)
-    assert found["kind"] == "photographs without poses" and found["facts"]["photographs"] == 96
+    assert found["kind"] == "photographs without poses" and found["facts"]["photographs"] == 64
     assert any("glassplat prepare" in line for line in found["next"])
 
 
@@ -160,4 +160,4 @@ def test_a_damaged_capture_says_what_is_wrong(tmp_path: Path, capsys: pytest.Cap
     shutil.copytree(SCENE, tmp_path / "capture")
     (tmp_path / "capture" / "images" / "0000.jpg").unlink()
     assert main(["info", str(tmp_path / "capture")]) == 2
-    assert "1 of the 96 photographs of the COLMAP model are missing" in " ".join(capsys.readouterr().err.split())
+    assert "1 of the 64 photographs of the COLMAP model are missing" in " ".join(capsys.readouterr().err.split())

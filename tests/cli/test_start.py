@@ -152,10 +152,10 @@ from glassplat.cli.main import main
 sys.exit(main({arguments!r}))
 """
 FIRST_WORDS = {
-    "train splat --data SCENE --output new": "a COLMAP capture of 96 photographs",
+    "train splat --data SCENE --output new": "a COLMAP capture of 64 photographs",
     "train planar --preset paper --data=SCENE --output new": "8 masks of panes",
     "demo --output new": "training planar",
-    "info SCENE": "a capture format: COLMAP points: 6048",
+    "info SCENE": "a capture format: COLMAP points: 5972",
     "info run": "a planar run capture: gone iterations: 3000",
     "eval run": "run: a planar run of 3000 iterations on gone",
     "render run --output new": "run: a planar run of 3000 iterations on gone",

@@ -63,7 +63,7 @@ def test_every_photograph_is_on_the_page_and_nothing_is_loaded(capture: Path) ->
     write_page(capture, capture / PAGE)
     text = (capture / PAGE).read_text()
     page = Parts(text)
-    assert len(page.all("img")) == 96
+    assert len(page.all("img")) == 64
     assert all(str(one["src"]).startswith("data:image/jpeg;base64,") for one in page.all("img"))
     assert "no panes yet" in text and "&lt;b&gt;left &amp; out&lt;/b&gt;.jpg" in text and "photograph once more" in text
     assert not page.all("script") and not page.all("link") and len(text) < 2_000_000

@@ -1,66 +1,100 @@
-"""Shrinking a capture keeps what its pixels mean."""
+"""The demo scene is made of surfaces that face outwards, with a picture for each, before and behind one free pane."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from tools.make_demo_scene import (
-    Arguments,
-    linear_from_srgb,
-    main,
-    shrink_camera,
-    shrink_mask,
-    shrink_pane,
-    shrink_picture,
-    shrink_strength,
-    srgb_from_linear,
-)
+from tools.demo_paint import pictures
+from tools.demo_things import BOTTOM, DEPTH, LEFT, RIGHT, TOP, all_shapes
+from tools.make_demo_scene import annotated_views, camera_poses, sparse_points, view
+from tools.pane_tracer import Array, reflectance
+
+SHAPES = all_shapes()
 
 
-def test_srgb_and_linear_are_inverses() -> None:
-    values = np.linspace(0, 1, 101)
-    np.testing.assert_allclose(linear_from_srgb(srgb_from_linear(values)), values, atol=1e-7)
+@pytest.mark.parametrize("paint", sorted({shape.paint for shape in SHAPES}))
+def test_triangles_face_the_side_of_their_normals(paint: str) -> None:
+    for shape in SHAPES:
+        if shape.paint == paint:
+            a, b, c = np.moveaxis(shape.vertices[shape.faces], 1, 0)
+            across = np.cross(b - a, c - a)
+            area = np.linalg.norm(across, axis=1)
+            facing = np.einsum("ni,nki->n", across, shape.normals[shape.faces]) / 3
+            wrong = area[facing < -0.2 * area].sum()
+            assert wrong < 0.02 * area.sum(), f"{wrong / area.sum():.0%} of {paint} at {shape.vertices.mean(axis=0)}"
 
 
-def test_pictures_are_averaged_as_light() -> None:
-    checkers = np.zeros((4, 6, 3), np.uint8)
-    checkers[::2, ::2] = checkers[1::2, 1::2] = 255
-    # Half of the light of white is 188 in sRGB, not 128.
-    np.testing.assert_array_equal(shrink_picture(checkers, 2), np.full((2, 3, 3), 188))
+def test_every_surface_has_its_picture_and_every_picture_its_surface() -> None:
+    painted = pictures()
+    assert {shape.paint for shape in SHAPES} == set(painted)
+    assert all(picture.min() >= 0 and picture.max() <= 1 for picture in painted.values())
 
 
-def test_a_pane_covers_only_pixels_that_lie_in_it_entirely() -> None:
-    labels = np.array([[1, 1, 1, 0], [1, 1, 1, 1], [2, 2, 1, 1], [2, 2, 2, 2]], np.uint8)
-    np.testing.assert_array_equal(shrink_pane(labels, 2), [[1, 0], [2, 0]])
+def test_nothing_stands_in_the_pane() -> None:
+    for shape in SHAPES:
+        x, y, z = shape.vertices[shape.faces].reshape(-1, 3, 3).transpose(2, 0, 1)
+        over = (
+            (x.max(1) > LEFT + 0.01) & (x.min(1) < RIGHT - 0.01) & (z.max(1) > BOTTOM + 0.01) & (z.min(1) < TOP - 0.01)
+        )
+        assert not (over & (y.min(1) < -1e-6) & (y.max(1) > 1e-6)).any()
 
 
-def test_masks_keep_their_labels_and_strengths_their_mean() -> None:
-    labels = np.array([[0, 3], [3, 3]], np.uint8)
-    assert shrink_mask(labels, 2).tolist() == [[3]]
-    strength = np.array([[0, 65535], [65535, 65535]], np.uint16)
-    assert shrink_strength(strength, 2).tolist() == [[49151]]
+def test_cameras_stand_before_the_pane_and_some_look_away() -> None:
+    poses = camera_poses(24)
+    assert all(pose[1, 3] < -0.4 for pose in poses)
+    assert [pose[1, 2] < 0 for pose in poses] == [number % 6 == 5 for number in range(24)]
+    np.testing.assert_allclose(np.linalg.det([pose[:3, :3] for pose in poses]), 1)
 
 
-def test_a_factor_that_does_not_divide_the_image_is_refused() -> None:
-    with pytest.raises(ValueError, match="5x4 cannot be shrunk by 2"):
-        shrink_picture(np.zeros((4, 5, 3), np.uint8), 2)
+def test_masks_go_to_training_views_that_show_the_pane() -> None:
+    shown = [np.full((4, 4), number % 6 != 5) for number in range(24)]
+    chosen = annotated_views(shown, 5)
+    assert len(chosen) == 5
+    assert all(number % 8 and number % 6 != 5 for number in chosen)
 
 
-def test_the_camera_covers_the_same_view() -> None:
-    assert shrink_camera("1 PINHOLE 400 300 332.8 331.6 200.0 150.0", 2) == (
-        "1 PINHOLE 200 150 166.400000 165.800000 100.000000 75.000000"
-    )
-    with pytest.raises(ValueError, match="OPENCV; expected PINHOLE"):
-        shrink_camera("1 OPENCV 400 300 332.8 331.6 200.0 150.0 0 0 0 0", 2)
+@dataclass(frozen=True)
+class Walls:
+    """A white wall behind the pane and a grey one far before it, for the tracer's part in a picture."""
+
+    def seen(self, origins: Array, directions: Array) -> SimpleNamespace:
+        inwards = directions[:, 1]
+        distance = np.where(inwards > 0, DEPTH - origins[:, 1], -8 - origins[:, 1]) / inwards
+        to_pane = np.where(inwards > 0, -origins[:, 1] / inwards, np.inf)
+        met = np.abs(origins[:, 0] + np.where(inwards > 0, to_pane, 0) * directions[:, 0]) < 0.5
+        met &= inwards > 0
+        transmission = np.where(inwards[:, None] > 0, 0.8, 0.2) * np.ones(3)
+        reflection = np.where(met[:, None], 0.2, 0.0) * np.ones(3)
+        strength = np.where(met, 0.1, 0.0)
+        radiance = (1 - strength)[:, None] * transmission + strength[:, None] * reflection
+        return SimpleNamespace(
+            radiance=radiance, transmission=transmission, reflection=reflection, strength=strength,
+            label=met.astype(np.uint8), distance=distance, to_pane=np.where(met, to_pane, np.inf),
+        )  # fmt: skip
 
 
-def test_an_existing_directory_is_left_alone(tmp_path: Path) -> None:
-    precious = tmp_path / "precious.png"
-    Image.new("RGB", (2, 2)).save(precious)
-    with pytest.raises(FileExistsError, match="remove it first"):
-        main(Arguments(source=tmp_path, output=tmp_path))
-    assert precious.is_file()
+def test_layers_add_up_in_every_pixel_even_at_the_edge_of_the_pane() -> None:
+    layers = view(Walls(), camera_poses(1)[0], 40, 3)
+    share = np.maximum(layers["strength"], 0)
+    whole = layers["whole"] > 0
+    composed = (1 - share) * layers["transmission"] + share * layers["reflection"]
+    np.testing.assert_allclose(composed[whole], layers["radiance"][whole])
+    assert (layers["reflection"].max(axis=(0, 1)) < 0.2 + 1e-12).all()
+
+
+def test_some_points_lie_where_the_pane_shows_what_it_mirrors() -> None:
+    positions, colors = sparse_points(Walls(), camera_poses(12), 2000)
+    behind = positions[:, 1] > DEPTH + 0.1
+    assert 0.02 < behind.mean() < 0.4
+    np.testing.assert_allclose(positions[behind, 1], 8, atol=0.05)
+    assert colors[behind].max() < 130 < colors[~behind & (positions[:, 1] > 0)].min()
+
+
+def test_glass_returns_more_light_at_a_slant() -> None:
+    values = [reflectance(cosine, 1.6) for cosine in (1.0, 0.5, 0.2)]
+    assert values == sorted(values)
+    assert values[0] == pytest.approx(0.101, abs=1e-3)

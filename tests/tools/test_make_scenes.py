@@ -11,8 +11,16 @@ import pytest
 from PIL import Image
 
 from glassplat.captures.dataset import load_dataset
-from tools.make_demo_scene import linear_from_srgb
-from tools.make_scenes import BALL_RADIUS, Arguments, camera_positions, main, world_from_opengl, write_points
+from tools.make_scenes import (
+    BALL_RADIUS,
+    Arguments,
+    camera_positions,
+    linear_from_srgb,
+    main,
+    srgb_from_linear,
+    world_from_opengl,
+    write_points,
+)
 from tools.scene_draws import COATINGS, SHAPES, DrawnScene, draw_scene
 from tools.scene_environment import directions, make_environment
 from tools.scene_surfaces import Array, Triangles, disc, ground_texture, placed, star_shaped, torus, torus_depth
@@ -20,6 +28,11 @@ from tools.scene_surfaces import Array, Triangles, disc, ground_texture, placed,
 BALL = Path(__file__).parent.parent / "data_files" / "ball"
 TEST_FRAMES = json.loads((BALL / "transforms_test.json").read_text())["frames"]
 TRAIN, TEST, SIZE = 24, 6, 96
+
+
+def test_srgb_and_linear_are_inverses() -> None:
+    values = np.linspace(0, 1, 101)
+    np.testing.assert_allclose(linear_from_srgb(srgb_from_linear(values)), values, atol=1e-7)
 
 
 def unit_pixels(path: Path) -> np.ndarray:
