@@ -55,7 +55,7 @@ def test_every_photograph_is_placed_where_it_was_taken(prepared: Path) -> None:
 
 def test_the_focal_length_is_found(prepared: Path) -> None:
     camera = load_dataset(prepared).train[0].camera
-    assert camera.fx == pytest.approx(166.4, rel=0.03)
+    assert camera.fx == pytest.approx(576, rel=0.03)
 
 
 def test_the_model_fits_the_straightened_photographs(prepared: Path) -> None:
