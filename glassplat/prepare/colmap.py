@@ -142,11 +142,14 @@ class FeatureDatabase:
         options.sift.max_num_features = features.most
         options.sift.peak_threshold = features.least_contrast
         options.sift.first_octave = -1 if features.from_enlarged else 0
+        # By name: a command that was killed may have left half a picture next to them.
+        names = [self.picture_name(index) for index in range(len(self.photographs))]
 
         def work(token: Any) -> None:
             library.pycolmap.extract_features(
                 self.path,
                 self.pictures,
+                image_names=names,
                 extraction_options=options,
                 device=library.pycolmap.Device.cpu,
                 cancellation_token=token,

@@ -6,10 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from glassplat.errors import InputError
-from glassplat.prepare.colmap import FeatureDatabase, sound
+from glassplat.prepare.colmap import FeatureDatabase, Features, sound
 from glassplat.prepare.photographs import Photograph
 
 
@@ -45,6 +47,25 @@ tables.commit()
     subprocess.run([sys.executable, "-c", script], check=True)  # Its SQLite must not meet COLMAP's in one process.
     with pytest.raises(InputError, match="damaged"):
         database.feature_counts()
+
+
+def test_half_a_picture_of_a_killed_command_is_no_photograph(tmp_path: Path) -> None:
+    """A temporary file that `kill -9` left in the folder, whole or cut off."""
+    photographs = []
+    for number in range(2):
+        path = tmp_path / f"{number}.png"
+        noise = np.random.default_rng(number).integers(0, 255, (12, 16), np.uint8)
+        Image.fromarray(noise).resize((160, 120), Image.Resampling.BICUBIC).save(path)
+        photographs.append(Photograph(path, path.name, 160, 120, "", None))
+    database = FeatureDatabase(tmp_path / "features.db", tmp_path / "grey", photographs)
+    database.write_pictures(lambda message: None)
+    whole = (tmp_path / "grey" / "000000.png").read_bytes()
+    for name, data in ((".000002.0a.tmp.png", whole), (".000003.0b.tmp.png", whole[: len(whole) // 2])):
+        (tmp_path / "grey" / name).write_bytes(data)
+    database.create("simple_radial")
+    database.extract(Features(500, 0.0067), lambda message: None, threads=1)
+    counts = database.feature_counts()
+    assert len(counts) == 2 and (counts > 0).all()
 
 
 def test_a_full_disk_and_errors_of_others_stay_what_they_are(tmp_path: Path) -> None:
