@@ -337,7 +337,7 @@ def framed(width: float, height: float, paint: str, place: Triple) -> list[Shape
 
 
 def display() -> list[Shape]:
-    """What stands behind the pane."""
+    """The display behind the pane."""
     x0, x1, y1, z0, z1 = LEFT, RIGHT, DEPTH, BOTTOM, TOP + 0.18
     walls = [
         quad((x0, 0, z0), (x1 - x0, 0, 0), (0, y1, 0), "planks", spacing=0.025, picture=(0.9, 0.9)),

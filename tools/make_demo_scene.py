@@ -87,7 +87,7 @@ class Traced(Protocol):
 
 
 class Lit(Protocol):
-    """What rays are traced through; see `tools.demo_light.LitScene`."""
+    """A scene that rays go through; see `tools.demo_light.LitScene`."""
 
     def seen(self, origins: Array, directions: Array) -> Traced:
         """Results of rays [N, 3] with unit directions."""
