@@ -448,43 +448,45 @@ def car(place: Triple) -> list[Shape]:
     return placed(made, place)
 
 
-def street() -> list[Shape]:
-    """Pavements, the road, houses on the other side, a café, trees, lamps, a bench and a car."""
-    far = -8.2
-    made = [
-        quad((-9, -2.4, 0), (18, 0, 0), (0, 2.4, 0), "paving", spacing=0.12, picture=(1.6, 1.6)),
-        quad((-9, -2.4, -0.12), (18, 0, 0), (0, 0, 0.12), "kerb", spacing=0.2, picture=(1, 1)),
-        quad((-9, -6.4, -0.12), (18, 0, 0), (0, 4.0, 0), "road", spacing=0.15, picture=(8, 4)),
-        quad((9, -6.4, -0.12), (-18, 0, 0), (0, 0, 0.12), "kerb", spacing=0.2, picture=(1, 1)),
-        quad((-9, far, 0), (18, 0, 0), (0, 1.8, 0), "paving", spacing=0.15, picture=(1.6, 1.6)),
-    ]
-    houses = (("house1", 7.4, 5.6), ("house2", 6.6, 4.4), ("house3", 7.9, 4.6), ("house4", 6.9, 4.4))
+FAR = -8.2
+"""Of the fronts on the other side of the street."""
+
+
+def houses() -> list[Shape]:
+    """Four houses on the other side, with roofs and sills."""
+    made = []
+    fronts = (("house1", 7.4, 5.6), ("house2", 6.6, 4.4), ("house3", 7.9, 4.6), ("house4", 6.9, 4.4))
     right = 9.5
-    for name, height, width in houses:
-        made.append(quad((right, far, 0), (-width, 0, 0), (0, 0, height), name, spacing=0.13))
+    for name, height, width in fronts:
+        made.append(quad((right, FAR, 0), (-width, 0, 0), (0, 0, height), name, spacing=0.13))
         made += placed(
-            box((-width, -0.25, height), (0, 0.12, height + 0.2), "cream", sides="kflrtb", spacing=0.2), (right, far, 0)
+            box((-width, -0.25, height), (0, 0.12, height + 0.2), "cream", sides="kflrtb", spacing=0.2), (right, FAR, 0)
         )
         roof = quad(
-            (right, far, height + 0.2), (-width, 0, 0), (0, -1.2, 1.3), "tiles", spacing=0.2, picture=(1.2, 1.2)
+            (right, FAR, height + 0.2), (-width, 0, 0), (0, -1.2, 1.3), "tiles", spacing=0.2, picture=(1.2, 1.2)
         )
         made += [roof]
         for column in (0.13, 0.42, 0.71):
             x = right - width * column - 0.05 * width
             for level in (0.54, 0.795):
                 made += box(
-                    (x - 0.55, far, height * level - 0.08),
-                    (x + 0.1, far + 0.16, height * level),
+                    (x - 0.55, FAR, height * level - 0.08),
+                    (x + 0.1, FAR + 0.16, height * level),
                     "cream",
                     sides="kflrtb",
                     spacing=0.12,
                 )
         right -= width
-    awning = quad((9.2, far + 0.02, 2.4), (-5.0, 0, 0), (0, 1.1, -0.5), "awning", spacing=0.12, picture=(2.5, 0))
+    return made
+
+
+def cafe() -> list[Shape]:
+    """The awning of a café, and tables and chairs before it."""
+    awning = quad((9.2, FAR + 0.02, 2.4), (-5.0, 0, 0), (0, 1.1, -0.5), "awning", spacing=0.12, picture=(2.5, 0))
     under = replace(
         awning, normals=-awning.normals, faces=awning.faces[:, ::-1], vertices=awning.vertices - [0, 0, 0.01]
     )
-    made += [awning, under]
+    made = [awning, under]
     for x in (5.0, 6.4, 7.8):  # tables before the café
         made += placed(
             [
@@ -495,20 +497,34 @@ def street() -> list[Shape]:
                     smooth=1,
                 )
             ],
-            (x, far + 0.95, 0),
+            (x, FAR + 0.95, 0),
         )
         for side, paint in ((-0.55, "red"), (0.55, "blue")):
             made += placed(
-                box((-0.18, -0.18, 0.38), (0.18, 0.18, 0.43), paint, sides="fklrtb"), (x + side, far + 0.95, 0)
+                box((-0.18, -0.18, 0.38), (0.18, 0.18, 0.43), paint, sides="fklrtb"), (x + side, FAR + 0.95, 0)
             )
             made += placed(
-                box((-0.18, -0.02, 0.43), (0.18, 0.02, 0.85), paint, sides="fklrt"), (x + side, far + 0.8, 0)
+                box((-0.18, -0.02, 0.43), (0.18, 0.02, 0.85), paint, sides="fklrt"), (x + side, FAR + 0.8, 0)
             )
-            made += placed(box((-0.16, -0.16, 0.0), (0.16, 0.16, 0.38), "ink", sides="fklr"), (x + side, far + 0.95, 0))
-    made += [
-        s for n, (x, y) in enumerate(((-3.6, far + 1.2), (2.2, far + 1.2), (-4.6, -1.9))) for s in tree((x, y, 0), n)
+            made += placed(box((-0.16, -0.16, 0.0), (0.16, 0.16, 0.38), "ink", sides="fklr"), (x + side, FAR + 0.95, 0))
+    return made
+
+
+def street() -> list[Shape]:
+    """Pavements, the road, houses on the other side, a café, trees, lamps, a bench and a car."""
+    made = [
+        quad((-9, -2.4, 0), (18, 0, 0), (0, 2.4, 0), "paving", spacing=0.12, picture=(1.6, 1.6)),
+        quad((-9, -2.4, -0.12), (18, 0, 0), (0, 0, 0.12), "kerb", spacing=0.2, picture=(1, 1)),
+        quad((-9, -6.4, -0.12), (18, 0, 0), (0, 4.0, 0), "road", spacing=0.15, picture=(8, 4)),
+        quad((9, -6.4, -0.12), (-18, 0, 0), (0, 0, 0.12), "kerb", spacing=0.2, picture=(1, 1)),
+        quad((-9, FAR, 0), (18, 0, 0), (0, 1.8, 0), "paving", spacing=0.15, picture=(1.6, 1.6)),
+        *houses(),
+        *cafe(),
     ]
-    for x, y in ((3.4, -1.95), (-0.6, far + 1.3)):
+    made += [
+        s for n, (x, y) in enumerate(((-3.6, FAR + 1.2), (2.2, FAR + 1.2), (-4.6, -1.9))) for s in tree((x, y, 0), n)
+    ]
+    for x, y in ((3.4, -1.95), (-0.6, FAR + 1.3)):
         post = [(0.12, 0), (0.12, 0.3), (0.05, 0.5), (0.04, 2.9), (0.07, 3.0)]
         made.append(lathe(post, "ink", turns=20).moved((x, y, 0)))
         made.append(ellipsoid((x, y, 3.2), (0.22, 0.22, 0.24), "white", 24, STREET_LAMP))
