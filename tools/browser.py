@@ -108,6 +108,15 @@ class Browser:
             self._ask("Page.reload")  # The same page at another place in it is not loaded again by itself.
         while not any(event.get("method") == "Page.loadEventFired" for event in self.events[begun:]):
             self.events.append(self._next())
+        if address.startswith("http") and "?" in address:
+            wait_until(self._is_past_the_key, "the page behind a link with a key")
+
+    def _is_past_the_key(self) -> bool:
+        """Return whether a link with a key in it has led on to the page."""
+        try:
+            return bool(self.evaluate("location.search === '' && document.readyState === 'complete'"))
+        except RuntimeError:  # It is being left.
+            return False
 
     def evaluate(self, expression: str) -> Any:
         """The value of an expression, awaited; raises RuntimeError with what the page threw."""
