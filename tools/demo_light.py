@@ -5,22 +5,19 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from tools.demo_paint import pictures, sky
-from tools.demo_things import BOTTOM, LEFT, RIGHT, STREET_LAMP, TOP, Array, Shape, all_shapes
-from tools.pane_tracer import reflectance
+from tools.demo_things import BOTTOM, LEFT, REFRACTION, RIGHT, STREET_LAMP, TOP, Array, Shape, all_shapes
+from tools.pane_tracer import Seen, reflectance
 
 mi.set_variant("llvm_ad_rgb")
 
-REFRACTION = 1.6
-"""Of the pane."""
 SUN, TOWARDS_SUN = (3.7, 2.8, 1.76), (0.42, 0.72, 0.56)
 """Irradiance of the evening sun, and the way to it: behind the shop, so that it lights the houses on the other side."""
 SKY = 2.0
@@ -33,28 +30,6 @@ ABOVE, MET_BEFORE = 2e-3, 1e-2
 """How far above a corner its paths begin, and how far they may go to meet it, metres."""
 SMOOTHINGS = 8
 """Times that the light of a corner is averaged with its neighbours', against noise."""
-
-
-class Seen(NamedTuple):
-    """Results of rays [N]; see `tools.pane_tracer.Seen`.
-
-    Attributes:
-        radiance: [N, 3] linear.
-        transmission: [N, 3].
-        reflection: [N, 3]; 0 where a ray meets no pane.
-        strength: [N].
-        label: [N] 1 where a ray meets the pane.
-        distance: [N] to what is seen through the pane; infinite for the sky.
-        to_pane: [N]; infinite where a ray meets none.
-    """
-
-    radiance: Array
-    transmission: Array
-    reflection: Array
-    strength: Array
-    label: NDArray[np.uint8]
-    distance: Array
-    to_pane: Array
 
 
 class LitScene:
@@ -102,7 +77,8 @@ class LitScene:
             reflection[met] = self.radiance(place[met] - [0, 1e-4, 0], directions[met] * [1, -1, 1])[0]
         radiance = (1 - strength)[:, None] * transmission + strength[:, None] * reflection
         to_pane = np.where(met, to_pane, np.inf)
-        return Seen(radiance, transmission, reflection, strength, met.astype(np.uint8), distance, to_pane)
+        label, no_silver = met.astype(np.uint8), np.zeros_like(radiance)
+        return Seen(radiance, transmission, reflection, strength, label, no_silver, distance, to_pane)
 
 
 @njit(cache=True)

@@ -18,8 +18,12 @@ Triple = tuple[float, float, float]
 
 LEFT, RIGHT, BOTTOM, TOP = -1.25, 1.25, 0.55, 2.05
 """Of the pane."""
+REFRACTION = 1.6
+"""Of the pane."""
 DEPTH = 0.95
 """Of the display behind it."""
+FAR = -8.2
+"""Of the fronts on the other side of the street."""
 STREET_LAMP = (1.6, 1.25, 0.8)
 """Radiance of the lamps in the street."""
 
@@ -446,10 +450,6 @@ def car(place: Triple) -> list[Shape]:
     made.append(ellipsoid((1.72, -0.55, 0.66), (0.1, 0.12, 0.12), "headlight"))
     made.append(ellipsoid((1.72, 0.55, 0.66), (0.1, 0.12, 0.12), "headlight"))
     return placed(made, place)
-
-
-FAR = -8.2
-"""Of the fronts on the other side of the street."""
 
 
 def houses() -> list[Shape]:

@@ -21,12 +21,19 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
-from tools.demo_things import BOTTOM, LEFT, RIGHT, TOP
-from tools.make_pane_scene import POINT_NOISE, TEST_EVERY, VIRTUAL_IN_GLASS, whole_labels
+from tools.demo_things import BOTTOM, FAR, LEFT, REFRACTION, RIGHT, TOP
+from tools.make_pane_scene import (
+    POINT_NOISE,
+    TEST_EVERY,
+    VIRTUAL_IN_GLASS,
+    picture,
+    random_rays,
+    whole_labels,
+    write_colmap,
+)
 from tools.make_scenes import as_bytes, srgb_from_linear
-from tools.pane_tracer import Array, reflectance
+from tools.pane_tracer import Array, Seen, reflectance
 
 MOST_BYTES = 8_000_000
 FOCAL_PER_WIDTH = 0.9
@@ -74,22 +81,10 @@ class Arguments:
     """File that keeps the light, to photograph the same scene again."""
 
 
-class Traced(Protocol):
-    """Results of rays; see `tools.demo_light.Seen`."""
-
-    radiance: Array
-    transmission: Array
-    reflection: Array
-    strength: Array
-    label: NDArray[np.uint8]
-    distance: Array
-    to_pane: Array
-
-
 class Lit(Protocol):
     """A scene that rays go through; see `tools.demo_light.LitScene`."""
 
-    def seen(self, origins: Array, directions: Array) -> Traced:
+    def seen(self, origins: Array, directions: Array) -> Seen:
         """Results of rays [N, 3] with unit directions."""
         ...
 
@@ -101,7 +96,7 @@ def camera_poses(views: int) -> list[Array]:
         side = 2 * ((number * 0.618) % 1) - 1
         if number % AWAY_EVERY == AWAY_EVERY - 1:
             place = np.array([1.6 * side, -generator.uniform(0.5, 1.6), generator.uniform(1.3, 1.7)])
-            target = np.array([3.2 * side + generator.uniform(-1.5, 1.5), -8.2, generator.uniform(1.2, 2.6)])
+            target = np.array([3.2 * side + generator.uniform(-1.5, 1.5), FAR, generator.uniform(1.2, 2.6)])
         else:
             place = np.array([1.9 * side, -generator.uniform(1.25, 2.9), generator.uniform(1.05, 1.75)])
             target = np.array([generator.uniform(-0.5, 0.5) + 0.25 * side, 0.35, generator.uniform(1.1, 1.35)])
@@ -134,14 +129,9 @@ def view(lit: Lit, pose: Array, width: int, rays: int) -> dict[str, Array]:
     return layers | {"label": labels[:, :, rays**2 // 2], "whole": whole_labels(labels)}
 
 
-def picture(linear: Array) -> Image.Image:
-    """A picture [H, W, 3] of radiance; brighter than white is white."""
-    return Image.fromarray(as_bytes(srgb_from_linear(np.clip(linear, 0, 1))))
-
-
 def save_jpeg(path: Path, linear: Array, quality: int) -> None:
     """Writes a picture in the full resolution of its colours, by which reflections differ from what is behind."""
-    picture(linear).save(path, quality=quality, subsampling=0, optimize=True)
+    Image.fromarray(picture(linear[:, :, None])).save(path, quality=quality, subsampling=0, optimize=True)
 
 
 def annotated_views(layers: list[Array], masks: int) -> set[int]:
@@ -153,11 +143,7 @@ def annotated_views(layers: list[Array], masks: int) -> set[int]:
 def sparse_points(lit: Lit, poses: list[Array], count: int) -> tuple[Array, NDArray[np.uint8]]:
     """Positions and colours [P, 3] of points that random rays meet, some of them mirrored, as structure from motion."""
     generator = np.random.default_rng(0)
-    eyes = np.stack(poses)[generator.integers(len(poses), size=count)]
-    rays = np.concatenate([generator.uniform(-0.55, 0.55, (count, 2)) * [1, 0.75], np.ones((count, 1))], axis=1)
-    directions = np.einsum("nij,nj->ni", eyes[:, :3, :3], rays)
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = eyes[:, :3, 3]
+    origins, directions = random_rays(poses, count, generator)
     seen = lit.seen(origins, directions)
     colors, length = seen.transmission.copy(), seen.distance.copy()
     virtual = (seen.label > 0) & (generator.random(count) < VIRTUAL_IN_GLASS)
@@ -171,28 +157,6 @@ def sparse_points(lit: Lit, poses: list[Array], count: int) -> tuple[Array, NDAr
     return positions + noise, as_bytes(srgb_from_linear(np.clip(colors[kept], 0, 1)))
 
 
-def write_model(folder: Path, lit: Lit, poses: list[Array], arguments: Arguments) -> None:
-    """Writes the COLMAP text model."""
-    width, height, focal = arguments.width, arguments.width * 3 // 4, FOCAL_PER_WIDTH * arguments.width
-    folder.mkdir(parents=True)
-    (folder / "cameras.txt").write_text(f"1 PINHOLE {width} {height} {focal} {focal} {width / 2} {height / 2}\n")
-    lines = []
-    for number, pose in enumerate(poses):
-        inverse = np.linalg.inv(pose)
-        x, y, z, w = Rotation.from_matrix(inverse[:3, :3]).as_quat()
-        values = " ".join(f"{value:.9f}" for value in (w, x, y, z, *inverse[:3, 3]))
-        lines.append(f"{number + 1} {values} 1 {number:04d}.jpg\n\n")
-    (folder / "images.txt").write_text("".join(lines))
-    positions, colors = sparse_points(lit, poses, arguments.points)
-    rows = zip(positions.tolist(), colors.tolist(), strict=True)
-    (folder / "points3D.txt").write_text(
-        "".join(
-            f"{n + 1} {x:.5f} {y:.5f} {z:.5f} {red} {green} {blue} 0.5\n"
-            for n, ((x, y, z), (red, green, blue)) in enumerate(rows)
-        )
-    )
-
-
 def write_truth(folder: Path, name: str, layers: dict[str, Array]) -> None:
     """Writes the layers of a test view, how much the pane reflects, and where it is."""
     save_jpeg(folder / "trans" / f"{name}.jpg", layers["transmission"], LAYER)
@@ -204,8 +168,6 @@ def write_truth(folder: Path, name: str, layers: dict[str, Array]) -> None:
 
 def write_plane(path: Path) -> None:
     """Writes the true pane."""
-    from tools.demo_light import REFRACTION
-
     entry = {
         "label": 1,
         "center": [(LEFT + RIGHT) / 2, 0.0, (BOTTOM + TOP) / 2],
@@ -240,7 +202,10 @@ def main(arguments: Arguments) -> None:
     print()
     for number in annotated_views(labels, arguments.masks):
         Image.fromarray(labels[number]).save(folder / "panes" / f"{number:04d}.png", optimize=True)
-    write_model(folder / "sparse/0", lit, poses, arguments)
+    (folder / "sparse/0").mkdir(parents=True)
+    names = [f"{number:04d}.jpg" for number in range(len(poses))]
+    points = sparse_points(lit, poses, arguments.points)
+    write_colmap(folder / "sparse/0", arguments.width, FOCAL_PER_WIDTH, dict(zip(names, poses, strict=True)), points)
     write_plane(folder / "gt/planes.json")
     size = {"width": arguments.width, "height": arguments.width * 3 // 4}
     counts = {"views": arguments.views, "masks": arguments.masks, "every": TEST_EVERY}

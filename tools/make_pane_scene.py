@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -141,14 +142,18 @@ def write_surface(folder: Path, name: str, normals: Array) -> None:
     Image.fromarray(as_bytes(share)).save(folder / f"{stem}_strength.png")
 
 
-def sparse_points(place: Place, poses: list[Array], count: int, seed: int) -> tuple[Array, NDArray[np.uint8]]:
-    """Positions and colours [P, 3] of surface points that random rays of the cameras meet, some of them mirrored."""
-    generator = np.random.default_rng(seed)
+def random_rays(poses: list[Array], count: int, generator: np.random.Generator) -> tuple[Array, Array]:
+    """Origins and unit directions [N, 3] of rays through random places of random views."""
     eyes = np.stack(poses)[generator.integers(len(poses), size=count)]
     rays = np.concatenate([generator.uniform(-0.55, 0.55, (count, 2)) * [1, 0.75], np.ones((count, 1))], axis=1)
     directions = np.einsum("nij,nj->ni", eyes[:, :3, :3], rays)
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = eyes[:, :3, 3].copy()
+    return eyes[:, :3, 3].copy(), directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def sparse_points(place: Place, poses: list[Array], count: int, seed: int) -> tuple[Array, NDArray[np.uint8]]:
+    """Positions and colours [P, 3] of surface points that random rays of the cameras meet, some of them mirrored."""
+    generator = np.random.default_rng(seed)
+    origins, directions = random_rays(poses, count, generator)
     bare, shown = place.without_panes(), place.seen(origins, directions)
     met = bare.seen(origins, directions)
     colors, length = met.radiance.copy(), met.distance.copy()
@@ -172,22 +177,30 @@ def has_features(seen: Seen) -> NDArray[np.bool_]:
     return ~seen.normal.any(axis=1) & (seen.radiance < 1).any(axis=1)
 
 
-def write_model(folder: Path, arguments: Arguments, poses: list[Array], place: Place) -> None:
-    """Writes the COLMAP text model."""
-    width, height = arguments.width, arguments.width * 3 // 4
-    focal = FOCAL_PER_WIDTH * width
+def write_colmap(
+    folder: Path, width: int, focal_per_width: float, poses: Mapping[str, Array], points: tuple[Array, Array]
+) -> None:
+    """Writes a COLMAP text model of one pinhole camera, whose pictures are three quarters as high as wide.
+
+    Args:
+        folder: to write to.
+        width: of the pictures, pixels.
+        focal_per_width: focal length, as a share of the width.
+        poses: camera-to-world [4, 4] by the name of the photograph.
+        points: positions and colours [P, 3].
+    """
+    height, focal = width * 3 // 4, focal_per_width * width
     (folder / "cameras.txt").write_text(f"1 PINHOLE {width} {height} {focal} {focal} {width / 2} {height / 2}\n")
     lines = []
-    for number, pose in enumerate(poses):
+    for number, (name, pose) in enumerate(poses.items(), start=1):
         inverse = np.linalg.inv(pose)
         x, y, z, w = Rotation.from_matrix(inverse[:3, :3]).as_quat()
         values = " ".join(f"{value:.9f}" for value in (w, x, y, z, *inverse[:3, 3]))
-        lines.append(f"{number + 1} {values} 1 {view_name(number)}\n\n")
+        lines.append(f"{number} {values} 1 {name}\n\n")
     (folder / "images.txt").write_text("".join(lines))
-    positions, colors = sparse_points(place, poses, arguments.points, arguments.any_seed)
     rows = [
         f"{number + 1} {x:.6f} {y:.6f} {z:.6f} {r} {g} {b} 0.5\n"
-        for number, ((x, y, z), (r, g, b)) in enumerate(zip(positions, colors, strict=True))
+        for number, ((x, y, z), (r, g, b)) in enumerate(zip(*points, strict=True))
     ]
     (folder / "points3D.txt").write_text("".join(rows))
 
@@ -324,7 +337,9 @@ def main(arguments: Arguments) -> None:
     drawn = chosen_place(arguments)
     print(folder.name, drawn.words, flush=True)
     place, poses = with_glass(drawn.place, arguments), drawn.poses
-    write_model(folder / "sparse/0", arguments, poses, place)
+    named = {view_name(number): pose for number, pose in enumerate(poses)}
+    points = sparse_points(place, poses, arguments.points, arguments.any_seed)
+    write_colmap(folder / "sparse/0", arguments.width, FOCAL_PER_WIDTH, named, points)
     write_planes(folder / "gt/planes.json", place)
     if arguments.case:
         write_rectangles(folder / "planes.json", place)

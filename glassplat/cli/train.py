@@ -225,8 +225,7 @@ class Demo:
         """Trains both methods, evaluates them and says where the pictures are."""
         recipes: tuple[Recipe, ...] = (PlanarRecipe(), SplatRecipe())
         for recipe, folder in zip(recipes, self.folders, strict=True):
-            options: dict[str, Any] = {"downscale": DEMO_DOWNSCALE, "seed": self.seed, "device": self.device}
-            run = Train(recipe, SCENE, folder, self.iterations, **options)
+            run = Train(recipe, SCENE, folder, self.iterations, DEMO_DOWNSCALE, seed=self.seed, device=self.device)
             run = run.resuming(RunDirectory(folder).checkpoint.is_file())
             say(console, f"training {recipe.method}")
             run.ready()

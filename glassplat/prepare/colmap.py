@@ -110,6 +110,11 @@ class FeatureDatabase:
     pictures: Path
     photographs: Sequence[Photograph]
 
+    @property
+    def picture_names(self) -> list[str]:
+        """Names of all photographs in the database."""
+        return [self.picture_name(index) for index in range(len(self.photographs))]
+
     def picture_name(self, index: int) -> str:
         """Name of a photograph in the database."""
         return f"{index:06d}.png"
@@ -128,7 +133,7 @@ class FeatureDatabase:
     def write_pictures(self, listen: Listener) -> None:
         """Writes the grey pictures that are missing: upright, reduced."""
         self.pictures.mkdir(parents=True, exist_ok=True)
-        targets = [self.pictures / self.picture_name(index) for index in range(len(self.photographs))]
+        targets = [self.pictures / name for name in self.picture_names]
         missing = [index for index, target in enumerate(targets) if not target.is_file()]
         for done, index in enumerate(missing):
             listen(Progress("reading the photographs", done, len(missing)))
@@ -142,14 +147,12 @@ class FeatureDatabase:
         options.sift.max_num_features = features.most
         options.sift.peak_threshold = features.least_contrast
         options.sift.first_octave = -1 if features.from_enlarged else 0
-        # By name: a command that was killed may have left half a picture next to them.
-        names = [self.picture_name(index) for index in range(len(self.photographs))]
 
         def work(token: Any) -> None:
             library.pycolmap.extract_features(
                 self.path,
                 self.pictures,
-                image_names=names,
+                image_names=self.picture_names,  # A command that was killed may have left half a picture there.
                 extraction_options=options,
                 device=library.pycolmap.Device.cpu,
                 cancellation_token=token,
