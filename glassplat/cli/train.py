@@ -205,7 +205,7 @@ class Demo:
     """
 
     output: Path = Path("runs/demo")
-    iterations: Several = 2000
+    iterations: Several = 1500
     seed: Seed = 0
     device: DeviceName = "auto"
 
