@@ -117,10 +117,10 @@ def walked(browser: Browser) -> Walk:
     wait = "glassplat.then(({ noted }) => noted.some(({ scale }) => scale === 1))"
     browser.wait(wait, "the first whole picture")
     begin = browser.evaluate("glassplat.then(({ noted }) => { noted.length = 0; return performance.now(); })")
-    used = processor_seconds(browser.process)
+    used = processor_seconds(os.getpid())
     browser.drag([(200, 150), *((200 + 3 * step, 150 + step) for step in range(DRAG_STEPS))], pause=0.02)
     end = browser.evaluate("performance.now()")
-    moving, used = browser.evaluate(noted), processor_seconds(browser.process) - used
+    moving, used = browser.evaluate(noted), processor_seconds(os.getpid()) - used
     browser.wait(wait, "the whole picture")
     resting = [picture for picture in browser.evaluate(noted) if picture["time"] > end]
     return Walk([p for p in moving if p["time"] <= end], resting, (end - begin) / 1000, end, used)

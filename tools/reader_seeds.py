@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from glassplat.annotate.document import FILE, read_document
+from glassplat.annotate.document import ANNOTATIONS, read_document
 from glassplat.captures import colmap_library as library
 from glassplat.captures.colmap import pose_matrix, read_model
 from glassplat.captures.masks import read_mask_values
@@ -321,7 +321,7 @@ READERS: dict[str, Reader] = {
     "recipe": Reader("recipe.json", lambda path: RunDirectory(path.parent).recipe(), _recipe_seeds, longest=16_384),
     "settings": Reader("settings.json", lambda path: RunDirectory(path.parent).settings(), _settings_seeds),
     "log": Reader("log.jsonl", lambda path: lines_until(path, 10), _log_seeds),
-    "annotations": Reader(FILE, _annotations, _annotations_seeds),
+    "annotations": Reader(ANNOTATIONS, _annotations, _annotations_seeds),
     "photograph": Reader("a.png", read_image, _picture_seeds, most_mib=LARGEST_PICTURE_MIB),
     "mask": Reader("a.png", read_mask_values, _mask_seeds, most_mib=LARGEST_PICTURE_MIB),
     "panorama": Reader(

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from filelock import FileLock
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
@@ -22,7 +23,9 @@ from glassplat.scene.camera import NumpyCamera
 
 Material = Literal["glass", "mirror", "screen"]
 
-FILE = "annotations.json"
+ANNOTATIONS = "annotations.json"
+LOCK = "annotations.lock"
+"""Stays behind, empty, where folders cannot be locked."""
 MOST_PANES, MOST_CORNERS, MOST_STROKES, MOST_PLACES = 64, 32, 500, 20_000
 """Of one document: more than anybody marks, and few enough to work with."""
 FARTHEST = 1e6
@@ -146,7 +149,7 @@ def read_document(folder: Path) -> Any:
     Raises:
         ValueError: the file is damaged.
     """
-    path = folder / FILE
+    path = folder / ANNOTATIONS
     if not path.exists():
         return {"version": 1, "panes": []}
     value = read_json(path)
@@ -164,8 +167,9 @@ def held(folder: Path) -> Iterator[None]:
     """Keeps other programs from saving marks of a capture meanwhile, where its file system has locks."""
     try:
         import fcntl
-    except ImportError:  # Windows.
-        yield
+    except ImportError:  # Windows, where folders cannot be locked.
+        with FileLock(folder / LOCK):
+            yield
         return
     descriptor = os.open(folder, os.O_RDONLY)
     try:
@@ -178,7 +182,7 @@ def held(folder: Path) -> Iterator[None]:
 
 def write_document(folder: Path, value: Any) -> None:
     """Writes a document that was checked."""
-    with atomic_write(folder / FILE) as temporary:
+    with atomic_write(folder / ANNOTATIONS) as temporary:
         temporary.write_text(json.dumps(value, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
 
 

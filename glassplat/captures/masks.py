@@ -305,7 +305,8 @@ def _why_panes(root: Path, masks: Mapping[str, Path], *, marked: bool) -> str | 
             )
         return None
     if labels:
-        return "The masks hold labels of panes, as in captures of earlier versions."
+        keep = " (if 1 is what to keep, write 255 for it)" if highest == 1 else ""
+        return f"The masks hold labels of panes, as in captures of earlier versions{keep}."
     return (
         f"There is a {PLANES} but no {PANE_FOLDER}/, as in captures of earlier versions."
         if (masks and (root / PLANES).is_file())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,12 @@ def test_more_panes_than_fit_are_refused() -> None:
         merged(document(), full, ours)
 
 
-def test_two_programs_that_save_at_the_same_moment_drop_nothing(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("has_folder_locks", [True, False])
+def test_two_programs_that_save_at_the_same_moment_drop_nothing(
+    room: Path, monkeypatch: pytest.MonkeyPatch, *, has_folder_locks: bool
+) -> None:
+    if not has_folder_locks:
+        monkeypatch.setitem(sys.modules, "fcntl", None)  # As on Windows.
     one, other = opened_session(room), opened_session(room)
     second: list[Future[Any]] = []
     write = session.write_document
