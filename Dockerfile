@@ -1,4 +1,4 @@
-# glassplat for the CPU, with its kernels compiled:
+# glassplat for the CPU, with the kernels of `splat` and `planar` compiled; others are at their first use:
 #
 #     docker build --tag splats .
 #     docker run --rm --volume "$PWD:/work" splats demo --output runs/demo

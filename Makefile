@@ -15,6 +15,7 @@ PORTABLE_TESTS := tests/files tests/captures tests/scene tests/model/test_run_lo
 # What releases are made with, and the lowest versions tried in.
 RELEASE := build/release
 LOWEST := build/lowest
+TESTING := 'pytest>=8.3' 'hypothesis>=6.100' 'gsply>=0.4' 'pygltflib>=1.16'
 
 .PHONY: help setup browser demo test portable lowest dist lint format docs bench clean
 .DEFAULT_GOAL := help
@@ -70,8 +71,9 @@ lowest:
 	"$(PYTHON)" -m venv --clear $(LOWEST)
 	$(LOWEST)/$(IN_VENV)/python -m pip --quiet install uv
 	$(LOWEST)/$(IN_VENV)/uv pip install --quiet --python $(LOWEST) --resolution lowest-direct \
-		--editable '.[prepare,view,video]' 'pytest>=8.3' 'hypothesis>=6.100' 'gsply>=0.4' 'pygltflib>=1.16'
-	$(LOWEST)/$(IN_VENV)/python -m pytest $(PORTABLE_TESTS)
+		--editable '.[prepare,view,video,heic,formats]' $(TESTING)
+	$(LOWEST)/$(IN_VENV)/python -m pytest $(PORTABLE_TESTS) tests/kernels/test_cache.py
+	$(LOWEST)/$(IN_VENV)/glassplat demo --iterations 8 --output $(LOWEST)/demo
 
 dist:
 	rm -rf dist $(RELEASE)
@@ -82,6 +84,9 @@ dist:
 	$(RELEASE)/$(IN_VENV)/python -m pip --quiet install dist/*.whl
 	cd $(RELEASE) && $(IN_VENV)/glassplat --version && $(IN_VENV)/glassplat --help >/dev/null
 	cd $(RELEASE) && $(IN_VENV)/python -c 'import glassplat; glassplat.load'
+	$(RELEASE)/$(IN_VENV)/python -m pip --quiet install $$(echo dist/*.whl)'[prepare,view,video,heic,formats]' $(TESTING)
+	tar --extract --file dist/*.tar.gz --directory $(RELEASE)
+	cd $(RELEASE)/glassplat-*/ && ../$(IN_VENV)/python -m pytest $(PORTABLE_TESTS)
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

@@ -19,7 +19,7 @@ from glassplat.evaluate.evaluate import timed_render
 from glassplat.evaluate.metrics import quantized
 from glassplat.evaluate.report import TITLE_HEIGHT, Panel, composed
 from glassplat.files.images import write_image
-from glassplat.render.layers import normal_colors
+from glassplat.render.layers import layer_image
 
 PARTS = {
     "transmission": "behind the glass",
@@ -59,8 +59,7 @@ def main() -> None:
     frame, _ = timed_render(stored.renderer, stored.scene, view)
     panels = [Panel("photograph", view.photo), Panel("render", quantized(frame.rgb))]
     for layer in (layer for layer in PARTS if layer in frame.layers):
-        image = normal_colors(frame.layers[layer]) if layer == "normal" else frame.layers[layer]
-        panels.append(Panel(PARTS[layer], quantized(image)))
+        panels.append(Panel(PARTS[layer], quantized(layer_image(frame, layer))))
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     write_image(arguments.output, composed([panels], "", "")[TITLE_HEIGHT:])
 

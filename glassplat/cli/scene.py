@@ -114,7 +114,7 @@ class View:
     """Look at a scene in the browser, layer by layer, with its panes as they are or edited.
 
     Attributes:
-        scene: a run's directory, or a splat file of any program (.ply, .spz, .glb, .splat).
+        scene: a run's directory, an exported folder, or a splat file (.ply, .spz, .glb, .splat, .sog, .ksplat).
         port: where the browser finds it.
         host: who may look with the link; 127.0.0.1 is this machine alone, 0.0.0.0 everybody who can reach it.
         output: folder for edited scenes and keyframes that are saved in the browser; the one that holds the scene if
@@ -158,7 +158,7 @@ class Video:
     """Film a scene along a path: one layer, several side by side, or one wiped over another.
 
     Attributes:
-        scene: a run's directory, or a splat file of any program (.ply, .spz, .glb, .splat).
+        scene: a run's directory, an exported folder, or a splat file (.ply, .spz, .glb, .splat, .sog, .ksplat).
         output: the film: .mp4 (VP9, plays in browsers; needs glassplat[video]), .webp or .gif.
         path: once around, or in a loop before what was photographed from one side; through the photographs' cameras;
             or through those of --keyframes.
@@ -232,7 +232,7 @@ class Clean:
     """Take floaters out of a scene, and give it metres; writes another scene.
 
     Attributes:
-        scene: a run's directory, or a splat file of any program (.ply, .spz, .glb, .splat).
+        scene: a run's directory, an exported folder, or a splat file (.ply, .spz, .glb, .splat, .sog, .ksplat).
         output: where the clean scene goes, a new folder; `glassplat view` and `export` read it like a run.
         rules: what goes.
         scale: two points, x y z each in world units, and how many metres apart they are; `view` measures points.
@@ -275,7 +275,7 @@ class Export:
     """Write a scene as others read it: PLY, SPZ, GLB, a web page with live panes, and the panes beside them.
 
     Attributes:
-        scene: a run's directory, or a splat file of any program (.ply, .spz, .glb, .splat).
+        scene: a run's directory, an exported folder, or a splat file (.ply, .spz, .glb, .splat, .sog, .ksplat).
         output: where the files go; a new folder, or one that this command wrote.
         formats: which files; glb is glTF with KHR_gaussian_splatting, html a page that shows the scene in any browser,
             by itself and without a server.

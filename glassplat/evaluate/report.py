@@ -21,7 +21,7 @@ from glassplat.files.images import flat_picture_names, write_image
 from glassplat.files.writing import atomic_write
 from glassplat.options import Blend
 from glassplat.render.frame import Frame
-from glassplat.render.layers import ERROR_SCALE, depth_colors, error_colors, label_colors, normal_colors
+from glassplat.render.layers import ERROR_SCALE, depth_colors, error_colors, label_colors, layer_image, normal_colors
 from glassplat.render.planar import as_mirror_image, dereflected_photo
 
 STYLE = """
@@ -165,7 +165,7 @@ def _layer_rows(frame: Frame, truth: TrueView | None, surface: TrueSurface) -> t
 def _rendered_panels(frame: Frame, scale: float) -> dict[str, Panel]:
     """Panels of a frame's layers by name."""
     layers = frame.layers
-    panels = {name: Panel(name.replace("_", " "), layers[name]) for name in COLORED if name in layers}
+    panels = {name: Panel(name.replace("_", " "), layer_image(frame, name)) for name in COLORED if name in layers}
     if "strength" in layers:
         panels["strength"] = _strength_panel("strength", layers["strength"], scale)
     if "normal" in layers:

@@ -566,7 +566,8 @@ def load(
     `glassplat export` write them.
 
     Args:
-        path: a run's directory, a folder of `Model.save` or `glassplat export`, or a .ply, .spz, .splat or .glb.
+        path: a run's directory, a folder of `Model.save` or `glassplat export`, or a .ply, .spz, .glb, .splat, .sog or
+                .ksplat.
         device: where the scene's tensors go; `auto` takes an NVIDIA GPU where one can be used.
         planes: panes of a splat file, a planes.json written by hand or by `export`; the one beside it if not given.
         up: which way is up in a splat file, for the cameras that look at it, if no cameras.json is beside it.

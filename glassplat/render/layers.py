@@ -101,7 +101,10 @@ def label_colors(labels: Tensor) -> Tensor:
 
 
 def layer_image(frame: Frame, layer: str) -> Tensor:
-    """A layer as an image [H, W] or [H, W, 3] in [0, 1]; depth is colour-mapped (near bright), normals (n + 1) / 2."""
+    """A layer as an image [H, W] or [H, W, 3] in [0, 1]; depth is colour-mapped (near bright), normals (n + 1) / 2.
+
+    What panes reflect ends where they do: whole tiles of it are rendered.
+    """
     if layer in ("rgb", "photographed"):
         image: Tensor = getattr(frame, layer)
         return image.clamp(0, 1)
@@ -110,6 +113,8 @@ def layer_image(frame: Frame, layer: str) -> Tensor:
         return normal_colors(image)
     if layer in ("depth", "median_depth"):
         return depth_colors(image, frame.layers["alpha"])
+    if layer == "reflection" and "mask" in frame.layers:
+        image = image * frame.layers["mask"][..., None]
     return image.clamp(0, 1)
 
 

@@ -28,7 +28,8 @@ from glassplat.evaluate.report import (
 from glassplat.evaluate.truth import TrueSurface
 from glassplat.files.images import read_image
 from glassplat.options import Blend
-from glassplat.render.layers import depth_colors, heat_colors, label_colors, normal_colors
+from glassplat.render.frame import Frame
+from glassplat.render.layers import depth_colors, heat_colors, label_colors, layer_image, normal_colors
 from glassplat.render.planar import dereflected_photo
 from glassplat.scene.panes import Planes
 
@@ -221,6 +222,13 @@ def test_near_is_bright_and_nothing_is_black() -> None:
 def test_depth_of_one_distance_or_of_nothing() -> None:
     assert torch.isfinite(depth_colors(torch.full((3, 4), 2.0))).all()
     assert depth_colors(torch.zeros(3, 4), torch.ones(3, 4)).abs().max() == 0
+
+
+def test_reflections_end_where_the_panes_do() -> None:
+    reflection, mask = torch.rand(2, 3, 3), torch.tensor([[0.0, 0.5, 1.0], [0.0, 1.0, 0.0]])
+    shown = layer_image(Frame(torch.rand(2, 3, 3), {"reflection": reflection, "mask": mask}), "reflection")
+    assert torch.equal(shown, reflection * mask[..., None])
+    assert torch.equal(layer_image(Frame(reflection, {"reflection": reflection}), "reflection"), reflection)
 
 
 def test_labels_have_colours_of_their_own() -> None:
