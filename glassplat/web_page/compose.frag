@@ -78,7 +78,7 @@ void glaze(int k, vec3 ray, inout vec3 seen, inout vec4 mirror) {
 
 vec3 layerOf(int layer, vec3 seen, vec3 behind, vec4 mirror, float mask) {
   if (layer == 1) return behind;
-  if (layer == 2) return encoded(mirror.rgb);
+  if (layer == 2) return encoded(mirror.rgb) * mask;
   if (layer == 3) return vec3(mirror.a);
   if (layer == 4) return vec3(mask);
   return seen;

@@ -16,6 +16,7 @@ from glassplat.evaluate.metrics import psnr
 from glassplat.publish.web_page import SCRIPTS, SHADERS, Sharing, asset, filled, page_text, write_page, write_preview
 from glassplat.render.deferred import Deferred
 from glassplat.render.frame import Renderer
+from glassplat.render.layers import layer_image
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.render.traced import Traced
@@ -37,9 +38,9 @@ def likeness(browser: Browser, scene: Scene, renderer: Planar | Splat, camera: C
     """Of the page's picture and the renderer's, in dB."""
     with torch.no_grad():
         frame = renderer(scene, camera)
-    truth = frame.rgb if layer == "rgb" else frame.layers[layer]
+    truth = layer_image(frame, layer)
     truth = truth if truth.dim() == 3 else truth[..., None].expand(-1, -1, 3)
-    return psnr(picture(browser, camera, layer), truth.clamp(0, 1))
+    return psnr(picture(browser, camera, layer), truth)
 
 
 @pytest.fixture(scope="module")
