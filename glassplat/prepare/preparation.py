@@ -326,7 +326,7 @@ def prepare(task: Preparation, listen: Listener, *, resume: bool = False, force:
     except InputError:
         remove_empty(missing)
         raise
-    solution = best_solution(photographs, workplace.folder, task.settings, listen)
+    solution = best_solution(photographs, workplace.folder, task.settings, task.least_registered, listen)
     report = report_of(solution)
     _check_enough(report, task)
     write_capture(solution, workplace.capture, listen)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from glassplat.prepare.photographs import Listener, Note, Photograph, Progress, 
 FEWEST_FEATURES = 50
 """Of the middle photograph; with fewer nothing can be matched."""
 ENOUGH = 0.95
-"""Share of the photographs placed with which no further attempt is made."""
+"""Share of the photographs with which no further attempt is made that takes no longer."""
 
 
 @dataclass(frozen=True)
@@ -93,15 +93,23 @@ def image_numbers(model: Any) -> dict[int, Any]:
     return {int(Path(image.name).stem): image for image in model.images.values() if image.has_pose}
 
 
-def best_solution(photographs: Sequence[Photograph], work: Path, settings: Settings, listen: Listener) -> Solution:
+def best_solution(
+    photographs: Sequence[Photograph], work: Path, settings: Settings, least: float, listen: Listener
+) -> Solution:
     """Places photographs, with as many attempts as it takes; what lies in `work` from before is used.
+
+    More features take many times as long, so they are tried only where less than the share `least` was placed.
 
     Raises:
         InputError: the photographs show too little to be recognised.
     """
     best: Solution | None = None
-    for number, attempt in enumerate(ATTEMPTS, start=1):
+    tried = 0
+    for attempt in ATTEMPTS:
         if best is not None:
+            enough = least if attempt.features == MANY else max(ENOUGH, least)
+            if best.registered >= enough * len(photographs):
+                break
             told = f"{best.registered} of {len(photographs)} photographs were placed; trying again with {attempt.name}"
             listen(Note(told))
         database = _matched(photographs, work, attempt.features, settings, listen)
@@ -113,13 +121,12 @@ def best_solution(photographs: Sequence[Photograph], work: Path, settings: Setti
             listen=listen,
             threads=settings.threads,
         )
-        found = Solution(database, models, attempt.name, number)
+        tried += 1
+        found = Solution(database, models, attempt.name, tried)
         if best is None or found.registered > best.registered:
             best = found
-        if best.registered >= ENOUGH * len(photographs):
-            break
     assert best is not None
-    return Solution(best.database, best.models, best.attempt, number)
+    return replace(best, tried=tried)
 
 
 def _matched(
