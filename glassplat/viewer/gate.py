@@ -90,14 +90,13 @@ MESSAGES: dict[str, dict[str, Field]] = {
         "ray_origin": POSITION,
         "ray_direction": Items(Number(-1.001, 1.001), 3),
         "screen_pos": Items(Items(Number(0, 1), 2), 1),
+        "modifier": Choice((None,)),
     },
 }
 """What browsers may say, by viser's names, and within which bounds; nothing else is heard.
 
 Among what is not heard: that the scene be shared through a public server, uploads, and pictures of other views.
 """
-if "modifier" in viser._messages.ScenePointerMessage.__dataclass_fields__:  # Since viser 1.1.
-    MESSAGES["ScenePointerMessage"]["modifier"] = Choice((None,))
 
 
 def understood(data: str | bytes) -> bytes | None:
@@ -134,7 +133,7 @@ def admission(access: Access, page: Callable[..., Any] | None) -> Callable[[Serv
             return replied(refused.status, {"Content-Type": "text/plain; charset=utf-8"}, str(refused))
         if entry is not None:
             return replied(HTTPStatus.OK, entry)
-        if PAGE_PATH.fullmatch(request.path.partition("?")[0]) is None:  # viser 1.0 follows `..` out of its folder.
+        if PAGE_PATH.fullmatch(request.path.partition("?")[0]) is None:  # viser may follow `..` out of its folder.
             return replied(HTTPStatus.NOT_FOUND, {}, "there is no such page")
         response = None if page is None else page(connection, request)
         if isinstance(response, Response):
