@@ -106,12 +106,15 @@ def digest_of(folder: Path) -> str:
 
 
 def digest_of_all(folder: Path) -> str:
-    """Digest of all files in a folder."""
-    digest = hashlib.sha256()
-    for path in sorted(folder.rglob("*")):
-        if path.is_file():
-            digest.update(path.name.encode() + path.read_bytes())
-    return digest.hexdigest()
+    """Line for each file in a folder, with its name and the digest of its contents."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return "\n".join(f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()}" for path in files)
+
+
+def other_bits(folder: Path, whole: Whole) -> str:
+    """Fault of a run that ended with other files than one that nobody disturbed, with their names."""
+    differing = set(digest_of(folder).split("\n")) ^ set(whole.digest.split("\n"))
+    return f"it ended with other bits: {sorted({line.split()[0] for line in differing if line})}" if differing else ""
 
 
 def resumed(whole: Whole, folder: Path) -> str:
@@ -123,7 +126,7 @@ def resumed(whole: Whole, folder: Path) -> str:
     ended = run_forked(training(whole, folder, *(["--resume"] if (folder / CHECKPOINT).exists() else [])))
     if ended.code != 0:
         return f"resumed: {ended.fault() or ended.output[-500:]}"
-    return "" if digest_of(folder) == whole.digest else "resumed, it ended with other bits"
+    return other_bits(folder, whole)
 
 
 def wait_for_moment(draw: random.Random, whole: Whole, folder: Path) -> None:
@@ -209,7 +212,7 @@ def two_at_once(draw: random.Random, whole: Whole, folder: Path) -> str:
         return faults
     if 0 not in [one.code for one in ended]:
         return f"neither was done: {[one.output[-200:] for one in ended]}"
-    return "" if digest_of(folder) == whole.digest else "together they ended with other bits"
+    return other_bits(folder, whole)
 
 
 def clock_jumps(draw: random.Random, whole: Whole, folder: Path) -> str:
@@ -221,7 +224,7 @@ def clock_jumps(draw: random.Random, whole: Whole, folder: Path) -> str:
     shutil.rmtree(site)
     if ended.code != 0:
         return ended.fault() or ended.output[-300:]
-    return "" if digest_of(folder) == whole.digest else "it ended with other bits"
+    return other_bits(folder, whole)
 
 
 def killer(seconds: float) -> Callable[[int], None]:

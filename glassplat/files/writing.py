@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import importlib
 import os
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -31,6 +32,10 @@ def splat_writer(kind: str) -> Callable[..., None]:
     module, _, name = SPLAT_WRITERS[kind].partition(":")
     writer: Callable[..., None] = getattr(importlib.import_module(module), name)
     return writer
+
+
+UNFINISHED = re.compile(r"\..{0,32}\.[0-9a-f]{12}\.tmp(\..{1,31})?")
+"""Name of a file that `atomic_write` has not put in its place yet."""
 
 
 @contextmanager
@@ -64,6 +69,14 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # never hide the error above behind one from the clean-up
             temporary.unlink()
+
+
+def remove_unfinished(folder: Path, suffixes: Sequence[str]) -> None:
+    """Removes what was left in a folder by writers that were killed; nobody may be writing such files there now."""
+    for path in folder.glob(".*"):
+        if UNFINISHED.fullmatch(path.name) and path.suffix in suffixes:
+            with suppress(OSError):
+                path.unlink()
 
 
 def _flush_to_disk(path: Path) -> None:

@@ -23,7 +23,7 @@ from filelock import FileLock, Timeout
 from glassplat.captures.masks import Polarity
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.records import parse_json, read_json, read_text
-from glassplat.files.writing import atomic_write, check_folder, make_folder
+from glassplat.files.writing import atomic_write, check_folder, make_folder, remove_unfinished
 from glassplat.options import Downscale, Seed, Several, options_from_json
 from glassplat.training.messages import Message, StepDone, Working
 from glassplat.training.ranks import leads
@@ -223,6 +223,15 @@ class RunDirectory:
         write_text(self.path / "recipe.json", recipe_to_json(recipe))
         write_text(self.path / "settings.json", json.dumps(dataclasses.asdict(settings), indent=2))
         write_cameras(self.path / "cameras.json", [(v.name, v.camera) for v in (*dataset.train, *dataset.test)])
+
+    def clear(self) -> None:
+        """Removes what a training left half-written that was killed; for who holds the lock.
+
+        Other commands may be writing JSON and pictures here.
+        """
+        remove_unfinished(self.path, (self.checkpoint.suffix,))
+        for folder in self.path.glob("point_cloud/iteration_*"):
+            remove_unfinished(folder, (".ply", ".json", ".safetensors", ".png"))
 
     def write_refined(self, dataset: Dataset, scene: Scene) -> None:
         """Replaces the recorded cameras by those that training found, if it looked for them.

@@ -168,6 +168,7 @@ class Run:
             self.state = first_state(self.recipe, settings, self._dataset)
         make_folder(directory.path)
         with run_directory.run_lock(directory.path):
+            directory.clear()
             # Another training may have ended here meanwhile.
             anew = directory.is_begun and not self._resume
             if self.state is None:

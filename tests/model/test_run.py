@@ -8,6 +8,8 @@ import math
 import os
 import resource
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -56,6 +58,39 @@ def run(
 
     begun = Run(RECIPE, SETTINGS, RunDirectory(path), tiny_capture(), resume=resume, checkpoint_every=checkpoint_every)
     return begun.to_the_end(listen)
+
+
+KILLED_AT = """
+import os, signal, sys
+from pathlib import Path
+from glassplat.files import writing
+from tests.model.test_run import run
+
+flush = writing._flush_to_disk
+
+def flushed(path):
+    if path.name.startswith(sys.argv[2]) and path.suffix == sys.argv[3]:
+        os.kill(os.getpid(), signal.SIGKILL)
+    flush(path)
+
+writing._flush_to_disk = flushed
+run(Path(sys.argv[1]), checkpoint_every=0)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no process is killed there")
+@pytest.mark.parametrize(("stem", "suffix"), [(".point_cloud.", ".ply"), (".scene.", ".json")])
+def test_what_a_killed_run_left_half_written_goes(tmp_path: Path, stem: str, suffix: str) -> None:
+    subprocess.run([sys.executable, "-c", KILLED_AT, str(tmp_path / "run"), stem, suffix], check=False)
+    scene = tmp_path / "run" / "point_cloud" / "iteration_12"
+    assert any(path.name.startswith(stem) for path in scene.iterdir())
+    (tmp_path / "run" / ".checkpoint.0123456789ab.tmp.safetensors").touch()
+    kept = [tmp_path / "run" / name for name in (".results.0123456789ab.tmp.json", ".mine.ply")]
+    for path in kept:
+        path.touch()
+    run(tmp_path / "run", resume=True)
+    assert sorted(path.name for path in scene.iterdir()) == ["point_cloud.ply", "scene.json"]
+    assert sorted((tmp_path / "run").glob(".*")) == sorted(kept)
 
 
 @pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
