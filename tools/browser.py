@@ -50,54 +50,33 @@ def driver() -> Iterator[Any]:
     """Playwright, which a thread can have only once: begun for the first who asks, ended with the last."""
     from playwright.sync_api import sync_playwright
 
-    if not _drivers:
-        _drivers.append(sync_playwright().start())
-    _drivers.append(_drivers[0])
+    _drivers.append(_drivers[-1] if _drivers else sync_playwright().start())
     try:
-        yield _drivers[0]
+        yield _drivers[-1]
     finally:
-        _drivers.pop()
-        if len(_drivers) == 1:
-            _drivers.pop().stop()
+        last = _drivers.pop()
+        if not _drivers:
+            last.stop()
 
 
 _drivers: list[Any] = []
-"""The one, and once more for each who uses it."""
+"""The same one, for each who uses it."""
 
 
 class Browser:
     """One tab of one browser; use it in a `with` statement."""
 
     def __init__(
-        self,
-        page: Path | str = "about:blank",
-        width: int = 640,
-        height: int = 480,
-        *,
-        query: str = "#still",
-        is_phone: bool = False,
+        self, page: Path | str = "about:blank", width: int = 640, height: int = 480, *, query: str = "#still"
     ) -> None:
-        """Opens a page from its file, with what stands behind its address, or from its address.
-
-        Args:
-            page: path of a file, or an address.
-            width: of the window, in pixels.
-            height: likewise.
-            query: what follows the address of a file.
-            is_phone: whether fingers touch it, and there are two pixels of the screen to one of the page.
-        """
+        """Opens a page from its file, with what stands behind its address, or from its address."""
         self._requests: list[str] = []
         self._complaints: list[str] = []
         with ExitStack() as ending:
             chromium = ending.enter_context(driver()).chromium
             browser = chromium.launch(executable_path=CHROMIUM, args=OPTIONS, timeout=1000 * PATIENCE)
             ending.callback(browser.close)
-            self._tab = browser.new_page(
-                viewport={"width": width, "height": height},
-                device_scale_factor=2 if is_phone else 1,
-                is_mobile=is_phone,
-                has_touch=is_phone,
-            )
+            self._tab = browser.new_page(viewport={"width": width, "height": height})
             self._tab.set_default_timeout(1000 * PATIENCE)
             self._tab.on("request", lambda request: self._requests.append(request.url))
             self._tab.on("pageerror", lambda error: self._complaints.append(str(error)))

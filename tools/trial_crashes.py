@@ -51,7 +51,7 @@ class Whole(NamedTuple):
     method: str
     data: Path
     folder: Path
-    digest: str
+    digests: frozenset[tuple[str, str]]
     seconds: float
 
 
@@ -94,27 +94,22 @@ def undisturbed(method: str, data: Path, folder: Path) -> Whole:
     for _ in range(2):
         shutil.rmtree(folder, ignore_errors=True)
         begun = time.monotonic()
-        ended = run_forked(training(Whole(method, data, folder, "", 0), folder))
+        ended = run_forked(training(Whole(method, data, folder, frozenset(), 0), folder))
         if ended.code != 0:
             raise RuntimeError(f"{method} cannot be trained at all: {ended.output[-500:]}")
-    return Whole(method, data, folder, digest_of(folder), time.monotonic() - begun)
+    return Whole(method, data, folder, digests_of(folder), time.monotonic() - begun)
 
 
-def digest_of(folder: Path) -> str:
-    """Digest of all files of a run's last scene."""
-    return digest_of_all(folder / "point_cloud" / f"iteration_{STEPS}")
-
-
-def digest_of_all(folder: Path) -> str:
-    """Line for each file in a folder, with its name and the digest of its contents."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return "\n".join(f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()}" for path in files)
+def digests_of(folder: Path) -> frozenset[tuple[str, str]]:
+    """Name and digest of every file of a run's last scene."""
+    files = (path for path in (folder / "point_cloud" / f"iteration_{STEPS}").rglob("*") if path.is_file())
+    return frozenset((path.name, hashlib.sha256(path.read_bytes()).hexdigest()) for path in files)
 
 
 def other_bits(folder: Path, whole: Whole) -> str:
     """Fault of a run that ended with other files than one that nobody disturbed, with their names."""
-    differing = set(digest_of(folder).split("\n")) ^ set(whole.digest.split("\n"))
-    return f"it ended with other bits: {sorted({line.split()[0] for line in differing if line})}" if differing else ""
+    differing = digests_of(folder) ^ whole.digests
+    return f"it ended with other bits: {sorted({name for name, _ in differing})}" if differing else ""
 
 
 def resumed(whole: Whole, folder: Path) -> str:
