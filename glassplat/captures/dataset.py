@@ -120,6 +120,11 @@ class Dataset:
     mask_polarity: Polarity = "auto"
 
     @property
+    def memory(self) -> Memory:
+        """Pixels of its views that were read."""
+        return self.train[0].memory
+
+    @property
     def photograph_bytes(self) -> int:
         """Memory that all training photographs take."""
         return sum(3 * view.camera.width * view.camera.height for view in self.train)

@@ -6,20 +6,26 @@ PNG of 8 or 16 bits (n + 1) / 2, in an NPY file [H, W, 3] of floats the vectors 
 Pixels stay in memory up to a budget, and are read ahead of the step that needs them. What is read first stays as long
 as there is room: every pass over the views comes to each of them once, so that what was used last is not more likely to
 be used again. A small part of the budget holds what was read ahead for the next steps, and gives the oldest of it up.
+What was costly to undistort or to reduce is kept on disk as long as a training lasts.
 """
 
 from __future__ import annotations
 
 import math
 import os
+import shutil
+import tempfile
+import time
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from threading import Lock
+from typing import IO
 
 import numpy as np
 import torch
@@ -57,6 +63,10 @@ AHEAD_SHARE = 0.25
 PIXEL_BYTES = 5
 """Of a view: three of the photograph, one of the panes, one of what is left out."""
 MOST_THREADS = 4
+DISK_RATE = 2e8
+"""Bytes that a slow disk reads in a second."""
+DISK_RESERVE = 5 * GIGABYTE
+"""Bytes of the disk that photographs leave free: the training writes there, too."""
 LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 """Files that say how much a container may take."""
 
@@ -80,6 +90,62 @@ class Source:
     def read(self) -> Tensor:
         """The pixels, from their file."""
         return self._reader() > 0 if self.is_mask else self._reader()
+
+
+class Spool:
+    """Pixels on disk, undistorted and reduced, in a file without a name that ends with the process.
+
+    Where the disk is full or cannot be written, it takes nothing more in, and photographs are read from their files.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._file: IO[bytes] | None = None
+        self._places: dict[Source, tuple[int, tuple[int, ...], np.dtype[np.generic]]] = {}
+        self._is_full = False
+        self._lock = Lock()
+
+    def put(self, source: Source, pixels: Tensor) -> None:
+        """Keeps the pixels of a source if there is room."""
+        values = pixels.numpy()
+        with self._lock:
+            if self._is_full or source in self._places:
+                return
+            try:
+                if shutil.disk_usage(self._folder).free < values.nbytes + DISK_RESERVE:
+                    self._is_full = True
+                    return
+                self._file = self._file or tempfile.TemporaryFile(dir=self._folder)
+                place = self._file.seek(0, os.SEEK_END)
+                self._file.write(values.tobytes())
+                self._file.flush()
+            except OSError:
+                self._is_full = True
+                return
+            self._places[source] = place, values.shape, values.dtype
+
+    def get(self, source: Source) -> Tensor | None:
+        """The pixels of a source; None where they are not here."""
+        with self._lock:
+            if self._file is None or source not in self._places:
+                return None
+            place, shape, dtype = self._places[source]
+            values = np.empty(shape, dtype)
+            try:
+                self._file.seek(place)
+                is_whole = self._file.readinto(values.reshape(-1).view(np.uint8)) == values.nbytes  # type: ignore[attr-defined]
+            except OSError:
+                is_whole = False
+        return torch.from_numpy(values) if is_whole else None
+
+    def close(self) -> None:
+        """Gives the room on disk back."""
+        with self._lock:
+            self._places.clear()
+            self._is_full = True
+            if self._file is not None:
+                self._file.close()
+                self._file = None
 
 
 class Memory:
@@ -106,6 +172,7 @@ class Memory:
         self._passing: OrderedDict[Source, Tensor] = OrderedDict()
         self._passing_bytes = 0
         self._pending: dict[Source, Future[Tensor]] = {}
+        self._spool: Spool | None = None
         self._lock = Lock()
 
     @property
@@ -139,6 +206,16 @@ class Memory:
             future = self._pending[source] = Future()
         reading_threads().submit(self._read, source, future)
 
+    @contextmanager
+    def spooled(self, folder: Path) -> Iterator[None]:
+        """As long as the context lasts, what has no room and was costly to read is kept on disk in a folder."""
+        self._spool = spool = Spool(folder)
+        try:
+            yield
+        finally:
+            self._spool = None
+            spool.close()
+
     def _found(self, source: Source) -> Tensor | None:
         if source in self._resident:
             return self._resident[source]
@@ -148,8 +225,12 @@ class Memory:
         return None
 
     def _read(self, source: Source, future: Future[Tensor]) -> None:
+        spool = self._spool
         try:
-            pixels = source.read()
+            stored = None if spool is None else spool.get(source)
+            begun = time.thread_time()
+            pixels = source.read() if stored is None else stored
+            is_costly = stored is None and time.thread_time() - begun > pixels.nbytes / DISK_RATE
         except BaseException as error:  # noqa: BLE001 - Raised where the pixels are asked for.
             with self._lock:
                 del self._pending[source]
@@ -157,20 +238,24 @@ class Memory:
             return
         with self._lock:
             del self._pending[source]
-            self._keep(source, pixels)
+            stays = self._keep(source, pixels)
         future.set_result(pixels)
+        if spool is not None and is_costly and not stays:
+            spool.put(source, pixels)
 
-    def _keep(self, source: Source, pixels: Tensor) -> None:
+    def _keep(self, source: Source, pixels: Tensor) -> bool:
+        """Keep pixels, and return whether they stay."""
         size = pixels.numel() * pixels.element_size()
         if size <= self._room:
             self._room -= size
             self._resident[source] = pixels
-            return
+            return True
         self._passing[source] = pixels
         self._passing_bytes += size
         while self._passing_bytes > self._passing_room and len(self._passing) > 1:
             _, oldest = self._passing.popitem(last=False)
             self._passing_bytes -= oldest.numel() * oldest.element_size()
+        return False
 
 
 @cache

@@ -229,7 +229,7 @@ def describe(dataset: Dataset, console: Console) -> None:
         f"{len(dataset.points.positions)} points, {counted(annotated, 'annotated view')} with "
         f"{counted(len(dataset.pane_labels), 'pane')}{given}",
     )
-    needed, room = dataset.photograph_bytes, dataset.train[0].memory.budget
+    needed, room = dataset.photograph_bytes, dataset.memory.budget
     if needed > room:
         say(
             console,

@@ -159,7 +159,8 @@ class Run:
         """Trains along, and writes nothing."""
         self.state = self._ranks.shared(self.state, self._settings.device)
         self._session = TrainingSession(self.state, self._ranks)
-        yield from self._session.trained(self._stages, self._dataset, self._settings.iterations)
+        with self._dataset.memory.spooled(self._directory.path):
+            yield from self._session.trained(self._stages, self._dataset, self._settings.iterations)
 
     def _leading(self) -> Generator[Message, None, None]:
         directory, settings = self._directory, self._settings
@@ -180,7 +181,8 @@ class Run:
             with run_directory.open_log(directory.log, self.state.step) as log:
                 self._session = TrainingSession(self.state, self._ranks, Record(directory.checkpoint, log, self._every))
                 yield from self._session.told(RunBegun(self.state.step, settings.iterations, anew))
-                yield from self._session.trained(self._stages, self._dataset, settings.iterations)
+                with self._dataset.memory.spooled(directory.path):
+                    yield from self._session.trained(self._stages, self._dataset, settings.iterations)
             self._export()
 
     @property

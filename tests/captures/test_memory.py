@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import math
+import os
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +13,7 @@ from threading import Event, Thread
 import pytest
 import torch
 
+from glassplat.captures import view as view_module
 from glassplat.captures.dataset import load_dataset
 from glassplat.captures.view import MOST_AHEAD, Memory, Source, default_budget, machine_memory
 from glassplat.errors import InputError
@@ -68,6 +71,76 @@ def test_a_step_reads_what_it_needs_also_where_there_is_no_room() -> None:
     assert Memory(math.inf).ahead == MOST_AHEAD
 
 
+def numbers(memory: Memory, files: Files) -> list[int]:
+    return [int(memory.get(source)[0, 0]) for source in files.sources]
+
+
+class Failing(io.BytesIO):
+    """A file on a disk that has failed."""
+
+    def readinto(self, buffer) -> int:
+        raise OSError("input/output error")
+
+
+@pytest.fixture
+def slow_files(monkeypatch: pytest.MonkeyPatch) -> Files:
+    """Files that cost more to read than a disk does, and more of them than `Memory(1)` holds."""
+    monkeypatch.setattr(view_module, "DISK_RATE", math.inf)
+    return Files(20)
+
+
+def test_what_was_costly_and_has_no_room_is_read_once_and_then_from_disk(slow_files: Files, tmp_path: Path) -> None:
+    memory = Memory(1, largest=SIZE)
+    with memory.spooled(tmp_path):
+        for _ in range(3):
+            assert numbers(memory, slow_files) == list(range(20))
+        assert not list(tmp_path.iterdir()) or os.name == "nt"
+    assert set(slow_files.times.values()) == {1}
+    assert numbers(memory, slow_files) == list(range(20))
+    assert set(slow_files.times.values()) == {2}
+    assert not list(tmp_path.iterdir())
+
+
+def test_masks_come_back_from_disk_as_they_were(slow_files: Files, tmp_path: Path) -> None:
+    memory, mask = Memory(1, largest=SIZE), Source(lambda: torch.arange(SIZE) % 3, is_mask=True)
+    with memory.spooled(tmp_path):
+        first = memory.get(mask)
+        numbers(memory, slow_files)
+        assert torch.equal(memory.get(mask), first)
+        assert memory.get(mask).dtype == torch.bool
+
+
+def test_what_is_cheap_to_read_does_not_go_to_the_disk(
+    slow_files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(view_module, "DISK_RATE", 1e-9)
+    memory = Memory(1, largest=SIZE)
+    with memory.spooled(tmp_path):
+        for _ in range(2):
+            numbers(memory, slow_files)
+    assert set(slow_files.times.values()) == {2}
+
+
+@pytest.mark.parametrize("what", ["full", "gone", "breaks", "cut off"])
+def test_a_disk_without_room_or_with_errors_costs_time_only(
+    what: str, slow_files: Files, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory, folder = Memory(1, largest=SIZE), tmp_path
+    if what == "full":
+        monkeypatch.setattr(view_module, "DISK_RESERVE", math.inf)
+    if what == "gone":
+        folder = tmp_path / "nowhere"
+    with memory.spooled(folder):
+        assert numbers(memory, slow_files) == list(range(20))
+        if what == "breaks":
+            memory._spool._file.close()
+            memory._spool._file = Failing()
+        if what == "cut off":
+            memory._spool._file.truncate(WHOLE // 2)
+        assert numbers(memory, slow_files) == list(range(20))
+    assert set(slow_files.times.values()) == {2}
+
+
 def test_reading_ahead_saves_the_wait_and_two_who_ask_read_once() -> None:
     files, memory, gate = Files(1), Memory(math.inf), Event()
     slow = Source(lambda: gate.wait(30) and torch.zeros(1))
@@ -116,18 +189,22 @@ def test_a_container_may_take_less_than_the_machine_has(monkeypatch: pytest.Monk
     assert machine_memory() == 1e6
 
 
-def trained_scene(root: Path, memory: float | None) -> Scene:
+def trained_scene(root: Path, memory: float | None, folder: Path) -> Scene:
     dataset = load_dataset(root, memory=memory)
     recipe = SplatRecipe(sh_degree=0)
     state = TrainState(recipe.initialise(dataset), seed=0)
-    names = [m.view for m in train(recipe.stages(0), dataset, state, 20) if isinstance(m, StepDone)]
+    with dataset.memory.spooled(folder):
+        names = [m.view for m in train(recipe.stages(0), dataset, state, 20) if isinstance(m, StepDone)]
     assert len(names) == 20
     assert dataset.train[0].memory.is_full == (memory is not None)
     return state.scene
 
 
-def test_a_capture_that_does_not_fit_trains_to_the_same_bits(capture) -> None:
+def test_a_capture_that_does_not_fit_trains_to_the_same_bits(
+    capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(view_module, "DISK_RATE", math.inf)
     capture.write_colmap()
-    roomy, tight = (trained_scene(capture.root, memory) for memory in (None, 1e-6))
+    roomy, tight = (trained_scene(capture.root, memory, tmp_path) for memory in (None, 1e-6))
     for name, tensor in roomy.parameters().items():
         assert torch.equal(tensor, tight.parameters()[name]), name
