@@ -1,6 +1,7 @@
 """Memory of a training whose photographs do not fit, and what it loses by reading them again.
 
     python -m benchmarks.photographs PHOTOS --count 3000 --memory 3 --seconds 240
+    python -m benchmarks.photographs PHOTOS --count 300 --memory 0.1 --downscale 2 --distortion 0.05 --seconds 240
 
 It repeats the photographs of a folder, by links in a temporary one, from places on a circle; what is learned from them
 means nothing. The first half of the time, in which memory fills, is left out of the shares.
@@ -55,7 +56,7 @@ def resident_gigabytes() -> float:
     return pages * resource.getpagesize() / 1e9
 
 
-def write_capture(photographs: list[Path], count: int, folder: Path) -> None:
+def write_capture(photographs: list[Path], count: int, distortion: float, folder: Path) -> None:
     """A capture of so many photographs, which look at the middle of a circle."""
     (folder / "images").mkdir()
     frames = []
@@ -68,13 +69,13 @@ def write_capture(photographs: list[Path], count: int, folder: Path) -> None:
         pose[:3, :3], pose[:3, 3] = turn, turn @ (0, 0, 4)
         frames.append({"file_path": name, "transform_matrix": pose.tolist()})
     width, height = Image.open(photographs[0]).size
-    lens = {"fl_x": width, "fl_y": width, "cx": width / 2, "cy": height / 2, "w": width, "h": height}
+    lens = {"fl_x": width, "fl_y": width, "cx": width / 2, "cy": height / 2, "w": width, "h": height, "k1": distortion}
     (folder / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
 
 
-def measure(folder: Path, memory: float, seconds: float) -> None:
+def measure(folder: Path, memory: float, downscale: float, seconds: float) -> None:
     """Trains for a while and prints a line ten times, and the shares at the end."""
-    dataset = load_dataset(folder)
+    dataset = load_dataset(folder, downscale=downscale)
     camera = dataset.train[0].camera
     known = Waited(memory * 1e9, largest=camera.width * camera.height)
     train_views, test_views = (tuple(replace(v, memory=known) for v in vs) for vs in (dataset.train, dataset.test))
@@ -85,7 +86,7 @@ def measure(folder: Path, memory: float, seconds: float) -> None:
     state = TrainState(recipe.initialise(dataset), seed=0)
     begun, told = time.perf_counter(), 0
     first: tuple[int, float, float, float] | None = None
-    with photographs_read(dataset) as check:
+    with known.spooled(folder), photographs_read(dataset) as check:
         for message in train(recipe.stages(0), dataset, state, 1_000_000):
             check()
             if not isinstance(message, StepDone):
@@ -117,12 +118,14 @@ def main() -> None:
     parser.add_argument("photographs", type=Path, help="folder of photographs of one size, or of such folders")
     parser.add_argument("--count", type=int, default=3000, help="photographs of the capture")
     parser.add_argument("--memory", type=float, default=3.0, help="gigabytes of photographs that may stay in memory")
+    parser.add_argument("--downscale", type=float, default=1.0, help="factor by which photographs are reduced")
+    parser.add_argument("--distortion", type=float, default=0.0, help="of the lens, which is undone: k1")
     parser.add_argument("--seconds", type=float, default=240.0, help="length of the training")
     arguments = parser.parse_args()
     found = sorted(path for path in arguments.photographs.rglob("*") if path.suffix.lower() in (".jpg", ".png"))
     with tempfile.TemporaryDirectory() as folder:
-        write_capture(found, arguments.count, Path(folder))
-        measure(Path(folder), arguments.memory, arguments.seconds)
+        write_capture(found, arguments.count, arguments.distortion, Path(folder))
+        measure(Path(folder), arguments.memory, arguments.downscale, arguments.seconds)
 
 
 if __name__ == "__main__":

@@ -115,7 +115,7 @@ class Spool:
                 if shutil.disk_usage(self._folder).free < values.nbytes + DISK_RESERVE:
                     self._is_full = True
                     return
-                self._file = self._file or tempfile.TemporaryFile(dir=self._folder)
+                self._file = self._file or tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115
                 place = self._file.seek(0, os.SEEK_END)
                 self._file.write(values.tobytes())
                 self._file.flush()

@@ -77,14 +77,14 @@ def ended(process: subprocess.Popen[str]) -> str:
     return text
 
 
-def started_apart(arguments: list[str], of_rank_1: list[str]) -> list[subprocess.CompletedProcess[str]]:
+def start_apart(arguments: list[str], of_rank_1: list[str]) -> list[subprocess.Popen[str]]:
     """Two ranks as two machines would start them, the second one with further arguments."""
     with socket.socket() as found:
         found.bind(("localhost", 0))
         port = str(found.getsockname()[1])
     where = {"MASTER_ADDR": "localhost", "MASTER_PORT": port, "WORLD_SIZE": "2", "TORCHELASTIC_RUN_ID": "test"}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    processes = [
+    return [
         subprocess.Popen(
             [sys.executable, "-m", *arguments, *more],
             cwd=ROOT,
@@ -93,6 +93,11 @@ def started_apart(arguments: list[str], of_rank_1: list[str]) -> list[subprocess
         )
         for rank, more in enumerate(([], of_rank_1))
     ]
+
+
+def started_apart(arguments: list[str], of_rank_1: list[str]) -> list[subprocess.CompletedProcess[str]]:
+    """The same, once both have ended."""
+    processes = start_apart(arguments, of_rank_1)
     spoken = [process.communicate(timeout=LONGEST) for process in processes]
     return [subprocess.CompletedProcess(p.args, p.returncode, *said) for p, said in zip(processes, spoken, strict=True)]
 
@@ -213,6 +218,24 @@ def test_the_death_of_a_rank_ends_the_others_with_one_message(rank: int, capture
     assert process.returncode == 1
     ours = [line for line in text.splitlines() if line.startswith(("stopped:", "error:"))]
     assert len(ours) == (0 if rank == 0 else 1), text  # Of rank 0 `torchrun` tells.
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.safetensors").step > 0
+
+
+def test_a_rank_that_falls_silent_is_given_up_and_what_was_trained_is_saved(capture: Path, tmp_path: Path) -> None:
+    arguments = train_arguments(capture, tmp_path / "run", "--checkpoint-every", "0.01", iterations=100_000)
+    first, silent = start_apart(["tests.training.impatient_rank", *arguments[1:]], [])
+    try:
+        wait_for(tmp_path / "run" / "checkpoint.safetensors", first)
+        silent.send_signal(signal.SIGSTOP)
+        _, text = first.communicate(timeout=LONGEST)
+    finally:
+        first.kill()
+        silent.kill()
+        silent.communicate()
+    assert first.returncode == 1
+    ours = [line for line in text.splitlines() if line.startswith(("stopped:", "error:"))]
+    assert len(ours) == 1, text
+    assert "does not answer" in ours[0]
     assert load_checkpoint(tmp_path / "run" / "checkpoint.safetensors").step > 0
 
 
