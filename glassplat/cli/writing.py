@@ -29,7 +29,7 @@ from glassplat.model.model import CAMERAS, ENVIRONMENT, GLASS, PLANES, Model, sa
 from glassplat.prepare.photographs import Progress as Step
 from glassplat.publish.camera_paths import interpolated, keyframes_of, widened
 from glassplat.publish.film import side_by_side, wiped, write_film
-from glassplat.publish.web_page import PREVIEW, Sharing, write_preview
+from glassplat.publish.web_page import MOST_GAUSSIANS, PREVIEW, Sharing, fits, write_preview
 from glassplat.render.frame import check_layers
 from glassplat.render.layers import layer_image
 from glassplat.render.planar import Planar, dereflected_photo
@@ -220,6 +220,10 @@ def _write_page(command: Export, model: Model, console: Console) -> None:
     if model.renderer.page_settings() is None:
         warn(console, f"no page was written: it does not show {model.recipe.method} runs of this kind")
         return
+    if not fits(model.scene):
+        warn(
+            console, f"a page holds {MOST_GAUSSIANS:,} Gaussians: this one shows those that cover most of a photograph"
+        )
     save_page(model, path, command.title or model.name, sharing=Sharing(command.credit, command.url))
     if command.url is not None:
         write_preview(command.output / PREVIEW, model.scene, model.renderer, tuple(model.cameras.items()))

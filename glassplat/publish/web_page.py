@@ -28,6 +28,7 @@ from glassplat.files.spz import FLIP, spz_bytes
 from glassplat.files.writing import atomic_write
 from glassplat.kernels.environment import cube_lookup
 from glassplat.render.frame import NEAR_PER_EXTENT, Renderer
+from glassplat.render.layers import contributions
 from glassplat.render.panes import glass_owners, nearest_hits, panes_in_camera
 from glassplat.render.traced import traced_colors
 from glassplat.scene.camera import Camera
@@ -163,6 +164,10 @@ CUBE_SIZE = 128
 MOST_VIEWS = 400
 MOST_PANES = 16
 """The page orders the panes of every pixel by hand."""
+MOST_GAUSSIANS = 1_000_000
+"""76 MB to load. Textures of 4096 rows, which every device has, hold 1.4 million of SH degree 3."""
+RANKING_VIEWS, RANKING_WIDTH = 64, 480
+"""Views by which Gaussians are ranked, and their width in pixels."""
 POSTER_WIDTH, POSTER_QUALITY = 640, 70
 LEAST_OPACITY = 1 / 255
 DESCRIPTION = "Look around, take the reflections off the glass, or turn it into a mirror."
@@ -262,13 +267,16 @@ def page_text(
         )
     poster_view = best_view(scene.planes, [camera for _, camera in cameras])
     poster = jpeg(renderer(scene, poster_camera(cameras[poster_view][1])).rgb)
-    scene = replace(scene, primary=drawn(scene.primary), glass=drawn(scene.glass)).to("cpu")
+    scene = replace(scene, primary=drawn(scene.primary), glass=drawn(scene.glass))
+    drawable = len(scene.primary)
+    scene = fitting(scene, [camera for _, camera in cameras]).to("cpu")
     mirrored = settings.get("mirrored")
     cube = b"" if mirrored is None else cube_bytes(scene, settings)
     channel, channel_range = channel_bytes(scene) if mirrored is None else (strength_bytes(scene), [0.0, 0.0])
     description = described(scene, settings, cameras, poster_view)
     count = len(scene.planes)
-    subtitle = f"{len(scene.primary):,} Gaussians" + (f" · {count} pane{'s' if count > 1 else ''}" if count else "")
+    kept = f"{len(scene.primary):,}" + (f" of {drawable:,}" if len(scene.primary) < drawable else "")
+    subtitle = f"{kept} Gaussians" + (f" · {count} pane{'s' if count > 1 else ''}" if count else "")
     # Glass has no colour; a constant one makes an SPZ file of it.
     glass = replace(scene.glass, sh=torch.zeros(len(scene.glass), 1, 3), channels={}, active_sh_degree=0)
     return filled(
@@ -330,6 +338,26 @@ def in_base64(data: bytes) -> str:
 def drawn(gaussians: Gaussians) -> Gaussians:
     """Those that can be seen at all."""
     return gaussians.select(torch.sigmoid(gaussians.logit_opacities) > LEAST_OPACITY)
+
+
+def fits(scene: Scene) -> bool:
+    """Return whether a page can show all Gaussians that can be seen."""
+    return len(drawn(scene.primary)) + len(drawn(scene.glass)) <= MOST_GAUSSIANS
+
+
+def fitting(scene: Scene, cameras: Sequence[Camera]) -> Scene:
+    """The scene with as many primary Gaussians as a page can show: those that cover most of some photograph."""
+    room = max(MOST_GAUSSIANS - len(scene.glass), 0)
+    if len(scene.primary) <= room:
+        return scene
+    most = scene.primary.means.new_zeros(len(scene.primary))
+    for camera in cameras[:: -(-len(cameras) // RANKING_VIEWS)]:
+        width = min(camera.width, RANKING_WIDTH)
+        small = camera.resized(width, max(round(width * camera.height / camera.width), 1))
+        most = torch.maximum(most, contributions(scene, small))
+    kept = torch.zeros(len(scene.primary), dtype=torch.bool, device=most.device)
+    kept[torch.topk(most, room).indices] = True
+    return replace(scene, primary=scene.primary.select(kept))
 
 
 def poster_camera(camera: Camera) -> Camera:

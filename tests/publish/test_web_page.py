@@ -13,7 +13,19 @@ import torch
 from PIL import Image
 
 from glassplat.evaluate.metrics import psnr
-from glassplat.publish.web_page import SCRIPTS, SHADERS, Sharing, asset, filled, page_text, write_page, write_preview
+from glassplat.publish import web_page
+from glassplat.publish.web_page import (
+    SCRIPTS,
+    SHADERS,
+    Sharing,
+    asset,
+    filled,
+    fits,
+    fitting,
+    page_text,
+    write_page,
+    write_preview,
+)
 from glassplat.render.deferred import Deferred
 from glassplat.render.frame import Renderer
 from glassplat.render.layers import layer_image
@@ -25,7 +37,7 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Environment, Scene, as_mirrors, without_glass
 from tests.browser_needed import needs_browser
 from tests.render.test_deferred import glossy as glossy_scene
-from tests.render.tiny_scene import camera_at, in_single_precision, joined, pane, showcase
+from tests.render.tiny_scene import camera_at, concatenated, in_single_precision, joined, pane, showcase
 from tests.training.tiny_capture import tiny_capture, true_scene
 from tools.browser import Browser
 from tools.page_likeness import picture, pixels_of
@@ -369,6 +381,21 @@ def test_names_cannot_end_the_script() -> None:
     assert "</script><b>" not in page and "</title><script>" not in page
     assert "\\u003c/script>\\u003cb>{{title}}" in page
     assert filled("a{{x}}b", {"x": "{{x}}"}) == "a{{x}}b"
+
+
+def test_a_page_keeps_what_photographs_show_of_more_gaussians_than_it_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, cameras = true_scene(), [camera for _, camera in CAMERAS]
+    faint = scene.primary.with_tensors({"logit_opacities": torch.full_like(scene.primary.logit_opacities, -5)})
+    crowded = replace(scene, primary=concatenated(faint, scene.primary))
+    assert fits(crowded) and fitting(crowded, cameras) is crowded
+    monkeypatch.setattr(web_page, "MOST_GAUSSIANS", len(scene.primary) + len(scene.glass))
+    assert not fits(crowded)
+    kept, count = fitting(crowded, cameras), len(scene.primary)
+    assert len(kept.primary) == count
+    for camera in cameras:
+        assert psnr(Planar()(kept, camera).rgb, Planar()(crowded, camera).rgb) > 40
+    assert f"{count:,} of {2 * count:,} Gaussians" in page_text(crowded, Planar(), CAMERAS, "title")
+    assert f"{count:,} Gaussians" in page_text(scene, Planar(), CAMERAS, "title")
 
 
 @pytest.mark.parametrize("broken", ["cameras", "values"])
