@@ -25,13 +25,17 @@ from glassplat.training.options import Rate
 Moments = dict[str, tuple[Tensor, Tensor]]
 
 
+BETAS = (0.9, 0.999)
+"""Of Adam, for steps of one view."""
+
+
 @dataclass
 class Optimizer:
     """Adam's state, keyed by the dotted parameter names of `Scene.parameters`.
 
     Attributes:
         moments: first and second moment of each parameter.
-        updates: how often each parameter was stepped, for the bias correction.
+        updates: by how many views each parameter was stepped, for the bias correction.
         paused: for how many more views a parameter is left as it is.
         hurried: by what the rate of a parameter is multiplied from now on; 1 where nothing is said.
     """
@@ -51,20 +55,21 @@ class Optimizer:
     ) -> None:
         """Updates `parameters` in place for every name in `gradients`, which are means over so many views.
 
-        The rates are those of a step of one view. They grow by the root of the number of views: as far as so many steps
-        would lead whose gradients agree on nothing.
+        Rates are those of a step of one view. They grow by the root of the number of views, and moments remember as
+        many views as ever: so a step leads as far as so many steps would whose gradients agree on nothing (Malladi et
+        al. 2022, "On the SDEs and Scaling Rules for Adaptive Gradient Algorithms").
         """
         learning = [name for name in gradients if parameters[name].numel() > 0 and not self._waits(name, views)]
-        adam(
-            [self._update(name, parameters[name], gradients[name], rates[name], math.sqrt(views)) for name in learning]
-        )
+        updates = [self._update(name, parameters[name], gradients[name], rates[name], views) for name in learning]
+        adam(updates, betas=(BETAS[0] ** views, BETAS[1] ** views))
 
-    def _update(self, name: str, parameter: Tensor, gradient: Tensor, rate: float | Tensor, factor: float) -> Update:
-        """The next step of a parameter, at so many times its rate; counts it."""
+    def _update(self, name: str, parameter: Tensor, gradient: Tensor, rate: float | Tensor, views: int) -> Update:
+        """The next step of a parameter, which so many views have asked for; counts them."""
         moments = self.moments_of(name, parameter)
-        self.updates[name] = self.updates.get(name, 0) + 1
-        factor *= self.hurried.get(name, 1.0)
-        return Update(parameter, gradient, *moments, lr=rate if factor == 1 else rate * factor, step=self.updates[name])
+        self.updates[name] = self.updates.get(name, 0) + views
+        factor = math.sqrt(views) * self.hurried.get(name, 1.0)
+        lr = rate if factor == 1 else rate * factor
+        return Update(parameter, gradient, *moments, lr=lr, step=self.updates[name] / views)
 
     def _waits(self, name: str, views: int) -> bool:
         """Return whether a parameter is paused; counts the views of the step."""

@@ -170,6 +170,23 @@ def test_learning_rates_grow_by_the_root_of_the_views_and_pauses_count_views() -
     assert torch.allclose(moved[1], 2 * moved[0])
 
 
+def test_moments_remember_as_many_views_whatever_the_batch() -> None:
+    """Four views of one gradient, then none: together or one by one, or as many machines change from run to run."""
+    moments = []
+    for batches in ((1, 1, 1, 1, 1, 1), (4, 2), (2, 1, 1, 2)):
+        parameters, optimizer = {"a": torch.zeros(3, dtype=torch.float64)}, Optimizer()
+        views = 0
+        for count in batches:
+            gradient = torch.full((3,), float(views < 4), dtype=torch.float64)
+            optimizer.step(parameters, {"a": gradient}, {"a": 0.1}, views=count)
+            views += count
+        assert optimizer.updates == {"a": 6}
+        moments.append(optimizer.moments["a"])
+    for first, second in moments[1:]:
+        assert torch.allclose(first, moments[0][0])
+        assert torch.allclose(second, moments[0][1])
+
+
 def test_noise_grows_as_the_rate_that_it_follows() -> None:
     *_, explore, _ = stages_of("mcmc")[0].post_steps
     moved = []

@@ -23,7 +23,8 @@ class Update(NamedTuple):
         second_moment: running mean of the squared gradient, as `parameter`, contiguous; changed in place.
         lr: learning rate, or one for each element of a row of the parameter, [columns] with columns the product of
             all dimensions after the first.
-        step: number of this step, from 1; the bias correction depends on it.
+        step: number of this step, from 1; the bias correction depends on it. A fraction where steps before it had other
+            betas.
     """
 
     parameter: Tensor
@@ -31,7 +32,7 @@ class Update(NamedTuple):
     first_moment: Tensor
     second_moment: Tensor
     lr: float | Tensor
-    step: int
+    step: float
 
     def corrections(self, betas: tuple[float, float]) -> tuple[float, float]:
         """The factors on the step size and on the root of the second moment that undo the bias towards zero."""
