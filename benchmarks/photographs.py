@@ -25,7 +25,7 @@ from PIL import Image
 from torch import Tensor
 
 from glassplat.captures.dataset import load_dataset, photographs_read
-from glassplat.captures.view import Memory, PointCloud, Source
+from glassplat.captures.view import Memory, PointCloud, Source, Spool, View
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.training.loop import train
 from glassplat.training.messages import StepDone
@@ -73,6 +73,21 @@ def write_capture(photographs: list[Path], count: int, distortion: float, folder
     (folder / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
 
 
+def read_seconds(views: tuple[View, ...], folder: Path) -> tuple[float, float]:
+    """Seconds of a core for a photograph: from its file, and from where undistorted and reduced ones are kept."""
+    spool, begun = Spool(folder), time.thread_time()
+    pixels = [(Source(view.read_photo), view.read_photo()) for view in views]
+    read = time.thread_time()
+    for source, photo in pixels:
+        spool.put(source, photo)
+    put = time.thread_time()
+    for source, _ in pixels:
+        spool.get(source)
+    again = time.thread_time() - put
+    spool.close()
+    return (read - begun) / len(views), again / len(views)
+
+
 def measure(folder: Path, memory: float, downscale: float, seconds: float) -> None:
     """Trains for a while and prints a line ten times, and the shares at the end."""
     dataset = load_dataset(folder, downscale=downscale)
@@ -104,11 +119,12 @@ def measure(folder: Path, memory: float, downscale: float, seconds: float) -> No
     steps, wall = message.step - step, passed - since
     share = (known.seconds - waited) / wall
     print(f"{wall / steps * 1e3:.0f} ms a step, {100 * share:.2f} % of it waiting for photographs")
-    computed, begun = time.thread_time() - computed, time.thread_time()
-    for view in dataset.train[:READ]:
-        view.read_photo()
-    reading = (time.thread_time() - begun) / READ
-    print(f"a core takes {computed / steps * 1e3:.0f} ms for a step, {reading * 1e3:.0f} ms to read a photograph")
+    computed = time.thread_time() - computed
+    reading, again = read_seconds(dataset.train[:READ], folder)
+    print(
+        f"a core takes {computed / steps * 1e3:.0f} ms for a step, {reading * 1e3:.0f} ms to read a photograph, "
+        f"{again * 1e3:.1f} ms to read it again once it is undistorted and reduced"
+    )
     print(f"at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")
 
 
