@@ -92,11 +92,11 @@ def in_turn(works: Mapping[str, Work], rounds: int) -> dict[str, list[float]]:
 def own_works(case: Case) -> dict[str, Work]:
     """Both passes without colours and with those of degree 3, and the hierarchy built and fitted again."""
     options: dict[str, Any] = {"flat": True, "near": 0.0}
-    colored = cpu.trace(case.shapes, case.rays, case.bvh, degree=3, **options)
+    colored = cpu.trace(case.shapes, case.rays, case.bvh, degree=3, learning=True, **options)
     cotangents = [torch.ones_like(output) for output in colored[:3]]
     return {
-        "trace": lambda: cpu.trace(case.shapes, case.rays, case.bvh, degree=-1, **options),
-        "colored": lambda: cpu.trace(case.shapes, case.rays, case.bvh, degree=3, **options),
+        "trace": lambda: cpu.trace(case.shapes, case.rays, case.bvh, degree=-1, learning=False, **options),
+        "colored": lambda: cpu.trace(case.shapes, case.rays, case.bvh, degree=3, learning=True, **options),
         "backward": lambda: cpu.trace_gradients(
             case.shapes, case.rays, case.bvh, colored, cotangents, degree=3, **options
         ),

@@ -212,6 +212,7 @@ class Surface:
     """The blended surfaces of one view (EnvGS, Eq. 3).
 
     Attributes:
+        image: [H, W, D] blended channels, as `shade_environment` reads them.
         base: [H, W, 3] colour without reflection, over the background.
         normal: [H, W, 3] blended normal, world axes, turned to the camera, not normalised.
         strength: [H, W] share of the reflection.
@@ -222,6 +223,7 @@ class Surface:
         extra: further layers, of discs those that say how thin the surface is.
     """
 
+    image: Tensor
     base: Tensor
     normal: Tensor
     strength: Tensor
@@ -264,6 +266,7 @@ def _seen_ellipsoids(
     result = composite(splats, channels[None], bins, probe=joined_probe(screen))
     image, alpha = result.image[0], result.alpha[0]
     return Surface(
+        image=image,
         base=over_background(image[..., :NORMAL_AT], alpha, background),
         normal=image[..., NORMAL_AT:STRENGTH_AT],
         strength=image[..., STRENGTH_AT],
@@ -300,6 +303,7 @@ def _seen_discs(
     image, extra = blended.image[0], disc_layers(blended, scene.extent)
     alpha, depth = extra.pop("alpha"), extra.pop("depth")
     return Surface(
+        image=image,
         base=over_background(image[..., :NORMAL_AT], alpha, background),
         normal=image[..., NORMAL_AT:STRENGTH_AT],
         strength=image[..., STRENGTH_AT],
@@ -311,12 +315,15 @@ def _seen_discs(
     )
 
 
-def reflected_rays(surface: Surface, camera: Camera, chosen: Tensor) -> tuple[Tensor, Tensor]:
-    """Places [R, 3] of the surface at the chosen pixels [H, W], and unit directions [R, 3] mirrored there (Eq. 4).
+def reflected_rays(surface: Surface, camera: Camera, chosen: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    """Places [R, 3] of the surface at pixels (rows and columns [R]), and unit vectors [R, 3] mirrored there (Eq. 4).
 
     Blended positions need no channels: with d the ray of a pixel whose camera z is 1, x = o + D d, D the blended depth.
     """
-    d = view_directions(camera)[chosen]
+    rotation = camera.cam_from_world[:3, :3]
+    (rows, columns), (fx, fy, cx, cy) = (index.to(rotation) + 0.5 for index in chosen), camera.intrinsics.to(rotation)
+    x, y = (columns - cx) / fx, (rows - cy) / fy
+    d = torch.stack([x, y, torch.ones_like(x)], dim=-1) @ rotation
     places = camera.center + surface.depth[chosen][:, None] * d
     normal = surface.normal[chosen]
     normal = normal / normal.norm(dim=-1, keepdim=True).clamp(min=NORMAL_MIN)

@@ -47,18 +47,15 @@ class ScreenPass:
 
 @dataclass(frozen=True)
 class SpacePass:
-    """Distances at which rays met the Gaussians of one scene part, where there is no screen.
-
-    The gradient of a loss with respect to their centres, times half of that distance, is what on a screen would be the
-    gradient in normalised device coordinates (EnvGS, Section 5.1).
+    """What densification reads of one scene part whose Gaussians rays meet in space, where there is no screen.
 
     Attributes:
         part: name of the scene part, as in `Scene.gaussian_sets`.
-        distances: [N] at which rays met them, world units; means by how much they added to each ray.
+        probe: [N, 2] that `trace` got; its gradient tells how far away Gaussians were met.
     """
 
     part: str
-    distances: Tensor
+    probe: Tensor
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,10 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from glassplat.kernels.environment import cube_lookup
-from glassplat.kernels.records import FLAT, RawGaussians, Rays
+from glassplat.kernels.environment import cube_lookup, shade_environment
+from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, RawGaussians, Rays, Shaded
 from glassplat.kernels.records import Traced as Found
-from glassplat.kernels.trace import build_bvh, shapes_of, trace
+from glassplat.kernels.trace import trace
 from glassplat.render.deferred import (
     INVISIBLE,
     Surface,
@@ -39,11 +38,6 @@ from glassplat.scene.scene import Scene
 START_PER_EXTENT = 0.005
 """Distance from a surface, as a share of the scene extent, before which a reflected ray meets nothing: the surroundings
 hold the surface too."""
-EVERY_RAY = 4
-"""Of so many rays one tells densification how far away things are."""
-SH_ONE = math.sqrt(3 / (4 * math.pi))
-"""Normalisation of the harmonics of degree 1."""
-WEIGHT_MIN = 1e-12
 
 
 @dataclass(frozen=True)
@@ -88,7 +82,8 @@ class Traced:
         check_mirrored(scene)
         camera = camera.to(scene.primary.means.device)
         surface = seen_surface(scene, camera, background=self.background, probed=probed)
-        rgb, reflection, rays = self._shaded(scene, camera, surface)
+        space = space_passes(scene) if probed else ()
+        rgb, reflection = self._shaded(scene, camera, surface, space)
         layers = surface.layers() | {"reflection": reflection}
         if self.surroundings:
             layers["surroundings"] = self.behind(scene, camera)
@@ -97,30 +92,43 @@ class Traced:
             layers=layers,
             direct=surface.direct,
             screen=surface.screen,
-            space=(space_pass(scene, rays),) if probed and len(scene.surroundings) else (),
+            space=space,
         )
 
-    def _shaded(self, scene: Scene, camera: Camera, surface: Surface) -> tuple[Tensor, Tensor, Rays]:
-        """The image and what it mirrors, [H, W, 3] each, and the rays along which things near are met (Eq. 5)."""
-        chosen = self._mirrors_near(scene, surface)
+    def _shaded(
+        self, scene: Scene, camera: Camera, surface: Surface, space: Sequence[SpacePass]
+    ) -> tuple[Tensor, Tensor]:
+        """The image and what it mirrors, [H, W, 3] each (Eq. 5)."""
+        rgb, base, reflection = self._distant(scene, camera, surface)
+        if not len(scene.surroundings):
+            return rgb, reflection
+        chosen = torch.where((surface.strength > self.least_strength) & (surface.depth > 0))
         places, directions = reflected_rays(surface, camera, chosen)
         if not self.joint:
             places, directions = places.detach(), directions.detach()
-        if len(scene.surroundings):
-            near = START_PER_EXTENT * scene.extent
-            colors = traced_colors(scene, places, directions, near, self.background)
-        else:
-            colors = places
-        reflection, mirrors = self._elsewhere(scene, camera, surface, chosen)
-        reflection = reflection.index_put(torch.where(chosen), colors)
-        strength = surface.strength[..., None]
-        share = torch.where(mirrors[..., None], strength, 0)
-        return (1 - share) * surface.base + share * reflection, reflection, Rays(places, directions)
+        near, probe = START_PER_EXTENT * scene.extent, next((record.probe for record in space), None)
+        colors = traced_colors(scene, places, directions, near, self.background, probe)
+        strength = surface.strength[chosen][:, None]
+        mixed = (1 - strength) * base[chosen] + strength * colors
+        return rgb.index_put(chosen, mixed), reflection.index_put(chosen, colors)
 
-    def _mirrors_near(self, scene: Scene, surface: Surface) -> Tensor:
-        """[H, W] bool: where rays are traced."""
-        chosen = (surface.strength > self.least_strength) & (surface.depth > 0)
-        return chosen if len(scene.surroundings) else torch.zeros_like(chosen)
+    def _distant(self, scene: Scene, camera: Camera, surface: Surface) -> Shaded:
+        """The image as if the environment were all that is mirrored; without one nothing is."""
+        image = surface.image
+        if scene.environment.is_empty:
+            return Shaded(surface.base, surface.base, torch.zeros_like(surface.base))
+        if not self.joint:
+            color, normal, rest = image.tensor_split((NORMAL_AT, STRENGTH_AT), dim=2)
+            image = torch.cat([color, normal.detach(), rest], dim=2)
+        return shade_environment(
+            image,
+            surface.alpha,
+            scene.environment.raw,
+            camera.intrinsics,
+            camera.cam_from_world[:3, :3].T.contiguous(),
+            background=self.background,
+            least_strength=self.faintest,
+        )
 
     def check(self, scene: Scene) -> None:
         """Raises ValueError where a scene lacks colours, or what reflection needs."""
@@ -140,16 +148,6 @@ class Traced:
         """Settings for the web page, which looks up the surroundings as they are seen from the middle of the things."""
         return page_settings(self.background, "near")
 
-    def _elsewhere(self, scene: Scene, camera: Camera, surface: Surface, chosen: Tensor) -> tuple[Tensor, Tensor]:
-        """[H, W, 3] what pixels mirror where no ray is traced, and [H, W] which ones mirror anything."""
-        black = torch.zeros_like(surface.base)
-        if scene.environment.is_empty:
-            return black, chosen
-        others = ~chosen & (surface.strength > self.faintest) & (surface.depth > 0)
-        _, directions = reflected_rays(surface, camera, others)
-        distant = torch.sigmoid(cube_lookup(scene.environment.raw, directions if self.joint else directions.detach()))
-        return black.index_put(torch.where(others), distant), chosen | others
-
     def behind(self, scene: Scene, camera: Camera) -> Tensor:
         """[H, W, 3] the surroundings that a ray through each pixel meets."""
         d = view_directions(camera).reshape(-1, 3)
@@ -159,59 +157,35 @@ class Traced:
 
 
 def traced_colors(
-    scene: Scene, origins: Tensor, directions: Tensor, near: float, background: tuple[float, float, float]
+    scene: Scene,
+    origins: Tensor,
+    directions: Tensor,
+    near: float,
+    background: tuple[float, float, float],
+    probe: Tensor | None = None,
 ) -> Tensor:
     """Colours [R, 3] of the surroundings along rays, from `near` lengths of their directions on.
 
     Behind them is the scene's environment, or without one the background.
     """
-    found = traced_surroundings(scene.surroundings, origins, directions, near)
+    found = traced_surroundings(scene.surroundings, origins, directions, near, probe)
     if scene.environment.is_empty:
         return over_background(found.colors, found.alphas, background)
     return found.colors + (1 - found.alphas)[:, None] * torch.sigmoid(cube_lookup(scene.environment.raw, directions))
 
 
-def traced_surroundings(part: Gaussians, origins: Tensor, directions: Tensor, near: float) -> Found:
+def traced_surroundings(
+    part: Gaussians, origins: Tensor, directions: Tensor, near: float, probe: Tensor | None = None
+) -> Found:
     """Trace rays [R, 3] through a set of Gaussians."""
     raw = RawGaussians(part.means, part.quats, part.log_scales, part.logit_opacities, part.sh)
-    bvh = build_bvh(shapes_of(raw), flat=part.log_scales.shape[1] == FLAT)
-    return trace(raw, Rays(origins, directions), bvh, sh_degree=part.active_sh_degree, near=near)
+    return trace(raw, Rays(origins, directions), sh_degree=part.active_sh_degree, near=near, probe=probe)
 
 
-def space_pass(scene: Scene, rays: Rays) -> SpacePass:
-    """The record that densification reads of surroundings which rays have met.
-
-    Of every `EVERY_RAY`th ray alone, since distances differ little from one pixel to the next. What none of them meets
-    counts as far away as it is from the middle of their origins.
-    """
-    part, few = scene.surroundings, Rays(*(each.detach()[::EVERY_RAY] for each in rays))
-    if not len(few.origins):
-        return SpacePass("surroundings", torch.zeros_like(part.means[:, 0]))
-    weights, distances = hit_distances(
-        part.with_tensors({n: t.detach() for n, t in part.tensors().items()}), few, START_PER_EXTENT * scene.extent
-    )
-    from_middle = (part.means.detach() - few.origins.mean(dim=0)).norm(dim=1)
-    return SpacePass("surroundings", torch.where(weights > 0, distances, from_middle))
-
-
-def hit_distances(part: Gaussians, rays: Rays, near: float) -> tuple[Tensor, Tensor]:
-    """Sums [N] of the blending weights with which rays meet Gaussians, and the means [N] of the distances by them.
-
-    A ray o + t d meets a Gaussian at t = (mean - o) . d, where it comes closest. With weights w the mean needs the sums
-    of w, of w d and of w o . d. They are gradients of harmonics up to the first degree: of one channel that counts each
-    ray once, and of one that counts it o . d times.
-    """
-    sh = torch.zeros(len(part), 4, 3).to(part.means)
-    sh[:, 0] = 0.5 / SH_ZERO  # Colours of 1, far from where they would be cut off.
-    along = (rays.origins * rays.directions).sum(dim=1)
-    with torch.enable_grad():
-        sh.requires_grad_()
-        found = traced_surroundings(replace(part, sh=sh, active_sh_degree=1), rays.origins, rays.directions, near)
-        (sums,) = torch.autograd.grad((found.colors[:, 0] + along * found.colors[:, 1]).sum(), sh)
-    weights, from_origins = sums[:, 0, 0] / SH_ZERO, sums[:, 0, 1] / SH_ZERO
-    y, z, x = (sums[:, 1:, 0] * sums.new_tensor([-1.0, 1.0, -1.0]) / SH_ONE).unbind(dim=1)
-    distances = (part.means * torch.stack([x, y, z], dim=1)).sum(dim=1) - from_origins
-    return weights, distances / weights.clamp(min=WEIGHT_MIN)
+def space_passes(scene: Scene) -> tuple[SpacePass, ...]:
+    """Records of surroundings that rays are about to meet, with a probe that asks for a gradient."""
+    part = scene.surroundings
+    return (SpacePass("surroundings", part.means.new_zeros(len(part), 2).requires_grad_()),) if len(part) else ()
 
 
 def mirrored_contributions(scene: Scene, camera: Camera) -> Tensor:
@@ -222,7 +196,7 @@ def mirrored_contributions(scene: Scene, camera: Camera) -> Tensor:
     camera = camera.to(scene.primary.means.device)
     with torch.no_grad():
         surface = seen_surface(scene, camera, background=(0.0, 0.0, 0.0))
-        chosen = (surface.strength > INVISIBLE) & (surface.depth > 0)
+        chosen = torch.where((surface.strength > INVISIBLE) & (surface.depth > 0))
         places, directions = reflected_rays(surface, camera, chosen)
     part = scene.surroundings
     with torch.enable_grad():

@@ -312,7 +312,7 @@ class ScreenStatistics:
         add_views(Sums(self.gradient_sum, self.pull_sum, self.view_count, self.max_radius), views)
 
     @torch.no_grad()
-    def add_in_space(self, means_gradient: Tensor, distances: Tensor) -> None:
+    def add_in_space(self, means_gradient: Tensor, met: Tensor) -> None:
         """Adds a training step in which rays met the Gaussians in space, in place (EnvGS, Section 5.1).
 
         A gradient times half of the distance at which a Gaussian was met is what on a screen would be one in normalised
@@ -320,10 +320,12 @@ class ScreenStatistics:
 
         Args:
             means_gradient: [N, 3] gradient of one view's loss with respect to the centres.
-            distances: [N] at which they were met, world units.
+            met: [N, 2] what they added to the rays: the sums of their blending weights, and of these times the
+                distances in world units.
         """
+        weights, products = met.unbind(dim=1)
         norms = means_gradient.norm(dim=-1)
-        pulls = 0.5 * distances * norms
+        pulls = 0.5 * torch.where(weights > 0, products / weights, 0) * norms
         for total, added in ((self.gradient_sum, pulls), (self.pull_sum, pulls), (self.view_count, norms > 0)):
             total += added
 

@@ -38,15 +38,14 @@ WHERE_TO_LOOK = (
 
 
 class Differentiated(NamedTuple):
-    """One view's losses and their gradients; of each pass on screen those of its centres and of its probe.
-
-    `space` and `visible` are the frame's.
+    """One view's losses and their gradients; of each pass on screen those of its centres and of its probe, of each in
+    space that of its probe. `visible` is the frame's.
     """
 
     losses: dict[str, float]
     gradients: dict[str, Tensor]
     screen: list[tuple[ScreenPass, Tensor, Tensor]]
-    space: tuple[SpacePass, ...]
+    space: list[tuple[SpacePass, Tensor]]
     visible: Tensor | None
 
 
@@ -296,13 +295,14 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Di
     values = torch.stack([*terms.values()]) * weights
     # Of their sum, and not of the terms with the weights as `grad_outputs`: to check these, PyTorch imports SymPy.
     sums = [values.sum()] if values.requires_grad else []
-    found = torch.autograd.grad(sums, [*leaves.values(), *centers, *probes], allow_unused=True)
-    gradients = {name: g for name, g in zip(leaves, found[: len(leaves)], strict=True) if g is not None}
-    on_screen = found[len(leaves) :]
-    pulls = zip(tracked, on_screen[: len(tracked)], on_screen[len(tracked) :], strict=True)
+    in_space = [record.probe for record in frame.space]
+    found = iter(torch.autograd.grad(sums, [*leaves.values(), *centers, *probes, *in_space], allow_unused=True))
+    gradients = {name: g for name, g in zip(leaves, itertools.islice(found, len(leaves)), strict=True) if g is not None}
+    pulls = zip(tracked, *(list(itertools.islice(found, len(tracked))) for _ in range(2)), strict=True)
     screen = [(s, v_means, v_probe) for s, v_means, v_probe in pulls if v_means is not None and v_probe is not None]
     losses = dict(zip(terms, values.tolist(), strict=True))
-    return Differentiated(losses, gradients, screen, frame.space, frame.visible)
+    space = [(record, v_probe) for record, v_probe in zip(frame.space, found, strict=True) if v_probe is not None]
+    return Differentiated(losses, gradients, screen, space, frame.visible)
 
 
 def seen_from(view: View, scene: Scene) -> View:
@@ -336,11 +336,11 @@ def collect(statistics: dict[str, ScreenStatistics], result: Differentiated, vie
     for record, v_means, v_probe in result.screen:
         known = statistics_of(statistics, record.part, v_means.shape[1], v_means.device)
         known.add(Views(v_means, v_probe, record.radii, *size, record.weight, record.direct))
-    for met in result.space:
+    for met, v_probe in result.space:
         gradient = result.gradients.get(f"{met.part}.means")
         if gradient is not None:
             known = statistics_of(statistics, met.part, gradient.shape[0], gradient.device)
-            known.add_in_space(gradient, met.distances)
+            known.add_in_space(gradient, v_probe)
 
 
 def statistics_of(

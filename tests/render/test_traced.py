@@ -8,10 +8,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from glassplat.kernels.trace import Rays
 from glassplat.render.deferred import INVISIBLE, Deferred, view_directions
 from glassplat.render.splat import Splat
-from glassplat.render.traced import Traced, hit_distances, mirrored_contributions, space_pass
+from glassplat.render.traced import Traced, mirrored_contributions, traced_surroundings
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Environment, Scene
@@ -124,33 +123,11 @@ def test_densification_is_told_how_far_away_rays_meet_things() -> None:
         sh=torch.zeros(3, 1, 3, dtype=torch.float64),
         channels={},
     )
-    weights, distances = hit_distances(small, Rays(origins, directions), 0.0)
+    probe = torch.zeros(3, 2, dtype=torch.float64, requires_grad=True)
+    found = traced_surroundings(small, origins, directions, 0.0, probe)
+    weights, products = torch.autograd.grad(found.colors.sum(), probe)[0].unbind(dim=1)
     torch.testing.assert_close(weights[1:], torch.tensor([1.0, 0.0], dtype=torch.float64))
-    torch.testing.assert_close(distances[:2], torch.tensor([2.0, 2.5], dtype=torch.float64))
-
-
-@pytest.mark.parametrize("flat", [False, True])
-def test_hit_distances_are_means_by_blending_weight(flat: bool) -> None:
-    part = flattened(surroundings()) if flat else surroundings()
-    generator = torch.Generator().manual_seed(5)
-    origins = 0.1 * torch.randn(40, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0, 3])
-    aims = part.means.mean(dim=0) + 0.3 * torch.randn(40, 3, generator=generator, dtype=torch.float64)
-    directions = torch.nn.functional.normalize(aims - origins, dim=1)
-    weights, distances = hit_distances(part, Rays(origins, directions), 0.0)
-    sums, products = torch.zeros_like(weights), torch.zeros_like(weights)
-    for origin, direction in zip(origins, directions, strict=True):
-        alone, along = hit_distances(part, Rays(origin[None], direction[None]), 0.0)
-        met = alone > 1e-9
-        torch.testing.assert_close(along[met], ((part.means - origin) @ direction)[met], atol=1e-6, rtol=1e-6)
-        sums, products = sums + alone, products + alone * along
-    torch.testing.assert_close(weights, sums)
-    assert float(sums.max()) > 1
-    torch.testing.assert_close((weights * distances), products)
-
-
-def test_places_that_mirror_nothing_tell_of_no_distance() -> None:
-    scene, none = glossy(), torch.zeros(0, 3, dtype=torch.float64)
-    assert not bool(space_pass(scene, Rays(none, none)).distances.any())
+    torch.testing.assert_close(products[:2] / weights[:2], torch.tensor([2.0, 2.5], dtype=torch.float64))
 
 
 def test_pixels_that_reflect_less_than_asked_keep_their_base() -> None:
@@ -253,10 +230,14 @@ def test_where_no_ray_is_traced_the_environment_alone_is_mirrored() -> None:
 def test_a_probed_frame_says_how_far_away_the_surroundings_were_met() -> None:
     scene, camera = glossy(), camera_at(0.0, 0.0, 0.0)
     assert Traced()(scene, camera).space == ()
-    (record,) = Traced()(scene, camera, probed=True).space
+    frame = Traced()(scene, camera, probed=True)
+    (record,) = frame.space
+    weights, products = torch.autograd.grad(frame.rgb.sum(), record.probe)[0].unbind(dim=1)
     # Things are three units before the camera, and the surroundings one and a half behind it.
     expected = (scene.surroundings.means - torch.tensor([0.0, 0.0, 3.0])).norm(dim=1)
-    torch.testing.assert_close(record.distances, expected, atol=0.7, rtol=0)
+    met = weights > 0
+    assert int(met.sum()) > 5
+    torch.testing.assert_close((products / weights)[met], expected[met], atol=1.0, rtol=0)
     assert record.part == "surroundings"
 
 
@@ -276,4 +257,3 @@ def test_a_view_of_nothing_reflects_nothing() -> None:
     for each in (scene, lit(scene)):
         frame = Traced(background=(0.2, 0.3, 0.4))(each, replace(away, cam_from_world=away.cam_from_world), probed=True)
         assert bool(frame.rgb.isfinite().all()) and int(frame.layers["reflection"].count_nonzero()) == 0
-        assert int(frame.space[0].distances.count_nonzero()) == 0

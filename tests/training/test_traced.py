@@ -168,7 +168,7 @@ def test_gradients_in_space_count_by_half_the_distance() -> None:
     statistics = ScreenStatistics.zeros(3)
     gradient = torch.tensor([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     for _ in range(2):
-        statistics.add_in_space(gradient, torch.tensor([2.0, 5.0, 4.0]))
+        statistics.add_in_space(gradient, torch.tensor([[0.5, 1.0], [0.0, 0.0], [3.0, 12.0]]))
     assert statistics.mean_gradient.tolist() == [5.0, 0.0, 2.0]
     assert statistics.view_count.tolist() == [[2.0, 0.0, 2.0]] * 2
 
@@ -179,8 +179,10 @@ def test_a_step_gathers_gradients_of_what_rays_met() -> None:
     state.scene = replace(state.scene, primary=replace(state.scene.primary, channels=strong))
     stage = RECIPE.stages(0)[2]
     result = differentiate(stage, state.scene, tiny_capture().train[0], probed=True)
-    (record,) = result.space
-    assert record.part == "surroundings" and bool(result.gradients["surroundings.means"].any())
+    ((record, met),) = result.space
+    assert record.part == "surroundings"
+    reached = result.gradients["surroundings.means"].any(dim=1)
+    assert bool(reached.any()) and bool((met[reached] > 0).all())
     assert not differentiate(stage, state.scene, tiny_capture().train[0], probed=False).space
 
 

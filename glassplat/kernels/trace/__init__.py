@@ -10,8 +10,9 @@ Search: Gaussians lie in the order of a Hilbert curve, with a box around each ei
 The tree needs no pointers; after small moves `order=bvh.order` fits the boxes again. A search keeps the nearest 16 hits
 beyond the last known one, and starts again from there while the ray still sees something.
 
-Gradients: the backward pass searches again, as the same code, and adds up the rows of each Gaussian in a fixed order:
-no atomics, the same bits for any number of threads. `reference.py` is the definition, every ray against every Gaussian.
+Gradients: the forward pass keeps what rays meet while it is little, the backward pass searches for the rest again, as
+the same code. It adds up the rows of each Gaussian in a fixed order: no atomics, the same bits for any number of
+threads. `reference.py` is the definition, every ray against every Gaussian.
 """
 
 from __future__ import annotations
@@ -80,7 +81,10 @@ def build_bvh(shapes: Shapes, *, flat: bool, order: Tensor | None = None) -> Bvh
     return kernels_for("trace", shapes.means.device).build_bvh(shapes, flat=flat, order=order)
 
 
-def trace(gaussians: RawGaussians, rays: Rays, bvh: Bvh, *, sh_degree: int, near: float) -> Traced:
+def trace(
+    gaussians: RawGaussians, rays: Rays, bvh: Bvh | None = None,
+    *, sh_degree: int, near: float, probe: Tensor | None = None,
+) -> Traced:  # fmt: skip
     """Blends what each ray meets, nearest first (EnvGS, Section 4.2 and Eq. 2).
 
     Gaussians are discs (2DGS) where `log_scales` is [N, 2], met where the ray crosses their plane, and ellipsoids
@@ -99,38 +103,44 @@ def trace(gaussians: RawGaussians, rays: Rays, bvh: Bvh, *, sh_degree: int, near
     Args:
         gaussians: raw tensors, float32 or float64.
         rays: of the same floating-point type.
-        bvh: `build_bvh` of these Gaussians.
+        bvh: `build_bvh` of these Gaussians, which is built otherwise.
         sh_degree: highest degree of the spherical harmonics to evaluate; `gaussians.sh` may hold more, or none at all,
             which makes all colours zero.
         near: smallest distance of a hit, in lengths of the ray's direction, at least 0.
+        probe: [N, 2], any values; they change nothing. Its gradient is what each Gaussian adds to the rays, whatever
+            the objective: the sums of its blending weights, and of these times the distances in world units.
 
     Raises:
         ValueError: a shape, the degree or `near` is out of range, or the hierarchy is of other Gaussians.
         TypeError: tensors of different or unsupported floating-point types, or on different devices.
     """
-    _check(gaussians, rays, bvh, sh_degree, near)
-    shapes = shapes_of(gaussians)
-    flat = gaussians.log_scales.shape[1] == FLAT
-    return Traced(*_Trace.apply(*shapes, *rays, bvh, flat, sh_degree if gaussians.sh.shape[1] else -1, near))
+    _check(gaussians, rays, bvh, sh_degree, near, probe)
+    shapes, flat = shapes_of(gaussians), gaussians.log_scales.shape[1] == FLAT
+    bvh = build_bvh(shapes, flat=flat) if bvh is None else bvh
+    return Traced(*_Trace.apply(*shapes, *rays, probe, bvh, flat, sh_degree if gaussians.sh.shape[1] else -1, near))
 
 
-def _check(gaussians: RawGaussians, rays: Rays, bvh: Bvh, sh_degree: int, near: float) -> None:
+def _check(
+    gaussians: RawGaussians, rays: Rays, bvh: Bvh | None, sh_degree: int, near: float, probe: Tensor | None
+) -> None:
     count, num_rays = gaussians.means.shape[0], rays.origins.shape[0]
     coefficients = gaussians.sh.shape[1] if gaussians.sh.dim() == 3 else 0
     scales = gaussians.log_scales.shape[1] if gaussians.log_scales.dim() == 2 else 0
-    check_tensors(
-        {
-            "means": (gaussians.means, (count, 3)),
-            "quats": (gaussians.quats, (count, 4)),
-            "log_scales": (gaussians.log_scales, (count, FLAT if scales == FLAT else SOLID)),
-            "logit_opacities": (gaussians.logit_opacities, (count,)),
-            "sh": (gaussians.sh, (count, coefficients, 3)),
-            "origins": (rays.origins, (num_rays, 3)),
-            "directions": (rays.directions, (num_rays, 3)),
-            "boxes": (bvh.boxes, tuple(bvh.boxes.shape)),
-        }
-    )
-    if bvh.order.shape[0] != count:
+    expected = {
+        "means": (gaussians.means, (count, 3)),
+        "quats": (gaussians.quats, (count, 4)),
+        "log_scales": (gaussians.log_scales, (count, FLAT if scales == FLAT else SOLID)),
+        "logit_opacities": (gaussians.logit_opacities, (count,)),
+        "sh": (gaussians.sh, (count, coefficients, 3)),
+        "origins": (rays.origins, (num_rays, 3)),
+        "directions": (rays.directions, (num_rays, 3)),
+    }
+    if bvh is not None:
+        expected["boxes"] = (bvh.boxes, tuple(bvh.boxes.shape))
+    if probe is not None:
+        expected["probe"] = (probe, (count, 2))
+    check_tensors(expected)
+    if bvh is not None and bvh.order.shape[0] != count:
         raise ValueError(
             f"bvh is over {bvh.order.shape[0]} Gaussians and there are {count}; build it again with build_bvh"
         )
@@ -145,15 +155,17 @@ class _Trace(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, frames: Tensor, opacities: Tensor, sh: Tensor, origins: Tensor, directions: Tensor,
-        bvh: Bvh, flat: bool, degree: int, near: float,
+        probe: Tensor | None, bvh: Bvh, flat: bool, degree: int, near: float,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         tensors = [tensor.detach().contiguous() for tensor in (means, frames, opacities, sh, origins, directions)]
         kernels = kernels_for("trace", means.device)
-        outputs: tuple[Tensor, ...] = kernels.trace(tensors[:4], tensors[4:], bvh, flat=flat, degree=degree, near=near)
+        outputs: tuple[Tensor, ...] = kernels.trace(
+            tensors[:4], tensors[4:], bvh, flat=flat, degree=degree, near=near, learning=any(ctx.needs_input_grad)
+        )
         ctx.save_for_backward(*tensors, *bvh, *outputs)
         ctx.options = {"flat": flat, "degree": degree, "near": near}
         ctx.mark_non_differentiable(outputs[3])
-        return outputs
+        return outputs[:4]
 
     @staticmethod
     @once_differentiable
@@ -163,4 +175,4 @@ class _Trace(torch.autograd.Function):
         cotangents = [gradient.contiguous() for gradient in gradients[:3]]
         kernels = kernels_for("trace", shapes[0].device)
         found = kernels.trace_gradients(shapes, rays, bvh, outputs, cotangents, **ctx.options)
-        return (*found, None, None, None, None)
+        return (*found[:6], found[6] if ctx.needs_input_grad[6] else None, None, None, None, None)

@@ -3,9 +3,9 @@
 Boxes are fitted one level after the other, from the lowest up. Rays are traced in blocks of neighbouring ones, each ray
 in chunks of its nearest hits. Blocks have a fixed size, whatever the number of threads.
 
-Gradients have the same bits for any number of threads, without atomics. Rays are traced again, and what they meet is
-written down, ray by ray. Then every block of rays keeps a row of sums for each Gaussian that it has met, and in the end
-each Gaussian adds up its rows, in the order of the blocks.
+Gradients have the same bits for any number of threads, without atomics. What rays meet is written down, ray by ray:
+few hits by the forward pass; rays that meet more are traced again. Then every block of rays keeps a row of sums for
+each Gaussian that it has met, and in the end each Gaussian adds up its rows, in the order of the blocks.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ def fit_boxes(real: type, flat: bool) -> Kernel:
 
 GRADIENT_BLOCK = 256
 """Rays per task of the backward pass, whose sums share rows."""
-FRAME_AT, OPACITY_AT, GEOMETRY = 3, 12, 13
-"""Columns of a row: gradients of mean (3), frame (9) and opacity; harmonics have rows of their own."""
+FRAME_AT, OPACITY_AT, PROBE_AT, GEOMETRY = 3, 12, 13, 15
+"""Columns of a row: gradients of mean (3), frame (9), opacity and probe (2); harmonics have rows of their own."""
 SUM_CHUNK = 512
 """Gaussians per task of the last sum."""
 
@@ -94,8 +94,8 @@ def trace_gradients(
     shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor], outputs: Sequence[Tensor],
     cotangents: Sequence[Tensor], *, flat: bool, degree: int, near: float,
 ) -> tuple[Tensor, ...]:  # fmt: skip
-    """Gradients of means, frames, opacities, sh, origins and directions; `outputs` are those of the forward pass."""
-    means, sh, hits = shapes[0], shapes[3], outputs[3]
+    """Gradients of means, frames, opacities, sh, origins, directions and probe; `outputs` are those of `trace`."""
+    means, sh, hits, kept = shapes[0], shapes[3], outputs[3], outputs[4]
     real, count = REAL_OF[means.dtype], means.shape[0]
     hit_offsets = torch.cat([hits.new_zeros(1, dtype=torch.int64), hits.cumsum(0)])
     met = torch.empty(int(hit_offsets[-1]), dtype=torch.int32)
@@ -104,8 +104,8 @@ def trace_gradients(
     places = np.full((numba.get_num_threads(), 2, count), -1, np.int32)
     inputs = tuple(tensor.numpy() for tensor in (*shapes[:3], *rays))
     trace_collect(real, flat)(
-        packed_leaves(shapes, bvh[0]), *inputs[3:], *arrays_of(bvh), real(near), hit_offsets.numpy(), places,
-        met.numpy(), distinct.numpy(),
+        packed_leaves(shapes, bvh[0]), *inputs[3:], *arrays_of(bvh), real(near), kept.numpy(), hit_offsets.numpy(),
+        places, met.numpy(), distinct.numpy(),
     )  # fmt: skip
     row_offsets = torch.cat([distinct.new_zeros(1), distinct.cumsum(0)])
     num_rows = int(row_offsets[-1])
@@ -118,17 +118,18 @@ def trace_gradients(
         *(tensor.numpy() for tensor in (*outputs[:3], *cotangents)),
         owners.numpy(), rows, sh_rows, *(tensor.numpy() for tensor in v_rays),
     )  # fmt: skip
-    return (*_summed(rows, sh_rows, owners, count, real), *v_rays)
+    sums, v_sh = _summed(rows, sh_rows, owners, count, real)
+    v_means, v_frames, v_opacities, v_probe = sums.tensor_split((FRAME_AT, OPACITY_AT, PROBE_AT), dim=1)
+    return v_means, v_frames.reshape(-1, 3, 3), v_opacities[:, 0], v_sh, *v_rays, v_probe
 
 
-def _summed(rows: NDArray[Any], sh_rows: NDArray[Any], owners: Tensor, count: int, real: type) -> tuple[Tensor, ...]:
-    """Gradients per Gaussian from rows per (block, Gaussian)."""
+def _summed(rows: NDArray[Any], sh_rows: NDArray[Any], owners: Tensor, count: int, real: type) -> tuple[Tensor, Tensor]:
+    """Sums [N, 15] of rows per (block, Gaussian), and [N, K, 3] of their harmonics."""
     order = torch.argsort(owners, stable=True)
     offsets = torch.cat([owners.new_zeros(1, dtype=torch.int64), torch.bincount(owners, minlength=count).cumsum(0)])
     sums, sh_sums = np.zeros((count, GEOMETRY), real), np.zeros((count, *sh_rows.shape[1:]), real)
     sum_block_rows(real)(rows, sh_rows, order.numpy(), offsets.numpy(), sums, sh_sums)
-    found, v_sh = torch.from_numpy(sums), torch.from_numpy(sh_sums)
-    return found[:, :FRAME_AT], found[:, FRAME_AT:OPACITY_AT].reshape(-1, 3, 3), found[:, OPACITY_AT], v_sh
+    return torch.from_numpy(sums), torch.from_numpy(sh_sums)
 
 
 @cache
@@ -137,7 +138,7 @@ def trace_collect(real: type, flat: bool) -> Kernel:
     next_hits, ray = traversal(real, flat)
 
     @kernel("trace_collect_discs" if flat else "trace_collect_ellipsoids", real)
-    def collect(leaves, origins, directions, order, boxes, offsets, near, hit_offsets, places, met, distinct):
+    def collect(leaves, origins, directions, order, boxes, offsets, near, kept, hit_offsets, places, met, distinct):
         count, num_blocks = origins.shape[0], distinct.size
         stride = even_stride(num_blocks)
         for task in prange(num_blocks):
@@ -148,20 +149,26 @@ def trace_collect(real: type, flat: bool) -> Kernel:
             stack, waiting = np.empty((STACK,), np.int64), np.empty((STACK,), real)
             different = 0
             for r in range(block * GRADIENT_BLOCK, min(count, (block + 1) * GRADIENT_BLOCK)):
-                o, d, inverse, _, _ = ray(origins, directions, r)
-                first, first_id, place = near, 2147483647, hit_offsets[r]
-                while place < hit_offsets[r + 1]:
-                    known = next_hits(
-                        o, d, inverse, leaves, order, boxes, offsets, first, first_id,
-                        ts, ids, alphas, entries, squares, stack, waiting,
-                    )  # fmt: skip
-                    for k in range(min(known, hit_offsets[r + 1] - place)):
-                        g = ids[k]
-                        met[place + k] = g
-                        if seen[g] != block:
-                            seen[g] = block
-                            different += 1
-                    first, first_id, place = ts[CHUNK - 1], ids[CHUNK - 1], place + CHUNK
+                begin, end = hit_offsets[r], hit_offsets[r + 1]
+                if end - begin <= kept.shape[1]:
+                    for k in range(end - begin):
+                        met[begin + k] = kept[r, k]
+                else:
+                    o, d, inverse, _, _ = ray(origins, directions, r)
+                    first, first_id, place = near, 2147483647, begin
+                    while place < end:
+                        known = next_hits(
+                            o, d, inverse, leaves, order, boxes, offsets, first, first_id,
+                            ts, ids, alphas, entries, squares, stack, waiting,
+                        )  # fmt: skip
+                        for k in range(min(known, end - place)):
+                            met[place + k] = ids[k]
+                        first, first_id, place = ts[CHUNK - 1], ids[CHUNK - 1], place + CHUNK
+                for place in range(begin, end):
+                    g = met[place]
+                    if seen[g] != block:
+                        seen[g] = block
+                        different += 1
             distinct[block] = different
 
     return collect
@@ -255,8 +262,11 @@ def trace_backward(real: type, flat: bool) -> Kernel:
                     covered, alpha = coverage(opacities[g], squared)
                     weight = alpha * left
                     value = shade(sh[g : g + 1], degree, unit, v_colors[r], weight, sh_rows[row : row + 1], v_unit)
-                    value += v_depths[r] * (t * length)
+                    distance = t * length
+                    value += v_depths[r] * distance
                     behind -= weight * value
+                    rows[row, PROBE_AT] += weight
+                    rows[row, PROBE_AT + 1] += weight * distance
                     v_alpha, v_t = left * value + (end - behind) / (one - alpha), weight * v_depths[r]
                     v_length += v_t * t
                     pull(
@@ -297,17 +307,24 @@ BLOCK = 64
 """Rays per task."""
 
 
+MOST_KEPT, KEPT_BYTES = 64, 2**26
+"""Hits of a ray that the forward pass keeps at most, and bytes for those of all rays."""
+
+
 def trace(
-    shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor], *, flat: bool, degree: int, near: float
-) -> tuple[Tensor, ...]:
-    """Fields of `Traced`; degree -1 is no colour."""
+    shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor],
+    *, flat: bool, degree: int, near: float, learning: bool,
+) -> tuple[Tensor, ...]:  # fmt: skip
+    """Fields of `Traced`, and [R, K] int32 each ray's nearest Gaussians for its gradients; degree -1 is no colour."""
     origins = rays[0]
     count, real = origins.shape[0], REAL_OF[origins.dtype]
+    num_kept = min(MOST_KEPT, KEPT_BYTES // (4 * max(count, 1))) if learning else 0
     outputs = (
         origins.new_empty(count, 3),
         origins.new_empty(count),
         origins.new_empty(count),
         torch.empty(count, dtype=torch.int32),
+        torch.empty(count, num_kept, dtype=torch.int32),
     )
     trace_forward(real, flat)(
         packed_leaves(shapes, bvh[0]),
@@ -322,7 +339,7 @@ def trace(
 
 @cache
 def trace_forward(real: type, flat: bool) -> Kernel:
-    """Fills colors, alphas, depths and hits."""
+    """Fills colors, alphas, depths, hits and the nearest of them."""
     next_hits, ray = traversal(real, flat)
     color = color_maths(real).color
     zero, half, one, least = real(0.0), real(0.5), real(1.0), real(TRANSMITTANCE_MIN)
@@ -330,7 +347,7 @@ def trace_forward(real: type, flat: bool) -> Kernel:
     @kernel("trace_forward_discs" if flat else "trace_forward_ellipsoids", real)
     def forward(
         leaves, sh, origins, directions, order, boxes, offsets, degree, near,
-        colors, alphas, depths, hits,
+        colors, alphas, depths, hits, kept,
     ):  # fmt: skip
         count = origins.shape[0]
         num_blocks = (count + BLOCK - 1) // BLOCK
@@ -356,6 +373,8 @@ def trace_forward(real: type, flat: bool) -> Kernel:
                             known = 0
                             break
                         g, weight = ids[k], found[k] * left
+                        if blended < kept.shape[1]:
+                            kept[r, blended] = g
                         if degree >= 0:
                             x, y, z = d[0] / length, d[1] / length, d[2] / length
                             c = color(sh, g, degree, x, y, z)

@@ -216,8 +216,8 @@ def next_hits_maths(real: type, flat: bool) -> Scalar:
 
 
 WARP = 32
-FRAME_AT, OPACITY_AT, GEOMETRY = 3, 12, 13
-"""Columns of a row: gradients of mean (3), frame (9) and opacity."""
+FRAME_AT, OPACITY_AT, PROBE_AT, GEOMETRY = 3, 12, 13, 15
+"""Columns of a row: gradients of mean (3), frame (9) and opacity, and the probe (2)."""
 HARMONICS = (MAX_DEGREE + 1) ** 2
 STRIDE = HARMONICS + 1
 """Of shared rows of harmonics, an odd number as that of `GEOMETRY`: lanes that write a column meet different banks."""
@@ -328,7 +328,7 @@ def trace_pull_gaussians(real: type, flat: bool) -> Kernel:
 
     @inlined
     def fill(row, offset, d, frame, length, weight, v_depth, v_squared, opacity):
-        """The gradients of one hit's mean, frame and opacity."""
+        """The gradients of one hit's mean, frame and opacity, and what it adds to the probe."""
         t, q, _ = meet(offset, d, frame)
         if not t < nowhere:
             for j in range(GEOMETRY):
@@ -341,15 +341,17 @@ def trace_pull_gaussians(real: type, flat: bool) -> Kernel:
         row[FRAME_AT + 3], row[FRAME_AT + 4], row[FRAME_AT + 5] = v_frame[1]
         row[FRAME_AT + 6], row[FRAME_AT + 7], row[FRAME_AT + 8] = v_frame[2]
         row[OPACITY_AT] = -two * v_squared / opacity
+        row[PROBE_AT], row[PROBE_AT + 1] = weight, weight * (t * length)
 
     @kernel(
         "trace_pull_discs" if flat else "trace_pull_ellipsoids",
         real,
-        "real2 real3 real1 real3 real2 real2 int long1 long1 int1 real1 real1 real2 real1 real2 real3 real1 real3",
+        "real2 real3 real1 real3 real2 real2 int long1 long1 int1 real1 real1 real2 real1 real2 real3 real1 real3 "
+        "real2",
     )
     def pull(
         means, frames, opacities, sh, origins, directions, degree, order, starts, hit_rays, weights, pulls,
-        v_colors, v_depths, v_means, v_frames, v_opacities, v_sh,
+        v_colors, v_depths, v_means, v_frames, v_opacities, v_sh, v_probe,
     ):  # fmt: skip
         rows = cuda.shared.array((WARP, GEOMETRY), real)
         harmonics = cuda.shared.array((WARP, STRIDE, 3), real)
@@ -387,6 +389,8 @@ def trace_pull_gaussians(real: type, flat: bool) -> Kernel:
             v_frames[g, (lane - FRAME_AT) // 3, (lane - FRAME_AT) % 3] = geometry
         elif lane == OPACITY_AT:
             v_opacities[g] = geometry
+        elif lane < GEOMETRY:
+            v_probe[g, lane - PROBE_AT] = geometry
         if lane < used:
             v_sh[g, lane // 3, lane % 3] = first_color
         if lane + WARP < used:
@@ -396,9 +400,10 @@ def trace_pull_gaussians(real: type, flat: bool) -> Kernel:
 
 
 def trace(
-    shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor], *, flat: bool, degree: int, near: float
-) -> tuple[Tensor, ...]:
-    """As `glassplat.kernels.trace.cpu.trace`."""
+    shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor],
+    *, flat: bool, degree: int, near: float, learning: bool,
+) -> tuple[Tensor, ...]:  # fmt: skip
+    """As `glassplat.kernels.trace.cpu.trace`, but that it keeps no hits."""
     origins = rays[0]
     count = origins.shape[0]
     outputs = (
@@ -408,7 +413,7 @@ def trace(
         torch.empty(count, dtype=torch.int32, device=origins.device),
     )
     _search(shapes, rays, bvh, flat)(degree, near, None, None, None, *outputs)
-    return outputs
+    return (*outputs, torch.empty(count, 0, dtype=torch.int32, device=origins.device))
 
 
 def trace_gradients(
@@ -432,13 +437,14 @@ def trace_gradients(
     )
     by_gaussian, order = torch.sort(hits.met, stable=True)
     starts = torch.searchsorted(by_gaussian, torch.arange(count + 1, dtype=torch.int32, device=means.device))
-    found = (torch.zeros_like(means), torch.zeros_like(shapes[1]), torch.zeros_like(shapes[2]), torch.zeros_like(sh))
+    found = tuple(torch.zeros_like(tensor) for tensor in shapes)
+    v_probe = means.new_zeros(count, 2)
     v_colors, _, v_depths = cotangents
     trace_pull_gaussians(real, flat)(
         count, WARP, *shapes, *rays, degree, order, starts, hits.rays, hits.weights, hits.pulls, v_colors, v_depths,
-        *found,
+        *found, v_probe,
     )  # fmt: skip
-    return (*found, *v_rays)
+    return (*found, *v_rays, v_probe)
 
 
 def _search(shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor], flat: bool) -> Callable[..., None]:

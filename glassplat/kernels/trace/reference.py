@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,7 +21,22 @@ class _Hits(NamedTuple):
     alpha: Tensor
 
 
-def trace(gaussians: RawGaussians, rays: Rays, bvh: Bvh | None, *, sh_degree: int, near: float) -> Traced:
+class _Probe(torch.autograd.Function):
+    """Hands alphas on; the gradient of a probe [N, 2] is `sums` [N, 2], whatever that of the alphas."""
+
+    @staticmethod
+    def forward(ctx: Any, alphas: Tensor, probe: Tensor, sums: Tensor) -> Tensor:
+        ctx.save_for_backward(sums)
+        return alphas.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
+        return gradients[0], ctx.saved_tensors[0], None
+
+
+def trace(
+    gaussians: RawGaussians, rays: Rays, bvh: Bvh | None, *, sh_degree: int, near: float, probe: Tensor | None = None
+) -> Traced:
     """Traces rays; see `glassplat.kernels.trace.trace`. The hierarchy is not looked at."""
     flat = gaussians.log_scales.shape[1] == FLAT
     shapes = shapes_of(gaussians)
@@ -42,9 +57,12 @@ def trace(gaussians: RawGaussians, rays: Rays, bvh: Bvh | None, *, sh_degree: in
     t = torch.where(blended, hits.t.gather(1, order), torch.zeros_like(alpha)) * length
     colors = _colors(shapes.sh, directions / length, sh_degree)
     colors = colors.gather(1, order[..., None].expand(-1, -1, 3))
-    return Traced(
-        (weights[..., None] * colors).sum(1), weights.sum(1), (weights * t).sum(1), blended.sum(1, dtype=torch.int32)
-    )
+    alphas = weights.sum(1)
+    if probe is not None:
+        added = torch.stack([weights, weights * t], dim=-1).detach()
+        sums = torch.zeros_like(probe).index_add(0, order.flatten(), added.flatten(0, 1))
+        alphas = _Probe.apply(alphas, probe, sums)
+    return Traced((weights[..., None] * colors).sum(1), alphas, (weights * t).sum(1), blended.sum(1, dtype=torch.int32))
 
 
 def _meet(shapes: Shapes, origins: Tensor, directions: Tensor, flat: bool, near: float) -> _Hits:
