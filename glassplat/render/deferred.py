@@ -265,12 +265,14 @@ def _seen_ellipsoids(
     bins = bin_tiles(splats, camera.width, camera.height)
     result = composite(splats, channels[None], bins, probe=joined_probe(screen))
     image, alpha = result.image[0], result.alpha[0]
+    # Split at once: a slice has a gradient as large as the image.
+    color, normal, strength, depth = image.split((3, 3, 1, 1), dim=2)
     return Surface(
         image=image,
-        base=over_background(image[..., :NORMAL_AT], alpha, background),
-        normal=image[..., NORMAL_AT:STRENGTH_AT],
-        strength=image[..., STRENGTH_AT],
-        depth=mean_depth(image[..., SURFACE_CHANNELS], alpha),
+        base=over_background(color, alpha, background),
+        normal=normal,
+        strength=strength.squeeze(2),
+        depth=mean_depth(depth.squeeze(2), alpha),
         alpha=alpha,
         direct=shown(projected),
         screen=screen,
@@ -302,11 +304,12 @@ def _seen_discs(
     blended = blended_discs(projected, channels, camera, near=near, screen=screen)
     image, extra = blended.image[0], disc_layers(blended, scene.extent)
     alpha, depth = extra.pop("alpha"), extra.pop("depth")
+    color, normal, strength = image.split((3, 3, 1), dim=2)
     return Surface(
         image=image,
-        base=over_background(image[..., :NORMAL_AT], alpha, background),
-        normal=image[..., NORMAL_AT:STRENGTH_AT],
-        strength=image[..., STRENGTH_AT],
+        base=over_background(color, alpha, background),
+        normal=normal,
+        strength=strength.squeeze(2),
         depth=depth,
         alpha=alpha,
         direct=shown(projected),

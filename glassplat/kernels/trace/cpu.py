@@ -110,7 +110,8 @@ def trace_gradients(
     row_offsets = torch.cat([distinct.new_zeros(1), distinct.cumsum(0)])
     num_rows = int(row_offsets[-1])
     owners = torch.empty(num_rows, dtype=torch.int32)
-    rows, sh_rows = np.zeros((num_rows, GEOMETRY), real), np.zeros((num_rows, *sh.shape[1:]), real)
+    # Not `numpy.zeros`: whoever meets a Gaussian first clears its row, in memory that the last step has used already.
+    rows, sh_rows = (means.new_empty(num_rows, *shape).numpy() for shape in ((GEOMETRY,), sh.shape[1:]))
     v_rays = tuple(torch.zeros_like(ray) for ray in rays)
     places[...] = -1
     trace_backward(real, flat)(
@@ -252,6 +253,8 @@ def trace_backward(real: type, flat: bool) -> Kernel:
                     g = met[place]
                     if seen[g] != block:
                         seen[g], own[g], owners[free] = block, free, g
+                        rows[free] = zero
+                        sh_rows[free] = zero
                         free += 1
                     row = own[g]
                     offset, frame = shape(means, frames, g, o)
