@@ -101,7 +101,6 @@ def own_works(case: Case) -> dict[str, Work]:
             case.shapes, case.rays, case.bvh, colored, cotangents, degree=3, **options
         ),
         "build": lambda: build_bvh(case.shapes, flat=True),
-        "refit": lambda: build_bvh(case.shapes, flat=True, order=case.bvh.order),
     }
 
 
@@ -115,7 +114,6 @@ def operation_works(count: int, width: int, device: str) -> dict[str, Work]:
     size = f"{len(rays.origins):,} rays"
     return {
         f"build_bvh, {count:,} discs": lambda: build_bvh(shapes, flat=True),
-        "build_bvh, order kept": lambda: build_bvh(shapes, flat=True, order=bvh.order),
         f"trace forward, {size}": lambda: trace(discs, rays, bvh, sh_degree=3, near=0.0),
         f"trace backward, {size}": backward(found, [torch.ones_like(x) for x in found], [*discs, *rays]),
     }
@@ -191,7 +189,7 @@ def add_case(tables: tuple[Table, Table], case: Case, embree: Embree | None, rou
         count, float(found[3].float().mean()), rays / mean["trace"] / 1e3, *beside, rays / mean["colored"] / 1e3,
         mean["backward"] / mean["colored"],
     )  # fmt: skip
-    tables[1].add(count, *(1e3 * mean[name] if name in mean else "" for name in ("build", "refit", "embree build")))
+    tables[1].add(count, *(1e3 * mean[name] if name in mean else "" for name in ("build", "embree build")))
     return agreement
 
 
@@ -199,7 +197,7 @@ def new_tables(rays: int) -> tuple[Table, Table]:
     """Rays a second, and milliseconds of building."""
     columns = ("discs", "hits a ray", "k rays/s", "Embree, k rays/s", "ours : Embree")
     note = "Processor time. Without colours, but for the last two columns; ratios are medians of ratios round by round."
-    title, built = f"{rays:,} rays of a mirror ball through discs, one thread", ("build", "refit", "Embree's build")
+    title, built = f"{rays:,} rays of a mirror ball through discs, one thread", ("build", "Embree's build")
     return (
         Table(title, (*columns, "k rays/s, SH 3", "backward : forward"), note),
         Table("The hierarchy, milliseconds", ("discs", *built), "Processor time, one thread."),

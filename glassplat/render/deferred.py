@@ -88,33 +88,6 @@ def environment_from_equirect(image: Tensor, size: int) -> Environment:
     return Environment(torch.logit(colors.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN)))
 
 
-def rotated(environment: Environment, rotation: Tensor) -> Environment:
-    """The environment of a rotated world: what was in direction d is in direction `rotation @ d`; resampled.
-
-    The centre of its region moves along.
-
-    Args:
-        environment: may be empty.
-        rotation: [3, 3] orthogonal matrix; may be a mirroring.
-
-    Raises:
-        ValueError: not an orthogonal matrix.
-    """
-    turn = rotation.detach().double()
-    identity = torch.eye(3, dtype=turn.dtype, device=turn.device)
-    if tuple(turn.shape) != (3, 3) or not torch.allclose(turn @ turn.T, identity, atol=1e-4):
-        raise ValueError(f"expected a rotation matrix [3, 3] with orthonormal rows, got {rotation.tolist()}")
-    region = environment.region
-    if region is not None:
-        x, y, z = (turn @ turn.new_tensor(region[:3])).tolist()
-        region = (x, y, z, region[3])
-    if environment.is_empty:
-        return Environment(environment.raw, region)
-    # A row d of directions times R is R^T d: where the rotated direction was before.
-    before = texel_directions(environment.size) @ turn.cpu()
-    return Environment(cube_lookup(environment.raw, before.to(environment.raw)), region)
-
-
 def resized(environment: Environment, size: int) -> Environment:
     """The environment with another number of texels; raw values are interpolated between texel centres."""
     _check_lit(environment)

@@ -13,7 +13,6 @@ from glassplat.render.deferred import (
     environment_from_equirect,
     equirect_from_environment,
     panorama_directions,
-    rotated,
     texel_directions,
 )
 from glassplat.scene.scene import Environment
@@ -83,36 +82,6 @@ def test_black_and_white_stay_finite() -> None:
     assert bool(raw.isfinite().all()) and 6.8 < float(raw.max()) < 7 and -7 < float(raw.min()) < -6.8
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_what_was_in_a_direction_is_in_the_rotated_direction(seed: int) -> None:
-    generator = torch.Generator().manual_seed(seed)
-    rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator))[0]
-    directions = torch.randn(500, 3, generator=generator)
-    environment = smooth(32)
-    turned = rotated(environment, rotation)
-    expected = colors_in(environment, directions)
-    torch.testing.assert_close(colors_in(turned, directions @ rotation.T), expected, atol=0.005, rtol=0)
-
-
-def test_quarter_turns_move_texels_as_they_are() -> None:
-    environment = Environment.random(5, generator=torch.Generator().manual_seed(1))
-    quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    turned = rotated(environment, quarter)
-    assert not torch.allclose(turned.raw, environment.raw)
-    # What +x showed, +y shows now: there columns run along z, and rows along x, which was -y.
-    torch.testing.assert_close(turned.raw[2], environment.raw[0].transpose(0, 1).flip(0))
-    for _ in range(3):
-        turned = rotated(turned, quarter)
-    torch.testing.assert_close(turned.raw, environment.raw, atol=1e-4, rtol=0)
-
-
-def test_the_region_turns_along() -> None:
-    quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    turned = rotated(Environment(smooth(2).raw, (1.0, 2.0, 3.0, 4.0)), quarter)
-    assert turned.region == (-2.0, 1.0, 3.0, 4.0)
-    assert rotated(Environment.empty(), quarter).is_empty
-
-
 def test_a_panorama_has_gradients() -> None:
     environment = smooth(3)
     raw = environment.raw.requires_grad_()
@@ -131,5 +100,3 @@ def test_bad_input_is_named() -> None:
         environment_from_equirect(torch.full((4, 8, 3), torch.nan), 4)
     with pytest.raises(ValueError, match="size is 0"):
         environment_from_equirect(torch.zeros(4, 8, 3), 0)
-    with pytest.raises(ValueError, match="rotation matrix"):
-        rotated(smooth(), 2 * torch.eye(3))

@@ -7,7 +7,7 @@ Gaussians. A ray ends before the Gaussian that would take its transmittance belo
 are discs seen from their edge (cosine below 1e-3), hits at or before `near`, and whatever is not finite.
 
 Search: Gaussians lie in the order of a Hilbert curve, with a box around each eight, and a node around each eight boxes.
-The tree needs no pointers; after small moves `order=bvh.order` fits the boxes again. A search keeps the nearest 16 hits
+The tree needs no pointers. A search keeps the nearest 16 hits
 beyond the last known one, and starts again from there while the ray still sees something.
 
 Gradients: the forward pass keeps what rays meet while it is little, the backward pass searches for the rest again, as
@@ -67,7 +67,7 @@ def reach(opacities: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def build_bvh(shapes: Shapes, *, flat: bool, order: Tensor | None = None) -> Bvh:
+def build_bvh(shapes: Shapes, *, flat: bool) -> Bvh:
     """Orders Gaussians along a curve through space, and puts boxes around eight of them, around eight boxes, and so on.
 
     A Gaussian that rays meet nowhere gets an empty box: its opacity is too low, or something of it is not finite.
@@ -75,10 +75,8 @@ def build_bvh(shapes: Shapes, *, flat: bool, order: Tensor | None = None) -> Bvh
     Args:
         shapes: activated Gaussians, float32 or float64.
         flat: whether they are discs.
-        order: [N] int32, of an earlier hierarchy: refits its boxes, which stays exact however far Gaussians have moved,
-            and fast to search while the order still holds.
     """
-    return kernels_for("trace", shapes.means.device).build_bvh(shapes, flat=flat, order=order)
+    return kernels_for("trace", shapes.means.device).build_bvh(shapes, flat=flat)
 
 
 def trace(

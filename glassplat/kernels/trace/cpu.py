@@ -32,11 +32,10 @@ from glassplat.kernels.trace.cpu_traversal import arrays_of, packed_leaves, trav
 from glassplat.kernels.trace.steps import CHUNK, STACK, WIDTH, coverage_maths, shape_reader
 
 
-def build_bvh(shapes: Shapes, *, flat: bool, order: Tensor | None) -> Bvh:
+def build_bvh(shapes: Shapes, *, flat: bool) -> Bvh:
     """As the operation."""
     count, real = shapes.means.shape[0], REAL_OF[shapes.means.dtype]
-    if order is None:
-        order = torch.argsort(hilbert_codes(shapes.means.detach()), stable=True).to(torch.int32)
+    order = torch.argsort(hilbert_codes(shapes.means.detach()), stable=True).to(torch.int32)
     offsets = torch.tensor(level_offsets(count))
     boxes = shapes.means.new_empty(int(offsets[-1]), 6, WIDTH)
     extents = reach(shapes.opacities)

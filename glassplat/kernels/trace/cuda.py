@@ -46,12 +46,11 @@ from glassplat.kernels.trace.steps import (
 THREADS = 128
 
 
-def build_bvh(shapes: Shapes, *, flat: bool, order: Tensor | None) -> Bvh:
+def build_bvh(shapes: Shapes, *, flat: bool) -> Bvh:
     """As `glassplat.kernels.trace.cpu.build_bvh`."""
     means, frames = (tensor.detach().contiguous() for tensor in shapes[:2])
     count, real = means.shape[0], REAL_OF[means.dtype]
-    if order is None:
-        order = torch.argsort(hilbert_codes(means), stable=True).to(torch.int32)
+    order = torch.argsort(hilbert_codes(means), stable=True).to(torch.int32)
     offsets = level_offsets(count)
     boxes = means.new_empty(offsets[-1], 6, WIDTH)
     extents = reach(shapes.opacities.detach())
