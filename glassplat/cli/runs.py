@@ -176,7 +176,7 @@ def train(asked: Train[Any], console: Console) -> None:
     say(console, f"next: glassplat eval {asked.output}")
 
 
-STEP_COSTS = {"Planar": 2.6, "Deferred": 1.2, "Traced": 9.0}
+STEP_COSTS = {"Planar": 2.6, "Deferred": 1.2, "Traced": 4.5}
 """Seconds of a step with a renderer, in those of a step of `splat`; measured on two cores (docs/performance.md)."""
 USUAL_ITERATIONS = 7000
 """What the pages of the methods recommend."""

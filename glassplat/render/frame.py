@@ -47,7 +47,7 @@ class ScreenPass:
 
 @dataclass(frozen=True)
 class SpacePass:
-    """What densification reads of one scene part whose Gaussians rays meet in space, where there is no screen.
+    """The record of one scene part whose Gaussians rays meet in space, where there is no screen; for densification.
 
     Attributes:
         part: name of the scene part, as in `Scene.gaussian_sets`.
