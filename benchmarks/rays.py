@@ -90,7 +90,7 @@ def in_turn(works: Mapping[str, Work], rounds: int) -> dict[str, list[float]]:
 
 
 def own_works(case: Case) -> dict[str, Work]:
-    """Both passes without colours and with those of degree 3, and the hierarchy built and fitted again."""
+    """Both passes without colours and with those of degree 3, and the hierarchy built."""
     options: dict[str, Any] = {"flat": True, "near": 0.0}
     colored = cpu.trace(case.shapes, case.rays, case.bvh, degree=3, learning=True, **options)
     cotangents = [torch.ones_like(output) for output in colored[:3]]

@@ -85,7 +85,7 @@ REASONS: dict[str, dict[str, str]] = {
     },
     "traced": GLOSSY
     | {
-        "primitive": "Discs: 33.20 to 32.10 dB on `table`, -0.1 on `car`, -0.2 on `sheet`.",
+        "primitive": "Discs lose 0.1 to 1.1 dB.",
         "sh_degree": "As 3DGS.",
         "harmonics_from_start": "View-dependent colours explain what reflects.",
         "mirrors": "A cube map finds the sky sooner, and normals with it.",

@@ -15,8 +15,8 @@ from torch.nn.functional import grid_sample
 
 from glassplat.kernels.composite import composite, mean_depth
 from glassplat.kernels.environment import cube_lookup, shade_environment, surface_channels
-from glassplat.kernels.panes.reference import ray_grid
-from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, STRENGTH_AT, SURFACE_CHANNELS, Projected
+from glassplat.kernels.panes.reference import pixel_rays, ray_grid
+from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, STRENGTH_AT, SURFACE_CHANNELS, Projected, Shaded
 from glassplat.kernels.tiles import bin_tiles
 from glassplat.options import Shading
 from glassplat.render.frame import (
@@ -297,14 +297,33 @@ def reflected_rays(surface: Surface, camera: Camera, chosen: tuple[Tensor, ...])
     Blended positions need no channels: with d the ray of a pixel whose camera z is 1, x = o + D d, D the blended depth.
     """
     rotation = camera.cam_from_world[:3, :3]
-    (rows, columns), (fx, fy, cx, cy) = (index.to(rotation) + 0.5 for index in chosen), camera.intrinsics.to(rotation)
-    x, y = (columns - cx) / fx, (rows - cy) / fy
-    d = torch.stack([x, y, torch.ones_like(x)], dim=-1) @ rotation
+    rows, columns = (index.to(rotation) for index in chosen)
+    d = pixel_rays(camera.intrinsics.to(rotation), columns, rows) @ rotation
     places = camera.center + surface.depth[chosen][:, None] * d
     normal = surface.normal[chosen]
     normal = normal / normal.norm(dim=-1, keepdim=True).clamp(min=NORMAL_MIN)
     mirrored = d - 2 * (d * normal).sum(-1, keepdim=True) * normal
     return places, torch.nn.functional.normalize(mirrored, dim=-1)
+
+
+def shaded_pixels(
+    scene: Scene,
+    camera: Camera,
+    image: Tensor,
+    alpha: Tensor,
+    background: tuple[float, float, float],
+    least_strength: float,
+) -> Shaded:
+    """Blended surfaces [H, W, D] with coverage [H, W], and what they mirror of the scene's environment."""
+    return shade_environment(
+        image,
+        alpha,
+        scene.environment.raw,
+        camera.intrinsics,
+        camera.cam_from_world[:3, :3].T.contiguous(),
+        background=background,
+        least_strength=least_strength,
+    )
 
 
 def view_directions(camera: Camera) -> Tensor:
@@ -405,15 +424,7 @@ class Deferred:
         self, scene: Scene, camera: Camera, projected: Projected, channels: Tensor, probe: Tensor | None
     ) -> tuple[Tensor, dict[str, Tensor]]:
         image, layers = self._blend(camera, projected, channels, probe)
-        shaded = shade_environment(
-            image,
-            layers["alpha"],
-            scene.environment.raw,
-            camera.intrinsics,
-            camera.cam_from_world[:3, :3].T.contiguous(),
-            background=self.background,
-            least_strength=self.least_strength,
-        )
+        shaded = shaded_pixels(scene, camera, image, layers["alpha"], self.background, self.least_strength)
         return shaded.rgb, layers | {"base": shaded.base, "reflection": shaded.reflection}
 
     def _shade_gaussians(

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from glassplat.kernels.environment import cube_lookup, shade_environment
-from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, RawGaussians, Rays, Shaded
+from glassplat.kernels.environment import cube_lookup
+from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, RawGaussians, Rays
 from glassplat.kernels.records import Traced as Found
 from glassplat.kernels.trace import trace
 from glassplat.render.deferred import (
@@ -19,6 +19,7 @@ from glassplat.render.deferred import (
     page_settings,
     reflected_rays,
     seen_surface,
+    shaded_pixels,
     view_directions,
 )
 from glassplat.render.frame import (
@@ -82,8 +83,9 @@ class Traced:
         check_mirrored(scene)
         camera = camera.to(scene.primary.means.device)
         surface = seen_surface(scene, camera, background=self.background, probed=probed)
-        space = space_passes(scene) if probed else ()
-        rgb, reflection = self._shaded(scene, camera, surface, space)
+        part = scene.surroundings
+        probe = part.means.new_zeros(len(part), 2).requires_grad_() if probed and len(part) else None
+        rgb, reflection = self._shaded(scene, camera, surface, probe)
         layers = surface.layers() | {"reflection": reflection}
         if self.surroundings:
             layers["surroundings"] = self.behind(scene, camera)
@@ -92,43 +94,34 @@ class Traced:
             layers=layers,
             direct=surface.direct,
             screen=surface.screen,
-            space=space,
+            space=() if probe is None else (SpacePass("surroundings", probe),),
         )
 
-    def _shaded(
-        self, scene: Scene, camera: Camera, surface: Surface, space: Sequence[SpacePass]
-    ) -> tuple[Tensor, Tensor]:
+    def _shaded(self, scene: Scene, camera: Camera, surface: Surface, probe: Tensor | None) -> tuple[Tensor, Tensor]:
         """The image and what it mirrors, [H, W, 3] each (Eq. 5)."""
-        rgb, base, reflection = self._distant(scene, camera, surface)
+        rgb, reflection = self._distant(scene, camera, surface)
         if not len(scene.surroundings):
             return rgb, reflection
         chosen = torch.where((surface.strength > self.least_strength) & (surface.depth > 0))
         places, directions = reflected_rays(surface, camera, chosen)
         if not self.joint:
             places, directions = places.detach(), directions.detach()
-        near, probe = START_PER_EXTENT * scene.extent, next((record.probe for record in space), None)
+        near = START_PER_EXTENT * scene.extent
         colors = traced_colors(scene, places, directions, near, self.background, probe)
         strength = surface.strength[chosen][:, None]
-        mixed = (1 - strength) * base[chosen] + strength * colors
+        mixed = (1 - strength) * surface.base[chosen] + strength * colors
         return rgb.index_put(chosen, mixed), reflection.index_put(chosen, colors)
 
-    def _distant(self, scene: Scene, camera: Camera, surface: Surface) -> Shaded:
-        """The image as if the environment were all that is mirrored; without one nothing is."""
+    def _distant(self, scene: Scene, camera: Camera, surface: Surface) -> tuple[Tensor, Tensor]:
+        """The image and what it mirrors if the environment is all that is mirrored; without one nothing is."""
         image = surface.image
         if scene.environment.is_empty:
-            return Shaded(surface.base, surface.base, torch.zeros_like(surface.base))
+            return surface.base, torch.zeros_like(surface.base)
         if not self.joint:
             color, normal, rest = image.tensor_split((NORMAL_AT, STRENGTH_AT), dim=2)
             image = torch.cat([color, normal.detach(), rest], dim=2)
-        return shade_environment(
-            image,
-            surface.alpha,
-            scene.environment.raw,
-            camera.intrinsics,
-            camera.cam_from_world[:3, :3].T.contiguous(),
-            background=self.background,
-            least_strength=self.faintest,
-        )
+        shaded = shaded_pixels(scene, camera, image, surface.alpha, self.background, self.faintest)
+        return shaded.rgb, shaded.reflection
 
     def check(self, scene: Scene) -> None:
         """Raises ValueError where a scene lacks colours, or what reflection needs."""
@@ -180,12 +173,6 @@ def traced_surroundings(
     """Trace rays [R, 3] through a set of Gaussians."""
     raw = RawGaussians(part.means, part.quats, part.log_scales, part.logit_opacities, part.sh)
     return trace(raw, Rays(origins, directions), sh_degree=part.active_sh_degree, near=near, probe=probe)
-
-
-def space_passes(scene: Scene) -> tuple[SpacePass, ...]:
-    """Records of surroundings that rays are about to meet, with a probe that asks for a gradient."""
-    part = scene.surroundings
-    return (SpacePass("surroundings", part.means.new_zeros(len(part), 2).requires_grad_()),) if len(part) else ()
 
 
 def mirrored_contributions(scene: Scene, camera: Camera) -> Tensor:

@@ -295,13 +295,14 @@ def differentiate(stage: Stage, scene: Scene, view: View, *, probed: bool) -> Di
     values = torch.stack([*terms.values()]) * weights
     # Of their sum, and not of the terms with the weights as `grad_outputs`: to check these, PyTorch imports SymPy.
     sums = [values.sum()] if values.requires_grad else []
-    in_space = [record.probe for record in frame.space]
-    found = iter(torch.autograd.grad(sums, [*leaves.values(), *centers, *probes, *in_space], allow_unused=True))
-    gradients = {name: g for name, g in zip(leaves, itertools.islice(found, len(leaves)), strict=True) if g is not None}
-    pulls = zip(tracked, *(list(itertools.islice(found, len(tracked))) for _ in range(2)), strict=True)
+    inputs = ([*leaves.values()], centers, probes, [record.probe for record in frame.space])
+    found = iter(torch.autograd.grad(sums, [*itertools.chain(*inputs)], allow_unused=True))
+    v_leaves, v_centers, v_probes, v_met = ([*itertools.islice(found, len(some))] for some in inputs)
+    gradients = {name: g for name, g in zip(leaves, v_leaves, strict=True) if g is not None}
+    pulls = zip(tracked, v_centers, v_probes, strict=True)
     screen = [(s, v_means, v_probe) for s, v_means, v_probe in pulls if v_means is not None and v_probe is not None]
+    space = [(record, met) for record, met in zip(frame.space, v_met, strict=True) if met is not None]
     losses = dict(zip(terms, values.tolist(), strict=True))
-    space = [(record, v_probe) for record, v_probe in zip(frame.space, found, strict=True) if v_probe is not None]
     return Differentiated(losses, gradients, screen, space, frame.visible)
 
 
@@ -336,11 +337,11 @@ def collect(statistics: dict[str, ScreenStatistics], result: Differentiated, vie
     for record, v_means, v_probe in result.screen:
         known = statistics_of(statistics, record.part, v_means.shape[1], v_means.device)
         known.add(Views(v_means, v_probe, record.radii, *size, record.weight, record.direct))
-    for met, v_probe in result.space:
-        gradient = result.gradients.get(f"{met.part}.means")
+    for traced, met in result.space:
+        gradient = result.gradients.get(f"{traced.part}.means")
         if gradient is not None:
-            known = statistics_of(statistics, met.part, gradient.shape[0], gradient.device)
-            known.add_in_space(gradient, v_probe)
+            known = statistics_of(statistics, traced.part, gradient.shape[0], gradient.device)
+            known.add_in_space(gradient, met)
 
 
 def statistics_of(

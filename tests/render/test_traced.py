@@ -235,9 +235,9 @@ def test_a_probed_frame_says_how_far_away_the_surroundings_were_met() -> None:
     weights, products = torch.autograd.grad(frame.rgb.sum(), record.probe)[0].unbind(dim=1)
     # Things are three units before the camera, and the surroundings one and a half behind it.
     expected = (scene.surroundings.means - torch.tensor([0.0, 0.0, 3.0])).norm(dim=1)
-    met = weights > 0
+    met = weights > 0.02  # And not grazed at one end.
     assert int(met.sum()) > 5
-    torch.testing.assert_close((products / weights)[met], expected[met], atol=1.0, rtol=0)
+    torch.testing.assert_close((products / weights)[met], expected[met], atol=0.7, rtol=0)
     assert record.part == "surroundings"
 
 
@@ -257,3 +257,5 @@ def test_a_view_of_nothing_reflects_nothing() -> None:
     for each in (scene, lit(scene)):
         frame = Traced(background=(0.2, 0.3, 0.4))(each, replace(away, cam_from_world=away.cam_from_world), probed=True)
         assert bool(frame.rgb.isfinite().all()) and int(frame.layers["reflection"].count_nonzero()) == 0
+        (met,) = torch.autograd.grad(frame.rgb.sum(), frame.space[0].probe)
+        assert int(met.count_nonzero()) == 0

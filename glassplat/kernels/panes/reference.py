@@ -52,11 +52,15 @@ def pane_hits(
 
 def ray_grid(intrinsics: Tensor, width: int, height: int) -> Tensor:
     """Rays [H, W, 3] through the pixel centres, (x, y, 1) in the camera frame."""
+    columns, rows = (torch.arange(n, dtype=intrinsics.dtype, device=intrinsics.device) for n in (width, height))
+    return pixel_rays(intrinsics, columns, rows[:, None])
+
+
+def pixel_rays(intrinsics: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
+    """Rays [..., 3] through the centres of pixels, (x, y, 1) in the camera frame; columns and rows are broadcast."""
     fx, fy, cx, cy = intrinsics
-    x = (torch.arange(width, dtype=intrinsics.dtype, device=intrinsics.device) + 0.5 - cx) / fx
-    y = (torch.arange(height, dtype=intrinsics.dtype, device=intrinsics.device) + 0.5 - cy) / fy
-    plane = x.expand(height, width)
-    return torch.stack([plane, y[:, None].expand(height, width), torch.ones_like(plane)], dim=-1)
+    x, y = torch.broadcast_tensors((columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy)
+    return torch.stack([x, y, torch.ones_like(x)], dim=-1)
 
 
 def two_surfaces(base: Tensor, cosine: Tensor) -> Tensor:

@@ -7,8 +7,8 @@ Gaussians. A ray ends before the Gaussian that would take its transmittance belo
 are discs seen from their edge (cosine below 1e-3), hits at or before `near`, and whatever is not finite.
 
 Search: Gaussians lie in the order of a Hilbert curve, with a box around each eight, and a node around each eight boxes.
-The tree needs no pointers. A search keeps the nearest 16 hits
-beyond the last known one, and starts again from there while the ray still sees something.
+The tree needs no pointers. A search keeps the nearest 16 hits beyond the last known one, and starts again from there
+while the ray still sees something.
 
 Gradients: the forward pass keeps what rays meet while it is little, the backward pass searches for the rest again, as
 the same code. It adds up the rows of each Gaussian in a fixed order: no atomics, the same bits for any number of

@@ -29,7 +29,17 @@ from glassplat.kernels.records import REAL_OF, Bvh, Shapes
 from glassplat.kernels.trace import reach
 from glassplat.kernels.trace.bvh import half_widths_maths, hilbert_codes, level_offsets
 from glassplat.kernels.trace.cpu_traversal import arrays_of, packed_leaves, traversal
-from glassplat.kernels.trace.steps import CHUNK, STACK, WIDTH, coverage_maths, shape_reader
+from glassplat.kernels.trace.steps import (
+    CHUNK,
+    FRAME_AT,
+    GEOMETRY,
+    OPACITY_AT,
+    PROBE_AT,
+    STACK,
+    WIDTH,
+    coverage_maths,
+    shape_reader,
+)
 
 
 def build_bvh(shapes: Shapes, *, flat: bool) -> Bvh:
@@ -83,8 +93,6 @@ def fit_boxes(real: type, flat: bool) -> Kernel:
 
 GRADIENT_BLOCK = 256
 """Rays per task of the backward pass, whose sums share rows."""
-FRAME_AT, OPACITY_AT, PROBE_AT, GEOMETRY = 3, 12, 13, 15
-"""Columns of a row: gradients of mean (3), frame (9), opacity and probe (2); harmonics have rows of their own."""
 SUM_CHUNK = 512
 """Gaussians per task of the last sum."""
 

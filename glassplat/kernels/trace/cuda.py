@@ -32,8 +32,12 @@ from glassplat.kernels.trace import reach
 from glassplat.kernels.trace.bvh import curve_cells, curve_place, half_widths_maths, level_offsets
 from glassplat.kernels.trace.steps import (
     CHUNK,
+    FRAME_AT,
+    GEOMETRY,
     LEVEL_BITS,
     NODE,
+    OPACITY_AT,
+    PROBE_AT,
     SLACK,
     STACK,
     WIDTH,
@@ -215,8 +219,6 @@ def next_hits_maths(real: type, flat: bool) -> Scalar:
 
 
 WARP = 32
-FRAME_AT, OPACITY_AT, PROBE_AT, GEOMETRY = 3, 12, 13, 15
-"""Columns of a row: gradients of mean (3), frame (9) and opacity, and the probe (2)."""
 HARMONICS = (MAX_DEGREE + 1) ** 2
 STRIDE = HARMONICS + 1
 """Of shared rows of harmonics, an odd number as that of `GEOMETRY`: lanes that write a column meet different banks."""

@@ -22,6 +22,8 @@ SLACK = 1e-5
 """Share by which boxes begin earlier and end later, so that rounding loses no hit."""
 LARGEST_INVERSE = 1e18
 """In place of 1 / 0 in the direction of a ray."""
+FRAME_AT, OPACITY_AT, PROBE_AT, GEOMETRY = 3, 12, 13, 15
+"""Columns of a row: gradients of mean (3), frame (9), opacity and probe (2); harmonics have rows of their own."""
 
 
 def ray_reader(real: type) -> Scalar:
