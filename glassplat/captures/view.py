@@ -506,6 +506,21 @@ LEAST_LENGTH = 0.5
 def estimated_normals(view: View) -> Tensor | None:
     """[H, W, 3] unit normals of a view in world axes, zero where none is known; None where there is no file.
 
+    Raises:
+        InputError: as `normals_in_camera`.
+    """
+    normals = normals_in_camera(view)
+    return None if normals is None else in_world(normals, view.camera)
+
+
+def in_world(normals: Tensor, camera: Camera) -> Tensor:
+    """Vectors [..., 3] in camera axes, turned to world axes; differentiable in the camera's pose."""
+    return normals @ camera.cam_from_world[:3, :3].to(normals)
+
+
+def normals_in_camera(view: View) -> Tensor | None:
+    """[H, W, 3] unit normals of a view in camera axes, zero where none is known; None where there is no file.
+
     The photograph's lens must be a pinhole: normals are reduced with it, but not undistorted.
 
     Raises:
@@ -527,7 +542,7 @@ def estimated_normals(view: View) -> Tensor | None:
     small = torch.nn.functional.interpolate(in_picture, (camera.height, camera.width), mode="area")[0].permute(1, 2, 0)
     known = small.norm(dim=-1, keepdim=True) > LEAST_LENGTH
     unit = torch.nn.functional.normalize(small, dim=-1) * torch.tensor(CAMERA_FROM_PICTURE)
-    return torch.where(known, unit @ camera.cam_from_world[:3, :3].to(unit), 0)
+    return torch.where(known, unit, 0)
 
 
 def normals_path(image_path: Path) -> Path | None:

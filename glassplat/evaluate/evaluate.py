@@ -115,6 +115,8 @@ def with_aligned_test_views(
 def aligned_camera(scene: Scene, renderer: Renderer, view: View, *, steps: int = STEPS) -> Camera:
     """The camera from which the scene looks most like the view's photograph, starting from the view's own.
 
+    The two are compared in the colours in which `evaluate` compares them.
+
     Args:
         scene: trained; gets no gradient.
         renderer: how photographs show it.
@@ -124,13 +126,14 @@ def aligned_camera(scene: Scene, renderer: Renderer, view: View, *, steps: int =
     device = scene.primary.means.device
     still = scene.with_parameters({name: tensor.detach() for name, tensor in scene.parameters().items()})
     camera, photo = view.camera.to(device), view.photo.to(device)
+    exposures = still.exposures.interpolated(view.name)
     twist = torch.zeros(6, device=device, requires_grad=True)
     optimizer = torch.optim.Adam([twist], lr=FIRST_STEP, betas=(0.8, 0.95))
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST_STEP / FIRST_STEP) ** (1 / max(steps, 1)))
     best, lowest = torch.zeros_like(twist), torch.inf
     for _ in range(steps):
         optimizer.zero_grad()
-        image = renderer(still, moved_camera(camera, twist, scene.extent)).rgb
+        image = exposures.applied(renderer(still, moved_camera(camera, twist, scene.extent)).rgb, view.name)
         found = photometric(with_ignored_right(image, view), photo)
         loss = found.l1.lerp(1 - found.ssim, SSIM_SHARE)
         if (value := float(loss.detach())) < lowest:
@@ -337,6 +340,7 @@ def _measure(
     if counted is not None:
         image = with_ignored_right(image, view)
         pane = pane if isinstance(pane, str) else pane & counted
+        surface = surface and replace(surface, covered=surface.covered & counted)
     measured: dict[str, metrics.Outcome] = {
         "psnr": _counted_psnr(image, photo, counted),
         "corrected_psnr": _counted_psnr(metrics.color_corrected(image, photo, region=counted), photo, counted),
@@ -361,7 +365,7 @@ def _right_half_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> me
     """Of the right half, in the colours that the left half tells (as is done for NeRF in the Wild)."""
     middle = max(photo.shape[1] // 2, 1)
     corrected = metrics.color_corrected(image, photo, slice(0, middle), counted)
-    right = slice(middle - 1, None)
+    right = slice(min(middle, photo.shape[1] - 1), None)
     return _counted_psnr(corrected[:, right], photo[:, right], None if counted is None else counted[:, right])
 
 

@@ -150,6 +150,7 @@ def fitted_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Pl
     if not labels and len(given):
         return given if centers is None else given.to(centers.device)
     shown = [(view.name, view.camera, view.pane_labels) for view in dataset.train if view.pane_labels is not None]
+    _check_marked(labels, [seen for _, _, seen in shown], dataset)
     points = dataset.points.positions
     fitted = fit_planes(
         points if centers is None else centers,
@@ -162,6 +163,18 @@ def fitted_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Pl
         unmarked=[(view.name, view.camera) for view in dataset.train if view.pane_labels is None],
     )
     return fitted if not len(given) else given.to(fitted.centers.device).joined(fitted)
+
+
+def _check_marked(labels: Sequence[int], masks: Sequence[Tensor], dataset: Dataset) -> None:
+    """Raises PlaneFitError where only photographs that are held out for tests show a pane."""
+    for label in labels:
+        if not any(bool((mask == label).any()) for mask in masks):
+            shown = ((view.name, view.pane_labels) for view in dataset.test)
+            held_out = [name for name, seen in shown if seen is not None and bool((seen == label).any())]
+            raise PlaneFitError(
+                f"pane {label} is marked in {', '.join(held_out)} only, and test photographs teach nothing; expected "
+                "it in two others at least, better three, taken from places well apart"
+            )
 
 
 def _as_given(planes: Planes, fit: PlaneFit) -> Planes:

@@ -59,8 +59,8 @@ class GrowSh:
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state`, if there is anything to edit."""
-        gaussians = state.scene.gaussian_sets()[self.part]
-        if gaussians.active_sh_degree == gaussians.max_sh_degree:
+        gaussians = state.scene.gaussian_sets().get(self.part)
+        if gaussians is None or gaussians.active_sh_degree == gaussians.max_sh_degree:
             return False
         raised = replace(gaussians, active_sh_degree=gaussians.active_sh_degree + 1)
         state.scene = state.scene.with_gaussians(self.part, raised)
@@ -159,7 +159,9 @@ class PruneIdle:
     @torch.no_grad()
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
         """Edits `state`, if there is anything to edit, and tells how far it is."""
-        gaussians = state.scene.gaussian_sets()[self.part]
+        gaussians = state.scene.gaussian_sets().get(self.part)
+        if gaussians is None:
+            return False
         most = torch.zeros_like(gaussians.logit_opacities)
         for done, view in enumerate(dataset.train):
             yield Working("looking for Gaussians that no view needs", done, len(dataset.train))
@@ -265,7 +267,9 @@ class ResetOpacity:
 
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> bool:
         """Edits `state`, if there is anything to edit."""
-        gaussians = state.scene.gaussian_sets()[self.part]
+        gaussians = state.scene.gaussian_sets().get(self.part)
+        if gaussians is None:
+            return False
         lowered, state.optimizer.moments = reset_opacity(
             gaussians, state.optimizer.moments, ceiling=self.ceiling, part=self.part
         )

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from glassplat.captures.view import FOLDER, View, estimated_normals, with_ignored_right
+from glassplat.captures.view import FOLDER, View, in_world, normals_in_camera, with_ignored_right
 from glassplat.kernels.loss_terms import gradient_conflict as shared_edges
 from glassplat.kernels.loss_terms import harmonic_energy
 from glassplat.kernels.photometric import photometric
@@ -182,12 +182,18 @@ def gradient_conflict(frame: Frame, view: View, scene: Scene) -> Tensor:
     return size * shared_edges(layers["without_panes"], layers["reflection"], hit)
 
 
+def _where_counted(errors: Tensor, view: View) -> Tensor:
+    """Errors [H, W] that are 0 where the view ignores pixels."""
+    return errors if view.ignored is None else errors.masked_fill(moved(view.ignored, errors.device), 0)
+
+
 def mask_loss(frame: Frame, view: View, scene: Scene) -> Tensor | None:
-    """Reflection mask loss L_m (TR-Gaussians, Eq. 16), on annotated views only."""
+    """Reflection mask loss L_m (TR-Gaussians, Eq. 16), on annotated views only. Ignored pixels count as right."""
     if view.pane_labels is None:
         return None
     annotated = moved(view.pane_labels > 0, frame.rgb.device).to(frame.rgb.dtype)
-    return (frame.layers["mask"] - annotated).abs().mean()
+    wrong = (frame.layers["mask"] - annotated).abs()
+    return _where_counted(wrong, view).mean()
 
 
 def intensity_departure(frame: Frame, view: View, scene: Scene) -> Tensor:
@@ -234,8 +240,8 @@ log = logging.getLogger("glassplat.training")
 class MonocularNormals:
     """The mean of 1 - n . N_m over the pixels of an image, n the blended normal made unit, N_m the estimated one.
 
-    Pixels without an estimate, or that show nothing, count as 0; a view without a file of normals has no such term.
-    Files are read once.
+    Pixels without an estimate, that show nothing or that the view ignores count as 0; a view without a file of normals
+    has no such term. Files are read once.
     """
 
     _known: dict[str, Tensor | None] = field(default_factory=dict, init=False, repr=False, compare=False)
@@ -243,13 +249,13 @@ class MonocularNormals:
     def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor | None:
         """The loss of a view; None where no normals lie beside its photograph."""
         if view.name not in self._known:
-            self._known[view.name] = estimated_normals(view)
+            self._known[view.name] = normals_in_camera(view)
             if self._known[view.name] is None and (view.image_path.parent.parent / FOLDER).is_dir():
                 log.warning("no normals for %s in the folder %r beside it: it is learned without", view.name, FOLDER)
         estimated = self._known[view.name]
         if estimated is None:
             return None
-        estimated = moved(estimated, frame.rgb.device).to(frame.rgb)
+        estimated = in_world(moved(estimated, frame.rgb.device).to(frame.rgb), view.camera)
         known = (estimated.square().sum(-1) > 0) & (frame.layers["alpha"].detach() > 0.5)
         blended = torch.nn.functional.normalize(frame.layers["normal"], dim=-1)
-        return (known * (1 - (blended * estimated).sum(-1))).mean()
+        return _where_counted(known * (1 - (blended * estimated).sum(-1)), view).mean()

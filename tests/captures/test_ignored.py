@@ -12,10 +12,13 @@ import pytest
 import torch
 from PIL import Image
 
+import glassplat.evaluate.evaluate
+import glassplat.evaluate.metrics
 from glassplat.captures.dataset import load_dataset
 from glassplat.captures.view import View
 from glassplat.errors import InputError
 from glassplat.evaluate.evaluate import evaluate
+from glassplat.evaluate.truth import TrueSurface
 from glassplat.files.sidecars import write_planes
 from glassplat.panes.material import compared_region, reduced_photograph
 from glassplat.render.frame import Frame
@@ -206,6 +209,29 @@ def test_metrics_leave_ignored_pixels_out() -> None:
     assert ignoring["ssim"] > passed_by["ssim"] + 0.02
     nothing = measured(replace(passed, read_ignored=lambda: torch.ones(28, 40)))
     assert nothing["psnr"] is None and "ignored" in nothing["psnr_reason"]
+
+
+def test_metrics_of_surfaces_leave_ignored_pixels_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset = tiny_capture()
+    view = replace(dataset.test[0], read_ignored=somewhere)
+    everywhere = TrueSurface(torch.ones(28, 40, dtype=torch.bool), None, torch.ones(28, 40))
+    monkeypatch.setattr(glassplat.evaluate.evaluate, "true_surface", lambda view: everywhere)
+    spoilt = torch.where(somewhere()[..., None], 255 - view.photo, view.photo)
+    passed = replace(View.in_memory(view.name, view.camera, photo=spoilt), read_ignored=somewhere)
+    clean, passed_by = (evaluate(true_scene(), Planar(), replace(dataset, test=(v,))).results for v in (view, passed))
+    assert passed_by["reflective_psnr"] == pytest.approx(clean["reflective_psnr"])
+
+
+def test_the_right_half_begins_in_the_middle(monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset = tiny_capture()
+    view = dataset.test[0]
+    with torch.no_grad():
+        almost = torch.round(Planar()(true_scene(), view.camera).rgb.clamp(0, 0.99) * 255 + 1).to(torch.uint8)
+    almost[:, view.camera.width // 2 - 1] = 255
+    monkeypatch.setattr(glassplat.evaluate.metrics, "color_corrected", lambda image, *rest, **more: image)
+    spoilt = View.in_memory(view.name, view.camera, photo=almost)
+    results = evaluate(true_scene(), Planar(), replace(dataset, test=(spoilt,))).results
+    assert results["psnr"] < 40 < 45 < results["right_half_psnr"]
 
 
 def test_ignored_pixels_do_not_tell_mirrors_from_glass() -> None:

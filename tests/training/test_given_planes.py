@@ -7,8 +7,10 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from glassplat.captures.dataset import load_dataset
 from glassplat.captures.view import PointCloud
@@ -91,3 +93,13 @@ def test_without_masks_and_rectangles_it_says_how_to_mark_panes(capture: Path) -
     (capture / "planes.json").unlink()
     with pytest.raises(PlaneFitError, match="glassplat annotate"):
         PlanarRecipe().initialise(load_dataset(capture))
+
+
+def test_a_pane_that_only_a_test_photograph_shows_is_refused_by_name(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path / "capture")
+    held_out = root / "panes" / load_dataset(root).test[0].name
+    mask = np.array(Image.open(held_out))
+    mask[:8, :8] = 2
+    Image.fromarray(mask).save(held_out)
+    with pytest.raises(PlaneFitError, match=f"pane 2 is marked in {held_out.name} only, and test photographs"):
+        PlanarRecipe().initialise(load_dataset(root))

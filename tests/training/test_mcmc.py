@@ -10,6 +10,8 @@ from torch import Tensor
 
 from glassplat.scene.camera import rotation_from_quat
 from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import Scene
+from glassplat.training.actions import AddNoise
 from glassplat.training.densify import (
     MOST_COPIES,
     rank_among_equals,
@@ -18,7 +20,8 @@ from glassplat.training.densify import (
     sgld_noise,
     shared_contribution,
 )
-from glassplat.training.options import McmcDensify
+from glassplat.training.options import FASTEST_ITERATIONS, PUBLISHED_ITERATIONS, McmcDensify, Rate
+from glassplat.training.stage import Clock, TrainState
 
 OPTIONS = McmcDensify()
 
@@ -200,6 +203,16 @@ def test_published_noise_is_in_world_units() -> None:
     covariances = rotations @ torch.diag_embed((2 * gaussians.log_scales).exp()) @ rotations.transpose(1, 2)
     expected = 5e5 * (rate * extent) * 0.5 * (covariances @ eta[..., None]).squeeze(-1)
     torch.testing.assert_close(published, expected, rtol=1e-3, atol=1e-6)
+
+
+def test_a_step_of_training_adds_noise_in_the_same_units() -> None:
+    gaussians, extent = make_gaussians([0.005] * 5), 3.0
+    state = TrainState(Scene(gaussians, extent), seed=4)
+    AddNoise(McmcDensify.published(), Rate(1.6e-4, per_extent=True))(state, Clock(0, 10, 1), None)
+    rate = 1.6e-4 * (PUBLISHED_ITERATIONS / FASTEST_ITERATIONS) ** Rate(1.0).short_run_power
+    generator = TrainState(Scene(gaussians, extent), seed=4).generator("explore")
+    expected = sgld_noise(McmcDensify.published(), gaussians, rate=rate, extent=extent, generator=generator)
+    torch.testing.assert_close(state.scene.primary.means - gaussians.means, expected, rtol=1e-3, atol=1e-6)
 
 
 def test_ranks_count_earlier_equals() -> None:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from glassplat.captures.dataset import Dataset, load_dataset, with_corrected_cameras
+from glassplat.captures.view import View
 from glassplat.evaluate.evaluate import aligned_camera, with_aligned_test_views
 from glassplat.files.scene_folder import read_scene, write_scene
 from glassplat.files.sidecars import read_cameras, write_colmap
@@ -23,7 +24,7 @@ from glassplat.render.frame import Renderer
 from glassplat.render.planar import Planar
 from glassplat.render.traced import Traced
 from glassplat.scene.camera import Camera
-from glassplat.scene.corrections import PoseCorrections, moved_camera
+from glassplat.scene.corrections import Exposures, PoseCorrections, moved_camera
 from glassplat.scene.scene import Scene
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.corrections import center_poses, poses_begun
@@ -159,6 +160,17 @@ def test_test_cameras_are_aligned_with_their_photographs() -> None:
     off = pixels_off(dataset.test[0].camera, truth.test[0].camera)
     assert pixels_off(aligned.test[0].camera, truth.test[0].camera) < 0.25 * off
     assert aligned.train is dataset.train
+
+
+def test_a_test_camera_is_aligned_in_the_colours_of_its_photograph() -> None:
+    true, scene = tiny_capture().test[0], true_scene()
+    darker = torch.zeros(2, 3, 4)
+    darker[:, :, :3] = -0.5 * torch.eye(3)
+    exposed = replace(scene, exposures=Exposures(darker, ("0.png", "2.png")))
+    view = View.in_memory("1.png", true.camera, photo=(0.5 * true.photo).round().to(torch.uint8))
+    start = view.with_camera(moved_camera(view.camera, TWIST, scene.extent))
+    found = aligned_camera(exposed, Planar(), start)
+    assert pixels_off(found, true.camera) < 0.15 * pixels_off(start.camera, true.camera)
 
 
 def test_where_nothing_is_in_sight_the_camera_stays() -> None:

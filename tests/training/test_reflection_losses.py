@@ -106,8 +106,18 @@ def test_mask_loss_applies_to_annotated_views_only() -> None:
     labels = torch.zeros(8, 9, dtype=torch.uint8)
     labels[:4] = 2
     assert mask_loss(frame, SimpleNamespace(pane_labels=None), SimpleNamespace()) is None
-    annotated = mask_loss(frame, SimpleNamespace(pane_labels=labels), SimpleNamespace())
+    annotated = mask_loss(frame, SimpleNamespace(pane_labels=labels, ignored=None), SimpleNamespace())
     torch.testing.assert_close(annotated, torch.tensor(0.5 * 0.75 + 0.5 * 0.25))
+
+
+def test_whoever_stands_before_a_pane_leaves_no_hole_in_it() -> None:
+    mask = torch.full((8, 9), 0.25, requires_grad=True)
+    labels = torch.ones(8, 9, dtype=torch.uint8)
+    ignored = torch.zeros(8, 9, dtype=torch.bool)
+    ignored[2:5, 3:7] = True
+    view = SimpleNamespace(pane_labels=labels, ignored=ignored)
+    (gradient,) = torch.autograd.grad(mask_loss(frame_with(mask=mask), view, SimpleNamespace()), mask)
+    assert not bool(gradient[ignored].any()) and bool((gradient[~ignored] < 0).all())
 
 
 def test_reflections_depart_from_what_they_mirror_as_much_darker_as_brighter() -> None:

@@ -16,7 +16,7 @@ from glassplat.methods.recipe import recipe_from_json, recipe_to_json
 from glassplat.methods.surroundings import AddSurroundings
 from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.scene import Environment
+from glassplat.scene.scene import Environment, Scene
 from glassplat.training.actions import Densify, GrowSh, PruneIdle, ResetOpacity
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.densify import ScreenStatistics
@@ -30,7 +30,7 @@ from glassplat.training.options import (
     SurroundingsOptions,
     SurroundingsStart,
 )
-from glassplat.training.stage import Clock, Every, TrainState, stage_starts
+from glassplat.training.stage import Clock, Every, Stage, TrainState, stage_starts
 from tests.training.progress_of import finished
 from tests.training.tiny_capture import tiny_capture
 
@@ -274,9 +274,35 @@ def test_what_hardly_reflects_learns_to_without_an_environment() -> None:
     faint = {"logit_strength": torch.full((len(state.scene.primary),), -6.0)}
     scene = replace(state.scene, primary=replace(state.scene.primary, channels=faint))
     for stage in recipe.stages(0)[1:]:
-        found = differentiate(stage, scene, tiny_capture().train[0], probed=False)
-        assert bool(found.gradients["primary.logit_strength"].any())
+        assert learns_to_reflect(stage, scene)
     assert recipe.renderer().least_strength == 0.02
+
+
+def test_what_is_too_faint_to_be_drawn_learns_to_reflect_an_environment() -> None:
+    state = surrounded_state()
+    faint = {"logit_strength": torch.full((len(state.scene.primary),), -7.0)}
+    primary = replace(state.scene.primary, channels=faint)
+    environment = Environment.random(4, generator=torch.Generator().manual_seed(0))
+    scene = replace(state.scene, primary=primary, environment=environment, surroundings=Gaussians.empty())
+    for stage in RECIPE.stages(0)[1:]:
+        assert learns_to_reflect(stage, scene)
+
+
+def learns_to_reflect(stage: Stage, scene: Scene) -> bool:
+    """Return whether the photograph alone, without the prices on strength, gives strengths a gradient."""
+    photometric = replace(stage, losses=stage.losses[:1])
+    found = differentiate(photometric, scene, tiny_capture().train[0], probed=False)
+    return "primary.logit_strength" in found.gradients and bool(found.gradients["primary.logit_strength"].any())
+
+
+def test_actions_leave_surroundings_alone_that_are_gone() -> None:
+    state = surrounded_state()
+    state.scene = replace(state.scene, surroundings=Gaussians.empty())
+    part, clock = "surroundings", Clock(32, 40, 6)
+    prune = PruneIdle(DefaultDensify(), part, mirrored_contributions)
+    for action in (GrowSh(Every(0.1), part), ResetOpacity(Every(0.1), part=part)):
+        assert not action.apply(state, tiny_capture(), clock)
+    assert not finished(prune.apply(state, tiny_capture(), clock))
 
 
 def test_a_scene_without_surroundings_is_refused() -> None:
