@@ -70,7 +70,7 @@ REASONS: dict[str, dict[str, str]] = {
         "seed_reflections": "Captures from the front show the room in the glass only.",
         "turn_reflections": "What the first stage built behind glass would stay there, and R0 too low.",
         "weights.intensity": "R0 and a(u) are nearly one factor.",
-        "moving_mean": "The mean depth follows the photographs.",
+        "moving_mean": "Gaussians move towards the mean depth; the mean itself is not pulled towards stray ones.",
         "perturbation.stop": "What was perturbed has time to settle.",
         "perturbation.bounds": "Opacities that were lowered by mistake can recover.",
         "early_growth": "Early Gaussians build the reflected room behind the pane (MCMC).",
