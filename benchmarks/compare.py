@@ -1,8 +1,8 @@
 """Compare methods and variants of them over scenes: train, evaluate, and write the tables of docs/results.md.
 
     python -m benchmarks.compare rooms/1 rooms/2 --methods splat planar --iterations 7000 --output runs/rooms
-    python -m benchmarks.compare rooms/* --variant no-conflict="--weights.conflict 0" --variant paper="--preset paper"
-    python -m benchmarks.compare rooms/* --variant planar:srgb="--blend srgb" --options "--downscale 2" --table
+    python -m benchmarks.compare rooms/* --variant no-conflict="--weights.conflict 0" --variant mcmc="--strategy mcmc"
+    python -m benchmarks.compare rooms/* --variant planar:paper="--preset paper" --options "--downscale 2" --table
 
 Every run is `glassplat train` and `glassplat eval` in a process of its own, in OUTPUT/SCENE/NAME-seedN. Repeat the
 command to go on after an interrupt: finished runs are skipped, begun ones go on from their checkpoint. A run that fails

@@ -5,7 +5,7 @@
     dataset = glassplat.load_dataset("shop", downscale=2)  # photographs, poses, masks of panes
     model = glassplat.Training(dataset, "planar", iterations=7000).run()  # or glassplat.load("runs/shop")
     frame = model.render("IMG_0042.jpg", layers=["transmission", "reflection"])  # tensors, with gradients
-    model.with_mirrors(1).without_pane(2).save("shop.html")  # edits are new models
+    model.with_mirrors(1).save("shop.html")  # edits are new models
 
 `load` reads a run, or a splat file of any program, as a `Model`, which renders, is edited and is saved. `load_dataset`
 reads a capture as a `Dataset`; `Training` trains on it and tells what happens, message by message. A scene is plain

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import shlex
 from pathlib import Path
 
 import pytest
+import torch
 
+import glassplat
 from glassplat.cli import main
 
 ROOT = Path(__file__).parent.parent
@@ -70,6 +73,22 @@ def test_the_command_line_takes_every_command_shown(arguments: list[str]) -> Non
 def test_make_has_every_target_shown(arguments: list[str]) -> None:
     targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     assert set(arguments) <= targets
+
+
+PYTHON_BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
+
+
+def test_the_term_of_a_recipe_of_ones_own_leaves_out_stages_without_depths() -> None:
+    blocks = PYTHON_BLOCK.findall((ROOT / "docs" / "python.md").read_text(encoding="utf-8"))
+    (block,) = [block for block in blocks if "LossTerm" in block]
+    names = {"glassplat": glassplat, "dataclasses": dataclasses}
+    exec(block, names)
+    stages = names["Calm"]().stages(seed=0)
+    terms = [term for stage in stages for term in stage.losses if term.name == "calm"]
+    assert len(terms) == len(stages)
+    image, depth = torch.zeros(2, 3, 3), torch.tensor([[0.0, 1.0, 3.0], [0.0, 0.0, 0.0]])
+    assert terms[0].function(glassplat.Frame(image, {}), None, None) is None
+    assert terms[0].function(glassplat.Frame(image, {"depth": depth}), None, None) == 0.75
 
 
 MODULE = re.compile(r"python -m ((?:tools|benchmarks)(?:\.\w+)?)([^`\n|;]*)")

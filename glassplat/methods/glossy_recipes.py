@@ -85,8 +85,8 @@ class GlossyOptions:
         hurry_found: so that `hurry_matte` counts after propagation where something reflects, too; before, high rates
             would spoil its normals.
         propagation_interval: steps between densifications while normals spread; None keeps `densify.interval`.
-        rates: learning rates of the Gaussians; they do not rise in short runs, which costs a mirror ball its normals
-            (lab/training.md).
+        rates: learning rates of the Gaussians; in short runs they rise before and after normals spread (`hurry_matte`,
+            `hurry_found`), but not meanwhile: that costs a mirror ball its normals (lab/training.md).
         reflection_rates: learning rates of strength and environment.
         rhythm: when opacities are reset and the SH degree grows.
         strategy: what decides how many Gaussians there are and where; `densify` or `mcmc` holds its options.

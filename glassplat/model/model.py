@@ -292,7 +292,7 @@ class Model:
         Args:
             path: .ply, .spz or .glb for other programs, with the panes beside it as `planes.json` and `glass.ply`, and
                 the cameras as `cameras.json`; .html for a page that shows it with live panes; without a suffix a folder
-                that is loaded bit for bit, like a run.
+                whose tensors are loaded bit for bit, like a run's.
             overwrite: replace files that are there.
 
         Returns:
@@ -467,7 +467,7 @@ def write_as_run(folder: Path, model: Savable, source: Path | None) -> None:
 
 
 def save_folder(model: Savable, folder: Path) -> Path:
-    """Writes a model as a run of its own, which `load` reads bit for bit; returns the folder.
+    """Writes a model as a run of its own, whose tensors are loaded bit for bit; returns the folder.
 
     Raises:
         FileExistsError: something is there; nothing was written.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shlex
 import subprocess
 import sys
 import time
@@ -25,6 +27,7 @@ from benchmarks.compare import (
     tables,
     values_of,
 )
+from glassplat.cli import main as command_line
 from tests.training.tiny_capture import write_tiny_capture
 
 
@@ -45,6 +48,13 @@ def row(text: str, *begin: str) -> list[str]:
     """The cells of the only line that begins with some."""
     (line,) = [line for line in text.splitlines() if line.startswith(f"| {' | '.join(begin)} |")]
     return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_the_help_shows_variants_that_can_be_trained() -> None:
+    shown = re.findall(r"--variant (\S+=\".*?\")", compare.__doc__ or "")
+    assert len(shown) == 3
+    for _, method, options in named_options(["splat", "planar"], [shlex.split(variant)[0] for variant in shown]):
+        command_line.parsed(["train", method, "--data", "room", "--output", "run", *options])
 
 
 def test_runs_are_trained_and_evaluated_once_and_failures_stop_no_other(
