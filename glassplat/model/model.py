@@ -602,9 +602,11 @@ def _from_run(path: Path, device: DeviceName) -> Model:
 
 
 def _from_file(path: Path, device: DeviceName, planes: Path | None, up: Up) -> Model:
-    """A scene that was not trained here, over black."""
+    """A scene that was not trained here, over black; discs, before which no pane can stand, as `splat` draws them."""
     with input_checked():
         scene, cameras, lost = imported_scene(path, planes, up)
     if lost:
         log.warning("%d Gaussians of %s are left out: values that are no numbers or too large to draw", lost, path)
-    return Model(scene.to(chosen_device(device)), PlanarRecipe(background=BLACK), by_name(cameras), path.stem, path)
+    discs = scene.primary.are_discs
+    recipe: Any = SplatRecipe(background=BLACK, primitive="disc") if discs else PlanarRecipe(background=BLACK)
+    return Model(scene.to(chosen_device(device)), recipe, by_name(cameras), path.stem, path)

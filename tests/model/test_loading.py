@@ -16,9 +16,11 @@ from glassplat.cli.main import main
 from glassplat.files.ply import write_gaussians
 from glassplat.files.sidecars import write_planes
 from glassplat.files.writing import FORGED_SUFFIXES, SPLAT_SUFFIXES, SPLAT_WRITERS, splat_writer
+from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.options import BLACK
 from tests.cli.tiny_run import write_run
 from tests.files.test_spz import typical
-from tests.training.tiny_capture import true_scene
+from tests.training.tiny_capture import tiny_capture, true_scene
 
 
 def test_what_was_exported_comes_back(tmp_path: Path) -> None:
@@ -31,6 +33,17 @@ def test_what_was_exported_comes_back(tmp_path: Path) -> None:
         assert torch.equal(again.scene.planes.centers, before.scene.planes.centers)
         assert torch.equal(again.scene.glass.means, before.scene.glass.means)
         assert list(again.cameras) == list(before.cameras)
+
+
+def test_a_file_of_discs_is_drawn_as_discs(tmp_path: Path) -> None:
+    solid = true_scene().primary
+    discs = replace(solid, log_scales=solid.log_scales[:, :2].contiguous())
+    write_gaussians(tmp_path / "scene.ply", discs)
+    loaded = load(tmp_path / "scene.ply", device="cpu")
+    camera = tiny_capture().train[0].camera
+    expected = SplatRecipe(background=BLACK, primitive="disc").renderer()(replace(true_scene(), primary=discs), camera)
+    assert float(expected.rgb.detach().max()) > 0.1
+    torch.testing.assert_close(loaded.image(camera), expected.rgb.detach(), atol=1 / 255, rtol=0)
 
 
 def given_by_hand(path: Path) -> Path:
