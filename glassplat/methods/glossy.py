@@ -57,7 +57,7 @@ def first_scene(recipe: DeferredRecipe, dataset: Dataset) -> Scene:
 
 def finished_renderer(recipe: DeferredRecipe) -> Deferred:
     """The renderer of the finished scene, with all its layers."""
-    return Deferred(recipe.background or BLACK, recipe.shading, least_strength=INVISIBLE)
+    return Deferred(recipe.background or BLACK, least_strength=INVISIBLE)
 
 
 def stages_of(recipe: DeferredRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
@@ -82,7 +82,7 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         densify_until=population.densify_until,
     )
     beat = Every(recipe.rhythm.beat, 0.0, recipe.schedule.stop, recipe.rhythm.least, skip_multiples_of=3)
-    renderer = Deferred(recipe.background or BLACK, recipe.shading, depth=recipe.consistency_weight != 0)
+    renderer = Deferred(recipe.background or BLACK, depth=recipe.consistency_weight != 0)
     guidance = weighted(
         LossTerm("outside", recipe.outside_weight, strength_outside),
         LossTerm("strength", recipe.strength_weight, mean_strength),
@@ -112,7 +112,7 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         setup=None,
         name="3 refinement",
         share=1 - recipe.schedule.stop,
-        renderer=Deferred(recipe.background or BLACK, recipe.shading, depth=False),
+        renderer=Deferred(recipe.background or BLACK, depth=False),
         losses=tuple(term for term in reflection.losses if term.name != "consistency"),
     )
     return bootstrap, reflection, refinement

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from glassplat.methods.splat_recipe import Primitive
 from glassplat.options import (
@@ -17,7 +18,6 @@ from glassplat.options import (
     NotNegative,
     Positive,
     Several,
-    Shading,
     Share,
     ShDegree,
 )
@@ -143,15 +143,10 @@ DEFERRED_CODE_ITERATIONS = 61_000
 
 @dataclass(frozen=True)
 class DeferredRecipe(GlossyOptions):
-    """3DGS-DR: a strength and a normal for every Gaussian, one environment, and shading per pixel.
-
-    Attributes:
-        shading: per pixel (`deferred`), or per Gaussian (`forward`, ablation).
-    """
+    """3DGS-DR: a strength and a normal for every Gaussian, one environment, and shading per pixel."""
 
     method: ClassVar[str] = "deferred"
-
-    shading: Internal[Shading] = "deferred"
+    FORMER: ClassVar[Mapping[str, Any]] = {"shading": "deferred"}
 
     @classmethod
     def paper(cls) -> DeferredRecipe:

@@ -18,7 +18,6 @@ from glassplat.kernels.environment import cube_lookup, shade_environment, surfac
 from glassplat.kernels.panes.reference import pixel_rays, ray_grid
 from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, STRENGTH_AT, SURFACE_CHANNELS, Projected, Shaded
 from glassplat.kernels.tiles import bin_tiles
-from glassplat.options import Shading
 from glassplat.render.frame import (
     NEAR_PER_EXTENT,
     Frame,
@@ -356,8 +355,6 @@ class Deferred:
 
     Attributes:
         background: colour behind everything, sRGB.
-        shading: `forward` shades every Gaussian instead of every pixel, the paper's ablation; its `reflection` layer
-            is the blended light that the Gaussians reflect, divided by R.
         depth: also render the depth layer.
         environment: also render the layer `environment`.
         least_strength: pixels that reflect less are not shaded, and their `reflection` is 0. Not for training, where a
@@ -365,7 +362,6 @@ class Deferred:
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    shading: Shading = "deferred"
     depth: bool = True
     environment: bool = False
     least_strength: float = 0.0
@@ -379,10 +375,9 @@ class Deferred:
         check_reflective(scene)
         camera = camera.to(scene.primary.means.device)
         projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
-        shade = self._shade_pixels if self.shading == "deferred" else self._shade_gaussians
         channels = self._channels_of(scene.primary, camera, projected)
         screen = (screen_pass("primary", projected),) if probed else ()
-        rgb, layers = shade(scene, camera, projected, channels, joined_probe(screen))
+        rgb, layers = self._shade_pixels(scene, camera, projected, channels, joined_probe(screen))
         if self.environment:
             layers["environment"] = torch.sigmoid(cube_lookup(scene.environment.raw, view_directions(camera)))
         return Frame(rgb, layers, direct=shown(projected), screen=screen)
@@ -401,10 +396,8 @@ class Deferred:
         """The renderer, also of `environment` where that is among the layers."""
         return replace(self, environment=self.environment or "environment" in layers)
 
-    def page_settings(self) -> Mapping[str, Any] | None:
+    def page_settings(self) -> Mapping[str, Any]:
         """Settings for the web page, which shades pixels and looks up distant light."""
-        if self.shading != "deferred":
-            return None
         return page_settings(self.background, "distant")
 
     def _channels_of(self, gaussians: Gaussians, camera: Camera, projected: Projected) -> Tensor:
@@ -426,20 +419,6 @@ class Deferred:
         image, layers = self._blend(camera, projected, channels, probe)
         shaded = shaded_pixels(scene, camera, image, layers["alpha"], self.background, self.least_strength)
         return shaded.rgb, layers | {"base": shaded.base, "reflection": shaded.reflection}
-
-    def _shade_gaussians(
-        self, scene: Scene, camera: Camera, projected: Projected, channels: Tensor, probe: Tensor | None
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        colors, normals, strengths = channels[:, :SURFACE_CHANNELS].split((NORMAL_AT, 3, 1), dim=1)
-        to_eye = torch.nn.functional.normalize(camera.center - scene.primary.means, dim=1)
-        cosines = (normals * to_eye).sum(-1, keepdim=True)
-        mirrored = torch.sigmoid(cube_lookup(scene.environment.raw, 2 * cosines * normals - to_eye))
-        channels = torch.cat([channels, strengths * colors, strengths * mirrored], dim=1)
-        image, layers = self._blend(camera, projected, channels, probe)
-        base = over_background(image[..., :NORMAL_AT], layers["alpha"], self.background)
-        lost, gained = image[..., -6:-3], image[..., -3:]
-        reflection = gained / layers["strength"][..., None].clamp(min=1e-6)
-        return base - lost + gained, layers | {"base": base, "reflection": reflection}
 
     def _blend(
         self, camera: Camera, projected: Projected, channels: Tensor, probe: Tensor | None

@@ -119,7 +119,7 @@ class WithNormals:
         """The renderer with these layers."""
         return self.renderer.with_layers(layers)
 
-    def page_settings(self) -> Mapping[str, Any] | None:
+    def page_settings(self) -> Mapping[str, Any]:
         """As the renderer does."""
         return self.renderer.page_settings()
 

@@ -80,7 +80,6 @@ def discs() -> Scene:
 RENDERED = [
     (Planar(), showcase()),
     (Deferred(), deferred_scene()),
-    (Deferred(shading="forward"), deferred_scene()),
     (Traced(), replace(traced_scene(), environment=deferred_scene().environment)),
     (Traced(), discs()),
 ]
