@@ -392,10 +392,15 @@ def check_reflective(scene: Scene) -> None:
     """Raises ValueError where a scene lacks what reflection needs."""
     if scene.environment.is_empty:
         raise ValueError("the scene has no environment; expected one trained with `deferred`")
+    check_strengths(scene, "deferred")
+
+
+def check_strengths(scene: Scene, method: str) -> None:
+    """Raises ValueError where nothing mirrors, or what is mirrored from afar cannot be drawn."""
     if "logit_strength" not in scene.primary.channels:
         raise ValueError(
             f"the Gaussians have the channels {sorted(scene.primary.channels)}; expected logit_strength, as "
-            "`deferred` trains it"
+            f"`{method}` trains it"
         )
     check_numbers(
         {"environment.raw": scene.environment.raw, "logit_strength": scene.primary.channels["logit_strength"]}
