@@ -162,7 +162,7 @@ def options_from_json(kind: type, value: Any) -> Any:
 
 
 def as_typed(name: str) -> str:
-    """The option of the command line that sets a field: `rates.means_end` is `--rates.means-end`."""
+    """The option of the command line that sets a field: `plane_fit.seed` is `--plane-fit.seed`."""
     return "--" + name.replace("_", "-")
 
 

@@ -101,7 +101,7 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
             _propagate(recipe, beat, renderer),
             GrowShAfterPropagation(Every(recipe.rhythm.sh)),
             *_resets(recipe, population),
-            RefineEnvironment(_doublings(recipe), recipe.texels),
+            RefineEnvironment(doublings(recipe.first_texels, recipe.texels), recipe.texels),
         ),
         post_steps=population.post_steps,
         setup=first_reflections(recipe),
@@ -160,11 +160,6 @@ def _environment(recipe: DeferredRecipe) -> AddEnvironment:
     return AddEnvironment(min(recipe.first_texels, recipe.texels), recipe.region, recipe.find_region)
 
 
-def _doublings(recipe: DeferredRecipe) -> tuple[float, ...]:
-    """The shares of the run at which the environment's edge length doubles."""
-    return doublings(recipe.first_texels, recipe.texels, recipe.refinements)
-
-
 def _edits(recipe: DeferredRecipe, population: Population) -> tuple[Action, ...]:
     """Actions that change the number of Gaussians once they reflect."""
     if recipe.propagation_interval is None or recipe.strategy == "mcmc":
@@ -212,11 +207,16 @@ def _population(recipe: DeferredRecipe) -> Population:
     )
 
 
-def doublings(first_texels: int, texels: int, refinements: tuple[float, float]) -> tuple[float, ...]:
-    """The shares of the run, evenly from a first to a last one, at which an edge length doubles until it is reached."""
+FIRST_DOUBLING, LAST_DOUBLING = 0.45, 0.65
+"""Shares of the run at which the environment's edge length doubles for the first and for the last time."""
+
+
+def doublings(first_texels: int, texels: int) -> tuple[float, ...]:
+    """The shares of the run, evenly from the first to the last, at which an edge length doubles until it is reached."""
     count = max(math.ceil(math.log2(texels / first_texels)), 0)
-    first, last = refinements
-    return tuple(first + (last - first) * number / max(count - 1, 1) for number in range(count))
+    return tuple(
+        FIRST_DOUBLING + (LAST_DOUBLING - FIRST_DOUBLING) * number / max(count - 1, 1) for number in range(count)
+    )
 
 
 NORMAL_TERMS = ("consistency", "monocular normals")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -10,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from glassplat.methods.splat_recipe import Primitive
 from glassplat.options import (
     ESSENTIAL,
-    Ascending,
     Color,
     Finite,
     InnerShare,
@@ -62,8 +60,6 @@ class GlossyOptions:
             for afterwards it is a run of `splat`, else harmonics wait.
         texels: edge length of the environment's cube faces in the end.
         first_texels: edge length at the start.
-        refinements: shares of the run at which the edge length doubles for the first and for the last time on the way
-            from `first_texels` to `texels`; other doublings are spread evenly in between.
         first_strength: reflection strength of every Gaussian at the start.
         search: what is taken for a mirror at once when reflections begin.
         region: only what lies in this sphere may reflect: centre and radius, world units. None leaves it to
@@ -96,6 +92,8 @@ class GlossyOptions:
         poses: whether the camera of each photograph is corrected.
     """
 
+    FORMER: ClassVar[dict[str, Any]] = {"refinements": [0.45, 0.65]}
+
     sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
     ssim_weight: Share = 0.2
     view_dependence_weight: NotNegative = 0.0
@@ -103,7 +101,6 @@ class GlossyOptions:
     bootstrap: Share = 0.06
     texels: Annotated[Texels, ESSENTIAL] = 64
     first_texels: Texels = 16
-    refinements: Internal[Annotated[tuple[Share, Share], Ascending()]] = (0.45, 0.65)
     first_strength: Internal[InnerShare] = 1e-3
     search: Internal[MirrorSearch] = field(default_factory=MirrorSearch)
     region: Annotated[tuple[Finite, Finite, Finite, Positive] | None, ESSENTIAL] = None
@@ -146,7 +143,7 @@ class DeferredRecipe(GlossyOptions):
     """3DGS-DR: a strength and a normal for every Gaussian, one environment, and shading per pixel."""
 
     method: ClassVar[str] = "deferred"
-    FORMER: ClassVar[Mapping[str, Any]] = {"shading": "deferred"}
+    FORMER: ClassVar[dict[str, Any]] = GlossyOptions.FORMER | {"shading": "deferred"}
 
     @classmethod
     def paper(cls) -> DeferredRecipe:

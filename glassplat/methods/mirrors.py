@@ -266,8 +266,6 @@ def normals_propagated(
     options: NormalPropagation, gaussians: Gaussians, moments: Moments
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
     """Raised opacities and strengths, and reflective Gaussians grown; what changed forgets its moments."""
-    if not options.propagates:
-        return gaussians, dict(moments)
     opacities = gaussians.logit_opacities.clamp(min=logit(options.least_opacity))
     strengths = gaussians.channels["logit_strength"].clamp(min=logit(options.least_strength))
     grows = strengths >= logit(options.reflective)
@@ -375,9 +373,8 @@ class Propagate:
         primary, moments = normals_propagated(self.propagation, state.scene.primary, state.optimizer.moments)
         primary, moments = colors_disturbed(self.propagation, primary, moments, state.generator(self.name))
         state.scene, state.optimizer.moments = replace(state.scene, primary=primary), moments
-        if self.propagation.propagates:
-            state.optimizer.paused["primary.logit_opacities"] = self.schedule.pause
-            state.records[RAISED] = clock.step
+        state.optimizer.paused["primary.logit_opacities"] = self.schedule.pause
+        state.records[RAISED] = clock.step
         return True
 
     @property

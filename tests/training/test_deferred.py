@@ -43,7 +43,6 @@ RECIPE = DeferredRecipe(
     bootstrap=0.2,
     texels=4,
     first_texels=2,
-    refinements=(0.4, 0.6),
     search=MirrorSearch(begin_found=False),
     region=(0.0, 0.0, 3.5, 1.0),
     rhythm=Rhythm(beat=0.1, least=2, sh=0.1),
