@@ -29,7 +29,7 @@ from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene import logit
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify, GrowSh, Population, PruneIdle, ResetOpacity, population_of
-from glassplat.training.corrections import exposures_begun, exposures_learnt, poses_begun, poses_learnt
+from glassplat.training.corrections import corrections_begun, corrections_learnt
 from glassplat.training.densify import as_discs
 from glassplat.training.losses import (
     LossTerm,
@@ -51,8 +51,7 @@ def first_scene(recipe: DeferredRecipe, dataset: Dataset) -> Scene:
     primary = _population(recipe).initial(dataset.points, recipe.sh_degree)
     strengths = torch.full((len(primary),), logit(recipe.first_strength))
     primary = replace(primary, channels={"logit_strength": strengths})
-    scene = Scene(primary, dataset.extent)
-    return poses_begun(recipe.poses, exposures_begun(recipe.exposure, scene, dataset), dataset)
+    return corrections_begun(recipe, Scene(primary, dataset.extent), dataset)
 
 
 def finished_renderer(recipe: DeferredRecipe) -> Deferred:
@@ -64,7 +63,7 @@ def stages_of(recipe: DeferredRecipe, seed: int, iterations: int = PUBLISHED_ITE
     """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has one stage."""
     short = iterations < recipe.least_iterations
     stages = _matte_stages(recipe, seed, iterations) if short else _reflecting_stages(recipe)
-    return poses_learnt(recipe.poses, exposures_learnt(recipe.exposure, stages))
+    return corrections_learnt(recipe, stages)
 
 
 def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:

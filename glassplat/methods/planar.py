@@ -31,13 +31,7 @@ from glassplat.scene.gaussians import mirrored_gaussians
 from glassplat.scene.panes import Planes, coplanar_groups
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify, GrowSh, PerturbOpacity, Population, ResetOpacity, population_of
-from glassplat.training.corrections import (
-    exposures_begun,
-    exposures_learnt,
-    photographer_learnt,
-    poses_begun,
-    poses_learnt,
-)
+from glassplat.training.corrections import corrections_begun, corrections_learnt, photographer_learnt
 from glassplat.training.densify import append, apply_edit, gaussians_from_points, keep
 from glassplat.training.losses import (
     LossTerm,
@@ -314,7 +308,7 @@ def first_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
     if dataset.measured_points:
         fitted_planes(dataset, None, recipe.plane_fit)
     scene = Scene(planar_population(recipe).initial(dataset.points, recipe.sh_degree), dataset.extent)
-    return poses_begun(recipe.poses, exposures_begun(recipe.exposure, scene, dataset), dataset)
+    return corrections_begun(recipe, scene, dataset)
 
 
 def _lack_of_masks(dataset: Dataset) -> str:
@@ -362,7 +356,7 @@ def stages_of(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERA
     )
     stages: tuple[Stage, ...] = (initialisation, _adjustment(recipe, second, setup), _joint(recipe, third))
     stages = photographer_learnt(recipe.photographer, stages, recipe.densify, seed)
-    return poses_learnt(recipe.poses, exposures_learnt(recipe.exposure, stages))
+    return corrections_learnt(recipe, stages)
 
 
 JOINT_FACTOR = 0.1

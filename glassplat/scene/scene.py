@@ -122,7 +122,7 @@ class Scene:
     photographer: Gaussians = field(default_factory=Gaussians.empty)
     up: Direction | None = None
     exposures: Exposures = field(default_factory=Exposures.neutral)
-    poses: PoseCorrections = field(default_factory=PoseCorrections.none)
+    poses: PoseCorrections = field(default_factory=PoseCorrections.neutral)
 
     def __repr__(self) -> str:
         sets = (f"{name}={gaussians}" for name, gaussians in self.gaussian_sets().items())

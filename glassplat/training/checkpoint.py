@@ -222,12 +222,12 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     moved = under(tensors, "scene/poses/")
     check_shapes(moved, {"twists": (6,)} if moved else {}, "poses")
     return Scene(
-        poses=PoseCorrections(**moved, names=tuple(header["corrected"])) if moved else empty.poses,
+        poses=PoseCorrections(moved["twists"], tuple(header["corrected"])) if moved else empty.poses,
         extent=header["extent"],
         planes=Planes(**planes, labels=header["labels"], mirrors=header["mirrors"]),
         environment=environment,
         up=direction(header["up"], "the header"),
-        exposures=Exposures(**exposed, names=tuple(header["photographs"])) if exposed else empty.exposures,
+        exposures=Exposures(exposed["affine"], tuple(header["photographs"])) if exposed else empty.exposures,
         **sets,
     )
 

@@ -325,11 +325,11 @@ class PhotoExposure:
 
     Attributes:
         rate: learning rate at the start; 0 takes all photographs as exposed alike.
-        rate_end: that at the end of the run, as a share of `rate`.
     """
 
+    FORMER: ClassVar[dict[str, Any]] = {"rate_end": 0.1}
+
     rate: LearningRate = 0.0
-    rate_end: Internal[PositiveShare] = 0.1
 
 
 @dataclass(frozen=True)
@@ -338,11 +338,11 @@ class PoseRefinement:
 
     Attributes:
         rate: learning rate at the start, radians and extents; 0 takes the capture's cameras as they are.
-        rate_end: that at the end of the run, as a share of `rate`.
     """
 
+    FORMER: ClassVar[dict[str, Any]] = {"rate_end": 0.1}
+
     rate: LearningRate = 0.0
-    rate_end: Internal[PositiveShare] = 0.1
 
 
 @dataclass(frozen=True)
