@@ -63,16 +63,7 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
         OSError: the disk is full or not writable; an older file at `path` stays as it was.
     """
     scene = state.scene
-    tensors: dict[str, Tensor] = {}
-    for part, gaussians in scene.gaussian_sets().items():
-        tensors |= {f"scene/{part}/{name}": t for name, t in gaussians.tensors().items()}
-    tensors |= {f"scene/planes/{name}": t for name, t in scene.planes.tensors().items()}
-    if not scene.environment.is_empty:
-        tensors |= {f"scene/environment/{name}": t for name, t in scene.environment.tensors().items()}
-    if len(scene.poses):
-        tensors |= {f"scene/poses/{name}": t for name, t in scene.poses.tensors().items()}
-    if len(scene.exposures):
-        tensors |= {f"scene/exposures/{name}": t for name, t in scene.exposures.tensors().items()}
+    tensors = {f"scene/{name.replace('.', '/', 1)}": tensor for name, tensor in scene.tensors().items()}
     for name, (first, second) in state.optimizer.moments.items():
         tensors |= {f"first/{name}": first, f"second/{name}": second}
     for part, statistics in state.statistics.items():

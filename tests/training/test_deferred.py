@@ -372,7 +372,7 @@ def test_the_environment_is_refined_up_to_its_size() -> None:
     for message in train(RECIPE.stages(seed=0), tiny_capture(), state, iterations=20):
         if isinstance(message, StepDone):
             sizes[message.step] = state.scene.environment.size
-    assert [sizes[step] for step in (4, 5, 7, 8, 12, 20)] == [0, 2, 2, 4, 4, 4]
+    assert [sizes[step] for step in (4, 5, 8, 9, 12, 20)] == [0, 2, 2, 4, 4, 4]
     assert state.scene.environment.region == RECIPE.region
 
 
