@@ -97,18 +97,13 @@ def residual_spreads(scene: Scene, views: Sequence[View], renderer: Renderer) ->
     shown, squares = torch.zeros(2, count, device=device)
     sums = torch.zeros(count, 3, device=device)
     for view in views:
-        weights, residuals = shown_and_residual(scene, view, renderer)
+        weights, residuals = contributions(scene, view.camera), residual_sums(scene, view, renderer)
         shown += weights
         sums += residuals
         squares += residuals.square().sum(dim=1) / weights.clamp(min=1e-6)
     shown_or_one = shown.clamp(min=1e-6)
     variance = squares / shown_or_one - (sums / shown_or_one[:, None]).square().sum(dim=1)
     return shown, (variance.clamp(min=0) / 3).sqrt()
-
-
-def shown_and_residual(scene: Scene, view: View, renderer: Renderer) -> tuple[Tensor, Tensor]:
-    """[N] what a view shows of each primary Gaussian, in pixels, and [N, 3] photograph minus render over these."""
-    return contributions(scene, view.camera), residual_sums(scene, view, renderer)
 
 
 def residual_sums(scene: Scene, view: View, renderer: Renderer) -> Tensor:
