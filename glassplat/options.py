@@ -1,12 +1,14 @@
 """Options as dataclasses: ranges in annotations, checked from the command line and from JSON.
 
 An annotation is the only place that says what a value may be: its type, `Literal` choices, and requirements such as
-`Range`. A dataclass whose fields have to fit together has a method `contradiction`.
+`Range`. A dataclass whose fields have to fit together has a method `contradiction`. One that files of earlier versions
+hold with fields which are constants now has them in `FORMER`, with their values.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
 import types
 import typing
@@ -18,6 +20,8 @@ from typing import Annotated, Any, Literal, NamedTuple, Protocol, TypeVar, runti
 import tyro
 
 from glassplat.errors import InputError
+
+log = logging.getLogger("glassplat.options")
 
 MOST = 1_000_000_000
 """Of anything that is counted: more than a machine holds, and few enough for every integer type."""
@@ -158,7 +162,7 @@ def options_from_json(kind: type, value: Any) -> Any:
 
 
 def as_typed(name: str) -> str:
-    """The option of the command line that sets a field: `rates.means_end` is `--rates.means-end`."""
+    """The option of the command line that sets a field: `plane_fit.seed` is `--plane-fit.seed`."""
     return "--" + name.replace("_", "-")
 
 
@@ -251,6 +255,7 @@ def _fields(kind: type, value: Any, name: str) -> Any:
         raise OptionError(name, value, "an object with named values")
     hints = typing.get_type_hints(kind, include_extras=True)
     known = [field.name for field in fields(kind)]
+    value = _without_former(value, getattr(kind, "FORMER", {}), name)
     unknown = sorted(map(str, set(value) - set(known)))
     if unknown:
         raise InputError(f"unknown fields {unknown} of {name or 'the options'}; there are {known}")
@@ -263,6 +268,14 @@ def _fields(kind: type, value: Any, name: str) -> Any:
     if contradiction:
         raise InputError(contradiction)
     return made
+
+
+def _without_former(values: Mapping[str, Any], former: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """The values by field without those of former fields; the log names one that is another than the constant now."""
+    for key in [key for key in former if key in values and values[key] != former[key]]:
+        field = f"{name}.{key}".removeprefix(".")
+        log.warning("%s is %s in a file of an earlier version; now it always is %s", field, values[key], former[key])
+    return {key: value for key, value in values.items() if key not in former}
 
 
 def _is_needed(field: dataclasses.Field) -> bool:
@@ -357,8 +370,6 @@ BLACK: Rgb = (0.0, 0.0, 0.0)
 
 Blend = Literal["srgb", "linear"]
 """The space in which transmission and reflection are blended: as photographed, or in radiance."""
-Shading = Literal["deferred", "forward"]
-"""Whether each pixel is shaded, or each Gaussian."""
 
 
 @dataclass(frozen=True)

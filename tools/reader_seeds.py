@@ -30,14 +30,14 @@ from glassplat.files.ply import write_gaussians
 from glassplat.files.scene_folder import drawable, read_scene, read_splats, write_scene
 from glassplat.files.sidecars import (
     read_cameras,
+    read_corrections,
     read_environment,
     read_equirect,
-    read_exposures,
     read_planes,
     write_cameras,
+    write_corrections,
     write_environment,
     write_equirect,
-    write_exposures,
     write_planes,
 )
 from glassplat.files.spz import HEADER, MAGIC, write_spz
@@ -304,8 +304,8 @@ READERS: dict[str, Reader] = {
     ),
     "exposures": Reader(
         "exposures.json",
-        read_exposures,
-        lambda folder: write_exposures(folder / "a.json", Exposures.neutral(("a.png",))),
+        lambda path: read_corrections(path, Exposures),
+        lambda folder: write_corrections(folder / "a.json", Exposures.neutral(("a.png",))),
     ),
     "environment": Reader(
         "environment.safetensors",

@@ -217,9 +217,6 @@ def _chosen(command: Export, scene: Scene) -> Scene:
 
 def _write_page(command: Export, model: Model, console: Console) -> None:
     path = command.output / "index.html"
-    if model.renderer.page_settings() is None:
-        warn(console, f"no page was written: it does not show {model.recipe.method} runs of this kind")
-        return
     if not fits(model.scene):
         warn(
             console, f"a page holds {MOST_GAUSSIANS:,} Gaussians: this one shows those that cover most of a photograph"

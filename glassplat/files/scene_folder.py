@@ -21,7 +21,7 @@ from glassplat.files.ply_table import read_table
 from glassplat.files.spz import GZIP, read_spz
 from glassplat.files.writing import FORGED_SUFFIXES, SCENE, SPLAT_SUFFIXES, atomic_write
 from glassplat.scene import SH_ZERO
-from glassplat.scene.corrections import Direction
+from glassplat.scene.corrections import Direction, Exposures, PoseCorrections
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
@@ -78,10 +78,10 @@ def write_scene(folder: Path, scene: Scene) -> None:
         header |= {"photographer_sh_degree": scene.photographer.active_sh_degree, "up": scene.up}
         files += [PHOTOGRAPHER]
     if len(scene.exposures):
-        sidecars.write_exposures(folder / EXPOSURES, scene.exposures)
+        sidecars.write_corrections(folder / EXPOSURES, scene.exposures)
         files += [EXPOSURES]
     if len(scene.poses):
-        sidecars.write_poses(folder / POSES, scene.poses)
+        sidecars.write_corrections(folder / POSES, scene.poses)
         files += [POSES]
     with atomic_write(folder / SCENE) as temporary:
         temporary.write_text(json.dumps(header, indent=2) + "\n", encoding="utf-8")
@@ -110,9 +110,9 @@ def read_scene(folder: Path) -> Scene:
         )
         scene = replace(scene, photographer=photographer, up=direction(header["up"], str(folder / SCENE)))
     if (folder / EXPOSURES).is_file():
-        scene = replace(scene, exposures=sidecars.read_exposures(folder / EXPOSURES))
+        scene = replace(scene, exposures=sidecars.read_corrections(folder / EXPOSURES, Exposures))
     if (folder / POSES).is_file():
-        scene = replace(scene, poses=sidecars.read_poses(folder / POSES))
+        scene = replace(scene, poses=sidecars.read_corrections(folder / POSES, PoseCorrections))
     return scene
 
 

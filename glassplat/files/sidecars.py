@@ -6,11 +6,11 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from os.path import isfile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from glassplat.files.images import read_image_float, write_image
 from glassplat.files.writing import atomic_write, make_folder
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 from glassplat.scene.camera import Camera
-from glassplat.scene.corrections import Exposures, PoseCorrections
+from glassplat.scene.corrections import ByPhotograph, Exposures, PoseCorrections
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Environment
 
@@ -343,64 +343,31 @@ def _camera_entry(index: int, name: str, camera: Camera) -> dict[str, Any]:
     }
 
 
-def write_by_photograph(path: Path, names: Sequence[str], values: Tensor) -> None:
-    """Writes values [N, ...] of N photographs; `read_by_photograph` returns them exactly."""
-    entries = dict(zip(names, values.detach().cpu().tolist(), strict=True))
+LARGEST_ENTRY = 1e3
+TRANSFORM = records.Items(records.Items(records.Number(-LARGEST_ENTRY, LARGEST_ENTRY), 4), 3)
+LARGEST_TWIST = 1e2
+TWIST = records.Items(records.Number(-LARGEST_TWIST, LARGEST_TWIST), 6)
+Correction = TypeVar("Correction", bound=ByPhotograph)
+ENTRIES: dict[type[ByPhotograph], records.Field] = {Exposures: TRANSFORM, PoseCorrections: TWIST}
+"""What the values of a photograph have to be, by kind of correction."""
+
+
+def write_corrections(path: Path, corrections: ByPhotograph) -> None:
+    """Writes the values by photograph; `read_corrections` returns them exactly."""
+    entries = dict(zip(corrections.names, corrections.values.detach().cpu().tolist(), strict=True))
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
 
 
-def read_by_photograph(path: Path, entry: records.Field, shape: tuple[int, ...]) -> tuple[tuple[str, ...], Tensor]:
-    """Names of N photographs and the float32 values [N, *shape] that `write_by_photograph` wrote.
-
-    Args:
-        path: the file.
-        entry: what the value of each photograph has to be; as nested lists, of `shape`.
-        shape: of one value.
+def read_corrections(path: Path, kind: type[Correction]) -> Correction:
+    """Reads the exposures or poses that `write_corrections` wrote, as float32.
 
     Raises:
         FileNotFoundError, ValueError: the file is missing or foreign; says what is wrong.
     """
-    entries = records.ByName(entry).read(records.read_json(path), str(path))
-    return tuple(entries), torch.tensor(list(entries.values()), dtype=torch.float32).reshape(len(entries), *shape)
-
-
-LARGEST_ENTRY = 1e3
-TRANSFORM = records.Items(records.Items(records.Number(-LARGEST_ENTRY, LARGEST_ENTRY), 4), 3)
-
-
-def write_exposures(path: Path, exposures: Exposures) -> None:
-    """Writes the transforms by photograph; `read_exposures` returns them exactly."""
-    write_by_photograph(path, exposures.names, exposures.affine)
-
-
-def read_exposures(path: Path) -> Exposures:
-    """Reads what `write_exposures` wrote.
-
-    Raises:
-        FileNotFoundError, ValueError: the file is missing or foreign; says what is wrong.
-    """
-    names, affine = read_by_photograph(path, TRANSFORM, (3, 4))
-    return Exposures(affine, names)
-
-
-LARGEST_TWIST = 1e2
-TWIST = records.Items(records.Number(-LARGEST_TWIST, LARGEST_TWIST), 6)
-
-
-def write_poses(path: Path, poses: PoseCorrections) -> None:
-    """Writes the twists by photograph; `read_poses` returns them exactly."""
-    write_by_photograph(path, poses.names, poses.twists)
-
-
-def read_poses(path: Path) -> PoseCorrections:
-    """Reads what `write_poses` wrote.
-
-    Raises:
-        FileNotFoundError, ValueError: the file is missing or foreign; says what is wrong.
-    """
-    names, twists = read_by_photograph(path, TWIST, (6,))
-    return PoseCorrections(twists, names)
+    entries = records.ByName(ENTRIES[kind]).read(records.read_json(path), str(path))
+    values = torch.tensor(list(entries.values()), dtype=torch.float32).reshape(len(entries), *kind.SHAPE)
+    return kind(values, tuple(entries))
 
 
 def write_colmap(

@@ -29,7 +29,7 @@ from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene import logit
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify, GrowSh, Population, PruneIdle, ResetOpacity, population_of
-from glassplat.training.corrections import exposures_begun, exposures_learnt, poses_begun, poses_learnt
+from glassplat.training.corrections import corrections_begun, corrections_learnt
 from glassplat.training.densify import as_discs
 from glassplat.training.losses import (
     LossTerm,
@@ -51,20 +51,19 @@ def first_scene(recipe: DeferredRecipe, dataset: Dataset) -> Scene:
     primary = _population(recipe).initial(dataset.points, recipe.sh_degree)
     strengths = torch.full((len(primary),), logit(recipe.first_strength))
     primary = replace(primary, channels={"logit_strength": strengths})
-    scene = Scene(primary, dataset.extent)
-    return poses_begun(recipe.poses, exposures_begun(recipe.exposure, scene, dataset), dataset)
+    return corrections_begun(recipe, Scene(primary, dataset.extent), dataset)
 
 
 def finished_renderer(recipe: DeferredRecipe) -> Deferred:
     """The renderer of the finished scene, with all its layers."""
-    return Deferred(recipe.background or BLACK, recipe.shading, least_strength=INVISIBLE)
+    return Deferred(recipe.background or BLACK, least_strength=INVISIBLE)
 
 
 def stages_of(recipe: DeferredRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
     """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has one stage."""
     short = iterations < recipe.least_iterations
     stages = _matte_stages(recipe, seed, iterations) if short else _reflecting_stages(recipe)
-    return poses_learnt(recipe.poses, exposures_learnt(recipe.exposure, stages))
+    return corrections_learnt(recipe, stages)
 
 
 def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
@@ -82,7 +81,7 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         densify_until=population.densify_until,
     )
     beat = Every(recipe.rhythm.beat, 0.0, recipe.schedule.stop, recipe.rhythm.least, skip_multiples_of=3)
-    renderer = Deferred(recipe.background or BLACK, recipe.shading, depth=recipe.consistency_weight != 0)
+    renderer = Deferred(recipe.background or BLACK, depth=recipe.consistency_weight != 0)
     guidance = weighted(
         LossTerm("outside", recipe.outside_weight, strength_outside),
         LossTerm("strength", recipe.strength_weight, mean_strength),
@@ -101,7 +100,7 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
             _propagate(recipe, beat, renderer),
             GrowShAfterPropagation(Every(recipe.rhythm.sh)),
             *_resets(recipe, population),
-            RefineEnvironment(_doublings(recipe), recipe.texels),
+            RefineEnvironment(doublings(recipe.first_texels, recipe.texels), recipe.texels),
         ),
         post_steps=population.post_steps,
         setup=first_reflections(recipe),
@@ -112,7 +111,7 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         setup=None,
         name="3 refinement",
         share=1 - recipe.schedule.stop,
-        renderer=Deferred(recipe.background or BLACK, recipe.shading, depth=False),
+        renderer=Deferred(recipe.background or BLACK, depth=False),
         losses=tuple(term for term in reflection.losses if term.name != "consistency"),
     )
     return bootstrap, reflection, refinement
@@ -158,11 +157,6 @@ def first_reflections(recipe: DeferredRecipe) -> BeginReflections:
 def _environment(recipe: DeferredRecipe) -> AddEnvironment:
     """Environment to mirror."""
     return AddEnvironment(min(recipe.first_texels, recipe.texels), recipe.region, recipe.find_region)
-
-
-def _doublings(recipe: DeferredRecipe) -> tuple[float, ...]:
-    """The shares of the run at which the environment's edge length doubles."""
-    return doublings(recipe.first_texels, recipe.texels, recipe.refinements)
 
 
 def _edits(recipe: DeferredRecipe, population: Population) -> tuple[Action, ...]:
@@ -212,11 +206,16 @@ def _population(recipe: DeferredRecipe) -> Population:
     )
 
 
-def doublings(first_texels: int, texels: int, refinements: tuple[float, float]) -> tuple[float, ...]:
-    """The shares of the run, evenly from a first to a last one, at which an edge length doubles until it is reached."""
+FIRST_DOUBLING, LAST_DOUBLING = 0.45, 0.65
+"""Shares of the run at which the environment's edge length doubles for the first and for the last time."""
+
+
+def doublings(first_texels: int, texels: int) -> tuple[float, ...]:
+    """The shares of the run, evenly from the first to the last, at which an edge length doubles until it is reached."""
     count = max(math.ceil(math.log2(texels / first_texels)), 0)
-    first, last = refinements
-    return tuple(first + (last - first) * number / max(count - 1, 1) for number in range(count))
+    return tuple(
+        FIRST_DOUBLING + (LAST_DOUBLING - FIRST_DOUBLING) * number / max(count - 1, 1) for number in range(count)
+    )
 
 
 NORMAL_TERMS = ("consistency", "monocular normals")

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from glassplat.methods.splat_recipe import Primitive
 from glassplat.options import (
     ESSENTIAL,
-    Ascending,
     Color,
     Finite,
     InnerShare,
@@ -17,7 +16,6 @@ from glassplat.options import (
     NotNegative,
     Positive,
     Several,
-    Shading,
     Share,
     ShDegree,
 )
@@ -62,8 +60,6 @@ class GlossyOptions:
             for afterwards it is a run of `splat`, else harmonics wait.
         texels: edge length of the environment's cube faces in the end.
         first_texels: edge length at the start.
-        refinements: shares of the run at which the edge length doubles for the first and for the last time on the way
-            from `first_texels` to `texels`; other doublings are spread evenly in between.
         first_strength: reflection strength of every Gaussian at the start.
         search: what is taken for a mirror at once when reflections begin.
         region: only what lies in this sphere may reflect: centre and radius, world units. None leaves it to
@@ -96,6 +92,8 @@ class GlossyOptions:
         poses: whether the camera of each photograph is corrected.
     """
 
+    FORMER: ClassVar[dict[str, Any]] = {"refinements": [0.45, 0.65]}
+
     sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
     ssim_weight: Share = 0.2
     view_dependence_weight: NotNegative = 0.0
@@ -103,7 +101,6 @@ class GlossyOptions:
     bootstrap: Share = 0.06
     texels: Annotated[Texels, ESSENTIAL] = 64
     first_texels: Texels = 16
-    refinements: Internal[Annotated[tuple[Share, Share], Ascending()]] = (0.45, 0.65)
     first_strength: Internal[InnerShare] = 1e-3
     search: Internal[MirrorSearch] = field(default_factory=MirrorSearch)
     region: Annotated[tuple[Finite, Finite, Finite, Positive] | None, ESSENTIAL] = None
@@ -143,15 +140,10 @@ DEFERRED_CODE_ITERATIONS = 61_000
 
 @dataclass(frozen=True)
 class DeferredRecipe(GlossyOptions):
-    """3DGS-DR: a strength and a normal for every Gaussian, one environment, and shading per pixel.
-
-    Attributes:
-        shading: per pixel (`deferred`), or per Gaussian (`forward`, ablation).
-    """
+    """3DGS-DR: a strength and a normal for every Gaussian, one environment, and shading per pixel."""
 
     method: ClassVar[str] = "deferred"
-
-    shading: Internal[Shading] = "deferred"
+    FORMER: ClassVar[dict[str, Any]] = GlossyOptions.FORMER | {"shading": "deferred"}
 
     @classmethod
     def paper(cls) -> DeferredRecipe:

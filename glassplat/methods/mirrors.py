@@ -97,18 +97,13 @@ def residual_spreads(scene: Scene, views: Sequence[View], renderer: Renderer) ->
     shown, squares = torch.zeros(2, count, device=device)
     sums = torch.zeros(count, 3, device=device)
     for view in views:
-        weights, residuals = shown_and_residual(scene, view, renderer)
+        weights, residuals = contributions(scene, view.camera), residual_sums(scene, view, renderer)
         shown += weights
         sums += residuals
         squares += residuals.square().sum(dim=1) / weights.clamp(min=1e-6)
     shown_or_one = shown.clamp(min=1e-6)
     variance = squares / shown_or_one - (sums / shown_or_one[:, None]).square().sum(dim=1)
     return shown, (variance.clamp(min=0) / 3).sqrt()
-
-
-def shown_and_residual(scene: Scene, view: View, renderer: Renderer) -> tuple[Tensor, Tensor]:
-    """[N] what a view shows of each primary Gaussian, in pixels, and [N, 3] photograph minus render over these."""
-    return contributions(scene, view.camera), residual_sums(scene, view, renderer)
 
 
 def residual_sums(scene: Scene, view: View, renderer: Renderer) -> Tensor:
@@ -266,8 +261,6 @@ def normals_propagated(
     options: NormalPropagation, gaussians: Gaussians, moments: Moments
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
     """Raised opacities and strengths, and reflective Gaussians grown; what changed forgets its moments."""
-    if not options.propagates:
-        return gaussians, dict(moments)
     opacities = gaussians.logit_opacities.clamp(min=logit(options.least_opacity))
     strengths = gaussians.channels["logit_strength"].clamp(min=logit(options.least_strength))
     grows = strengths >= logit(options.reflective)
@@ -375,9 +368,8 @@ class Propagate:
         primary, moments = normals_propagated(self.propagation, state.scene.primary, state.optimizer.moments)
         primary, moments = colors_disturbed(self.propagation, primary, moments, state.generator(self.name))
         state.scene, state.optimizer.moments = replace(state.scene, primary=primary), moments
-        if self.propagation.propagates:
-            state.optimizer.paused["primary.logit_opacities"] = self.schedule.pause
-            state.records[RAISED] = clock.step
+        state.optimizer.paused["primary.logit_opacities"] = self.schedule.pause
+        state.records[RAISED] = clock.step
         return True
 
     @property

@@ -31,13 +31,7 @@ from glassplat.scene.gaussians import mirrored_gaussians
 from glassplat.scene.panes import Planes, coplanar_groups
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify, GrowSh, PerturbOpacity, Population, ResetOpacity, population_of
-from glassplat.training.corrections import (
-    exposures_begun,
-    exposures_learnt,
-    photographer_learnt,
-    poses_begun,
-    poses_learnt,
-)
+from glassplat.training.corrections import corrections_begun, corrections_learnt, photographer_learnt
 from glassplat.training.densify import append, apply_edit, gaussians_from_points, keep
 from glassplat.training.losses import (
     LossTerm,
@@ -327,7 +321,7 @@ def first_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
     if dataset.measured_points:
         fitted_planes(dataset, None, recipe.plane_fit)
     scene = Scene(planar_population(recipe).initial(dataset.points, recipe.sh_degree), dataset.extent)
-    return poses_begun(recipe.poses, exposures_begun(recipe.exposure, scene, dataset), dataset)
+    return corrections_begun(recipe, scene, dataset)
 
 
 def _lack_of_masks(dataset: Dataset) -> str:
@@ -373,12 +367,27 @@ def stages_of(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERA
         post_steps=population.post_steps,
         densify_until=population.densify_until,
     )
-    if not recipe.multi_stage:
-        stages: tuple[Stage, ...] = (initialisation, replace(_joint(recipe, second + third), setup=setup))
-    else:
-        stages = (initialisation, _adjustment(recipe, second, setup), _joint(recipe, third))
+    stages: tuple[Stage, ...] = (initialisation, _adjustment(recipe, second, setup), _joint(recipe, third))
     stages = photographer_learnt(recipe.photographer, stages, recipe.densify, seed)
-    return poses_learnt(recipe.poses, exposures_learnt(recipe.exposure, stages))
+    return corrections_learnt(recipe, stages)
+
+
+JOINT_FACTOR = 0.1
+"""On the learning rates of where panes are, in stage 3 (the paper's)."""
+
+
+def plane_rates(factor: float = 1.0) -> dict[str, Rate]:
+    """Learning rates of planes and glass, which the paper leaves out; see lab/training.md.
+
+    Those of centre, per scene extent, and normal are multiplied by a factor.
+    """
+    return {
+        "planes.centers": Rate(1e-4 * factor, per_extent=True),
+        "planes.raw_normals": Rate(1e-4 * factor),
+        "planes.logit_reflectances": Rate(1e-2),
+        "planes.log_transmittances": Rate(5e-3),
+        "glass.logit_mark": Rate(5e-2),
+    }
 
 
 def _adjustment(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
@@ -389,7 +398,7 @@ def _adjustment(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
         share=share,
         renderer=_training_renderer(recipe, "planes"),
         losses=_joint_terms(recipe, population),
-        rates=recipe.rates.of("primary") | recipe.rates.of("glass") | recipe.plane_rates.of(1.0),
+        rates=recipe.rates.of("primary") | recipe.rates.of("glass") | plane_rates(),
         actions=(
             *population.edits,
             GrowSh(Every(recipe.rhythm.sh)),
@@ -414,7 +423,7 @@ def _joint(recipe: PlanarRecipe, share: float) -> Stage:
         losses=_joint_terms(recipe, population),
         rates=recipe.rates.of("primary")
         | recipe.rates.of("glass")
-        | recipe.plane_rates.of(recipe.plane_rates.joint_factor)
+        | plane_rates(JOINT_FACTOR)
         | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {}),
         actions=(
             *_turns(recipe),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from glassplat.kernels import Fresnel
 from glassplat.options import (
@@ -27,7 +27,6 @@ from glassplat.training.options import (
     McmcDensify,
     PhotoExposure,
     Photographer,
-    PlaneRates,
     PoseRefinement,
     Rhythm,
     Strategy,
@@ -86,7 +85,6 @@ class PlanarRecipe:
             Gaussians from where no photograph does, so that harmonics extrapolate; the paper has no such term.
         background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         stage_shares: lengths of the three stages in relation to each other (paper: 3000, 3000 and 24,000 iterations).
-        multi_stage: False skips stage 2 (ablation).
         fresnel: how the strength rises with the angle: as that of a pane with two surfaces, by Schlick's curve of one
             surface as in the paper, or not at all (ablation).
         intensity: False drops the reflection intensity a(u) (ablation).
@@ -105,7 +103,6 @@ class PlanarRecipe:
         moving_mean: let the gradient of the depth deviation pass through the mean depth too, as Eq. 14 is written; if
             not, Gaussians are drawn to the mean, and the mean not to them.
         rates: learning rates of the Gaussians.
-        plane_rates: learning rates of planes and glass.
         plane_fit: how planes are found from masks.
         rhythm: when opacities are reset and the SH degree grows.
         strategy: what decides how many primary Gaussians there are and where: densification, or MCMC (Eq. 20), under
@@ -123,13 +120,23 @@ class PlanarRecipe:
     """
 
     method: ClassVar[str] = "planar"
+    FORMER: ClassVar[dict[str, Any]] = {
+        "multi_stage": True,
+        "plane_rates": {
+            "center": 1e-4,
+            "normal": 1e-4,
+            "reflectance": 1e-2,
+            "mark": 5e-2,
+            "transmittance": 5e-3,
+            "joint_factor": 0.1,
+        },
+    }
 
     sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
     ssim_weight: Share = 0.2
     view_dependence_weight: NotNegative = 0.1
     background: Annotated[Color | None, ESSENTIAL] = None
     stage_shares: Internal[tuple[Positive, Positive, Positive]] = (0.1, 0.1, 0.8)
-    multi_stage: Internal[bool] = True
     fresnel: Internal[Fresnel] = "pane"
     intensity: Internal[bool] = True
     blend: Internal[Blend] = "linear"
@@ -145,7 +152,6 @@ class PlanarRecipe:
     moving_mean: Internal[bool] = False
     perturbation: Perturbation = field(default_factory=Perturbation)
     rates: GaussianRates = field(default_factory=GaussianRates)
-    plane_rates: Internal[PlaneRates] = field(default_factory=PlaneRates)
     plane_fit: PlaneFit = field(default_factory=PlaneFit)
     rhythm: Rhythm = field(default_factory=Rhythm)
     strategy: Annotated[Strategy, ESSENTIAL] = "default"

@@ -10,7 +10,7 @@ from glassplat.options import BLACK
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import GrowSh, Population, population_of
-from glassplat.training.corrections import exposures_begun, exposures_learnt, poses_begun, poses_learnt
+from glassplat.training.corrections import corrections_begun, corrections_learnt
 from glassplat.training.densify import as_discs
 from glassplat.training.losses import LossTerm, PhotometricLoss, disc_normals, distortion, view_dependence, weighted
 from glassplat.training.options import PUBLISHED_ITERATIONS
@@ -24,7 +24,7 @@ def first_scene(recipe: SplatRecipe, dataset: Dataset) -> Scene:
     """The first scene: one Gaussian per point."""
     first = _population(recipe).initial(dataset.points, recipe.sh_degree)
     scene = Scene(as_discs(first) if recipe.primitive == "disc" else first, dataset.extent)
-    return poses_begun(recipe.poses, exposures_begun(recipe.exposure, scene, dataset), dataset)
+    return corrections_begun(recipe, scene, dataset)
 
 
 def finished_renderer(recipe: SplatRecipe) -> Splat:
@@ -55,7 +55,7 @@ def stages_of(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITERAT
         stages.append(replace(last, name=name, renderer=_bare(recipe, normal=with_normals), losses=losses))
         began = start
     stages[-1] = replace(stages[-1], share=1 - began)
-    return poses_learnt(recipe.poses, exposures_learnt(recipe.exposure, tuple(stages)))
+    return corrections_learnt(recipe, tuple(stages))
 
 
 def _bare(recipe: SplatRecipe, *, normal: bool = False) -> Splat:

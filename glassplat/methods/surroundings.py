@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -154,14 +155,6 @@ def copied_surroundings(primary: Gaussians, chosen: Tensor, *, sh_degree: int) -
     )
 
 
-def joined(*parts: Gaussians) -> Gaussians:
-    """One set of several that hold the same tensors."""
-    names = parts[0].tensors()
-    tensors = {name: torch.cat([part.tensors()[name] for part in parts]) for name in names}
-    most = max(parts, key=lambda part: part.active_sh_degree)
-    return most.with_tensors(tensors)
-
-
 log = logging.getLogger("glassplat.training")
 
 TOO_SHORT = (
@@ -229,11 +222,12 @@ class AddSurroundings:
         """Edits `state`; `matte` [N] bool tells which primary Gaussians may be copied."""
         parts = [part for part in self._parts(state, dataset, matte) if len(part)]
         # A scene in which everything reflects has nothing to copy.
-        found = joined(*(parts or [self._in_box(state, dataset)]))
+        found = reduce(Gaussians.joined, parts or [self._in_box(state, dataset)])
         ordered, _ = apply_edit(found, {}, in_morton_order(found.means), part="surroundings")
         state.scene = replace(state.scene, surroundings=ordered)
 
     def _parts(self, state: TrainState, dataset: Dataset, matte: Tensor) -> list[Gaussians]:
+        """Those of the highest active SH degree, which the whole set has, come first."""
         parts = []
         if self.start.source != "box":
             parts.append(copied_surroundings(state.scene.primary, matte, sh_degree=self.sh_degree))

@@ -405,13 +405,7 @@ def save_model(model: Savable, path: Path, *, overwrite: bool) -> Path:
 
 
 def save_page(model: Savable, path: Path, title: str, *, sharing: Sharing = PRIVATE) -> None:
-    """Writes the page that shows a model with live panes in any browser.
-
-    Raises:
-        InputError: it shows no `deferred` scene that shades every Gaussian.
-    """
-    if model.renderer.page_settings() is None:
-        raise InputError(f"the page does not show {model.recipe.method} scenes of this kind: it shades pixels")
+    """Writes the page that shows a model with live panes in any browser."""
     with input_checked():
         write_page(path, model.scene, model.renderer, tuple(model.cameras.items()), title, sharing=sharing)
 

@@ -86,13 +86,11 @@ class Features:
     Attributes:
         most: features of one photograph.
         least_contrast: of a feature, as COLMAP's peak threshold.
-        from_enlarged: look at twice the size as well, which finds the smallest ones.
         guided: match a second time along the lines that the first matches lead to.
     """
 
     most: int
     least_contrast: float
-    from_enlarged: bool = True
     guided: bool = False
 
 
@@ -146,7 +144,7 @@ class FeatureDatabase:
         options = library.pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False)
         options.sift.max_num_features = features.most
         options.sift.peak_threshold = features.least_contrast
-        options.sift.first_octave = -1 if features.from_enlarged else 0
+        options.sift.first_octave = -1  # Twice the size, in which the smallest are found.
 
         def work(token: Any) -> None:
             library.pycolmap.extract_features(

@@ -258,8 +258,6 @@ def page_text(
 ) -> str:
     """Text of the page."""
     settings = renderer.page_settings()
-    if settings is None:
-        raise ValueError(f"a page cannot show what this {type(renderer).__name__} renders: it shades every Gaussian")
     if not cameras or len(scene.planes) > MOST_PANES:
         raise ValueError(
             f"there are {len(cameras)} cameras and {len(scene.planes)} panes; expected at least one camera and at most "

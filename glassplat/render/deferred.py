@@ -13,12 +13,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from glassplat.kernels.composite import composite, mean_depth
-from glassplat.kernels.environment import cube_lookup, shade_environment, surface_channels
+from glassplat.kernels.composite import mean_depth
+from glassplat.kernels.environment import cube_lookup, shade_environment
 from glassplat.kernels.panes.reference import pixel_rays, ray_grid
-from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, STRENGTH_AT, SURFACE_CHANNELS, Projected, Shaded
-from glassplat.kernels.tiles import bin_tiles
-from glassplat.options import Shading
+from glassplat.kernels.records import NORMAL_MIN, Shaded
 from glassplat.render.frame import (
     NEAR_PER_EXTENT,
     Frame,
@@ -26,16 +24,13 @@ from glassplat.render.frame import (
     check_colored,
     check_ellipsoids,
     check_numbers,
-    joined_probe,
-    joined_splats,
     over_background,
     project_gaussians,
     screen_pass,
     shown,
 )
-from glassplat.render.splat import blended_discs, disc_layers, projected_discs
+from glassplat.render.splat import blended_discs, blended_ellipsoids, disc_layers, ellipsoid_channels, projected_discs
 from glassplat.scene.camera import Camera
-from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import FACES, Environment, Scene
 
 COLOR_MARGIN = 1e-3
@@ -189,7 +184,7 @@ class Surface:
         base: [H, W, 3] colour without reflection, over the background.
         normal: [H, W, 3] blended normal, world axes, turned to the camera, not normalised.
         strength: [H, W] share of the reflection.
-        depth: [H, W] mean camera z, 0 where nothing is.
+        depth: [H, W] mean camera z, 0 where nothing is; empty if it was not asked for.
         alpha: [H, W] coverage.
         direct: [N] bool, which Gaussians reach a pixel.
         screen: the record of the pass, if it was probed.
@@ -213,63 +208,55 @@ class Surface:
             "base": self.base,
             "normal": self.normal,
             "strength": self.strength,
-            "depth": self.depth,
+            **({"depth": self.depth} if self.depth.numel() else {}),
             "alpha": self.alpha,
         }
 
 
 def seen_surface(
-    scene: Scene, camera: Camera, *, background: tuple[float, float, float], probed: bool = False
+    scene: Scene,
+    camera: Camera,
+    *,
+    background: tuple[float, float, float],
+    depth: bool = True,
+    probed: bool = False,
 ) -> Surface:
-    """Blends the surfaces of the primary Gaussians, which have a `logit_strength`: ellipsoids or discs."""
-    near = NEAR_PER_EXTENT * scene.extent
-    seen = _seen_discs if scene.primary.are_discs else _seen_ellipsoids
-    return seen(scene, camera, near, background, probed)
+    """Blends the surfaces of the primary Gaussians, which have a `logit_strength`: ellipsoids or discs.
+
+    Without `depth`, ellipsoids have none; it costs them one more channel.
+    """
+    if scene.primary.are_discs:
+        return _seen_discs(scene, camera, background, probed)
+    return _seen_ellipsoids(scene, camera, background, depth, probed)
 
 
 def _seen_ellipsoids(
-    scene: Scene, camera: Camera, near: float, background: tuple[float, float, float], probed: bool
+    scene: Scene, camera: Camera, background: tuple[float, float, float], deep: bool, probed: bool
 ) -> Surface:
     """Depths are those of the centres."""
-    projected = project_gaussians(scene.primary, camera, near=near)
+    projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
     screen = (screen_pass("primary", projected),) if probed else ()
-    channels = _ellipsoid_channels(scene.primary, projected, camera.center)
-    splats = joined_splats(projected)
-    bins = bin_tiles(splats, camera.width, camera.height)
-    result = composite(splats, channels[None], bins, probe=joined_probe(screen))
+    extra = projected.depths[0, :, None] if deep else None
+    channels = ellipsoid_channels(scene.primary, projected, camera, extra)
+    result = blended_ellipsoids(projected, channels[None], camera, screen=screen)
     image, alpha = result.image[0], result.alpha[0]
     # Split at once: a slice has a gradient as large as the image.
-    color, normal, strength, depth = image.split((3, 3, 1, 1), dim=2)
+    color, normal, strength, *depth = image.split((3, 3, 1, 1) if deep else (3, 3, 1), dim=2)
     return Surface(
         image=image,
         base=over_background(color, alpha, background),
         normal=normal,
         strength=strength.squeeze(2),
-        depth=mean_depth(depth.squeeze(2), alpha),
+        depth=mean_depth(depth[0].squeeze(2), alpha) if deep else alpha.new_zeros(0),
         alpha=alpha,
         direct=shown(projected),
         screen=screen,
     )
 
 
-def _ellipsoid_channels(gaussians: Gaussians, projected: Projected, eye: Tensor) -> Tensor:
-    """[N, 8] colour, normal, strength and depth of each ellipsoid; normals are turned to `eye` [3]."""
-    return surface_channels(
-        projected.colors[0],
-        projected.radii[0],
-        gaussians.quats,
-        gaussians.log_scales,
-        gaussians.means,
-        gaussians.channels["logit_strength"],
-        eye,
-        projected.depths[0, :, None],
-    )
-
-
-def _seen_discs(
-    scene: Scene, camera: Camera, near: float, background: tuple[float, float, float], probed: bool
-) -> Surface:
+def _seen_discs(scene: Scene, camera: Camera, background: tuple[float, float, float], probed: bool) -> Surface:
     """Depths are those of the places where rays meet the discs."""
+    near = NEAR_PER_EXTENT * scene.extent
     projected = projected_discs(scene.primary, camera, near=near)
     screen = (screen_pass("primary", projected),) if probed else ()
     strengths = torch.sigmoid(scene.primary.channels["logit_strength"])[None, :, None]
@@ -356,8 +343,6 @@ class Deferred:
 
     Attributes:
         background: colour behind everything, sRGB.
-        shading: `forward` shades every Gaussian instead of every pixel, the paper's ablation; its `reflection` layer
-            is the blended light that the Gaussians reflect, divided by R.
         depth: also render the depth layer.
         environment: also render the layer `environment`.
         least_strength: pixels that reflect less are not shaded, and their `reflection` is 0. Not for training, where a
@@ -365,7 +350,6 @@ class Deferred:
     """
 
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    shading: Shading = "deferred"
     depth: bool = True
     environment: bool = False
     least_strength: float = 0.0
@@ -378,14 +362,12 @@ class Deferred:
         """
         check_reflective(scene)
         camera = camera.to(scene.primary.means.device)
-        projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
-        shade = self._shade_pixels if self.shading == "deferred" else self._shade_gaussians
-        channels = self._channels_of(scene.primary, camera, projected)
-        screen = (screen_pass("primary", projected),) if probed else ()
-        rgb, layers = shade(scene, camera, projected, channels, joined_probe(screen))
+        surface = seen_surface(scene, camera, background=self.background, depth=self.depth, probed=probed)
+        shaded = shaded_pixels(scene, camera, surface.image, surface.alpha, self.background, self.least_strength)
+        layers = surface.layers() | {"reflection": shaded.reflection}
         if self.environment:
             layers["environment"] = torch.sigmoid(cube_lookup(scene.environment.raw, view_directions(camera)))
-        return Frame(rgb, layers, direct=shown(projected), screen=screen)
+        return Frame(shaded.rgb, layers, direct=surface.direct, screen=surface.screen)
 
     def check(self, scene: Scene) -> None:
         """Raises ValueError where a scene lacks colours, or what reflection needs."""
@@ -401,67 +383,24 @@ class Deferred:
         """The renderer, also of `environment` where that is among the layers."""
         return replace(self, environment=self.environment or "environment" in layers)
 
-    def page_settings(self) -> Mapping[str, Any] | None:
+    def page_settings(self) -> Mapping[str, Any]:
         """Settings for the web page, which shades pixels and looks up distant light."""
-        if self.shading != "deferred":
-            return None
         return page_settings(self.background, "distant")
-
-    def _channels_of(self, gaussians: Gaussians, camera: Camera, projected: Projected) -> Tensor:
-        """[N, D] what each Gaussian adds to the image: as `shade_environment` reads it, then depth, if asked for."""
-        return surface_channels(
-            projected.colors[0],
-            projected.radii[0],
-            gaussians.quats,
-            gaussians.log_scales,
-            gaussians.means,
-            gaussians.channels["logit_strength"],
-            camera.center,
-            projected.depths[0, :, None] if self.depth else None,
-        )
-
-    def _shade_pixels(
-        self, scene: Scene, camera: Camera, projected: Projected, channels: Tensor, probe: Tensor | None
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        image, layers = self._blend(camera, projected, channels, probe)
-        shaded = shaded_pixels(scene, camera, image, layers["alpha"], self.background, self.least_strength)
-        return shaded.rgb, layers | {"base": shaded.base, "reflection": shaded.reflection}
-
-    def _shade_gaussians(
-        self, scene: Scene, camera: Camera, projected: Projected, channels: Tensor, probe: Tensor | None
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        colors, normals, strengths = channels[:, :SURFACE_CHANNELS].split((NORMAL_AT, 3, 1), dim=1)
-        to_eye = torch.nn.functional.normalize(camera.center - scene.primary.means, dim=1)
-        cosines = (normals * to_eye).sum(-1, keepdim=True)
-        mirrored = torch.sigmoid(cube_lookup(scene.environment.raw, 2 * cosines * normals - to_eye))
-        channels = torch.cat([channels, strengths * colors, strengths * mirrored], dim=1)
-        image, layers = self._blend(camera, projected, channels, probe)
-        base = over_background(image[..., :NORMAL_AT], layers["alpha"], self.background)
-        lost, gained = image[..., -6:-3], image[..., -3:]
-        reflection = gained / layers["strength"][..., None].clamp(min=1e-6)
-        return base - lost + gained, layers | {"base": base, "reflection": reflection}
-
-    def _blend(
-        self, camera: Camera, projected: Projected, channels: Tensor, probe: Tensor | None
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The blended image [H, W, D] of channels [N, D], and its layers but for the base."""
-        splats = joined_splats(projected)
-        result = composite(splats, channels[None], bin_tiles(splats, camera.width, camera.height), probe=probe)
-        image, alpha = result.image[0], result.alpha[0]
-        layers = {"alpha": alpha, "normal": image[..., NORMAL_AT:STRENGTH_AT], "strength": image[..., STRENGTH_AT]}
-        if self.depth:
-            layers["depth"] = mean_depth(image[..., SURFACE_CHANNELS], alpha)
-        return image, layers
 
 
 def check_reflective(scene: Scene) -> None:
     """Raises ValueError where a scene lacks what reflection needs."""
     if scene.environment.is_empty:
         raise ValueError("the scene has no environment; expected one trained with `deferred`")
+    check_strengths(scene, "deferred")
+
+
+def check_strengths(scene: Scene, method: str) -> None:
+    """Raises ValueError where nothing mirrors, or what is mirrored from afar cannot be drawn."""
     if "logit_strength" not in scene.primary.channels:
         raise ValueError(
             f"the Gaussians have the channels {sorted(scene.primary.channels)}; expected logit_strength, as "
-            "`deferred` trains it"
+            f"`{method}` trains it"
         )
     check_numbers(
         {"environment.raw": scene.environment.raw, "logit_strength": scene.primary.channels["logit_strength"]}

@@ -122,8 +122,8 @@ class Renderer(Protocol):
         """The renderer, also of those of these layers that it renders only when asked."""
         ...
 
-    def page_settings(self) -> Mapping[str, Any] | None:
-        """Settings with which the web page draws the same; None if it cannot."""
+    def page_settings(self) -> Mapping[str, Any]:
+        """Settings with which the web page draws the same."""
         ...
 
 

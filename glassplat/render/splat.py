@@ -9,10 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from glassplat.kernels.composite import BlendedDiscs, composite, composite_discs, mean_depth
+from glassplat.kernels.composite import BlendedDiscs, Composite, composite, composite_discs, mean_depth
 from glassplat.kernels.environment import surface_channels
 from glassplat.kernels.project import project_discs
-from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, Discs, ProjectedDiscs
+from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, Discs, Projected, ProjectedDiscs
 from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.frame import (
     MEDIAN_DEPTH,
@@ -84,6 +84,39 @@ def disc_layers(blended: BlendedDiscs, extent: float) -> dict[str, Tensor]:
     }
 
 
+def ellipsoid_channels(
+    gaussians: Gaussians, projected: Projected, camera: Camera, extra: Tensor | None = None
+) -> Tensor:
+    """Values [N, D] for ellipsoids to blend: colour, normal towards the camera, strength, and what is extra.
+
+    Args:
+        gaussians: the set; without a `logit_strength` the strengths mean nothing.
+        projected: the set in that camera.
+        camera: at which the normals point.
+        extra: [N, E] further values.
+    """
+    strengths = gaussians.channels.get("logit_strength")
+    return surface_channels(
+        projected.colors[0],
+        projected.radii[0],
+        gaussians.quats,
+        gaussians.log_scales,
+        gaussians.means,
+        gaussians.means.new_zeros(len(gaussians)) if strengths is None else strengths,
+        camera.center,
+        extra,
+    )
+
+
+def blended_ellipsoids(
+    projected: Projected, channels: Tensor, camera: Camera, *, screen: Sequence[ScreenPass] = ()
+) -> Composite:
+    """Blends channels [1, N, D] of ellipsoids over the pixels of a camera; arguments as of `blended_discs`."""
+    splats = joined_splats(projected)
+    bins = bin_tiles(splats, camera.width, camera.height)
+    return composite(splats, channels, bins, probe=joined_probe(screen))
+
+
 @dataclass(frozen=True)
 class WithNormals:
     """The frames of a renderer, with a layer `normal` [H, W, 3] where they have none.
@@ -119,27 +152,17 @@ class WithNormals:
         """The renderer with these layers."""
         return self.renderer.with_layers(layers)
 
-    def page_settings(self) -> Mapping[str, Any] | None:
+    def page_settings(self) -> Mapping[str, Any]:
         """As the renderer does."""
         return self.renderer.page_settings()
 
 
 def ellipsoid_normals(scene: Scene, camera: Camera) -> Tensor:
     """[H, W, 3] blended normals of the primary Gaussians, world axes, towards the camera, at most of unit length."""
-    gaussians = scene.primary
-    projected = project_gaussians(gaussians, camera, near=NEAR_PER_EXTENT * scene.extent)
-    channels = surface_channels(
-        projected.colors[0],
-        projected.radii[0],
-        gaussians.quats,
-        gaussians.log_scales,
-        gaussians.means,
-        gaussians.means.new_zeros(len(gaussians)),
-        camera.center,
-    )
-    splats = joined_splats(projected)
-    bins = bin_tiles(splats, camera.width, camera.height)
-    return composite(splats, channels[None, :, NORMAL_AT:STRENGTH_AT].contiguous(), bins).image[0]
+    projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
+    channels = ellipsoid_channels(scene.primary, projected, camera)
+    normals = channels[None, :, NORMAL_AT:STRENGTH_AT].contiguous()
+    return blended_ellipsoids(projected, normals, camera).image[0]
 
 
 @dataclass(frozen=True)
@@ -171,13 +194,11 @@ class Splat:
         if scene.primary.are_discs:
             return self._discs(scene, camera, probed)
         projected = project_gaussians(scene.primary, camera, near=NEAR_PER_EXTENT * scene.extent)
-        splats = joined_splats(projected)
         channels = projected.colors
         if self.depth:
             channels = torch.cat([channels, projected.depths[..., None]], dim=-1)
         screen = (screen_pass("primary", projected),) if probed else ()
-        bins = bin_tiles(splats, camera.width, camera.height)
-        result = composite(splats, channels, bins, probe=joined_probe(screen))
+        result = blended_ellipsoids(projected, channels, camera, screen=screen)
         # As a batch of one and split, because the gradient of an indexed image is a whole one of zeros first.
         color, *depth = result.image.squeeze(0).split((3, 1) if self.depth else 3, dim=-1)
         alpha = result.alpha.squeeze(0)

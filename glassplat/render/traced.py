@@ -16,6 +16,7 @@ from glassplat.kernels.trace import trace
 from glassplat.render.deferred import (
     INVISIBLE,
     Surface,
+    check_strengths,
     page_settings,
     reflected_rays,
     seen_surface,
@@ -28,7 +29,6 @@ from glassplat.render.frame import (
     Frame,
     SpacePass,
     check_colored,
-    check_numbers,
     over_background,
 )
 from glassplat.scene import SH_ZERO
@@ -202,11 +202,4 @@ def check_mirrored(scene: Scene) -> None:
     """
     if not len(scene.surroundings) and scene.environment.is_empty:
         raise ValueError("the scene has no surroundings; expected one trained with `traced`")
-    if "logit_strength" not in scene.primary.channels:
-        raise ValueError(
-            f"the Gaussians have the channels {sorted(scene.primary.channels)}; expected logit_strength, as `traced` "
-            "trains it"
-        )
-    check_numbers(
-        {"environment.raw": scene.environment.raw, "logit_strength": scene.primary.channels["logit_strength"]}
-    )
+    check_strengths(scene, "traced")

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -35,29 +36,29 @@ def _in_order(name: str) -> tuple[list[tuple[int, str]], str]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts], name
 
 
-EXPOSURE_TENSORS = ("affine",)
-
-
 @dataclass(frozen=True)
-class Exposures:
-    """For each photograph what makes its colours of those of the scene: c' = c + A c + b, sRGB.
-
-    Cameras change exposure and white balance from one photograph to the next. In sRGB, a power of the radiance, both
-    are nearly factors on the channels.
+class ByPhotograph:
+    """Values for each of V photographs; a subclass says what they mean.
 
     Attributes:
-        affine: [V, 3, 4] A and b; zero for a photograph in the scene's own colours.
+        values: [V, ...] all zero for a photograph that is taken as it is.
         names: of the V photographs.
     """
 
-    affine: Tensor
+    TENSOR: ClassVar[str]
+    """Name of the values."""
+    SHAPE: ClassVar[tuple[int, ...]]
+    """Of those of one photograph."""
+
+    values: Tensor
     names: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        if tuple(self.affine.shape) != (len(self.names), 3, 4):
+        expected = [len(self.names), *self.SHAPE]
+        if list(self.values.shape) != expected:
             raise ValueError(
-                f"affine has shape {list(self.affine.shape)} for {len(self.names)} photographs; expected "
-                f"[{len(self.names)}, 3, 4]"
+                f"{self.TENSOR} has shape {list(self.values.shape)} for {len(self.names)} photographs; expected "
+                f"{expected}"
             )
 
     def __len__(self) -> int:
@@ -65,18 +66,56 @@ class Exposures:
         return len(self.names)
 
     def of(self, name: str) -> Tensor | None:
-        """[3, 4] that of a photograph; None for one that has none, whose colours are the scene's."""
-        return self.affine[self.names.index(name)] if name in self.names else None
+        """Values of a photograph; None for one that has none and is taken as it is."""
+        return self.values[self.names.index(name)] if name in self.names else None
 
-    def interpolated(self, name: str) -> Exposures:
-        """The same with a transform for a photograph that has none: the mean of its neighbours' in the order of names.
+    def interpolated(self, name: str) -> Self:
+        """The same with values for a photograph that has none: the mean of its neighbours' in the order of names.
 
         Itself where the photograph has its own, or no neighbours.
         """
         rows = [] if name in self.names else neighbours(name, self.names)
         if not rows:
             return self
-        return Exposures(torch.cat([self.affine, self.affine[rows].mean(dim=0, keepdim=True)]), (*self.names, name))
+        mean = self.values[rows].mean(dim=0, keepdim=True)
+        return replace(self, values=torch.cat([self.values, mean]), names=(*self.names, name))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+        return {self.TENSOR: self.values}
+
+    def with_tensors(self, tensors: Mapping[str, Tensor]) -> Self:
+        """The same with its tensors replaced by name."""
+        unknown = set(tensors) - {self.TENSOR}
+        if unknown:
+            raise ValueError(f"unknown tensors {sorted(unknown)}; {type(self).__name__} has {self.TENSOR}")
+        return replace(self, values=tensors.get(self.TENSOR, self.values))
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same on another device."""
+        return replace(self, values=self.values.to(device))
+
+    @classmethod
+    def neutral(cls, names: tuple[str, ...] = ()) -> Self:
+        """All photographs taken as they are."""
+        return cls(torch.zeros(len(names), *cls.SHAPE), names)
+
+
+@dataclass(frozen=True)
+class Exposures(ByPhotograph):
+    """For each photograph what makes its colours of those of the scene: c' = c + A c + b, sRGB.
+
+    Cameras change exposure and white balance from one photograph to the next. In sRGB, a power of the radiance, both
+    are nearly factors on the channels.
+    """
+
+    TENSOR = "affine"
+    SHAPE = (3, 4)
+
+    @property
+    def affine(self) -> Tensor:
+        """[V, 3, 4] A and b; zero for a photograph in the scene's own colours."""
+        return self.values
 
     def applied(self, image: Tensor, name: str) -> Tensor:
         """An image [..., 3] of the scene in the colours of a photograph; differentiable in both."""
@@ -93,56 +132,25 @@ class Exposures:
         own = own.to(photo)
         return (photo - own[:, 3]) @ torch.linalg.inv(torch.eye(3).to(photo) + own[:, :3].T)
 
-    def tensors(self) -> dict[str, Tensor]:
-        """All tensors by name."""
-        return {name: getattr(self, name) for name in EXPOSURE_TENSORS}
-
-    def with_tensors(self, tensors: Mapping[str, Tensor]) -> Exposures:
-        """The same with its tensors replaced by name."""
-        unknown = set(tensors) - set(EXPOSURE_TENSORS)
-        if unknown:
-            raise ValueError(f"unknown tensors {sorted(unknown)}; exposures have {sorted(EXPOSURE_TENSORS)}")
-        return replace(self, affine=tensors.get("affine", self.affine))
-
-    def to(self, device: torch.device | str) -> Exposures:
-        """The same on another device."""
-        return self.with_tensors({name: tensor.to(device) for name, tensor in self.tensors().items()})
-
-    @staticmethod
-    def neutral(names: tuple[str, ...] = ()) -> Exposures:
-        """All photographs in the scene's own colours."""
-        return Exposures(torch.zeros(len(names), 3, 4), names)
-
-
-POSE_TENSORS = ("twists",)
-
 
 @dataclass(frozen=True)
-class PoseCorrections:
+class PoseCorrections(ByPhotograph):
     """For each photograph a small motion of its camera about its own centre, in axes parallel to the world's.
 
     cam_from_world = [R | t] becomes exp(twist turned by R) cam_from_world. In these axes a motion that all cameras have
     in common is the mean of their twists, and that of a camera between two others the mean of theirs.
-
-    Attributes:
-        twists: [V, 6] rotation vector in radians, and translation in scene extents, so that both are small numbers
-            whatever the capture's units. Zero for a camera that stays.
-        names: of the V photographs; one that is missing keeps its camera.
     """
 
-    twists: Tensor
-    names: tuple[str, ...]
+    TENSOR = "twists"
+    SHAPE = (6,)
 
-    def __post_init__(self) -> None:
-        if tuple(self.twists.shape) != (len(self.names), 6):
-            raise ValueError(
-                f"twists have shape {list(self.twists.shape)} for {len(self.names)} photographs; expected "
-                f"[{len(self.names)}, 6]"
-            )
+    @property
+    def twists(self) -> Tensor:
+        """[V, 6] rotation vectors in radians, and translations in scene extents; zero for a camera that stays.
 
-    def __len__(self) -> int:
-        """Number of photographs."""
-        return len(self.names)
+        So both are small numbers whatever the capture's units.
+        """
+        return self.values
 
     def corrected(self, camera: Camera, name: str, extent: float) -> Camera:
         """The camera of a photograph where it really is; differentiable in the twists.
@@ -152,43 +160,11 @@ class PoseCorrections:
             name: of the photograph.
             extent: of the scene, world units.
         """
-        if name not in self.names:
+        twist = self.of(name)
+        if twist is None:
             return camera
-        twist = self.twists[self.names.index(name)]
         cam_axes_from_world = camera.cam_from_world[:3, :3].to(twist)
         return moved_camera(camera, (twist.reshape(2, 3) @ cam_axes_from_world.T).reshape(6), extent)
-
-    def interpolated(self, name: str) -> PoseCorrections:
-        """The same with a motion for a photograph that has none: the mean of its neighbours' in the order of names.
-
-        Itself where the photograph has its own, or no neighbours.
-        """
-        rows = [] if name in self.names else neighbours(name, self.names)
-        if not rows:
-            return self
-        return PoseCorrections(
-            torch.cat([self.twists, self.twists[rows].mean(dim=0, keepdim=True)]), (*self.names, name)
-        )
-
-    def tensors(self) -> dict[str, Tensor]:
-        """All tensors by name."""
-        return {"twists": self.twists}
-
-    def with_tensors(self, tensors: Mapping[str, Tensor]) -> PoseCorrections:
-        """The same with its tensors replaced by name."""
-        unknown = set(tensors) - set(POSE_TENSORS)
-        if unknown:
-            raise ValueError(f"unknown tensors {sorted(unknown)}; pose corrections have {sorted(POSE_TENSORS)}")
-        return replace(self, twists=tensors.get("twists", self.twists))
-
-    def to(self, device: torch.device | str) -> PoseCorrections:
-        """The same on another device."""
-        return replace(self, twists=self.twists.to(device))
-
-    @staticmethod
-    def none(names: tuple[str, ...] = ()) -> PoseCorrections:
-        """All cameras where they were said to be."""
-        return PoseCorrections(torch.zeros(len(names), 6), names)
 
 
 def moved_camera(camera: Camera, twist: Tensor, extent: float) -> Camera:

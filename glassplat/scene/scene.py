@@ -122,7 +122,7 @@ class Scene:
     photographer: Gaussians = field(default_factory=Gaussians.empty)
     up: Direction | None = None
     exposures: Exposures = field(default_factory=Exposures.neutral)
-    poses: PoseCorrections = field(default_factory=PoseCorrections.none)
+    poses: PoseCorrections = field(default_factory=PoseCorrections.neutral)
 
     def __repr__(self) -> str:
         sets = (f"{name}={gaussians}" for name, gaussians in self.gaussian_sets().items())
@@ -133,19 +133,20 @@ class Scene:
         sets = {"primary": self.primary, "glass": self.glass}
         return sets | {name: getattr(self, name) for name in OPTIONAL_SETS if len(getattr(self, name))}
 
-    def parameters(self) -> dict[str, Tensor]:
-        """Every trainable tensor by dotted name (`primary.means`, `planes.centers`, ...).
+    def tensors(self) -> dict[str, Tensor]:
+        """Every tensor by dotted name (`primary.means`, `planes.tangents`, ...).
 
         The environment (`environment.raw`), the exposures and the poses are among them where there are any.
         """
-        found = {f"{part}.{name}": t for part, g in self.gaussian_sets().items() for name, t in g.tensors().items()}
-        found |= {f"planes.{name}": t for name, t in self.planes.tensors().items() if name in PANE_TENSORS}
-        distant = {} if self.environment.is_empty else self.environment.tensors()
-        found |= {f"environment.{name}": tensor for name, tensor in distant.items()}
-        exposed = self.exposures.tensors() if len(self.exposures) else {}
-        moved = self.poses.tensors() if len(self.poses) else {}
-        found |= {f"poses.{name}": tensor for name, tensor in moved.items()}
-        return found | {f"exposures.{name}": tensor for name, tensor in exposed.items()}
+        parts: dict[str, Any] = {**self.gaussian_sets(), "planes": self.planes}
+        parts |= {} if self.environment.is_empty else {"environment": self.environment}
+        parts |= {name: getattr(self, name) for name in ("poses", "exposures") if len(getattr(self, name))}
+        return {f"{part}.{name}": t for part, held in parts.items() for name, t in held.tensors().items()}
+
+    def parameters(self) -> dict[str, Tensor]:
+        """Every trainable tensor by dotted name: all but those that say which part of a plane a pane is."""
+        fixed = {f"planes.{name}" for name in self.planes.tensors().keys() - set(PANE_TENSORS)}
+        return {name: tensor for name, tensor in self.tensors().items() if name not in fixed}
 
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> Scene:
         """The same scene with some tensors replaced by dotted name."""

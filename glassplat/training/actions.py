@@ -365,6 +365,10 @@ def default_population(densifier: DefaultDensify, rhythm: Rhythm) -> Population:
     return Population(edits=edits, resets=(reset,), densify_until=densifier.stop)
 
 
+MCMC_OPACITY = 0.5
+"""Of the first Gaussians under `mcmc`."""
+
+
 def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
     """3DGS-MCMC: relocate, add, explore, and regularise opacities and scales; opacities are never reset.
 
@@ -379,7 +383,7 @@ def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
         LossTerm("scale", densifier.scale_weight, of_all(mean_scale) if everywhere else mean_scale),
     )
     return Population(
-        opacity=densifier.initial_opacity,
+        opacity=MCMC_OPACITY,
         spread=densifier.initial_spread,
         edits=(Relocate(densifier),),
         post_steps=(AddNoise(densifier, means_rate),) if densifier.noise_rate != 0 else (),

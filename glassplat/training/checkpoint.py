@@ -63,16 +63,7 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
         OSError: the disk is full or not writable; an older file at `path` stays as it was.
     """
     scene = state.scene
-    tensors: dict[str, Tensor] = {}
-    for part, gaussians in scene.gaussian_sets().items():
-        tensors |= {f"scene/{part}/{name}": t for name, t in gaussians.tensors().items()}
-    tensors |= {f"scene/planes/{name}": t for name, t in scene.planes.tensors().items()}
-    if not scene.environment.is_empty:
-        tensors |= {f"scene/environment/{name}": t for name, t in scene.environment.tensors().items()}
-    if len(scene.poses):
-        tensors |= {f"scene/poses/{name}": t for name, t in scene.poses.tensors().items()}
-    if len(scene.exposures):
-        tensors |= {f"scene/exposures/{name}": t for name, t in scene.exposures.tensors().items()}
+    tensors = {f"scene/{name.replace('.', '/', 1)}": tensor for name, tensor in scene.tensors().items()}
     for name, (first, second) in state.optimizer.moments.items():
         tensors |= {f"first/{name}": first, f"second/{name}": second}
     for part, statistics in state.statistics.items():
@@ -222,12 +213,12 @@ def restored_scene(header: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     moved = under(tensors, "scene/poses/")
     check_shapes(moved, {"twists": (6,)} if moved else {}, "poses")
     return Scene(
-        poses=PoseCorrections(**moved, names=tuple(header["corrected"])) if moved else empty.poses,
+        poses=PoseCorrections(moved["twists"], tuple(header["corrected"])) if moved else empty.poses,
         extent=header["extent"],
         planes=Planes(**planes, labels=header["labels"], mirrors=header["mirrors"]),
         environment=environment,
         up=direction(header["up"], "the header"),
-        exposures=Exposures(**exposed, names=tuple(header["photographs"])) if exposed else empty.exposures,
+        exposures=Exposures(exposed["affine"], tuple(header["photographs"])) if exposed else empty.exposures,
         **sets,
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -13,7 +14,7 @@ from glassplat.captures.dataset import Dataset
 from glassplat.render.planar import Planar
 from glassplat.scene import logit
 from glassplat.scene.camera import Camera
-from glassplat.scene.corrections import Exposures, PoseCorrections, upward
+from glassplat.scene.corrections import ByPhotograph, Exposures, PoseCorrections, upward
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
@@ -21,54 +22,66 @@ from glassplat.training.actions import Densify
 from glassplat.training.options import DefaultDensify, PhotoExposure, Photographer, PoseRefinement, Rate
 from glassplat.training.stage import Clock, Setup, Stage, TrainState, Work, carried_out
 
+END_SHARE = 0.1
+"""Learning rate at the end of the run, as a share of that at the start."""
+CORRECTIONS: dict[str, type[ByPhotograph]] = {"exposures": Exposures, "poses": PoseCorrections}
+"""Of photographs, by part of the scene."""
 
-def exposures_begun(options: PhotoExposure, scene: Scene, dataset: Dataset) -> Scene:
-    """The first scene, with transforms that change nothing yet."""
+
+class Corrects(Protocol):
+    """A recipe, as far as photographs are corrected."""
+
+    @property
+    def exposure(self) -> PhotoExposure:
+        """Options of the exposure of each photograph."""
+        ...
+
+    @property
+    def poses(self) -> PoseRefinement:
+        """Options of the camera of each photograph."""
+        ...
+
+
+def _rates(recipe: Corrects) -> dict[str, float]:
+    """Learning rates at the start, by part of the scene, of those that learn at all."""
+    rates = {"exposures": recipe.exposure.rate, "poses": recipe.poses.rate}
+    return {part: rate for part, rate in rates.items() if rate}
+
+
+def corrections_begun(recipe: Corrects, scene: Scene, dataset: Dataset) -> Scene:
+    """The first scene, with corrections that change nothing yet."""
     names = tuple(view.name for view in dataset.train)
-    return replace(scene, exposures=Exposures.neutral(names)) if options.rate else scene
+    begun: dict[str, Any] = {part: CORRECTIONS[part].neutral(names) for part in _rates(recipe)}
+    return replace(scene, **begun)
 
 
-def exposures_learnt(options: PhotoExposure, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
-    """The stages, in which the transforms learn as well."""
-    if not options.rate:
-        return stages
-    rate = {"exposures.affine": Rate(options.rate, options.rate * options.rate_end)}
-    # Before the motions that take means over steps.
-    return tuple(replace(s, rates={**s.rates, **rate}, post_steps=(center_exposures, *s.post_steps)) for s in stages)
+def corrections_learnt(recipe: Corrects, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+    """The stages, in which the corrections learn as well."""
+    for part, start in _rates(recipe).items():
+        rate = {f"{part}.{CORRECTIONS[part].TENSOR}": Rate(start, start * END_SHARE)}
+        # Before the motions that take means over steps.
+        stages = tuple(replace(s, rates={**s.rates, **rate}, post_steps=(Center(part), *s.post_steps)) for s in stages)
+    return stages
 
 
-def center_exposures(state: TrainState, clock: Clock, visible: Tensor | None) -> None:
-    """Takes the mean of all transforms off each of them.
+@dataclass(frozen=True)
+class Center:
+    """Takes the mean of all corrections off each of them.
 
     What all photographs have in common belongs to the scene: were it twice as bright and all photographs half as much,
-    training would see no difference, and views that nobody photographed would have the wrong colours.
+    training would see no difference, and views that nobody photographed would have the wrong colours. Were all cameras
+    and the scene moved together, training would see none either, and test cameras stay behind.
+
+    Attributes:
+        part: exposures or poses.
     """
-    affine = state.scene.exposures.affine.detach()
-    affine -= affine.mean(dim=0)
 
+    part: str
 
-def poses_begun(options: PoseRefinement, scene: Scene, dataset: Dataset) -> Scene:
-    """The first scene, with all cameras where they are said to be."""
-    names = tuple(view.name for view in dataset.train)
-    return replace(scene, poses=PoseCorrections.none(names)) if options.rate else scene
-
-
-def poses_learnt(options: PoseRefinement, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
-    """The stages, in which the cameras learn as well."""
-    if not options.rate:
-        return stages
-    rate = {"poses.twists": Rate(options.rate, options.rate * options.rate_end)}
-    # Before the motions that take means over steps.
-    return tuple(replace(s, rates={**s.rates, **rate}, post_steps=(center_poses, *s.post_steps)) for s in stages)
-
-
-def center_poses(state: TrainState, clock: Clock, visible: Tensor | None) -> None:
-    """Takes the mean of all motions off each of them, translation and rotation.
-
-    Were all cameras and the scene moved together, training would see no difference, and test cameras stay behind.
-    """
-    twists = state.scene.poses.twists.detach()
-    twists -= twists.mean(dim=0)
+    def __call__(self, state: TrainState, clock: Clock, visible: Tensor | None) -> None:
+        """Edits `state`."""
+        values = getattr(state.scene, self.part).values.detach()
+        values -= values.mean(dim=0)
 
 
 NEAREST, FARTHEST = 0.03, 0.6

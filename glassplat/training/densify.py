@@ -449,6 +449,10 @@ def reset_opacity(
     return gaussians.with_tensors({"logit_opacities": lowered}), forget(moments, (f"{part}.logit_opacities",))
 
 
+DEAD_OPACITY = 0.005
+"""Gaussians at most this opaque are relocated."""
+NOISE_SHARPNESS = 100.0
+"""How fast the noise fades above that."""
 MOST_COPIES = 51
 """Gaussians that may share one place, the first one included; the sum of `shared_contribution` is exact up to here."""
 MOST_LOGIT = 16.0
@@ -487,7 +491,7 @@ def relocation(options: McmcDensify, gaussians: Gaussians, generator: torch.Gene
 
     Without live ones nothing moves; where more than `MOST_COPIES` would share a place, the surplus stays dead.
     """
-    live = _live(options, gaussians)
+    live = _live(gaussians)
     dead = (~live).nonzero().squeeze(1)
     targets = drawn_by_opacity(gaussians, live, dead.shape[0], generator)
     fits = rank_among_equals(targets) < MOST_COPIES - 1
@@ -501,7 +505,7 @@ def addition(options: McmcDensify, gaussians: Gaussians, cap: int, generator: to
     count = len(gaussians)
     # Rounded up, because a set of a few Gaussians would never grow otherwise.
     room = max(min(cap, math.ceil(options.growth * count)) - count, 0)
-    targets = drawn_by_opacity(gaussians, _live(options, gaussians), room, generator)
+    targets = drawn_by_opacity(gaussians, _live(gaussians), room, generator)
     targets = targets[rank_among_equals(targets) < MOST_COPIES - 1]
     return shared_among_copies(gaussians, torch.cat([torch.arange(count, device=targets.device), targets]))
 
@@ -512,7 +516,7 @@ def sgld_noise(
 ) -> Tensor:
     """[N, 3] offsets of the centres in world units: the noise term of the paper's Langevin dynamics.
 
-    noise_rate * rate * sigmoid(-noise_sharpness (opacity - dead_opacity)) * covariance @ eta, eta standard normal.
+    noise_rate * rate * sigmoid(-100 (opacity - 0.005)) * covariance @ eta, eta standard normal.
     The published factor multiplies an area by a rate that is a length, both in world units (`noise_units`), and so
     depends on the capture's; else both are in scene extents, which is the same where the extent is one.
 
@@ -531,13 +535,13 @@ def sgld_noise(
     directions = (rotations @ along_axes[..., None]).squeeze(-1)
     directions = directions * extent if options.noise_units == "world" else directions / extent
     opacities = torch.sigmoid(gaussians.logit_opacities)
-    gate = torch.sigmoid(-options.noise_sharpness * (opacities - options.dead_opacity))
+    gate = torch.sigmoid(-NOISE_SHARPNESS * (opacities - DEAD_OPACITY))
     return options.noise_rate * rate * gate[:, None] * directions
 
 
-def _live(options: McmcDensify, gaussians: Gaussians) -> Tensor:
+def _live(gaussians: Gaussians) -> Tensor:
     """[N] bool: which Gaussians are opaque enough to stay."""
-    return torch.sigmoid(gaussians.logit_opacities) > options.dead_opacity
+    return torch.sigmoid(gaussians.logit_opacities) > DEAD_OPACITY
 
 
 def drawn_by_opacity(gaussians: Gaussians, live: Tensor, count: int, generator: torch.Generator) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
@@ -64,12 +64,16 @@ class Rate:
         return float(self.start ** (1 - decayed) * self.end**decayed * scale)
 
 
+MEANS_END = 1.6e-6
+"""Learning rate of positions at the end of a run, per scene extent."""
+
+
 @dataclass(frozen=True)
 class GaussianRates:
     """Learning rates of a set of Gaussians (3DGS).
 
     Attributes:
-        means: position, per scene extent, at the start of the run; decays to `means_end`.
+        means: position, per scene extent, at the start of the run; decays to `MEANS_END`.
         decay: share of the run at which it has done so.
         sh: constant SH coefficient; the others get a twentieth.
         opacity, scale, rotation: of the raw values.
@@ -79,8 +83,9 @@ class GaussianRates:
             (lab/training.md).
     """
 
+    FORMER: ClassVar[dict[str, Any]] = {"means_end": MEANS_END}
+
     means: LearningRate = 1.6e-4
-    means_end: Internal[PositiveShare] = 1.6e-6
     decay: Internal[PositiveShare] = 1.0
     sh: LearningRate = 2.5e-3
     opacity: LearningRate = 5e-2
@@ -93,42 +98,11 @@ class GaussianRates:
         """The rates by dotted parameter name."""
         power = self.short_run_power
         return {
-            f"{part}.means": Rate(self.means, self.means_end, decay=self.decay, per_extent=True, short_run_power=power),
+            f"{part}.means": Rate(self.means, MEANS_END, decay=self.decay, per_extent=True, short_run_power=power),
             f"{part}.sh": Rate(self.sh, rest=1 / 20, short_run_power=power),
             f"{part}.logit_opacities": Rate(self.opacity),
             f"{part}.log_scales": Rate(self.scale, short_run_power=power),
             f"{part}.quats": Rate(self.rotation, short_run_power=power),
-        }
-
-
-@dataclass(frozen=True)
-class PlaneRates:
-    """Learning rates of planes and glass, which the paper leaves out; see lab/training.md.
-
-    Attributes:
-        center: plane position in stage 2, per scene extent.
-        normal: plane normal in stage 2.
-        reflectance: logit of R0.
-        mark: logit of the glass mark.
-        transmittance: its logarithm, where panes may be tinted.
-        joint_factor: factor on `center` and `normal` in stage 3 (paper: 0.1).
-    """
-
-    center: LearningRate = 1e-4
-    normal: LearningRate = 1e-4
-    reflectance: LearningRate = 1e-2
-    mark: LearningRate = 5e-2
-    transmittance: LearningRate = 5e-3
-    joint_factor: Share = 0.1
-
-    def of(self, factor: float) -> dict[str, Rate]:
-        """The rates by dotted parameter name."""
-        return {
-            "planes.centers": Rate(self.center * factor, per_extent=True),
-            "planes.raw_normals": Rate(self.normal * factor),
-            "planes.logit_reflectances": Rate(self.reflectance),
-            "planes.log_transmittances": Rate(self.transmittance),
-            "glass.logit_mark": Rate(self.mark),
         }
 
 
@@ -258,34 +232,34 @@ class McmcDensify:
         stop: share of the run after which relocation and growth end; the noise goes on.
         growth: factor by which the number grows in every three hundredth of the run, until the cap: with the published
             30,000 iterations at every relocation. A single relocation at most doubles it.
-        dead_opacity: Gaussians at most this opaque are relocated.
         noise_rate: noise on the positions, as a multiple of their learning rate; 0 switches it
             off.
         noise_units: in which variances and learning rate are multiplied: scene `extents`, so that the noise is the same
             whatever the capture's units, or as published `world` units.
-        noise_sharpness: how fast the noise fades above `dead_opacity`.
         opacity_weight: lambda_o, weight of the mean opacity in the objective.
         scale_weight: lambda_Sigma, weight of the mean standard deviation in the objective.
         reach: what noise and regularisers act on at a step: what its view shows (`shown`; the regularisers on what it
             shows directly), or as published on `all` Gaussians.
-        initial_opacity: opacity of the first Gaussians.
         initial_spread: standard deviation of the first Gaussians, as a share of the distance to their neighbours. The
             published 0.1 takes a thousand steps or more to grow over the gaps (lab/gaussians.md).
     """
+
+    FORMER: ClassVar[dict[str, Any]] = {
+        "dead_opacity": 0.005,
+        "noise_sharpness": 100.0,
+        "initial_opacity": 0.5,
+    }
 
     cap: Annotated[Count | None, ESSENTIAL, tyro.conf.arg(aliases=("--cap",))] = None
     interval: Internal[Several] = 100
     start: Internal[Share] = 500 / 30_000
     stop: Internal[Share] = 25_000 / 30_000
     growth: Internal[Annotated[float, Range(1, 100)]] = 1.05
-    dead_opacity: Internal[InnerShare] = 0.005
     noise_rate: NotNegative = 5e5
     noise_units: Internal[Literal["extents", "world"]] = "extents"
-    noise_sharpness: Internal[NotNegative] = 100.0
     opacity_weight: NotNegative = 0.01
     scale_weight: NotNegative = 0.01
     reach: Internal[Literal["shown", "all"]] = "shown"
-    initial_opacity: Internal[InnerShare] = 0.5
     initial_spread: Internal[Positive] = 1.0
 
     @staticmethod
@@ -326,7 +300,6 @@ class NormalPropagation:
     correct too, so that the other receives a gradient that means something.
 
     Attributes:
-        propagates: whether normals are propagated at all (ablation).
         least_opacity: every opacity is raised to this, so that every visible Gaussian counts.
         least_strength: every reflection strength is raised to this, so that it has a gradient.
         reflective: Gaussians of at least this strength grow (paper: 0.1; its code: 0.02).
@@ -336,7 +309,8 @@ class NormalPropagation:
         sabotaged: Gaussians of at most this strength are disturbed (paper: 0.1; its code: 0.05).
     """
 
-    propagates: bool = True
+    FORMER: ClassVar[dict[str, Any]] = {"propagates": True}
+
     least_opacity: InnerShare = 0.9
     least_strength: InnerShare = 1e-3
     reflective: InnerShare = 0.02
@@ -351,11 +325,11 @@ class PhotoExposure:
 
     Attributes:
         rate: learning rate at the start; 0 takes all photographs as exposed alike.
-        rate_end: that at the end of the run, as a share of `rate`.
     """
 
+    FORMER: ClassVar[dict[str, Any]] = {"rate_end": 0.1}
+
     rate: LearningRate = 0.0
-    rate_end: Internal[PositiveShare] = 0.1
 
 
 @dataclass(frozen=True)
@@ -364,11 +338,11 @@ class PoseRefinement:
 
     Attributes:
         rate: learning rate at the start, radians and extents; 0 takes the capture's cameras as they are.
-        rate_end: that at the end of the run, as a share of `rate`.
     """
 
+    FORMER: ClassVar[dict[str, Any]] = {"rate_end": 0.1}
+
     rate: LearningRate = 0.0
-    rate_end: Internal[PositiveShare] = 0.1
 
 
 @dataclass(frozen=True)

@@ -79,14 +79,13 @@ def test_a_wrong_option_ends_with_one_message(
 @pytest.mark.parametrize(
     ("recipe", "named"),
     [
-        (PlanarRecipe(rates=GaussianRates(means_end=0.0)), "--rates.means-end"),
+        (PlanarRecipe(rates=GaussianRates(decay=0.0)), "--rates.decay"),
         (PlanarRecipe(plane_fit=PlaneFit(seed=10**30)), "--plane-fit.seed"),
         (PlanarRecipe(stage_shares=(0.0, 0.0, 0.0)), "--stage-shares"),
         (PlanarRecipe(stage_shares=(math.nan, 1.0, 1.0)), "--stage-shares"),
         (PlanarRecipe(stage_shares=(1.0, -1.0, 1.0)), "--stage-shares"),
         (PlanarRecipe(perturbation=Perturbation(bounds=(0.9, 0.1))), "--perturbation.bounds"),
         (SplatRecipe(mcmc=McmcDensify(growth=0.5)), "--mcmc.growth"),
-        (DeferredRecipe(refinements=(0.6, 0.4)), "--refinements"),
         (DeferredRecipe(propagation=NormalPropagation(least_opacity=1.0)), "--propagation.least-opacity"),
     ],
     ids=str,

@@ -3,14 +3,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from glassplat.files.sidecars import read_exposures, write_exposures
+from glassplat.files.sidecars import read_corrections, write_corrections
 from glassplat.scene.corrections import Exposures
 
 
 def test_what_was_written_is_read(tmp_path: Path) -> None:
     affine = torch.randn(3, 3, 4, generator=torch.Generator().manual_seed(0))
-    write_exposures(tmp_path / "exposures.json", Exposures(affine, ("a.png", "b/c.png", "ü.png")))
-    found = read_exposures(tmp_path / "exposures.json")
+    write_corrections(tmp_path / "exposures.json", Exposures(affine, ("a.png", "b/c.png", "ü.png")))
+    found = read_corrections(tmp_path / "exposures.json", Exposures)
     assert found.names == ("a.png", "b/c.png", "ü.png")
     assert torch.equal(found.affine, affine)
 
@@ -22,4 +22,4 @@ def test_a_foreign_file_is_an_error_that_names_it(tmp_path: Path, text: str) -> 
     path = tmp_path / "exposures.json"
     path.write_text(text)
     with pytest.raises(ValueError, match=r"exposures\.json"):
-        read_exposures(path)
+        read_corrections(path, Exposures)

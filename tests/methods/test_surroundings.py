@@ -8,13 +8,7 @@ import pytest
 import torch
 
 from glassplat.captures.view import PointCloud
-from glassplat.methods.surroundings import (
-    copied_surroundings,
-    joined,
-    percentile_box,
-    suitable_cells,
-    surroundings_in_box,
-)
+from glassplat.methods.surroundings import copied_surroundings, percentile_box, suitable_cells, surroundings_in_box
 from glassplat.scene.gaussians import Gaussians
 from tests.render.tiny_scene import in_single_precision, showcase
 
@@ -78,5 +72,5 @@ def test_copies_keep_as_many_harmonics_as_they_may() -> None:
 
 def test_sets_are_joined_in_order() -> None:
     first, second = in_box(), in_box(cells=2)
-    both = joined(first, replace(second, active_sh_degree=1))
+    both = replace(first, active_sh_degree=1).joined(second)
     assert torch.equal(both.means, torch.cat([first.means, second.means])) and both.active_sh_degree == 1

@@ -9,15 +9,12 @@ import pytest
 import torch
 
 from glassplat.kernels.environment.reference import cube_lookup
-from glassplat.options import Shading
 from glassplat.render.deferred import Deferred, view_directions
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Environment, Scene
 from tests.render.tiny_scene import camera_at, in_single_precision, random_gaussians
-
-BOTH = pytest.mark.parametrize("shading", ["deferred", "forward"])
 
 
 def glossy(strength: float = 0.3, *, count: int = 14, size: int = 4) -> Scene:
@@ -54,31 +51,24 @@ def rolled(camera: Camera) -> Camera:
     return replace(camera, cam_from_world=pose)
 
 
-@BOTH
 @pytest.mark.parametrize("tilt", [0.0, 0.3, -0.2])
-def test_a_flat_mirror_shows_the_environment_in_the_mirrored_direction(tilt: float, shading: Shading) -> None:
+def test_a_flat_mirror_shows_the_environment_in_the_mirrored_direction(tilt: float) -> None:
     camera = rolled(camera_at(0.1, -0.2, 0.0))
-    frame = Deferred(shading=shading)(wall(tilt), camera)
+    frame = Deferred()(wall(tilt), camera)
     normal = torch.tensor([math.sin(tilt), 0.0, math.cos(tilt)], dtype=torch.float64)
     away = view_directions(camera)
     mirrored = away - 2 * (away @ normal)[..., None] * normal
     expected = torch.sigmoid(cube_lookup(wall(tilt).environment.raw, mirrored))
-    if shading == "forward":
-        # The one Gaussian has one colour: that of its centre.
-        to_center = wall(tilt).primary.means[0] - camera.center
-        mirrored = to_center - 2 * (to_center @ normal) * normal
-        expected = torch.sigmoid(cube_lookup(wall(tilt).environment.raw, mirrored)).expand_as(frame.rgb)
     # An alpha is at most 0.99.
     torch.testing.assert_close(frame.rgb, 0.99 * expected, atol=0.02, rtol=0)
     normals = torch.nn.functional.normalize(frame.layers["normal"], dim=-1)
     torch.testing.assert_close(normals, -normal.expand_as(normals), atol=1e-6, rtol=0)
 
 
-@BOTH
-def test_without_strength_it_is_splat(shading: Shading) -> None:
+def test_without_strength_it_is_splat() -> None:
     scene, camera = glossy(1e-12), camera_at(0.1, 0.0, 0.0)
     plain = Splat()(scene, camera)
-    frame = Deferred(shading=shading)(scene, camera)
+    frame = Deferred()(scene, camera)
     torch.testing.assert_close(frame.rgb, plain.rgb, atol=1e-9, rtol=0)
     for name in ("alpha", "depth"):
         torch.testing.assert_close(frame.layers[name], plain.layers[name])
@@ -105,17 +95,15 @@ def test_pixels_that_hardly_reflect_cost_no_visible_difference() -> None:
     assert bool((change <= least * most + 1e-12).all())
 
 
-@BOTH
-def test_an_empty_pixel_shows_the_background(shading: Shading) -> None:
+def test_an_empty_pixel_shows_the_background() -> None:
     scene = glossy(count=1)
-    frame = Deferred(background=(1.0, 0.5, 0.25), shading=shading)(scene, camera_at(0.0, 0.0, 0.0))
+    frame = Deferred(background=(1.0, 0.5, 0.25))(scene, camera_at(0.0, 0.0, 0.0))
     empty = frame.layers["alpha"] == 0
     assert empty.any() and not empty.all()
     assert frame.rgb[empty].unique(dim=0).tolist() == [[1.0, 0.5, 0.25]]
 
 
-@BOTH
-def test_gradients_reach_everything_that_learns(shading: Shading) -> None:
+def test_gradients_reach_everything_that_learns() -> None:
     scene, camera = glossy(count=5, size=2), camera_at(0.1, 0.0, 0.0, width=12, height=10)
     names = ["primary.means", "primary.quats", "primary.log_scales", "primary.logit_opacities", "primary.sh",
              "primary.logit_strength", "environment.raw"]  # fmt: skip
@@ -124,7 +112,7 @@ def test_gradients_reach_everything_that_learns(shading: Shading) -> None:
 
     def loss(*tensors: torch.Tensor) -> torch.Tensor:
         learning = scene.with_parameters(dict(zip(names, tensors, strict=True)))
-        return (Deferred(shading=shading)(learning, camera).rgb * weights).sum()
+        return (Deferred()(learning, camera).rgb * weights).sum()
 
     assert torch.autograd.gradcheck(loss, values, eps=1e-6, atol=1e-5, rtol=1e-3)
     found = torch.autograd.grad(loss(*values), values)

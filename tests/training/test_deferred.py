@@ -43,7 +43,6 @@ RECIPE = DeferredRecipe(
     bootstrap=0.2,
     texels=4,
     first_texels=2,
-    refinements=(0.4, 0.6),
     search=MirrorSearch(begin_found=False),
     region=(0.0, 0.0, 3.5, 1.0),
     rhythm=Rhythm(beat=0.1, least=2, sh=0.1),
@@ -373,7 +372,7 @@ def test_the_environment_is_refined_up_to_its_size() -> None:
     for message in train(RECIPE.stages(seed=0), tiny_capture(), state, iterations=20):
         if isinstance(message, StepDone):
             sizes[message.step] = state.scene.environment.size
-    assert [sizes[step] for step in (4, 5, 7, 8, 12, 20)] == [0, 2, 2, 4, 4, 4]
+    assert [sizes[step] for step in (4, 5, 8, 9, 12, 20)] == [0, 2, 2, 4, 4, 4]
     assert state.scene.environment.region == RECIPE.region
 
 

@@ -14,7 +14,7 @@ from glassplat.files.scene_folder import read_scene, write_scene
 from glassplat.methods.recipe import RECIPES
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
-from glassplat.training.corrections import center_exposures, exposures_begun
+from glassplat.training.corrections import Center, corrections_begun
 from glassplat.training.loop import train
 from glassplat.training.options import PhotoExposure
 from glassplat.training.stage import TrainState
@@ -36,14 +36,14 @@ def darkened(dataset: Dataset) -> Dataset:
 
 def trained(recipe: SplatRecipe, steps: int = 240) -> TrainState:
     dataset = darkened(tiny_capture())
-    scene = exposures_begun(recipe.exposure, replace(true_scene(), planes=type(true_scene().planes).empty()), dataset)
+    scene = corrections_begun(recipe, replace(true_scene(), planes=type(true_scene().planes).empty()), dataset)
     state = TrainState(scene, 0)
     frozen = tuple(
         replace(
             stage,
             rates={n: r for n, r in stage.rates.items() if n.startswith("exposures")},
             actions=(),
-            post_steps=tuple(post_step for post_step in stage.post_steps if post_step is center_exposures),
+            post_steps=tuple(post_step for post_step in stage.post_steps if post_step == Center("exposures")),
         )
         for stage in recipe.stages(0)
     )
@@ -70,7 +70,7 @@ def test_every_stage_of_every_method_learns_them(method: str, iterations: int) -
     recipe = RECIPES[method](exposure=LEARNED)
     stages = recipe.stages(0, iterations)
     assert all("exposures.affine" in stage.rates for stage in stages)
-    assert all(stage.post_steps[0] is center_exposures for stage in stages)
+    assert all(stage.post_steps[0] == Center("exposures") for stage in stages)
     assert recipe.initialise(CAPTURE).exposures.names == tuple(v.name for v in CAPTURE.train)
 
 

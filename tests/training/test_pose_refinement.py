@@ -27,7 +27,7 @@ from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import Exposures, PoseCorrections, moved_camera
 from glassplat.scene.scene import Scene
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
-from glassplat.training.corrections import center_poses, poses_begun
+from glassplat.training.corrections import Center, corrections_begun
 from glassplat.training.densify import as_discs
 from glassplat.training.loop import train
 from glassplat.training.options import PoseRefinement
@@ -39,7 +39,7 @@ from tests.render.tiny_scene import showcase
 from tests.training.tiny_capture import tiny_capture, true_scene, write_tiny_capture
 
 TWIST = torch.tensor([0.011, -0.014, 0.008, 0.012, -0.006, 0.004])
-REFINED = PoseRefinement(rate=1e-3, rate_end=0.05)
+REFINED = PoseRefinement(rate=1e-3)
 
 
 def shaken(dataset: Dataset, numbers: tuple[int, ...] = (2,)) -> Dataset:
@@ -81,7 +81,6 @@ def discs() -> Scene:
 RENDERED = [
     (Planar(), showcase()),
     (Deferred(), deferred_scene()),
-    (Deferred(shading="forward"), deferred_scene()),
     (Traced(), replace(traced_scene(), environment=deferred_scene().environment)),
     (Traced(), discs()),
 ]
@@ -120,7 +119,7 @@ def test_a_view_keeps_its_photograph_when_its_camera_moves() -> None:
 def test_a_camera_that_is_off_finds_its_place() -> None:
     dataset = shaken(tiny_capture())
     recipe = SplatRecipe(poses=REFINED)
-    scene = poses_begun(recipe.poses, true_scene(), dataset)
+    scene = corrections_begun(recipe, true_scene(), dataset)
     stages = tuple(
         replace(s, renderer=Planar(), rates={"poses.twists": s.rates["poses.twists"]}, actions=(), post_steps=())
         for s in recipe.stages(0)
@@ -186,7 +185,7 @@ def test_every_stage_of_every_method_refines(method: str, iterations: int) -> No
     assert all("poses.twists" in stage.rates for stage in recipe.stages(0, iterations))
     capture = replace(tiny_capture(), measured_points=False)
     assert recipe.initialise(capture).poses.names == tuple(view.name for view in capture.train)
-    assert all(stage.post_steps[0] is center_poses for stage in recipe.stages(0, iterations))
+    assert all(stage.post_steps[0] == Center("poses") for stage in recipe.stages(0, iterations))
     off = replace(recipe, poses=PoseRefinement(rate=0.0))
     assert not any("poses.twists" in stage.rates for stage in off.stages(0, iterations))
     assert len(off.initialise(capture).poses) == 0

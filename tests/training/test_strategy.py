@@ -104,9 +104,8 @@ def test_the_strategy_decides_what_happens_to_the_primary_gaussians(recipe: Any)
 
 
 @pytest.mark.parametrize("iterations", [251, 1234, 7_000])
-@pytest.mark.parametrize("multi_stage", [True, False])
-def test_planar_grows_after_one_reset_when_joint_optimisation_begins(multi_stage: bool, iterations: int) -> None:
-    stages = PlanarRecipe(strategy="mcmc", multi_stage=multi_stage).stages(seed=0)
+def test_planar_grows_after_one_reset_when_joint_optimisation_begins(iterations: int) -> None:
+    stages = PlanarRecipe(strategy="mcmc").stages(seed=0)
     starts = stage_starts(stages, iterations)
     due: dict[type, list[int]] = {ResetOpacity: [], Relocate: []}
     for stage, start, end in zip(stages, starts, starts[1:], strict=False):
@@ -167,7 +166,7 @@ def test_a_step_hands_on_what_its_view_shows() -> None:
 
 
 def test_the_strategy_decides_how_the_first_gaussians_look() -> None:
-    options = McmcDensify(initial_opacity=0.5, initial_spread=0.1)
+    options = McmcDensify(initial_spread=0.1)
     recipes = SplatRecipe(strategy="mcmc", mcmc=options), SplatRecipe(mcmc=options)
     sampled, default = (recipe.initialise(tiny_capture()).primary for recipe in recipes)
     assert torch.sigmoid(sampled.logit_opacities).mean().item() == pytest.approx(0.5)

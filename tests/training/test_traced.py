@@ -157,6 +157,15 @@ def test_surroundings_are_copied_spread_or_both() -> None:
     assert set(copied.means[:, 0].tolist()) <= set(fresh_state().scene.primary.means[:, 0].tolist())
 
 
+def test_copies_keep_their_harmonics_beside_the_box() -> None:
+    state = fresh_state()
+    primary = replace(state.scene.primary, active_sh_degree=1)
+    state.scene = replace(state.scene, primary=primary)
+    everything = torch.ones(len(primary), dtype=torch.bool)
+    AddSurroundings(SurroundingsStart("both", cells=2), 1)(state, tiny_capture(), everything)
+    assert len(state.scene.surroundings) == 40 + len(primary) and state.scene.surroundings.active_sh_degree == 1
+
+
 def test_where_everything_reflects_there_is_nothing_to_copy() -> None:
     state = fresh_state()
     nothing = torch.zeros(len(state.scene.primary), dtype=torch.bool)
