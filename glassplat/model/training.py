@@ -145,7 +145,8 @@ class Run:
         """Trains from one message to the next.
 
         Raises:
-            InputError: the run was recorded with other settings, or a photograph cannot be read, of the test views too.
+            InputError: the run was recorded with other settings or photographs, or a photograph cannot be read, of the
+                test views too.
             KeyboardInterrupt: the user stopped the run; the checkpoint is written.
             TrainingDivergedError: training cannot go on; the last checkpoint stays.
             OSError: the disk is full or fails; the last checkpoint stays.
@@ -173,7 +174,7 @@ class Run:
             # Another training may have ended here meanwhile.
             anew = directory.is_begun and not self._resume
             if self.state is None:
-                self.state = resumed_state(self.recipe, settings, directory)
+                self.state = resumed_state(self.recipe, settings, directory, self._dataset)
             else:
                 directory.check_vacant()
                 directory.begin(self.recipe, settings, self._dataset)
@@ -214,12 +215,12 @@ def first_state(recipe: Any, settings: run_directory.RunSettings, dataset: Datas
 
 
 def resumed_state(
-    recipe: Any, settings: run_directory.RunSettings, directory: run_directory.RunDirectory
+    recipe: Any, settings: run_directory.RunSettings, directory: run_directory.RunDirectory, dataset: Dataset
 ) -> TrainState:
     """The checkpoint's state.
 
     Raises:
-        InputError: the run was recorded with other settings, or nothing is saved.
+        InputError: the run was recorded with other settings or photographs, or nothing is saved.
     """
     directory.check_saved()
     # A run may go on on another device.
@@ -230,6 +231,7 @@ def resumed_state(
             f"resume it, got {settings}. Repeat the original options, with the version of glassplat that began "
             "it, or choose another --output"
         )
+    directory.check_photographs(dataset)
     state = load_checkpoint(
         directory.checkpoint, method=recipe.method, seed=settings.seed, iterations=settings.iterations
     )
