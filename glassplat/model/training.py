@@ -27,7 +27,15 @@ from glassplat.model import run_directory
 from glassplat.model.model import Model
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import train
-from glassplat.training.messages import ActionDone, CheckpointWritten, Message, RunBegun, StepDone, Working
+from glassplat.training.messages import (
+    ActionDone,
+    CheckpointWritten,
+    Message,
+    RunBegun,
+    StageEntered,
+    StepDone,
+    Working,
+)
 from glassplat.training.ranks import Ranks, is_launched, join
 from glassplat.training.stage import Stage, TrainState, check_length
 
@@ -330,7 +338,7 @@ class TrainingSession:
                 self._record.log.write(message)
             yield message
         except BaseException as error:
-            if isinstance(message, StepDone | ActionDone):
+            if isinstance(message, StageEntered | StepDone | ActionDone):
                 self.save()
             if self._stop.requested and isinstance(error, OSError):
                 self._stop.end()  # A terminal that was closed can show nothing, and that is no failure.
