@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, NoReturn
 import torch
 
 from glassplat import __version__
-from glassplat.captures.dataset import Dataset, photographs_read
+from glassplat.captures.dataset import Dataset, photographs_read, with_corrected_cameras
 from glassplat.errors import InputError, RankLostError
 from glassplat.files.writing import make_folder
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
@@ -490,10 +490,13 @@ class Training:
     def model(self) -> Model:
         """The scene as trained so far; its tensors go on changing, so `save` it, or clone what has to stay.
 
+        Its cameras are where training has found them by now, if it looks for them.
+
         Raises:
             RuntimeError: the first scene has not been made yet.
         """
-        cameras = {view.name: view.camera for view in (*self._dataset.train, *self._dataset.test)}
+        seen = with_corrected_cameras(self._dataset, self.state.scene)
+        cameras = {view.name: view.camera for view in (*seen.train, *seen.test)}
         return Model(self.state.scene, self.recipe, cameras, self._dataset.root.name)
 
     def save(self) -> None:

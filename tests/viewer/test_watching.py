@@ -168,5 +168,5 @@ def test_a_training_that_nobody_watches_says_where_to_look(
 
 def test_a_scene_that_lacks_what_its_method_mirrors_is_drawn_plainly() -> None:
     early = replace(model(), recipe=DeferredRecipe(background=(0.0, 0.0, 0.0)))
-    assert isinstance(renderer_now(early), Splat)
-    assert renderer_now(model()) == model().renderer
+    assert isinstance(renderer_now(early.recipe, early.scene), Splat)
+    assert renderer_now(model().recipe, model().scene) == model().renderer
