@@ -181,7 +181,7 @@ class Run:
             directory.clear()
             # Another training may have ended here meanwhile.
             anew = directory.is_begun and not self._resume
-            if self.state is None:
+            if self._resume:
                 self.state = resumed_state(self.recipe, settings, directory, self._dataset)
             else:
                 directory.check_vacant()

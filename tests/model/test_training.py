@@ -91,6 +91,22 @@ def test_who_leaves_the_loop_where_a_stage_begins_can_go_on_there(recipe: Any, t
     assert all(torch.equal(tensor, whole[name]) for name, tensor in found.items())
 
 
+def test_a_training_that_goes_on_can_be_left_and_gone_on_with_again(tmp_path: Path) -> None:
+    def training(**options: bool) -> Training:
+        return Training(tiny_capture(), RECIPE, iterations=6, device="cpu", output=tmp_path / "run", **options)
+
+    for message in training():
+        if isinstance(message, StepDone) and message.step == 2:
+            break
+    resumed = training(resume=True)
+    for message in resumed:
+        if isinstance(message, StepDone) and message.step == 4:
+            break
+    assert steps(resumed) == [5, 6] and steps(resumed) == []
+    whole = Training(tiny_capture(), RECIPE, iterations=6, device="cpu").run()
+    assert torch.equal(resumed.model.scene.primary.means, whole.scene.primary.means)
+
+
 def test_a_listener_that_fails_where_a_stage_begins_loses_nothing(tmp_path: Path) -> None:
     def listen(message: Message) -> None:
         if isinstance(message, StageEntered):
