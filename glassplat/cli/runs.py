@@ -27,6 +27,7 @@ from glassplat.model.training import Listener, Training
 from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
 from glassplat.training.messages import Message
+from glassplat.training.ranks import leads
 from glassplat.training.stage import stage_starts
 from glassplat.viewer.server import Viewer
 
@@ -186,8 +187,8 @@ def shortcuts(asked: Train[Any]) -> str:
 
 @contextmanager
 def _watched(asked: Train[Any], training: Training, dataset: Dataset, console: Console) -> Iterator[Listener]:
-    """Further listeners: the viewer, if asked for."""
-    if not asked.view:
+    """Further listeners: the viewer, if asked for; of several ranks the first one has it."""
+    if not asked.view or not leads():
         yield lambda message: None
         return
     from glassplat.model.watching import WatchedTraining

@@ -200,7 +200,9 @@ class Run:
         return self._session is not None and self._session.is_stopping
 
     def save(self) -> None:
-        """Writes a checkpoint and the scene, between two messages of which the last one is `StepDone` or later.
+        """Writes a checkpoint and the scene, between two messages of which the last one is `StageEntered` or later.
+
+        Of several ranks the first one writes, and the others do nothing.
 
         Raises:
             RuntimeError: the run has not begun.
@@ -209,7 +211,8 @@ class Run:
         if self._session is None or self.state is None:
             raise RuntimeError("nothing to save: the run has not begun")
         self._session.save()
-        self._export()
+        if self._ranks.leads:
+            self._export()
 
     def _export(self) -> None:
         assert self.state is not None
@@ -500,7 +503,9 @@ class Training:
         return Model(self.state.scene, self.recipe, cameras, self._dataset.root.name)
 
     def save(self) -> None:
-        """Writes a checkpoint and the scene into `output` now; between two messages, after a `StepDone`.
+        """Writes a checkpoint and the scene into `output` now; between two messages, from the first `StageEntered` on.
+
+        Of several processes the first one writes, and the others do nothing.
 
         Raises:
             RuntimeError: there is no `output`, or the run has not begun.

@@ -343,6 +343,24 @@ def test_the_checkpoint_of_another_method_is_not_gone_on_with(tmp_path: Path) ->
             run(tmp_path, resume=True)
 
 
+class Following(Ranks):
+    """As the ranks look from one that does not lead, which is alone all the same."""
+
+    @property
+    def leads(self) -> bool:
+        return False
+
+
+def test_a_rank_that_does_not_lead_saves_nothing(tmp_path: Path) -> None:
+    following = Run(RECIPE, SETTINGS, RunDirectory(tmp_path / "run"), tiny_capture(), ranks=Following())
+    following.state = training.first_state(RECIPE, SETTINGS, tiny_capture())
+    for message in following.messages():
+        if isinstance(message, StepDone):
+            following.save()
+    assert following.state.step == 12
+    assert list(tmp_path.rglob("*.*")) == []
+
+
 def test_a_capture_of_other_photographs_is_not_gone_on_with(tmp_path: Path) -> None:
     """Other views than before would be held out for testing."""
     with pytest.raises(KeyboardInterrupt):
