@@ -21,6 +21,8 @@ FIRST_PAUSE, LONGEST_PAUSE = 1.0, 10.0
 """Seconds between two lines: at first, so that a newcomer sees that something happens, and in the end."""
 SPEED_SECONDS = 60.0
 """How far back the speed is measured from which the time left follows."""
+LONG_WORK = 5.0
+"""Seconds of work between two steps from which on it is no part of the speed: as at the beginning of a stage."""
 SMOOTHING = 0.98
 WIDE = 110
 """Columns of a terminal from which on the last checkpoint has room in the bar."""
@@ -78,16 +80,24 @@ class Plan:
 
 
 class Pace:
-    """The speed of this sitting over its last minute, and the time left by it."""
+    """The speed of this sitting over its last minute, or since the last long work, and the time left by it."""
 
     def __init__(self, plan: Plan, clock: Callable[[], float] = time.monotonic) -> None:
         self._plan, self._clock = plan, clock
         self._passed: deque[tuple[float, int]] = deque()
-        self._is_forecast = False
+        self._is_forecast = self._has_worked = False
+        self._stepped = clock()
+
+    def work(self) -> None:
+        """Notes that there is more between two steps than the step."""
+        self._has_worked = True
 
     def step(self, number: int) -> None:
         """Notes a step, now and then."""
         now = self._clock()
+        if self._has_worked and now - self._stepped >= LONG_WORK:
+            self._passed.clear()
+        self._stepped, self._has_worked = now, False
         if not self._passed or now - self._passed[-1][0] >= FIRST_PAUSE:
             self._passed.append((now, number))
         while len(self._passed) > 2 and now - self._passed[1][0] > SPEED_SECONDS:
@@ -177,10 +187,12 @@ class TrainingProgress:
             self._begin(message)
         elif isinstance(message, messages.StageEntered):
             standing.stage = message.stage
+            self._pace.work()
             self._say(f"step {message.step}: stage {message.stage}, {_counted(message.counts)}")
         elif isinstance(message, messages.ActionDone) and not message.action.startswith(FREQUENT):
             self._say(f"step {message.step}: {message.action}")
         elif isinstance(message, messages.Working):
+            self._pace.work()
             self._display.work(standing, message)
         elif isinstance(message, messages.CheckpointWritten):
             standing.saved = message.step

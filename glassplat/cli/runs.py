@@ -17,7 +17,7 @@ from glassplat.captures.view import GIGABYTE, PointCloud, View
 from glassplat.cli.console import counted, say, warn
 from glassplat.cli.places import chosen_views
 from glassplat.cli.progress import Plan, TrainingProgress
-from glassplat.errors import InputError, first_names, input_checked
+from glassplat.errors import InputError, input_checked
 from glassplat.files.images import picture_paths
 from glassplat.files.sidecars import read_cameras
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
@@ -27,6 +27,7 @@ from glassplat.model.training import Listener, Training
 from glassplat.render.frame import Renderer
 from glassplat.scene.scene import Scene
 from glassplat.training.messages import Message
+from glassplat.training.ranks import leads
 from glassplat.training.stage import stage_starts
 from glassplat.viewer.server import Viewer
 
@@ -71,7 +72,9 @@ def open_run(path: Path, device: DeviceName = "auto", data: Path | None = None) 
     with input_checked():
         recorded.renderer().check(scene)
     scene = scene.to(chosen_device(device))
-    dataset = with_corrected_cameras(capture_of(directory, recorded, data), scene)
+    dataset = capture_of(directory, recorded, data)
+    directory.check_photographs(dataset)
+    dataset = with_corrected_cameras(dataset, scene)
     recipe = settled(recorded, dataset)
     return StoredRun(directory, recipe, scene, recipe.renderer(), dataset, iterations)
 
@@ -80,7 +83,7 @@ def capture_of(directory: RunDirectory, recipe: Any, moved: Path | None = None) 
     """The capture of a run, where it was or where it is said to be now; of a scene without one its cameras alone.
 
     Raises:
-        InputError: it cannot be read, or is another one.
+        InputError: it cannot be read.
         FileNotFoundError: it is no longer where it was.
     """
     if directory.imported.is_file() and moved is None:
@@ -91,15 +94,12 @@ def capture_of(directory: RunDirectory, recipe: Any, moved: Path | None = None) 
         raise FileNotFoundError(
             f"the capture of {directory.path} is no longer at {data}; say with --data where it is now"
         )
-    dataset = load_dataset(
+    return load_dataset(
         data,
         downscale=settings.downscale,
         background=photo_background(recipe),
         mask_polarity=settings.mask_polarity,
     )
-    if moved is not None:
-        _check_same(directory, dataset)
-    return dataset
 
 
 def _without_photographs(directory: RunDirectory) -> Dataset:
@@ -115,22 +115,6 @@ def _without_photographs(directory: RunDirectory) -> Dataset:
     test = views[::TEST_EVERY]
     train = tuple(view for view in views if view not in test)
     return Dataset(directory.path, train, test, points, extent=1.0)
-
-
-def _check_same(directory: RunDirectory, dataset: Dataset) -> None:
-    """Refuse a capture of other photographs than the run was trained on."""
-    trained, found = directory.photographs(), {view.name for view in (*dataset.train, *dataset.test)}
-    if trained is None or trained == found:
-        return
-    only = [
-        f"{first_names(sorted(names))} only in {where}"
-        for names, where in ((trained - found, "the run"), (found - trained, "the capture"))
-        if names
-    ]
-    raise InputError(
-        f"{dataset.root} is not the capture that {directory.path} was trained on: {', '.join(only)}. Give the same "
-        "photographs to --data"
-    )
 
 
 def pictures_of(dataset: Dataset) -> dict[str, Path]:
@@ -203,8 +187,8 @@ def shortcuts(asked: Train[Any]) -> str:
 
 @contextmanager
 def _watched(asked: Train[Any], training: Training, dataset: Dataset, console: Console) -> Iterator[Listener]:
-    """Further listeners: the viewer, if asked for."""
-    if not asked.view:
+    """Further listeners: the viewer, if asked for; of several ranks the first one has it."""
+    if not asked.view or not leads():
         yield lambda message: None
         return
     from glassplat.model.watching import WatchedTraining

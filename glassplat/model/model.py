@@ -291,8 +291,9 @@ class Model:
 
         Args:
             path: .ply, .spz or .glb for other programs, with the panes beside it as `planes.json` and `glass.ply`, and
-                the cameras as `cameras.json`; .html for a page that shows it with live panes; without a suffix a folder
-                whose tensors are loaded bit for bit, like a run's.
+                the cameras as `cameras.json`, and an environment as `environment.png` and `.json`; .html for
+                a page that shows it with live panes; without a suffix a folder whose tensors are loaded bit for bit,
+                like a run's.
             overwrite: replace files that are there.
 
         Returns:
@@ -385,7 +386,8 @@ def save_model(model: Savable, path: Path, *, overwrite: bool) -> Path:
     if kind not in writing.WRITTEN:
         endings = ", ".join(f".{known}" for known in writing.WRITTEN)
         raise InputError(f"{path}: expected a name that ends in {endings}, or a folder's")
-    beside = [path.with_name(name) for name in (PLANES, GLASS, CAMERAS)] if kind in writing.SPLAT_WRITERS else []
+    names = (PLANES, GLASS, CAMERAS, *(() if model.scene.environment.is_empty else (ENVIRONMENT, PANORAMA)))
+    beside = [path.with_name(name) for name in names] if kind in writing.SPLAT_WRITERS else []
     found = [str(target) for target in (path, *beside) if target.exists()]
     if found and not overwrite:
         raise FileExistsError(

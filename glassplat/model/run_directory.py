@@ -283,6 +283,27 @@ class RunDirectory:
         except (OSError, ValueError, TypeError, KeyError):
             return None
 
+    def check_photographs(self, dataset: Dataset) -> None:
+        """Refuse a capture of other photographs than the run was trained on.
+
+        Which of them are for testing follows from all of them; with one more or less, they would be others.
+
+        Raises:
+            InputError: says which ones only the run or only the capture has.
+        """
+        trained, found = self.photographs(), {view.name for view in (*dataset.train, *dataset.test)}
+        if trained is None or trained == found:
+            return
+        only = [
+            f"{first_names(sorted(names))} only in {where}"
+            for names, where in ((trained - found, "the run"), (found - trained, "the capture"))
+            if names
+        ]
+        raise InputError(
+            f"{dataset.root} is not the capture that {self.path} was trained on: {', '.join(only)}. Give the same "
+            "photographs to --data"
+        )
+
     def export(self, scene: Scene, step: int) -> Path:
         """Writes the scene in the formats that others read; returns its folder."""
         from glassplat.files.scene_folder import write_scene

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, NoReturn
 import torch
 
 from glassplat import __version__
-from glassplat.captures.dataset import Dataset, photographs_read
+from glassplat.captures.dataset import Dataset, photographs_read, with_corrected_cameras
 from glassplat.errors import InputError, RankLostError
 from glassplat.files.writing import make_folder
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
@@ -27,7 +27,15 @@ from glassplat.model import run_directory
 from glassplat.model.model import Model
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.loop import train
-from glassplat.training.messages import ActionDone, CheckpointWritten, Message, RunBegun, StepDone, Working
+from glassplat.training.messages import (
+    ActionDone,
+    CheckpointWritten,
+    Message,
+    RunBegun,
+    StageEntered,
+    StepDone,
+    Working,
+)
 from glassplat.training.ranks import Ranks, is_launched, join
 from glassplat.training.stage import Stage, TrainState, check_length
 
@@ -145,7 +153,8 @@ class Run:
         """Trains from one message to the next.
 
         Raises:
-            InputError: the run was recorded with other settings, or a photograph cannot be read, of the test views too.
+            InputError: the run was recorded with other settings or photographs, or a photograph cannot be read, of the
+                test views too.
             KeyboardInterrupt: the user stopped the run; the checkpoint is written.
             TrainingDivergedError: training cannot go on; the last checkpoint stays.
             OSError: the disk is full or fails; the last checkpoint stays.
@@ -172,8 +181,8 @@ class Run:
             directory.clear()
             # Another training may have ended here meanwhile.
             anew = directory.is_begun and not self._resume
-            if self.state is None:
-                self.state = resumed_state(self.recipe, settings, directory)
+            if self._resume:
+                self.state = resumed_state(self.recipe, settings, directory, self._dataset)
             else:
                 directory.check_vacant()
                 directory.begin(self.recipe, settings, self._dataset)
@@ -191,7 +200,9 @@ class Run:
         return self._session is not None and self._session.is_stopping
 
     def save(self) -> None:
-        """Writes a checkpoint and the scene, between two messages of which the last one is `StepDone` or later.
+        """Writes a checkpoint and the scene, between two messages of which the last one is `StageEntered` or later.
+
+        Of several ranks the first one writes, and the others do nothing.
 
         Raises:
             RuntimeError: the run has not begun.
@@ -200,7 +211,8 @@ class Run:
         if self._session is None or self.state is None:
             raise RuntimeError("nothing to save: the run has not begun")
         self._session.save()
-        self._export()
+        if self._ranks.leads:
+            self._export()
 
     def _export(self) -> None:
         assert self.state is not None
@@ -214,12 +226,12 @@ def first_state(recipe: Any, settings: run_directory.RunSettings, dataset: Datas
 
 
 def resumed_state(
-    recipe: Any, settings: run_directory.RunSettings, directory: run_directory.RunDirectory
+    recipe: Any, settings: run_directory.RunSettings, directory: run_directory.RunDirectory, dataset: Dataset
 ) -> TrainState:
     """The checkpoint's state.
 
     Raises:
-        InputError: the run was recorded with other settings, or nothing is saved.
+        InputError: the run was recorded with other settings or photographs, or nothing is saved.
     """
     directory.check_saved()
     # A run may go on on another device.
@@ -230,6 +242,7 @@ def resumed_state(
             f"resume it, got {settings}. Repeat the original options, with the version of glassplat that began "
             "it, or choose another --output"
         )
+    directory.check_photographs(dataset)
     state = load_checkpoint(
         directory.checkpoint, method=recipe.method, seed=settings.seed, iterations=settings.iterations
     )
@@ -328,7 +341,7 @@ class TrainingSession:
                 self._record.log.write(message)
             yield message
         except BaseException as error:
-            if isinstance(message, StepDone | ActionDone):
+            if isinstance(message, StageEntered | StepDone | ActionDone):
                 self.save()
             if self._stop.requested and isinstance(error, OSError):
                 self._stop.end()  # A terminal that was closed can show nothing, and that is no failure.
@@ -480,14 +493,19 @@ class Training:
     def model(self) -> Model:
         """The scene as trained so far; its tensors go on changing, so `save` it, or clone what has to stay.
 
+        Its cameras are where training has found them by now, if it looks for them.
+
         Raises:
             RuntimeError: the first scene has not been made yet.
         """
-        cameras = {view.name: view.camera for view in (*self._dataset.train, *self._dataset.test)}
+        seen = with_corrected_cameras(self._dataset, self.state.scene)
+        cameras = {view.name: view.camera for view in (*seen.train, *seen.test)}
         return Model(self.state.scene, self.recipe, cameras, self._dataset.root.name)
 
     def save(self) -> None:
-        """Writes a checkpoint and the scene into `output` now; between two messages, after a `StepDone`.
+        """Writes a checkpoint and the scene into `output` now; between two messages, from the first `StageEntered` on.
+
+        Of several processes the first one writes, and the others do nothing.
 
         Raises:
             RuntimeError: there is no `output`, or the run has not begun.

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from shlex import quote
+from typing import Any
 
 from glassplat.captures.dataset import Dataset
 from glassplat.errors import InputError
@@ -145,7 +146,8 @@ class WatchedTraining:
 
     def _update(self, viewer: Viewer, message: StepDone) -> None:
         """Shows the scene as it is now, and asks for pictures of it now and then."""
-        viewer.change(self._training.model.scene, renderer_now(self._training.model))
+        scene = self._training.state.scene  # Not that of its model, whose cameras would be corrected at every step.
+        viewer.change(scene, renderer_now(self._training.recipe, scene))
         now = time.monotonic()
         if now - self._refreshed >= REFRESH_SECONDS and viewer.loop.expected_seconds() is None:
             self._refreshed = now
@@ -179,10 +181,11 @@ class WatchedTraining:
         self._is_save_asked = True
 
 
-def renderer_now(model: Model) -> Renderer:
-    """The model's renderer, or, where the scene lacks what that needs yet, a plain one."""
+def renderer_now(recipe: Any, scene: Scene) -> Renderer:
+    """The recipe's renderer, or, where the scene lacks what that needs yet, a plain one."""
+    renderer: Renderer = recipe.renderer()
     try:
-        model.renderer.check(model.scene)
+        renderer.check(scene)
     except ValueError:
-        return Splat(model.recipe.background)
-    return model.renderer
+        return Splat(recipe.background)
+    return renderer

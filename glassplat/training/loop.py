@@ -31,6 +31,8 @@ class NoGaussiansError(TrainingDivergedError):
     """There is nothing to train: no Gaussians, or none that a view shows."""
 
 
+SET_UP = "set up"
+"""Name in `TrainState.records`: the first step of the stage whose setup was carried out last."""
 WHERE_TO_LOOK = (
     "Expected cameras that look at the points: check their poses and focal lengths, and whether the points are those "
     "of this capture; photographs of a few pixels (--downscale) or high learning rates end like this too"
@@ -75,8 +77,9 @@ def train(
 ) -> Iterator[Message]:
     """Trains until `iterations`, from wherever `state` stands.
 
-    `state` is edited in place and is consistent whenever `StepDone` or an `ActionDone` after it is out, so a consumer
-    may save it or stop iterating there; training goes on later from a saved state with the same result.
+    `state` is edited in place and is consistent whenever `StageEntered`, `StepDone` or an `ActionDone` after it is out,
+    so a consumer may save it or stop iterating there; training goes on later from it, saved or not, with the same
+    result.
 
     Args:
         stages: the recipe's stages.
@@ -101,8 +104,9 @@ def train(
         if state.step >= end:
             continue
         if state.step == start:
-            if stage.setup is not None:
+            if stage.setup is not None and state.records.get(SET_UP) != start:
                 yield from carried_out(stage.setup(state, with_corrected_cameras(dataset, state.scene)))
+                state.records[SET_UP] = start
                 ranks.settle(state)
             yield StageEntered(state.step, stage.name, counts_of(state.scene))
         while state.step < end:

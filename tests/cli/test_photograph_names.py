@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -132,3 +133,18 @@ def test_another_capture_is_not_taken_for_it(tmp_path: Path, capsys: pytest.Capt
     assert main(["eval", str(run), "--data", str(tmp_path / "other")]) == 2
     message = " ".join(capsys.readouterr().err.split())
     assert "is not the capture that" in message and "0.png" in message and "other0.png" in message
+
+
+@pytest.mark.parametrize("command", ["dereflect", "render", "eval"])
+def test_a_capture_that_has_lost_a_photograph_is_refused_where_it_is(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every eighth one is for testing: without the first, those would be tested that were trained on."""
+    run, poses = write_run(tmp_path / "run"), tmp_path / "capture" / "transforms.json"
+    found = json.loads(poses.read_text())
+    poses.write_text(json.dumps(found | {"frames": found["frames"][1:]}))
+    options = [command, str(run), *([] if command == "eval" else ["--output", str(tmp_path / "output")])]
+    assert main(options) == 2
+    message = " ".join(capsys.readouterr().err.split())
+    assert "is not the capture that" in message and "0.png only in the run" in message
+    assert not (tmp_path / "output").exists()

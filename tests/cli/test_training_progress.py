@@ -95,6 +95,31 @@ def test_the_time_left_of_a_cheap_stage_counts_what_the_next_one_costs() -> None
     assert lines_of([step(number) for number in range(900, 931)], 9.0, plan)[-1].endswith(f"{in_words(9 * 70)} left")
 
 
+def left_after(work: list[Message], seconds: float) -> str:
+    """What is left after a step of half a second that follows work of so many seconds, and ten steps before it."""
+    clock, file = FakeClock(), io.StringIO()
+    with TrainingProgress(Console(file=file, width=40), PLAN, clock) as progress:
+        for number in range(1, 101):
+            clock.now += 0.5
+            progress.show(step(number))
+        for message in work:
+            clock.now += seconds / len(work)
+            progress.show(message)
+        for number in range(101, 125):
+            clock.now += 0.5
+            progress.show(step(number))
+    return file.getvalue().splitlines()[-1].split(", ")[-1]
+
+
+@pytest.mark.parametrize("work", [[Working("fitting planes", 0, 2)] * 2, [StageEntered(100, "2", COUNTS)]])
+def test_what_takes_long_at_the_beginning_of_a_stage_is_no_part_of_the_speed(work: list[Message]) -> None:
+    assert left_after(work, 300.0) == left_after([], 0.0) == "7 min left"
+
+
+def test_what_recurs_between_steps_is_part_of_the_speed() -> None:
+    assert left_after([Working("looking for Gaussians that no view needs", 0, 2)], 4.0) == "8 min left"
+
+
 @pytest.mark.parametrize("method", RECIPES)
 def test_every_method_has_a_plan(method: str, tmp_path: Path) -> None:
     run = Train(recipe_of(method), tmp_path, tmp_path / "run", 30_000, device="cpu")

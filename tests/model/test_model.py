@@ -14,6 +14,7 @@ from PIL import Image
 
 import glassplat
 from glassplat import Camera, Gaussians, InputError, Model, Planar, PlanarRecipe, Scene, SplatRecipe
+from glassplat.scene.scene import Environment
 from tests.cli.tiny_run import write_run
 from tests.training.tiny_capture import tiny_capture, true_scene
 
@@ -157,6 +158,20 @@ def test_panes_of_what_was_there_are_not_taken_over(tmp_path: Path) -> None:
         bare().save(tmp_path / "b.ply")
     bare().save(tmp_path / "b.ply", overwrite=True)
     assert glassplat.load(tmp_path / "b.ply", device="cpu").panes == ()
+
+
+@pytest.mark.parametrize("name", ["environment.png", "environment.json"])
+def test_an_environment_that_is_there_is_not_overwritten_unasked(name: str, tmp_path: Path) -> None:
+    whole = model()
+    mirroring = whole.with_scene(dataclasses.replace(whole.scene, environment=Environment(torch.zeros(6, 4, 4, 3))))
+    (tmp_path / name).write_text("somebody's")
+    with pytest.raises(FileExistsError, match=rf"{name} is already there; nothing was written"):
+        mirroring.save(tmp_path / "a.ply")
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [(name, "somebody's")]
+    whole.save(tmp_path / "plain.ply")
+    assert (tmp_path / name).read_text() == "somebody's", "a scene without an environment writes none"
+    mirroring.save(tmp_path / "a.ply", overwrite=True)
+    assert b"somebody's" not in (tmp_path / name).read_bytes()
 
 
 def test_a_model_is_saved_as_a_page_and_as_nothing_unknown(tmp_path: Path) -> None:

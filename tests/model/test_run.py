@@ -343,6 +343,35 @@ def test_the_checkpoint_of_another_method_is_not_gone_on_with(tmp_path: Path) ->
             run(tmp_path, resume=True)
 
 
+class Following(Ranks):
+    """As the ranks look from one that does not lead, which is alone all the same."""
+
+    @property
+    def leads(self) -> bool:
+        return False
+
+
+def test_a_rank_that_does_not_lead_saves_nothing(tmp_path: Path) -> None:
+    following = Run(RECIPE, SETTINGS, RunDirectory(tmp_path / "run"), tiny_capture(), ranks=Following())
+    following.state = training.first_state(RECIPE, SETTINGS, tiny_capture())
+    for message in following.messages():
+        if isinstance(message, StepDone):
+            following.save()
+    assert following.state.step == 12
+    assert list(tmp_path.rglob("*.*")) == []
+
+
+def test_a_capture_of_other_photographs_is_not_gone_on_with(tmp_path: Path) -> None:
+    """Other views than before would be held out for testing."""
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, interrupt_at=5)
+    before = RunDirectory(tmp_path).checkpoint.read_bytes()
+    fewer = replace(tiny_capture(), train=tiny_capture().train[1:], test=tiny_capture().train[1:2])
+    with pytest.raises(InputError, match=r"tiny is not the capture that .* was trained on: 0\.png only in the run"):
+        Run(RECIPE, SETTINGS, RunDirectory(tmp_path), fewer, resume=True).to_the_end(print)
+    assert RunDirectory(tmp_path).checkpoint.read_bytes() == before
+
+
 @pytest.mark.parametrize(
     "recipe", [RECIPE, PlanarRecipe(fresnel="none", weights=ReflectionWeights(depth=0.0), background=(1.0, 1.0, 1.0))]
 )

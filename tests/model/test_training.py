@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 import glassplat
-from glassplat import Frame, InputError, LossTerm, Scene, SplatRecipe, Stage, StepDone, Training, View
-from tests.training.tiny_capture import tiny_capture
+from glassplat import Frame, InputError, LossTerm, Scene, SplatRecipe, Stage, StageEntered, StepDone, Training, View
+from glassplat.captures.dataset import load_dataset
+from glassplat.methods.glossy_recipes import DeferredRecipe, TracedRecipe
+from glassplat.methods.planar_recipe import PlanarRecipe
+from glassplat.training.messages import Message
+from tests.training.tiny_capture import tiny_capture, write_tiny_capture
 
 RECIPE = SplatRecipe(sh_degree=1)
 
@@ -58,6 +63,59 @@ def test_who_leaves_the_loop_can_go_on_where_it_was_left(tmp_path: Path) -> None
     assert torch.equal(glassplat.load(tmp_path / "run", device="cpu").scene.primary.means, whole.scene.primary.means)
     with pytest.raises(InputError, match="already holds a run"):
         training()
+
+
+PANES = PlanarRecipe(sh_degree=1, stage_shares=(0.4, 0.2, 0.4), detect_mirrors=False, seed_reflections=False)
+SETUPS = {
+    "planar": PANES,
+    "deferred": DeferredRecipe(sh_degree=1, least_iterations=1, texels=4, first_texels=2, bootstrap=0.4),
+    "traced": TracedRecipe(sh_degree=1, least_iterations=1, texels=4, first_texels=2, bootstrap=0.4),
+}
+
+
+@pytest.mark.parametrize("recipe", SETUPS.values(), ids=SETUPS)
+def test_who_leaves_the_loop_where_a_stage_begins_can_go_on_there(recipe: Any, tmp_path: Path) -> None:
+    """What the stage's setup has made is in the checkpoint, and is not made a second time."""
+    dataset = load_dataset(write_tiny_capture(tmp_path / "capture"))
+
+    def training(**options: Any) -> Training:
+        return Training(dataset, recipe, iterations=10, device="cpu", **options)
+
+    for message in training(output=tmp_path / "run"):
+        if isinstance(message, StageEntered) and message.step == 4:
+            break
+    resumed = training(output=tmp_path / "run", resume=True)
+    assert steps(resumed) == [5, 6, 7, 8, 9, 10]
+    found, whole = resumed.model.scene.parameters(), training().run().scene.parameters()
+    assert found.keys() == whole.keys()
+    assert all(torch.equal(tensor, whole[name]) for name, tensor in found.items())
+
+
+def test_a_training_that_goes_on_can_be_left_and_gone_on_with_again(tmp_path: Path) -> None:
+    def training(**options: bool) -> Training:
+        return Training(tiny_capture(), RECIPE, iterations=6, device="cpu", output=tmp_path / "run", **options)
+
+    for message in training():
+        if isinstance(message, StepDone) and message.step == 2:
+            break
+    resumed = training(resume=True)
+    for message in resumed:
+        if isinstance(message, StepDone) and message.step == 4:
+            break
+    assert steps(resumed) == [5, 6] and steps(resumed) == []
+    whole = Training(tiny_capture(), RECIPE, iterations=6, device="cpu").run()
+    assert torch.equal(resumed.model.scene.primary.means, whole.scene.primary.means)
+
+
+def test_a_listener_that_fails_where_a_stage_begins_loses_nothing(tmp_path: Path) -> None:
+    def listen(message: Message) -> None:
+        if isinstance(message, StageEntered):
+            raise ConnectionError("nobody listens")
+
+    with pytest.raises(ConnectionError):
+        Training(tiny_capture(), RECIPE, iterations=6, device="cpu", output=tmp_path / "run").run(listen)
+    resumed = Training(tiny_capture(), RECIPE, iterations=6, device="cpu", output=tmp_path / "run", resume=True)
+    assert steps(resumed) == [1, 2, 3, 4, 5, 6]
 
 
 def test_a_scene_is_saved_in_the_middle_of_a_run(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from glassplat.files.sidecars import read_cameras, write_colmap
 from glassplat.methods.recipe import RECIPES
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory, RunSettings
-from glassplat.model.training import Run
+from glassplat.model.training import Run, Training
 from glassplat.render.deferred import Deferred
 from glassplat.render.frame import Renderer
 from glassplat.render.planar import Planar
@@ -216,6 +216,17 @@ def test_a_run_leaves_the_refined_cameras(tmp_path: Path) -> None:
         assert misplacement(recorded[after.name], after.camera) < 1e-5
         assert misplacement(before.camera, after.camera) > 1e-4
     assert float(state.scene.poses.twists.mean(dim=0).abs().max()) < 1e-6
+
+
+def test_the_model_of_a_training_has_the_cameras_that_its_run_records(tmp_path: Path) -> None:
+    dataset = load_dataset(write_tiny_capture(tmp_path / "capture"))
+    recipe = SplatRecipe(poses=PoseRefinement(rate=1e-2))
+    model = Training(dataset, recipe, iterations=30, device="cpu", output=tmp_path / "run").run()
+    recorded = dict(read_cameras(tmp_path / "run" / "cameras.json"))
+    assert model.cameras.keys() == recorded.keys()
+    for view in (*dataset.train, *dataset.test):
+        assert misplacement(recorded[view.name], model.cameras[view.name]) < 1e-5
+        assert misplacement(view.camera, model.cameras[view.name]) > 1e-4
 
 
 def test_a_refined_model_is_read_as_colmap(tmp_path: Path) -> None:

@@ -134,6 +134,26 @@ def test_resuming_continues_to_the_same_result(pause: int, tmp_path: Path) -> No
     assert_same_scene(whole.scene, resumed.scene)
 
 
+@pytest.mark.parametrize("is_saved", [False, True])
+@pytest.mark.parametrize("begins", [0, 4])
+def test_a_setup_is_carried_out_once_whoever_leaves_after_it(begins: int, is_saved: bool, tmp_path: Path) -> None:
+    def grow(state: TrainState, dataset: object) -> None:
+        state.scene.primary.log_scales.add_(0.1)
+
+    (stage,) = SplatRecipe(sh_degree=1).stages(seed=0)
+    stages = (replace(stage, share=0.5, setup=grow), replace(stage, share=0.5, setup=grow))
+    whole, left = fresh_state(), fresh_state()
+    run(whole, stages, 8)
+    for message in train(stages, tiny_capture(), left, 8):
+        if isinstance(message, StageEntered) and message.step == begins:
+            break
+    if is_saved:
+        save_checkpoint(tmp_path / "checkpoint.safetensors", left)
+        left = load_checkpoint(tmp_path / "checkpoint.safetensors")
+    run(left, stages, 8)
+    assert_same_scene(whole.scene, left.scene)
+
+
 def test_a_loss_that_is_not_finite_stops_training_and_is_named() -> None:
     broken = Stage(
         name="broken",

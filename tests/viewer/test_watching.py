@@ -11,15 +11,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from glassplat import Training
 from glassplat.access import Access
+from glassplat.cli import runs
 from glassplat.cli.main import main
 from glassplat.methods.glossy_recipes import DeferredRecipe
 from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.model import watching
 from glassplat.model.watching import WatchedTraining, renderer_now
 from glassplat.render.splat import Splat
 from glassplat.training.messages import Message
@@ -166,7 +170,21 @@ def test_a_training_that_nobody_watches_says_where_to_look(
     assert hosts == ["127.0.0.1"]
 
 
+@pytest.mark.parametrize("rank", [0, 1])
+def test_of_several_ranks_the_first_one_is_watched(rank: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("TORCHELASTIC_RUN_ID", "test"), ("WORLD_SIZE", "2"), ("RANK", str(rank))):
+        monkeypatch.setenv(name, value)
+    begun: list[bool] = []
+    watched = SimpleNamespace(hear=print, stop=lambda: begun.append(False))
+    monkeypatch.setattr(watching, "WatchedTraining", lambda *given, **options: begun.append(True) or watched)
+    asked: Any = SimpleNamespace(view=True)
+    nothing: Any = None
+    with runs._watched(asked, nothing, nothing, Console()):
+        pass
+    assert begun == ([True, False] if rank == 0 else [])
+
+
 def test_a_scene_that_lacks_what_its_method_mirrors_is_drawn_plainly() -> None:
     early = replace(model(), recipe=DeferredRecipe(background=(0.0, 0.0, 0.0)))
-    assert isinstance(renderer_now(early), Splat)
-    assert renderer_now(model()) == model().renderer
+    assert isinstance(renderer_now(early.recipe, early.scene), Splat)
+    assert renderer_now(model().recipe, model().scene) == model().renderer
