@@ -18,8 +18,8 @@ from glassplat.methods.planar import fitted_planes
 from glassplat.model.run_directory import RunDirectory
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.material import virtual_points
-from glassplat.prepare.preparation import RECORD
-from glassplat.prepare.report_page import PAGE, write_page
+from glassplat.prepare.preparation import PAGE, RECORD
+from glassplat.prepare.report_page import write_page
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 
