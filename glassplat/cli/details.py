@@ -141,6 +141,18 @@ def trained_part(directory: RunDirectory) -> Finding:
     return finding
 
 
+def imported_part(directory: RunDirectory) -> Finding:
+    """Part about a scene that lies in a run's directory, and that no photographs can be compared with.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    finding = Finding()
+    _describe_scene(directory.latest_scene()[0], finding)
+    _suggest_looking(directory.path, finding)
+    return finding
+
+
 def scene_part(path: Path) -> Finding:
     """Part about the scene in a folder.
 
@@ -201,5 +213,9 @@ def _describe_results(directory: RunDirectory, finding: Finding) -> None:
             finding.facts["measured"] = ", ".join(measures)
         except (ValueError, TypeError, AttributeError):
             finding.problems.append(f"{directory.results} is damaged; evaluate it again")
+    _suggest_looking(path, finding)
+
+
+def _suggest_looking(path: Path, finding: Finding) -> None:
     finding.next.append(f"glassplat view {path}    shows it in the browser")
     finding.next.append(f"glassplat export {path} --output PAGE    makes a page to share, and files for other programs")

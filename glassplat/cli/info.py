@@ -171,12 +171,16 @@ def splat_finding(path: Path) -> Iterator[Finding]:
 
 
 def run_finding(path: Path) -> Iterator[Finding]:
-    """The directory of a training.
+    """The directory of a training, or of a scene that was written like one.
 
     Raises:
         InputError: its records are damaged.
     """
     directory = RunDirectory(path)
+    if directory.imported.is_file():
+        yield Finding("a scene without a capture")
+        yield import_held(DETAILS).imported_part(directory)
+        return
     recipe, settings = directory.recipe(), directory.settings()
     finding = Finding(f"a {recipe.method} run")
     finding.facts |= {"capture": settings.data, "iterations": settings.iterations, "downscale": settings.downscale}

@@ -127,6 +127,16 @@ def test_a_run_without_a_scene_goes_on(tmp_path: Path, capsys: pytest.CaptureFix
     assert any("--resume" in problem for problem in told(run, capsys)["problems"])
 
 
+def test_a_scene_without_a_capture_is_described(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "out"
+    assert main(["export", str(write_run(tmp_path / "run")), "--output", str(output), "--formats", "ply"]) == 0
+    assert main(["clean", str(output), "--output", str(tmp_path / "tidy")]) == 0
+    capsys.readouterr()
+    found = told(tmp_path / "tidy", capsys)
+    assert found["kind"] == "a scene without a capture" and found["facts"]["panes"].startswith("1 (R0")
+    assert [line.split()[1] for line in found["next"]] == ["view", "export"]
+
+
 def small(gaussians: Gaussians) -> Gaussians:
     return Gaussians(gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh)
 
