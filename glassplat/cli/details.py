@@ -189,17 +189,20 @@ def _look_at(gaussians: Gaussians, finding: Finding) -> None:
     if not len(gaussians):
         finding.problems.append("it holds no Gaussian")
         return
-    finding.facts["degree of harmonics"] = gaussians.max_sh_degree
+    if gaussians.max_sh_degree >= 0:
+        finding.facts["degree of harmonics"] = gaussians.max_sh_degree
     finite = torch.isfinite(gaussians.means).all(dim=1)
     if not bool(finite.all()):
         finding.problems.append(f"{int((~finite).sum())} Gaussians have no place that is finite; they are not drawn")
     means = gaussians.means[finite]
+    if not len(means):
+        return
     low, high = (torch.quantile(means[:: max(1, len(means) // 100_000)], share, dim=0) for share in (0.02, 0.98))
     spans = " x ".join(f"{float(side):.3g}" for side in high - low)
     finding.facts["size of the middle 96 %"] = f"{spans} world units"
     faint = float((torch.sigmoid(gaussians.logit_opacities) < FAINT).float().mean())
     if faint > MANY_FAINT:
-        finding.problems.append(f"{faint:.0%} of the Gaussians are nearly invisible; `glassplat export` can prune them")
+        finding.problems.append(f"{faint:.0%} of the Gaussians are nearly invisible")
 
 
 def _describe_results(directory: RunDirectory, finding: Finding) -> None:

@@ -150,7 +150,22 @@ def test_splat_files_are_counted_and_judged(suffix: str, tmp_path: Path, capsys:
     assert found["facts"]["Gaussians"] == len(gaussians) and found["healthy"]
     faint = gaussians.with_tensors({"logit_opacities": torch.full((len(gaussians),), -8.0)})
     (write_gaussians if suffix == ".ply" else write_spz)(path, faint)
-    assert "nearly invisible" in told(path, capsys)["problems"][0]
+    assert told(path, capsys)["problems"] == ["100% of the Gaussians are nearly invisible"]
+
+
+def test_gaussians_without_a_finite_place_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gaussians = small(true_scene().primary)
+    nowhere = gaussians.with_tensors({"means": torch.full_like(gaussians.means, torch.nan)})
+    write_gaussians(tmp_path / "splat.ply", nowhere)
+    (problem,) = told(tmp_path / "splat.ply", capsys)["problems"]
+    assert problem.startswith(f"{len(gaussians)} Gaussians have no place that is finite")
+
+
+def test_glass_without_colours_has_no_degree(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    glass = true_scene().glass
+    write_gaussians(tmp_path / "glass.ply", glass)
+    facts = told(tmp_path / "glass.ply", capsys)["facts"]
+    assert facts["Gaussians"] == len(glass) and "degree of harmonics" not in facts
 
 
 @pytest.mark.parametrize(
