@@ -10,6 +10,7 @@ import torch
 from glassplat.captures.dataset import Dataset, dataset_of, load_dataset
 from glassplat.captures.files import CaptureFiles
 from glassplat.captures.view import normals_path
+from glassplat.cli.console import shell_word
 from glassplat.cli.info import FEW_VIEWS, Finding
 from glassplat.errors import InputError
 from glassplat.files.records import read_json
@@ -73,8 +74,8 @@ def _marked(path: Path, dataset: Dataset) -> Finding:
     annotated = sum(view.is_annotated for view in dataset.train)
     if not dataset.pane_labels and dataset.planes is None:
         finding.facts["panes"] = "none marked"
-        finding.next.append(f"glassplat annotate {path}    marks panes")
-        finding.next.append(f"glassplat train splat --data {path} --output RUN    needs none")
+        finding.next.append(f"glassplat annotate {shell_word(path)}    marks panes")
+        finding.next.append(f"glassplat train splat --data {shell_word(path)} --output RUN    needs none")
         return finding
     given = () if dataset.planes is None else dataset.planes.labels
     labels = sorted({*dataset.pane_labels, *given})
@@ -95,13 +96,13 @@ def _behind(path: Path, dataset: Dataset) -> Finding:
         planes = fitted_planes(dataset, None, PlaneFit())
     except PlaneFitError as error:
         finding.problems.append(str(error))
-        finding.next.append(f"glassplat annotate {path}    marks panes by corners instead")
+        finding.next.append(f"glassplat annotate {shell_word(path)}    marks panes by corners instead")
         return finding
     if dataset.measured_points:
         cameras = [view.camera for view in dataset.train]
         behind = int(virtual_points(dataset.points.positions, planes, cameras).sum())
         finding.facts["points behind panes"] = f"{behind} ({behind / max(len(dataset.points), 1):.0%})"
-    finding.next.append(f"glassplat train planar --data {path} --output RUN")
+    finding.next.append(f"glassplat train planar --data {shell_word(path)} --output RUN")
     return finding
 
 
@@ -208,7 +209,7 @@ def _look_at(gaussians: Gaussians, finding: Finding) -> None:
 def _describe_results(directory: RunDirectory, finding: Finding) -> None:
     path = directory.path
     if not directory.results.is_file():
-        finding.next.append(f"glassplat eval {path}    measures it on its test views")
+        finding.next.append(f"glassplat eval {shell_word(path)}    measures it on its test views")
     else:
         try:
             results = read_json(directory.results)
@@ -220,5 +221,7 @@ def _describe_results(directory: RunDirectory, finding: Finding) -> None:
 
 
 def _suggest_looking(path: Path, finding: Finding) -> None:
-    finding.next.append(f"glassplat view {path}    shows it in the browser")
-    finding.next.append(f"glassplat export {path} --output PAGE    makes a page to share, and files for other programs")
+    finding.next.append(f"glassplat view {shell_word(path)}    shows it in the browser")
+    finding.next.append(
+        f"glassplat export {shell_word(path)} --output PAGE    makes a page to share, and files for other programs"
+    )

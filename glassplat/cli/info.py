@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 
 from glassplat.captures.files import CaptureFiles, read_capture
-from glassplat.cli.console import import_held, say, warn
+from glassplat.cli.console import import_held, say, shell_word, warn
 from glassplat.errors import InputError, UnknownFormatError, first_names
 from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
 from glassplat.files.records import read_json
@@ -124,7 +124,7 @@ def photographs_finding(path: Path) -> Iterator[Finding]:
         )
     if len(found) - len(broken) < FEW_VIEWS:
         finding.problems.append(f"{len(found) - len(broken)} photographs are few; 30 and more do better")
-    finding.next.append(f"glassplat prepare {path} --output CAPTURE    finds out where they were taken")
+    finding.next.append(f"glassplat prepare {shell_word(path)} --output CAPTURE    finds out where they were taken")
     yield finding
 
 
@@ -143,7 +143,9 @@ def video_finding(path: Path) -> Iterator[Finding]:
     finding = Finding(
         "a video", {"bytes": size, "frames": footage.frames, "pictures": f"{footage.width}x{footage.height}"}
     )
-    finding.next.append(f"glassplat prepare {path} --output CAPTURE    takes photographs from it, and places them")
+    finding.next.append(
+        f"glassplat prepare {shell_word(path)} --output CAPTURE    takes photographs from it, and places them"
+    )
     yield finding
 
 
@@ -152,8 +154,8 @@ def preparation_finding(path: Path) -> Iterator[Finding]:
     settings = read_json(path / "settings.json")
     finding = Finding("an interrupted preparation", {"of": settings.get("input")})
     finding.problems.append("it is not finished")
-    output = str(path).removesuffix(".partial")
-    finding.next.append(f"glassplat prepare {settings.get('input')} --output {output} --resume")
+    source, output = settings.get("input"), str(path).removesuffix(".partial")
+    finding.next.append(f"glassplat prepare {shell_word(source)} --output {shell_word(output)} --resume")
     yield finding
 
 
@@ -208,7 +210,7 @@ def export_finding(path: Path) -> Iterator[Finding]:
     """
     yield Finding("an exported scene", {"files": ", ".join(sorted(one.name for one in path.iterdir()))})
     yield import_held(DETAILS).splats_part(scene_source(path))
-    opened = [f"glassplat view {path}    shows it in the browser"]
+    opened = [f"glassplat view {shell_word(path)}    shows it in the browser"]
     if (path / "index.html").is_file():
         opened.append(f"open {path / 'index.html'} in a browser, or share it: it needs no server")
     yield Finding(next=opened)

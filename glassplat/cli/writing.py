@@ -17,7 +17,7 @@ from rich.progress import track
 from torch import Tensor
 
 from glassplat.captures.view import View
-from glassplat.cli.console import counted, say, warn
+from glassplat.cli.console import counted, say, shell_word, warn
 from glassplat.cli.places import SceneEdits, check_targets, chosen_views, claim_folder
 from glassplat.cli.progress import WorkProgress
 from glassplat.cli.runs import StoredRun, open_run, photographs_of, pictures_of
@@ -100,9 +100,10 @@ def planar_renderer(stored: StoredRun) -> Planar:
     renderer = stored.renderer
     if isinstance(renderer, Planar) and len(stored.scene.planes):
         return replace(renderer, photographer="present")
+    data = shell_word(stored.directory.settings().data)
     raise InputError(
         f"{stored.directory.path} is a {stored.recipe.method} run without panes, so it knows no reflection; train one "
-        f"that does, with pane masks: glassplat train planar --data {stored.directory.settings().data} --output RUN"
+        f"that does, with pane masks: glassplat train planar --data {data} --output RUN"
     )
 
 
@@ -187,7 +188,7 @@ def write_clean(command: Clean, console: Console) -> None:
         tidy = tidy.scaled(factor)
         say(console, f"one unit is a metre now; it was {factor:.4g} m")
     tidy.save(command.output)
-    say(console, f"next: glassplat view {command.output}")
+    say(console, f"next: glassplat view {shell_word(command.output)}")
 
 
 def write_files(command: Export, console: Console) -> None:

@@ -20,7 +20,7 @@ from tests.training.tiny_capture import true_scene
 
 
 def exported(tmp_path: Path, *options: str) -> Path:
-    output = tmp_path / "out"
+    output = tmp_path / "an export"
     assert main(["export", str(write_run(tmp_path / "run")), "--output", str(output), *options]) == 0
     return output
 
@@ -46,10 +46,10 @@ def test_the_folder_is_opened_like_any_other_scene(tmp_path: Path, capsys: pytes
     assert "1 pane -> " in capsys.readouterr().out
     model = load(output)
     assert torch.equal(model.scene.primary.means, true_scene().primary.means)
-    assert len(model.scene.planes) == 1 and model.name == "out"
+    assert len(model.scene.planes) == 1 and model.name == "an export"
     assert main(["info", str(output)]) == 0
     told = capsys.readouterr().out
-    assert "an exported scene" in told and f"next: glassplat view {output}" in told
+    assert "an exported scene" in told and f"next: glassplat view '{output}'" in told
     assert main(["export", str(output), "--output", str(tmp_path / "again"), "--formats", "ply"]) == 0
     assert len(load(tmp_path / "again").scene.planes) == 1
 

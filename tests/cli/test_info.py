@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -29,6 +30,8 @@ def told(path: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     assert main(["info", str(path)]) == 0
     text = capsys.readouterr().out
     assert found["kind"] in text and all(line.split("    ")[0] in text for line in found["next"])
+    commands = [shlex.split(line) for line in found["next"] if line.startswith("glassplat")]
+    assert all(str(path).removesuffix(".partial") in words for words in commands)
     return found
 
 
@@ -41,8 +44,8 @@ def test_a_capture_is_described_with_its_panes(capsys: pytest.CaptureFixture[str
 
 
 def test_a_capture_without_masks_is_to_be_annotated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copytree(SCENE, tmp_path / "capture", ignore=shutil.ignore_patterns("panes", "gt"))
-    found = told(tmp_path / "capture", capsys)
+    shutil.copytree(SCENE, tmp_path / "my capture", ignore=shutil.ignore_patterns("panes", "gt"))
+    found = told(tmp_path / "my capture", capsys)
     assert found["facts"]["panes"] == "none marked"
     assert any("glassplat annotate" in line for line in found["next"])
 
@@ -57,15 +60,15 @@ def test_estimated_normals_are_counted(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_photographs_are_to_be_prepared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copytree(SCENE / "images", tmp_path / "photographs")
-    found = told(tmp_path / "photographs", capsys)
+    shutil.copytree(SCENE / "images", tmp_path / "my photographs")
+    found = told(tmp_path / "my photographs", capsys)
     assert found["kind"] == "photographs without poses" and found["facts"]["photographs"] == 64
     assert any("glassplat prepare" in line for line in found["next"])
 
 
 def test_a_video_is_looked_into(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     offsets = np.linspace(0, 40, 12)
-    found = told(film(tmp_path / "walk.avi", offsets), capsys)
+    found = told(film(tmp_path / "a walk.avi", offsets), capsys)
     assert found["kind"] == "a video" and found["healthy"] and found["facts"]["frames"] == 12
     assert any("glassplat prepare" in line for line in found["next"])
     (tmp_path / "notes.mp4").write_text("no video")
@@ -104,14 +107,14 @@ def test_a_folder_of_few_photographs_is_said_to_be_small(tmp_path: Path, capsys:
 
 
 def test_what_was_interrupted_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "c.partial").mkdir()
-    (tmp_path / "c.partial" / "settings.json").write_text('{"input": "photographs"}')
-    found = told(tmp_path / "c.partial", capsys)
+    (tmp_path / "my capture.partial").mkdir()
+    (tmp_path / "my capture.partial" / "settings.json").write_text('{"input": "photographs"}')
+    found = told(tmp_path / "my capture.partial", capsys)
     assert not found["healthy"] and found["next"][0].endswith("--resume")
 
 
 def test_a_run_is_described_and_misses_its_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = write_run(tmp_path / "run")
+    run = write_run(tmp_path / "my run")
     found = told(run, capsys)
     assert found["kind"] == "a planar run" and found["facts"]["panes"].startswith("1 (R0")
     assert any("glassplat eval" in line for line in found["next"])
@@ -130,9 +133,10 @@ def test_a_run_without_a_scene_goes_on(tmp_path: Path, capsys: pytest.CaptureFix
 def test_a_scene_without_a_capture_is_described(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "out"
     assert main(["export", str(write_run(tmp_path / "run")), "--output", str(output), "--formats", "ply"]) == 0
-    assert main(["clean", str(output), "--output", str(tmp_path / "tidy")]) == 0
-    capsys.readouterr()
-    found = told(tmp_path / "tidy", capsys)
+    tidy = tmp_path / "my scene"
+    assert main(["clean", str(output), "--output", str(tidy)]) == 0
+    assert f"next: glassplat view '{tidy}'" in " ".join(capsys.readouterr().out.split())
+    found = told(tidy, capsys)
     assert found["kind"] == "a scene without a capture" and found["facts"]["panes"].startswith("1 (R0")
     assert [line.split()[1] for line in found["next"]] == ["view", "export"]
 
