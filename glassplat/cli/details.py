@@ -11,7 +11,7 @@ from glassplat.captures.dataset import Dataset, dataset_of, load_dataset
 from glassplat.captures.files import CaptureFiles
 from glassplat.captures.view import normals_path
 from glassplat.cli.console import shell_word
-from glassplat.cli.info import FEW_VIEWS, Finding
+from glassplat.cli.info import FEW_VIEWS, Finding, describe_broken
 from glassplat.errors import InputError
 from glassplat.files.records import read_json
 from glassplat.files.scene_folder import read_scene, read_splats
@@ -47,6 +47,9 @@ def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
     yield finding
     yield _marked(files.root, dataset)
     yield _behind(files.root, dataset)
+    decoded = Finding()
+    describe_broken([view.image_path for view in (*dataset.train, *dataset.test)], decoded)
+    yield decoded
 
 
 def write_capture_page(path: Path, target: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -117,15 +117,21 @@ def photographs_finding(path: Path) -> Iterator[Finding]:
         raise InputError(f"{path} is nothing that is known; expected {KINDS}; it holds {names}")
     yield Finding("photographs without poses", {"photographs": len(found)})
     finding = Finding()
-    if broken := broken_photographs(found):
+    sound = len(found) - describe_broken(found, finding)
+    if sound < FEW_VIEWS:
+        finding.problems.append(f"{sound} photographs are few; 30 and more do better")
+    finding.next.append(f"glassplat prepare {shell_word(path)} --output CAPTURE    finds out where they were taken")
+    yield finding
+
+
+def describe_broken(photographs: Sequence[Path], finding: Finding) -> int:
+    """Looks for photographs that nothing can be done with; each is decoded. Returns how many there are."""
+    if broken := broken_photographs(photographs):
         finding.problems.append(
             f"{len(broken)} are broken, tiny or of a kind that cannot be read ({first_names(broken)}); replace or "
             "remove them"
         )
-    if len(found) - len(broken) < FEW_VIEWS:
-        finding.problems.append(f"{len(found) - len(broken)} photographs are few; 30 and more do better")
-    finding.next.append(f"glassplat prepare {shell_word(path)} --output CAPTURE    finds out where they were taken")
-    yield finding
+    return len(broken)
 
 
 def video_finding(path: Path) -> Iterator[Finding]:

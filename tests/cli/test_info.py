@@ -100,6 +100,15 @@ def test_photographs_that_prepare_would_refuse_are_named(tmp_path: Path, capsys:
     assert f"2 are broken, tiny or of a kind that cannot be read ({first.name}, {second.name})" in found["problems"][0]
 
 
+def test_a_photograph_of_a_capture_that_is_cut_off_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture = shutil.copytree(SCENE, tmp_path / "capture", ignore=shutil.ignore_patterns("panes", "gt"))
+    photograph = capture / "images" / "0005.jpg"
+    photograph.write_bytes(photograph.read_bytes()[:4000])
+    assert told(capture, capsys)["problems"] == [
+        "1 are broken, tiny or of a kind that cannot be read (0005.jpg); replace or remove them"
+    ]
+
+
 def test_a_folder_of_few_photographs_is_said_to_be_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "few").mkdir()
     shutil.copy(SCENE / "images" / "0000.jpg", tmp_path / "few")
