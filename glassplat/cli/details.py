@@ -12,16 +12,19 @@ from glassplat.captures.files import CaptureFiles
 from glassplat.captures.view import normals_path
 from glassplat.cli.console import shell_word
 from glassplat.cli.info import FEW_VIEWS, Finding, describe_broken
-from glassplat.errors import InputError
+from glassplat.errors import InputError, input_checked
 from glassplat.files.records import read_json
 from glassplat.files.scene_folder import read_scene, read_splats
+from glassplat.files.sidecars import read_planes
 from glassplat.methods.planar import fitted_planes
+from glassplat.model.model import PLANES
 from glassplat.model.run_directory import RunDirectory
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.material import virtual_points
 from glassplat.prepare.preparation import PAGE, RECORD
 from glassplat.prepare.report_page import write_page
 from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
 
 FEW_POINTS, FEW_MASKS = 500, 3
@@ -115,17 +118,17 @@ FAINT = 0.01
 
 
 def splats_part(path: Path) -> Finding:
-    """Part about a file of Gaussians.
+    """Part about a file of Gaussians, with the panes beside it, which `load` takes, too.
 
     Raises:
-        InputError: it cannot be read.
+        InputError: one of them cannot be read.
     """
-    try:
+    beside = path.with_name(PLANES)
+    with input_checked():
         gaussians = read_splats(path)
-    except ValueError as error:
-        raise InputError(str(error)) from error
+        planes = read_planes(beside) if beside.is_file() else Planes.empty()
     finding = Finding()
-    _look_at(gaussians, finding)
+    _describe_scene(Scene(gaussians, extent=1.0, planes=planes), finding)
     return finding
 
 

@@ -103,15 +103,18 @@ def _prepared(path: Path, finding: Finding) -> None:
         return  # Others make captures too.
 
 
+def is_photograph(path: Path) -> bool:
+    """Return whether a name is that of a photograph."""
+    return path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
+
+
 def photographs_finding(path: Path) -> Iterator[Finding]:
     """A folder of photographs without poses.
 
     Raises:
         InputError: there are none.
     """
-    found = sorted(
-        one for one in path.rglob("*") if one.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) and one.is_file()
-    )
+    found = sorted(one for one in path.rglob("*") if is_photograph(one) and one.is_file())
     if not found:
         names = first_names(sorted(one.name for one in path.iterdir()), 8) or "nothing"
         raise InputError(f"{path} is nothing that is known; expected {KINDS}; it holds {names}")
@@ -196,6 +199,18 @@ def run_finding(path: Path) -> Iterator[Finding]:
         finding.problems.append(f"its capture is no longer at {settings.data}; say with --data where it is now")
     yield finding
     yield import_held(DETAILS).trained_part(directory)
+
+
+def holds_runs(path: Path) -> bool:
+    """Return whether a folder has runs in it, and no photographs beside them."""
+    return any(path.glob("*/recipe.json")) and not any(is_photograph(one) for one in path.iterdir())
+
+
+def runs_finding(path: Path) -> Iterator[Finding]:
+    """A folder with the directories of trainings in it, as `glassplat demo` writes it."""
+    runs = sorted(recipe.parent for recipe in path.glob("*/recipe.json"))
+    commands = [f"glassplat info {shell_word(run)}" for run in runs]
+    yield Finding("a folder of runs", {"runs": ", ".join(run.name for run in runs)}, next=commands)
 
 
 def scene_finding(path: Path) -> Iterator[Finding]:
@@ -300,7 +315,7 @@ def _finder_of_folder(path: Path) -> Finder:
         return scene_finding
     if scene_source(path) != path:
         return export_finding
-    if all(one.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) for one in path.iterdir()):
+    if all(map(is_photograph, path.iterdir())):
         return photographs_finding
     return _capture_or_photographs
 
@@ -309,4 +324,4 @@ def _capture_or_photographs(path: Path) -> Iterator[Finding]:
     try:
         yield from capture_finding(path)
     except UnknownFormatError:
-        yield from photographs_finding(path)
+        yield from (runs_finding if holds_runs(path) else photographs_finding)(path)
