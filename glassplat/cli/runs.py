@@ -171,7 +171,7 @@ def train(asked: Train[Any], console: Console) -> None:
     say(
         console,
         f"trained {asked.recipe.method} for {training.step} iterations in {training.seconds:.0f} s: "
-        f"{len(scene.primary)} Gaussians, {counted(len(scene.planes), 'pane')} -> {asked.output}",
+        f"{len(scene.primary) + len(scene.glass)} Gaussians, {counted(len(scene.planes), 'pane')} -> {asked.output}",
     )
     say(console, f"next: glassplat eval {shell_word(asked.output)}")
 
