@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
@@ -10,12 +12,12 @@ import tyro
 from rich.console import Console
 
 from glassplat.captures.colmap_library import quiet_pycolmap
-from glassplat.cli.console import import_now, say, warn
+from glassplat.cli.console import import_now, say, shell_word, warn
 from glassplat.cli.progress import WorkProgress
 from glassplat.files.writing import check_capture_folder
 from glassplat.options import Range, Share
 from glassplat.prepare.colmap import LensName, Mapper
-from glassplat.prepare.preparation import Preparation, Workplace, check_places, prepare
+from glassplat.prepare.preparation import PAGE, Preparation, Workplace, check_places, prepare
 from glassplat.prepare.reconstruction import Settings
 
 
@@ -56,20 +58,29 @@ class Prepare:
             self.input, self.output, self.max_size, self.frames, self.least_registered, settings=settings
         )
 
+    @cached_property
+    def _finished(self) -> threading.Event:
+        """Set once this command has made the capture; one that is there may be of an earlier command."""
+        return threading.Event()
+
     def run(self, console: Console) -> None:
         """Prepares, with progress, and says what became of the photographs."""
         with WorkProgress(console) as progress:
             report = prepare(self._task(), progress.show, resume=self.resume, force=self.force)
+            self._finished.set()
         for line in report.lines():
             (warn if line.startswith("advice") else say)(console, line)
-        from glassplat.prepare.report_page import PAGE, write_page  # PyTorch, which nothing before needs.
+        from glassplat.prepare.report_page import write_page  # PyTorch, which nothing before needs.
 
         write_page(self.output, self.output / PAGE)
         say(console, f"capture: {self.output}, report: {self.output / PAGE}")
-        say(console, f"next: glassplat annotate {self.output}")
+        say(console, f"next: glassplat annotate {shell_word(self.output)}")
 
     def left_behind(self) -> str:
         """Text after an interrupt: the state on disk, and how to go on."""
+        if self._finished.is_set():
+            page = f"glassplat info {shell_word(self.output)} --page {shell_word(self.output / PAGE)}"
+            return f"the capture in {self.output} is whole; `{page}` writes its report"
         if Workplace(self.output).folder.exists():
             return f"repeat the command with --resume to go on; what is done so far lies in {self.output}.partial"
         return "nothing was written: repeat the command to begin again"

@@ -26,6 +26,7 @@ import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from shlex import quote
 from types import FrameType
 from typing import Any, Literal, NamedTuple
 
@@ -45,6 +46,11 @@ def message_console(*, stderr: bool = False) -> Console:
     console = Console(stderr=stderr, markup=False, emoji=False, highlight=False)
     console.soft_wrap = not console.is_terminal
     return console
+
+
+def shell_word(path: object) -> str:
+    """A path as it is typed in a command."""
+    return quote(str(path))
 
 
 def counted(number: int, noun: str) -> str:

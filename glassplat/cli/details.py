@@ -10,17 +10,21 @@ import torch
 from glassplat.captures.dataset import Dataset, dataset_of, load_dataset
 from glassplat.captures.files import CaptureFiles
 from glassplat.captures.view import normals_path
-from glassplat.cli.info import FEW_VIEWS, Finding
-from glassplat.errors import InputError
+from glassplat.cli.console import shell_word
+from glassplat.cli.info import FEW_VIEWS, Finding, describe_broken
+from glassplat.errors import InputError, input_checked
 from glassplat.files.records import read_json
 from glassplat.files.scene_folder import read_scene, read_splats
+from glassplat.files.sidecars import read_planes
 from glassplat.methods.planar import fitted_planes
+from glassplat.model.model import PLANES
 from glassplat.model.run_directory import RunDirectory
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.material import virtual_points
-from glassplat.prepare.preparation import RECORD
-from glassplat.prepare.report_page import PAGE, write_page
+from glassplat.prepare.preparation import PAGE, RECORD
+from glassplat.prepare.report_page import write_page
 from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
 
 FEW_POINTS, FEW_MASKS = 500, 3
@@ -46,6 +50,9 @@ def remaining_parts(files: CaptureFiles) -> Iterator[Finding]:
     yield finding
     yield _marked(files.root, dataset)
     yield _behind(files.root, dataset)
+    decoded = Finding()
+    describe_broken([view.image_path for view in (*dataset.train, *dataset.test)], decoded)
+    yield decoded
 
 
 def write_capture_page(path: Path, target: Path) -> None:
@@ -73,8 +80,8 @@ def _marked(path: Path, dataset: Dataset) -> Finding:
     annotated = sum(view.is_annotated for view in dataset.train)
     if not dataset.pane_labels and dataset.planes is None:
         finding.facts["panes"] = "none marked"
-        finding.next.append(f"glassplat annotate {path}    marks panes")
-        finding.next.append(f"glassplat train splat --data {path} --output RUN    needs none")
+        finding.next.append(f"glassplat annotate {shell_word(path)}    marks panes")
+        finding.next.append(f"glassplat train splat --data {shell_word(path)} --output RUN    needs none")
         return finding
     given = () if dataset.planes is None else dataset.planes.labels
     labels = sorted({*dataset.pane_labels, *given})
@@ -95,13 +102,13 @@ def _behind(path: Path, dataset: Dataset) -> Finding:
         planes = fitted_planes(dataset, None, PlaneFit())
     except PlaneFitError as error:
         finding.problems.append(str(error))
-        finding.next.append(f"glassplat annotate {path}    marks panes by corners instead")
+        finding.next.append(f"glassplat annotate {shell_word(path)}    marks panes by corners instead")
         return finding
     if dataset.measured_points:
         cameras = [view.camera for view in dataset.train]
         behind = int(virtual_points(dataset.points.positions, planes, cameras).sum())
         finding.facts["points behind panes"] = f"{behind} ({behind / max(len(dataset.points), 1):.0%})"
-    finding.next.append(f"glassplat train planar --data {path} --output RUN")
+    finding.next.append(f"glassplat train planar --data {shell_word(path)} --output RUN")
     return finding
 
 
@@ -111,17 +118,17 @@ FAINT = 0.01
 
 
 def splats_part(path: Path) -> Finding:
-    """Part about a file of Gaussians.
+    """Part about a file of Gaussians, with the panes beside it, which `load` takes, too.
 
     Raises:
-        InputError: it cannot be read.
+        InputError: one of them cannot be read.
     """
-    try:
+    beside = path.with_name(PLANES)
+    with input_checked():
         gaussians = read_splats(path)
-    except ValueError as error:
-        raise InputError(str(error)) from error
+        planes = read_planes(beside) if beside.is_file() else Planes.empty()
     finding = Finding()
-    _look_at(gaussians, finding)
+    _describe_scene(Scene(gaussians, extent=1.0, planes=planes), finding)
     return finding
 
 
@@ -138,6 +145,18 @@ def trained_part(directory: RunDirectory) -> Finding:
     finding.facts["trained to"] = step
     _describe_scene(scene, finding)
     _describe_results(directory, finding)
+    return finding
+
+
+def imported_part(directory: RunDirectory) -> Finding:
+    """Part about a scene that lies in a run's directory, and that no photographs can be compared with.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    finding = Finding()
+    _describe_scene(directory.latest_scene()[0], finding)
+    _suggest_looking(directory.path, finding)
     return finding
 
 
@@ -177,23 +196,26 @@ def _look_at(gaussians: Gaussians, finding: Finding) -> None:
     if not len(gaussians):
         finding.problems.append("it holds no Gaussian")
         return
-    finding.facts["degree of harmonics"] = gaussians.max_sh_degree
+    if gaussians.max_sh_degree >= 0:
+        finding.facts["degree of harmonics"] = gaussians.max_sh_degree
     finite = torch.isfinite(gaussians.means).all(dim=1)
     if not bool(finite.all()):
         finding.problems.append(f"{int((~finite).sum())} Gaussians have no place that is finite; they are not drawn")
     means = gaussians.means[finite]
+    if not len(means):
+        return
     low, high = (torch.quantile(means[:: max(1, len(means) // 100_000)], share, dim=0) for share in (0.02, 0.98))
     spans = " x ".join(f"{float(side):.3g}" for side in high - low)
     finding.facts["size of the middle 96 %"] = f"{spans} world units"
     faint = float((torch.sigmoid(gaussians.logit_opacities) < FAINT).float().mean())
     if faint > MANY_FAINT:
-        finding.problems.append(f"{faint:.0%} of the Gaussians are nearly invisible; `glassplat export` can prune them")
+        finding.problems.append(f"{faint:.0%} of the Gaussians are nearly invisible")
 
 
 def _describe_results(directory: RunDirectory, finding: Finding) -> None:
     path = directory.path
     if not directory.results.is_file():
-        finding.next.append(f"glassplat eval {path}    measures it on its test views")
+        finding.next.append(f"glassplat eval {shell_word(path)}    measures it on its test views")
     else:
         try:
             results = read_json(directory.results)
@@ -201,5 +223,11 @@ def _describe_results(directory: RunDirectory, finding: Finding) -> None:
             finding.facts["measured"] = ", ".join(measures)
         except (ValueError, TypeError, AttributeError):
             finding.problems.append(f"{directory.results} is damaged; evaluate it again")
-    finding.next.append(f"glassplat view {path}    shows it in the browser")
-    finding.next.append(f"glassplat export {path} --output PAGE    makes a page to share, and files for other programs")
+    _suggest_looking(path, finding)
+
+
+def _suggest_looking(path: Path, finding: Finding) -> None:
+    finding.next.append(f"glassplat view {shell_word(path)}    shows it in the browser")
+    finding.next.append(
+        f"glassplat export {shell_word(path)} --output PAGE    makes a page to share, and files for other programs"
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 
 from glassplat.captures.files import CaptureFiles, read_capture
-from glassplat.cli.console import import_held, say, warn
+from glassplat.cli.console import import_held, say, shell_word, warn
 from glassplat.errors import InputError, UnknownFormatError, first_names
 from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
 from glassplat.files.records import read_json
@@ -103,29 +103,38 @@ def _prepared(path: Path, finding: Finding) -> None:
         return  # Others make captures too.
 
 
+def is_photograph(path: Path) -> bool:
+    """Return whether a name is that of a photograph."""
+    return path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
+
+
 def photographs_finding(path: Path) -> Iterator[Finding]:
     """A folder of photographs without poses.
 
     Raises:
         InputError: there are none.
     """
-    found = sorted(
-        one for one in path.rglob("*") if one.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) and one.is_file()
-    )
+    found = sorted(one for one in path.rglob("*") if is_photograph(one) and one.is_file())
     if not found:
         names = first_names(sorted(one.name for one in path.iterdir()), 8) or "nothing"
         raise InputError(f"{path} is nothing that is known; expected {KINDS}; it holds {names}")
     yield Finding("photographs without poses", {"photographs": len(found)})
     finding = Finding()
-    if broken := broken_photographs(found):
+    sound = len(found) - describe_broken(found, finding)
+    if sound < FEW_VIEWS:
+        finding.problems.append(f"{sound} photographs are few; 30 and more do better")
+    finding.next.append(f"glassplat prepare {shell_word(path)} --output CAPTURE    finds out where they were taken")
+    yield finding
+
+
+def describe_broken(photographs: Sequence[Path], finding: Finding) -> int:
+    """Looks for photographs that nothing can be done with; each is decoded. Returns how many there are."""
+    if broken := broken_photographs(photographs):
         finding.problems.append(
             f"{len(broken)} are broken, tiny or of a kind that cannot be read ({first_names(broken)}); replace or "
             "remove them"
         )
-    if len(found) - len(broken) < FEW_VIEWS:
-        finding.problems.append(f"{len(found) - len(broken)} photographs are few; 30 and more do better")
-    finding.next.append(f"glassplat prepare {path} --output CAPTURE    finds out where they were taken")
-    yield finding
+    return len(broken)
 
 
 def video_finding(path: Path) -> Iterator[Finding]:
@@ -143,7 +152,9 @@ def video_finding(path: Path) -> Iterator[Finding]:
     finding = Finding(
         "a video", {"bytes": size, "frames": footage.frames, "pictures": f"{footage.width}x{footage.height}"}
     )
-    finding.next.append(f"glassplat prepare {path} --output CAPTURE    takes photographs from it, and places them")
+    finding.next.append(
+        f"glassplat prepare {shell_word(path)} --output CAPTURE    takes photographs from it, and places them"
+    )
     yield finding
 
 
@@ -152,8 +163,8 @@ def preparation_finding(path: Path) -> Iterator[Finding]:
     settings = read_json(path / "settings.json")
     finding = Finding("an interrupted preparation", {"of": settings.get("input")})
     finding.problems.append("it is not finished")
-    output = str(path).removesuffix(".partial")
-    finding.next.append(f"glassplat prepare {settings.get('input')} --output {output} --resume")
+    source, output = settings.get("input"), str(path).removesuffix(".partial")
+    finding.next.append(f"glassplat prepare {shell_word(source)} --output {shell_word(output)} --resume")
     yield finding
 
 
@@ -171,12 +182,16 @@ def splat_finding(path: Path) -> Iterator[Finding]:
 
 
 def run_finding(path: Path) -> Iterator[Finding]:
-    """The directory of a training.
+    """The directory of a training, or of a scene that was written like one.
 
     Raises:
         InputError: its records are damaged.
     """
     directory = RunDirectory(path)
+    if directory.imported.is_file():
+        yield Finding("a scene without a capture")
+        yield import_held(DETAILS).imported_part(directory)
+        return
     recipe, settings = directory.recipe(), directory.settings()
     finding = Finding(f"a {recipe.method} run")
     finding.facts |= {"capture": settings.data, "iterations": settings.iterations, "downscale": settings.downscale}
@@ -184,6 +199,18 @@ def run_finding(path: Path) -> Iterator[Finding]:
         finding.problems.append(f"its capture is no longer at {settings.data}; say with --data where it is now")
     yield finding
     yield import_held(DETAILS).trained_part(directory)
+
+
+def holds_runs(path: Path) -> bool:
+    """Return whether a folder has runs in it, and no photographs beside them."""
+    return any(path.glob("*/recipe.json")) and not any(is_photograph(one) for one in path.iterdir())
+
+
+def runs_finding(path: Path) -> Iterator[Finding]:
+    """A folder with the directories of trainings in it, as `glassplat demo` writes it."""
+    runs = sorted(recipe.parent for recipe in path.glob("*/recipe.json"))
+    commands = [f"glassplat info {shell_word(run)}" for run in runs]
+    yield Finding("a folder of runs", {"runs": ", ".join(run.name for run in runs)}, next=commands)
 
 
 def scene_finding(path: Path) -> Iterator[Finding]:
@@ -204,7 +231,7 @@ def export_finding(path: Path) -> Iterator[Finding]:
     """
     yield Finding("an exported scene", {"files": ", ".join(sorted(one.name for one in path.iterdir()))})
     yield import_held(DETAILS).splats_part(scene_source(path))
-    opened = [f"glassplat view {path}    shows it in the browser"]
+    opened = [f"glassplat view {shell_word(path)}    shows it in the browser"]
     if (path / "index.html").is_file():
         opened.append(f"open {path / 'index.html'} in a browser, or share it: it needs no server")
     yield Finding(next=opened)
@@ -288,7 +315,7 @@ def _finder_of_folder(path: Path) -> Finder:
         return scene_finding
     if scene_source(path) != path:
         return export_finding
-    if all(one.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES) for one in path.iterdir()):
+    if all(map(is_photograph, path.iterdir())):
         return photographs_finding
     return _capture_or_photographs
 
@@ -297,4 +324,4 @@ def _capture_or_photographs(path: Path) -> Iterator[Finding]:
     try:
         yield from capture_finding(path)
     except UnknownFormatError:
-        yield from photographs_finding(path)
+        yield from (runs_finding if holds_runs(path) else photographs_finding)(path)

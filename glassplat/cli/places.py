@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 from glassplat.cli.console import message_console, say
 from glassplat.errors import InputError, first_names, input_checked
 from glassplat.files.records import read_json, reading
-from glassplat.files.writing import check_folder, make_folder, real_path, scene_source
+from glassplat.files.writing import LOADED, check_folder, make_folder, real_path, scene_source
 from glassplat.kernels.backend.devices import DeviceName
 from glassplat.model.run_directory import RunDirectory, write_text
 from glassplat.options import Finite, PaneLabel, Share, Up
@@ -98,10 +98,14 @@ def check_scene(path: Path) -> None:
         InputError: the folder is no run, or the file cannot be read.
     """
     path = scene_source(path)
-    if path.is_dir() or not (path.is_file() or path.suffix):
-        RunDirectory(path).check_begun()
-    else:
+    if path.is_file() or (path.suffix and not path.is_dir()):
         check_file(path)
+        return
+    if not path.exists():
+        raise FileNotFoundError(f"there is nothing at {path}; expected {LOADED}")
+    if not (path / "recipe.json").is_file():
+        raise InputError(f"{path} holds no scene; expected {LOADED}")
+    RunDirectory(path).check_begun()
 
 
 def say_scene(path: Path) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from glassplat.access import is_local
 from glassplat.captures.dataset import TEST_EVERY, Dataset, dataset_of, load_dataset, with_corrected_cameras
 from glassplat.captures.view import GIGABYTE, PointCloud, View
-from glassplat.cli.console import counted, say, warn
+from glassplat.cli.console import counted, say, shell_word, warn
 from glassplat.cli.places import chosen_views
 from glassplat.cli.progress import Plan, TrainingProgress
 from glassplat.errors import InputError, input_checked
@@ -155,9 +155,9 @@ def train(asked: Train[Any], console: Console) -> None:
     say(
         console,
         f"trained {asked.recipe.method} for {training.step} iterations in {training.seconds:.0f} s: "
-        f"{len(scene.primary)} Gaussians, {counted(len(scene.planes), 'pane')} -> {asked.output}",
+        f"{len(scene.primary) + len(scene.glass)} Gaussians, {counted(len(scene.planes), 'pane')} -> {asked.output}",
     )
-    say(console, f"next: glassplat eval {asked.output}")
+    say(console, f"next: glassplat eval {shell_word(asked.output)}")
 
 
 STEP_COSTS = {"Planar": 2.6, "Deferred": 1.2, "Traced": 4.5}

@@ -276,7 +276,8 @@ class Export:
 
     Attributes:
         scene: a run's directory, an exported folder, or a splat file (.ply, .spz, .glb, .splat, .sog, .ksplat).
-        output: where the files go; a new folder, or one that this command wrote.
+        output: where the files go; a new folder, or one that this command wrote: what it does not write again there
+            is removed.
         formats: which files; glb is glTF with KHR_gaussian_splatting, html a page that shows the scene in any browser,
             by itself and without a server.
         layer: all is the scene with its panes beside it, as planes.json and glass.ply; transmission is the place

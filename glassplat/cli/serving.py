@@ -18,7 +18,7 @@ from torch import Tensor
 from glassplat.access import is_local
 from glassplat.annotate.server import AnnotationServer
 from glassplat.annotate.session import opened_session
-from glassplat.cli.console import say
+from glassplat.cli.console import say, shell_word
 from glassplat.cli.runs import announce, capture_of
 from glassplat.errors import InputError
 from glassplat.model.model import Model, shown_of
@@ -76,7 +76,7 @@ def serve_marking(command: Annotate, console: Console) -> None:
         if command.open_browser and has_screen():
             until_the_end.enter_context(opened_in_browser(server.address, session.root))
         server.serve_forever(poll_interval=0.2)
-    say(console, f"next: glassplat train planar --data {command.capture} --output RUN")
+    say(console, f"next: glassplat train planar --data {shell_word(command.capture)} --output RUN")
 
 
 @contextmanager

@@ -70,11 +70,18 @@ class Train(Generic[RecipeKind]):
     view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
 
     def ready(self) -> None:
-        """Refuses what stands in the way, says what the capture's folder holds, and imports what trains."""
+        """Refuses what stands in the way, says what the capture's folder holds, and imports what trains.
+
+        Raises:
+            InputError: among others, the run is too short for its stages.
+        """
         check_output(RunDirectory(self.output), resume=self.resume)
         say(message_console(), self.files)
         import_now("glassplat.cli.runs")
         self.recipe.renderer()  # Imports what this method trains with, too, before anything is written.
+        from glassplat.training.stage import check_length
+
+        check_length(self.recipe.stages(self.seed, self.iterations), self.iterations)
 
     @cached_property
     def files(self) -> CaptureFiles:

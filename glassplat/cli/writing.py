@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,17 +17,17 @@ from rich.progress import track
 from torch import Tensor
 
 from glassplat.captures.view import View
-from glassplat.cli.console import counted, say, warn
-from glassplat.cli.places import check_targets, chosen_views, claim_folder
+from glassplat.cli.console import counted, say, shell_word, warn
+from glassplat.cli.places import SceneEdits, check_targets, chosen_views, claim_folder
 from glassplat.cli.progress import WorkProgress
 from glassplat.cli.runs import StoredRun, open_run, photographs_of, pictures_of
-from glassplat.errors import InputError, input_checked
+from glassplat.errors import InputError, first_names, input_checked
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.evaluate.metrics import quantized
 from glassplat.files.images import write_image
 from glassplat.files.sidecars import read_cameras, write_cameras
-from glassplat.files.writing import SPLAT_WRITERS, atomic_write, splat_writer
-from glassplat.model.model import CAMERAS, ENVIRONMENT, GLASS, PLANES, Model, save_page, write_beside
+from glassplat.files.writing import SPLAT_WRITERS, atomic_write, real_path, scene_source, splat_writer
+from glassplat.model.model import CAMERAS, ENVIRONMENT, GLASS, PANORAMA, PLANES, Model, save_page, write_beside
 from glassplat.prepare.photographs import Progress as Step
 from glassplat.publish.camera_paths import interpolated, keyframes_of, widened
 from glassplat.publish.film import side_by_side, wiped, write_film
@@ -98,9 +100,10 @@ def planar_renderer(stored: StoredRun) -> Planar:
     renderer = stored.renderer
     if isinstance(renderer, Planar) and len(stored.scene.planes):
         return replace(renderer, photographer="present")
+    data = shell_word(stored.directory.settings().data)
     raise InputError(
         f"{stored.directory.path} is a {stored.recipe.method} run without panes, so it knows no reflection; train one "
-        f"that does, with pane masks: glassplat train planar --data {stored.directory.settings().data} --output RUN"
+        f"that does, with pane masks: glassplat train planar --data {data} --output RUN"
     )
 
 
@@ -185,27 +188,51 @@ def write_clean(command: Clean, console: Console) -> None:
         tidy = tidy.scaled(factor)
         say(console, f"one unit is a metre now; it was {factor:.4g} m")
     tidy.save(command.output)
-    say(console, f"next: glassplat view {command.output}")
+    say(console, f"next: glassplat view {shell_word(command.output)}")
 
 
 def write_files(command: Export, console: Console) -> None:
-    """Writes the files."""
+    """Writes the files, and removes what an earlier run of the command wrote and this one does not."""
     model = command.file.opened(command.scene, command.device)
     model = model.with_scene(_chosen(command, command.edits.applied(model.scene)))
     splats = {kind: command.output / f"scene.{kind}" for kind in SPLAT_WRITERS}
-    beside = [command.output / name for name in ("index.html", PREVIEW, GLASS, PLANES, CAMERAS)]
+    beside = [command.output / name for name in BESIDE_SPLATS]
     check_targets(command.output, [*beside, *splats.values()], [])
-    if claim_folder(command.output, "export", command.scene):
+    is_again = claim_folder(command.output, "export", command.scene)
+    if is_again:
         say(console, f"replacing the files of an earlier run of this command in {command.output}")
-    _write_beside(command, model.scene, console)
+    written = [*_write_beside(command, model.scene, console), command.output / CAMERAS]
     write_cameras(command.output / CAMERAS, model.cameras.items())
     for kind in (kind for kind in splats if kind in command.formats):
         options = {"version": command.spz_version} if kind == "spz" else {}
         with input_checked():
             splat_writer(kind)(splats[kind], model.scene.primary, **options)
+        written.append(splats[kind])
         say(console, f"{splats[kind].stat().st_size / 1e6:.2f} MB -> {splats[kind]}")
     if "html" in command.formats:
-        _write_page(command, model, console)
+        written += _write_page(command, model, console)
+    if is_again:
+        _remove_earlier(command, [*beside, *splats.values()], written, console)
+
+
+BESIDE_SPLATS = ("index.html", PREVIEW, GLASS, PLANES, ENVIRONMENT, PANORAMA, CAMERAS)
+"""What `export` may write beside `scene.*`."""
+
+
+def _remove_earlier(command: Export, targets: Sequence[Path], written: Sequence[Path], console: Console) -> None:
+    """Removes those files of an earlier run that this one did not replace: they may show another scene, or its panes.
+
+    Of a folder that is exported onto itself the splats stay, since edits leave them as they are; where there are none,
+    everything does.
+    """
+    earlier = [path for path in targets if path not in written and os.path.lexists(path) and not path.is_dir()]
+    if real_path(scene_source(command.scene)).parent == real_path(command.output):
+        edited = command.edits != SceneEdits() or command.layer != "all"
+        earlier = [path for path in earlier if edited and path.name in BESIDE_SPLATS]
+    for path in earlier:
+        path.unlink()
+    if earlier:
+        say(console, f"removed {first_names([path.name for path in earlier], len(earlier))} of the earlier run")
 
 
 def _chosen(command: Export, scene: Scene) -> Scene:
@@ -215,22 +242,27 @@ def _chosen(command: Export, scene: Scene) -> Scene:
     return replace(bare, primary=replace(bare.primary, channels={}))
 
 
-def _write_page(command: Export, model: Model, console: Console) -> None:
+def _write_page(command: Export, model: Model, console: Console) -> list[Path]:
+    """The page and its preview, where it shows the scene and has an address; returns what was written."""
     path = command.output / "index.html"
     if not fits(model.scene):
         warn(
             console, f"a page holds {MOST_GAUSSIANS:,} Gaussians: this one shows those that cover most of a photograph"
         )
     save_page(model, path, command.title or model.name, sharing=Sharing(command.credit, command.url))
+    written = [path]
     if command.url is not None:
         write_preview(command.output / PREVIEW, model.scene, model.renderer, tuple(model.cameras.items()))
+        written.append(command.output / PREVIEW)
     say(console, f"{path.stat().st_size / 1e6:.2f} MB, open it in a browser -> {path}")
+    return written
 
 
-def _write_beside(command: Export, scene: Scene, console: Console) -> None:
-    """Planes, glass and environment, where there are any."""
-    write_beside(command.output, scene)
+def _write_beside(command: Export, scene: Scene, console: Console) -> list[Path]:
+    """Planes, glass and environment, where there are any; returns what was written."""
+    written = write_beside(command.output, scene)
     if len(scene.planes):
         say(console, f"{counted(len(scene.planes), 'pane')} -> {command.output / PLANES}, their shape -> {GLASS}")
     if not scene.environment.is_empty:
         warn(console, f"other viewers show this scene without what it mirrors; that is in {ENVIRONMENT}")
+    return written

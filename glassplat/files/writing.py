@@ -15,6 +15,8 @@ FORGED_SUFFIXES = (".sog", ".ksplat")
 """Formats that an extra reads and writes."""
 SPLAT_SUFFIXES = (".ply", ".spz", ".glb", ".splat", *FORGED_SUFFIXES)
 """Of files of Gaussians that are read."""
+LOADED = f"a run, a folder of an export, or a splat file ({', '.join(SPLAT_SUFFIXES)})"
+"""What can be opened as a scene."""
 SPLAT_WRITERS = {
     "ply": "glassplat.files.ply:write_gaussians",
     "spz": "glassplat.files.spz:write_spz",

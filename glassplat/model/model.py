@@ -479,8 +479,6 @@ AXES: dict[str, tuple[int, int, int]] = {
     "x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1),
 }  # fmt: skip
 EXTENT_MARGIN = 1.1
-LOADED = f"a run, a folder of an export, or a splat file ({', '.join(writing.SPLAT_SUFFIXES)})"
-"""What can be opened."""
 log = logging.getLogger(__name__)
 
 
@@ -575,7 +573,7 @@ def load(
     """
     path = Path(path)
     if not path.exists():
-        raise FileNotFoundError(f"there is nothing at {path}; expected {LOADED}")
+        raise FileNotFoundError(f"there is nothing at {path}; expected {writing.LOADED}")
     source = writing.scene_source(path)
     if not source.is_dir():
         model = _from_file(source, device, None if planes is None else Path(planes), up)

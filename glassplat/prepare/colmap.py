@@ -46,22 +46,24 @@ def interruptible(work: Callable[[Any], Result], meanwhile: Callable[[], None] =
     token = library.pycolmap.CancellationToken()
     results: list[Result] = []
     errors: list[BaseException] = []
+    # Not `join`: one that a signal interrupts takes the thread for ended, and the next one returns at once.
+    ended = threading.Event()
 
     def run() -> None:
         try:
             results.append(work(token))
         except BaseException as error:  # noqa: BLE001 - Raised again where somebody waits.
             errors.append(error)
+        finally:
+            ended.set()
 
-    thread = threading.Thread(target=run, name="pycolmap", daemon=True)
-    thread.start()
+    threading.Thread(target=run, name="pycolmap", daemon=True).start()
     try:
-        while thread.is_alive():
-            thread.join(LOOK_EVERY)
+        while not ended.wait(LOOK_EVERY):
             meanwhile()
     except BaseException:
         token.cancel()
-        thread.join()  # It writes into the database: whoever goes on from here finds it whole.
+        ended.wait()  # It writes into the database: whoever goes on from here finds it whole.
         raise
     if errors:
         raise errors[0]

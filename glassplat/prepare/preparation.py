@@ -22,6 +22,8 @@ from glassplat.prepare.reconstruction import Settings, Solution, best_solution, 
 
 RECORD = "prepare.json"
 """In the capture: that it was prepared here, and the report."""
+PAGE = "prepare.html"
+"""In the capture: the same for people."""
 HAND_MADE = ("panes", "masks", "ignore", "planes.json", "annotations.json")
 """In a capture: what somebody spent time on."""
 

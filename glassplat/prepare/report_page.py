@@ -125,7 +125,6 @@ def _headings(eyes: Sequence[NumpyCamera], axes: Array, on_page: Callable[[Array
     return strokes
 
 
-PAGE = "prepare.html"
 THUMBNAIL = (160, 120)
 MOST_THUMBNAILS = 200
 """Of more photographs only every second or third is shown: the page stays below 2 MB."""

@@ -52,6 +52,10 @@ def check_port(host: str, port: int) -> None:
         try:
             probe.bind((host, port))
         except OSError as error:
+            if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+                raise InputError(
+                    f"{host} is no address of this machine ({error.strerror or error}); choose another --host"
+                ) from error
             reason = "in use by another program" if error.errno == errno.EADDRINUSE else (error.strerror or str(error))
             raise InputError(f"port {port} of {host} cannot be used ({reason}); choose another --port") from error
 

@@ -27,15 +27,18 @@ def train(method: str, output: Path, *options: str) -> int:
 
 
 @pytest.mark.parametrize("method", ["splat", "planar"])
-def test_train_eval_render(method: str, tmp_path: Path) -> None:
-    run = tmp_path / "run"
+def test_train_eval_render(method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tmp_path / "a run"
     assert train(method, run, "--iterations", "20") == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert f"next: glassplat eval '{run}'" in told
     assert (run / "point_cloud" / "iteration_20" / "point_cloud.ply").is_file()
     assert (run / "cameras.json").is_file()
     assert main(["eval", str(run)]) == 0
     results = json.loads((run / "results.json").read_text())
     assert set(results) >= PROMISED
     assert results["method"] == method
+    assert f" s: {results['num_gaussians']} Gaussians, " in told
     assert all(f"{name}_reason" in results for name in PROMISED if results[name] is None)
     assert len(results["planes"]) == (1 if method == "planar" else 0)
     assert all(set(plane) >= PLANE_KEYS for plane in results["planes"])
@@ -99,6 +102,10 @@ def test_bad_input_ends_with_one_message(tmp_path: Path, capsys: pytest.CaptureF
     fails_with(
         ["train", "splat", "--data", str(SCENE), *output, "--iterations", "0"], capsys, "--iterations is 0; expected"
     )
+    short = ["train", "planar", "--data", str(SCENE), *output, "--iterations", "1"]
+    assert main(short) == 2
+    told = capsys.readouterr()
+    assert "expected at least 8" in " ".join(told.err.split()) and "training and" not in told.out
     fails_with(["eval", str(empty)], capsys, "is not a run directory")
     assert not (tmp_path / "run").exists()
 

@@ -20,7 +20,7 @@ from tests.training.tiny_capture import true_scene
 
 
 def exported(tmp_path: Path, *options: str) -> Path:
-    output = tmp_path / "out"
+    output = tmp_path / "an export"
     assert main(["export", str(write_run(tmp_path / "run")), "--output", str(output), *options]) == 0
     return output
 
@@ -46,10 +46,10 @@ def test_the_folder_is_opened_like_any_other_scene(tmp_path: Path, capsys: pytes
     assert "1 pane -> " in capsys.readouterr().out
     model = load(output)
     assert torch.equal(model.scene.primary.means, true_scene().primary.means)
-    assert len(model.scene.planes) == 1 and model.name == "out"
+    assert len(model.scene.planes) == 1 and model.name == "an export"
     assert main(["info", str(output)]) == 0
     told = capsys.readouterr().out
-    assert "an exported scene" in told and f"next: glassplat view {output}" in told
+    assert "an exported scene" in told and f"next: glassplat view '{output}'" in told
     assert main(["export", str(output), "--output", str(tmp_path / "again"), "--formats", "ply"]) == 0
     assert len(load(tmp_path / "again").scene.planes) == 1
 
@@ -86,3 +86,36 @@ def test_foreign_folders_and_missing_runs_are_left_alone(tmp_path: Path, capsys:
     assert main(["export", str(tmp_path / "none"), "--output", str(tmp_path / "new")]) == 2
     assert f"there is nothing at {tmp_path / 'none'}; expected" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("options", ["--remove-glass", "--layer transmission"])
+def test_nothing_of_an_earlier_scene_is_left(options: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = exported(tmp_path, "--formats", "ply", "spz", "html", "--url", "https://example.org")
+    (output / "notes.txt").write_text("mine")
+    again = ["export", str(tmp_path / "run"), "--output", str(output), "--formats", "ply", *options.split()]
+    capsys.readouterr()
+    assert main(again) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "removed index.html, preview.jpg, glass.ply, planes.json, scene.spz of the earlier run" in told
+    names = ["cameras.json", "glassplat.json", "notes.txt", "scene.ply"]
+    assert sorted(path.name for path in output.iterdir()) == names
+    assert not len(load(output).scene.planes)
+
+
+def test_another_scene_takes_no_panes_over(tmp_path: Path) -> None:
+    output = exported(tmp_path, "--formats", "ply", "spz")
+    splat = write_run(tmp_path / "splat", planar=False)
+    assert main(["export", str(splat), "--output", str(output), "--formats", "spz"]) == 0
+    assert sorted(path.name for path in output.iterdir()) == ["cameras.json", "glassplat.json", "scene.spz"]
+    assert not len(load(output).scene.planes)
+
+
+def test_a_folder_is_exported_onto_itself(tmp_path: Path) -> None:
+    output = exported(tmp_path, "--formats", "ply", "html")
+    onto_itself = ["export", str(output), "--output", str(output), "--formats", "spz"]
+    assert main(onto_itself) == 0
+    assert {"scene.ply", "scene.spz", "index.html", "planes.json"} <= {path.name for path in output.iterdir()}
+    assert main([*onto_itself, "--remove-glass"]) == 0
+    left = ["cameras.json", "glassplat.json", "scene.ply", "scene.spz"]
+    assert sorted(path.name for path in output.iterdir()) == left
+    assert torch.equal(load(output).scene.primary.means, true_scene().primary.means)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -29,6 +30,8 @@ def told(path: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     assert main(["info", str(path)]) == 0
     text = capsys.readouterr().out
     assert found["kind"] in text and all(line.split("    ")[0] in text for line in found["next"])
+    commands = [shlex.split(line) for line in found["next"] if line.startswith("glassplat")]
+    assert all(any(word.startswith(str(path).removesuffix(".partial")) for word in words) for words in commands)
     return found
 
 
@@ -41,8 +44,8 @@ def test_a_capture_is_described_with_its_panes(capsys: pytest.CaptureFixture[str
 
 
 def test_a_capture_without_masks_is_to_be_annotated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copytree(SCENE, tmp_path / "capture", ignore=shutil.ignore_patterns("panes", "gt"))
-    found = told(tmp_path / "capture", capsys)
+    shutil.copytree(SCENE, tmp_path / "my capture", ignore=shutil.ignore_patterns("panes", "gt"))
+    found = told(tmp_path / "my capture", capsys)
     assert found["facts"]["panes"] == "none marked"
     assert any("glassplat annotate" in line for line in found["next"])
 
@@ -57,15 +60,15 @@ def test_estimated_normals_are_counted(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_photographs_are_to_be_prepared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copytree(SCENE / "images", tmp_path / "photographs")
-    found = told(tmp_path / "photographs", capsys)
+    shutil.copytree(SCENE / "images", tmp_path / "my photographs")
+    found = told(tmp_path / "my photographs", capsys)
     assert found["kind"] == "photographs without poses" and found["facts"]["photographs"] == 64
     assert any("glassplat prepare" in line for line in found["next"])
 
 
 def test_a_video_is_looked_into(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     offsets = np.linspace(0, 40, 12)
-    found = told(film(tmp_path / "walk.avi", offsets), capsys)
+    found = told(film(tmp_path / "a walk.avi", offsets), capsys)
     assert found["kind"] == "a video" and found["healthy"] and found["facts"]["frames"] == 12
     assert any("glassplat prepare" in line for line in found["next"])
     (tmp_path / "notes.mp4").write_text("no video")
@@ -97,6 +100,15 @@ def test_photographs_that_prepare_would_refuse_are_named(tmp_path: Path, capsys:
     assert f"2 are broken, tiny or of a kind that cannot be read ({first.name}, {second.name})" in found["problems"][0]
 
 
+def test_a_photograph_of_a_capture_that_is_cut_off_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture = shutil.copytree(SCENE, tmp_path / "capture", ignore=shutil.ignore_patterns("panes", "gt"))
+    photograph = capture / "images" / "0005.jpg"
+    photograph.write_bytes(photograph.read_bytes()[:4000])
+    assert told(capture, capsys)["problems"] == [
+        "1 are broken, tiny or of a kind that cannot be read (0005.jpg); replace or remove them"
+    ]
+
+
 def test_a_folder_of_few_photographs_is_said_to_be_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "few").mkdir()
     shutil.copy(SCENE / "images" / "0000.jpg", tmp_path / "few")
@@ -104,14 +116,14 @@ def test_a_folder_of_few_photographs_is_said_to_be_small(tmp_path: Path, capsys:
 
 
 def test_what_was_interrupted_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "c.partial").mkdir()
-    (tmp_path / "c.partial" / "settings.json").write_text('{"input": "photographs"}')
-    found = told(tmp_path / "c.partial", capsys)
+    (tmp_path / "my capture.partial").mkdir()
+    (tmp_path / "my capture.partial" / "settings.json").write_text('{"input": "photographs"}')
+    found = told(tmp_path / "my capture.partial", capsys)
     assert not found["healthy"] and found["next"][0].endswith("--resume")
 
 
 def test_a_run_is_described_and_misses_its_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = write_run(tmp_path / "run")
+    run = write_run(tmp_path / "my run")
     found = told(run, capsys)
     assert found["kind"] == "a planar run" and found["facts"]["panes"].startswith("1 (R0")
     assert any("glassplat eval" in line for line in found["next"])
@@ -127,6 +139,43 @@ def test_a_run_without_a_scene_goes_on(tmp_path: Path, capsys: pytest.CaptureFix
     assert any("--resume" in problem for problem in told(run, capsys)["problems"])
 
 
+def test_a_scene_without_a_capture_is_described(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "out"
+    assert main(["export", str(write_run(tmp_path / "run")), "--output", str(output), "--formats", "ply"]) == 0
+    tidy = tmp_path / "my scene"
+    assert main(["clean", str(output), "--output", str(tidy)]) == 0
+    assert f"next: glassplat view '{tidy}'" in " ".join(capsys.readouterr().out.split())
+    found = told(tidy, capsys)
+    assert found["kind"] == "a scene without a capture" and found["facts"]["panes"].startswith("1 (R0")
+    assert [line.split()[1] for line in found["next"]] == ["view", "export"]
+
+
+def test_an_exported_folder_tells_its_panes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "an export"
+    export = ["export", str(write_run(tmp_path / "run")), "--output", str(output), "--formats", "ply"]
+    assert main([*export, "--as-mirror", "1"]) == 0
+    capsys.readouterr()
+    found = told(output, capsys)
+    assert found["kind"] == "an exported scene" and found["facts"]["panes"] == "1 (mirror)"
+    (output / "planes.json").write_text("{}")
+    assert main(["info", str(output)]) == 2
+
+
+def test_a_folder_of_runs_is_none_of_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    demo = tmp_path / "a demo"
+    write_run(demo / "planar")
+    write_run(demo / "splat", planar=False)
+    shutil.rmtree(demo / "capture")
+    (demo / "planar" / "sheets").mkdir()
+    shutil.copy(SCENE / "images" / "0000.jpg", demo / "planar" / "sheets")
+    found = told(demo, capsys)
+    assert found["kind"] == "a folder of runs" and found["facts"]["runs"] == "planar, splat"
+    assert [shlex.split(line)[1:] for line in found["next"]] == [
+        ["info", str(demo / "planar")],
+        ["info", str(demo / "splat")],
+    ]
+
+
 def small(gaussians: Gaussians) -> Gaussians:
     return Gaussians(gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh)
 
@@ -140,7 +189,22 @@ def test_splat_files_are_counted_and_judged(suffix: str, tmp_path: Path, capsys:
     assert found["facts"]["Gaussians"] == len(gaussians) and found["healthy"]
     faint = gaussians.with_tensors({"logit_opacities": torch.full((len(gaussians),), -8.0)})
     (write_gaussians if suffix == ".ply" else write_spz)(path, faint)
-    assert "nearly invisible" in told(path, capsys)["problems"][0]
+    assert told(path, capsys)["problems"] == ["100% of the Gaussians are nearly invisible"]
+
+
+def test_gaussians_without_a_finite_place_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gaussians = small(true_scene().primary)
+    nowhere = gaussians.with_tensors({"means": torch.full_like(gaussians.means, torch.nan)})
+    write_gaussians(tmp_path / "splat.ply", nowhere)
+    (problem,) = told(tmp_path / "splat.ply", capsys)["problems"]
+    assert problem.startswith(f"{len(gaussians)} Gaussians have no place that is finite")
+
+
+def test_glass_without_colours_has_no_degree(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    glass = true_scene().glass
+    write_gaussians(tmp_path / "glass.ply", glass)
+    facts = told(tmp_path / "glass.ply", capsys)["facts"]
+    assert facts["Gaussians"] == len(glass) and "degree of harmonics" not in facts
 
 
 @pytest.mark.parametrize(

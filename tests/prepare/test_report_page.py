@@ -14,7 +14,8 @@ import pytest
 from glassplat.captures.dataset import load_dataset
 from glassplat.cli.main import main
 from glassplat.cli.train import SCENE
-from glassplat.prepare.report_page import PAGE, plan, write_page
+from glassplat.prepare.preparation import PAGE
+from glassplat.prepare.report_page import plan, write_page
 
 RECORD = {
     "command": "prepare",
