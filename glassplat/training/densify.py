@@ -16,7 +16,6 @@ from functools import cache
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.captures.view import PointCloud
@@ -30,7 +29,6 @@ from glassplat.training.options import DefaultDensify, McmcDensify
 NEIGHBOURS = 3
 SMALLEST_SCALE = 1e-6
 """Floor of the standard deviation, as a share of the cloud's size: points that coincide would have none."""
-MORTON_BITS = 21
 
 
 def gaussians_from_points(
@@ -60,8 +58,9 @@ def gaussians_from_points(
         raise ValueError(f"sh_degree is {sh_degree} and opacity {opacity}; expected 0..3 and a number between 0 and 1")
     if not spread > 0:
         raise ValueError(f"spread is {spread}; expected a positive share of the distance between points")
-    order = torch.from_numpy(morton_order(points.positions.numpy()))
-    means = points.positions[order].clone()
+    # In float64, so that the size of the cloud is not rounded.
+    order = in_morton_order(points.positions.double()).source
+    means = points.positions[order]
     count, device = len(points), means.device
     sh = torch.zeros(count, (sh_degree + 1) ** 2, 3, device=device)
     sh[:, 0] = (points.colors[order].float() / 255 - 0.5) / SH_ZERO
@@ -81,26 +80,6 @@ def as_discs(spheres: Gaussians, *, seed: int = 0) -> Gaussians:
     quats = torch.randn(spheres.quats.shape, generator=generator).to(spheres.quats)
     log_scales = spheres.log_scales[:, :DISC_SCALES].contiguous()
     return replace(spheres, quats=torch.nn.functional.normalize(quats, dim=1), log_scales=log_scales)
-
-
-def morton_order(positions: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Indices [P] that sort points [P, 3] along a Z-order curve over their bounding box; ties keep their order."""
-    low = positions.min(axis=0).astype(np.float64)
-    size = float((positions.max(axis=0) - low).max()) or 1.0
-    cells = ((positions - low) / size * (2**MORTON_BITS - 1)).astype(np.uint64)
-    codes = _spread(cells[:, 0]) | (_spread(cells[:, 1]) << np.uint64(1)) | (_spread(cells[:, 2]) << np.uint64(2))
-    return np.argsort(codes, kind="stable")
-
-
-def _spread(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Move bit i of 21-bit values to bit 3 i."""
-    steps = (
-        (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    )  # fmt: skip
-    for shift, mask in steps:
-        values = (values | (values << np.uint64(shift))) & np.uint64(mask)
-    return values
 
 
 def _spacing(means: Tensor) -> Tensor:
