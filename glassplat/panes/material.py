@@ -211,13 +211,6 @@ def reduced_photograph(scene: Scene, view: View) -> Photograph:
     return Photograph(camera.resized(size[1], size[0]), pixels, told == 1, labels)
 
 
-def mirror_labels(scene: Scene, views: Sequence[View]) -> tuple[int, ...]:
-    """Labels of the panes that are mirrors; see `judged_pane`."""
-    photographs = photographs_of(scene, views)
-    judged = {label: judged_pane(scene, label, photographs) for label in scene.planes.labels}
-    return tuple(label for label, found in judged.items() if found.is_mirror)
-
-
 def judged_pane(scene: Scene, label: int, photographs: Sequence[Photograph]) -> JudgedPane:
     """Likeness of a pane to a mirror, where it is most like one.
 

@@ -184,18 +184,6 @@ class Camera:
             self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
         )
 
-    def ray_directions(self) -> Tensor:
-        """[H, W, 3] unit world-space directions through the pixel centres."""
-        matrix = self.cam_from_world
-        x = (torch.arange(self.width, dtype=matrix.dtype, device=matrix.device) + 0.5 - self.cx) / self.fx
-        y = (torch.arange(self.height, dtype=matrix.dtype, device=matrix.device) + 0.5 - self.cy) / self.fy
-        in_camera = torch.stack(
-            [x.expand(self.height, -1), y[:, None].expand(-1, self.width), torch.ones_like(x).expand(self.height, -1)],
-            dim=-1,
-        )
-        in_world = in_camera @ matrix[:3, :3]
-        return in_world / in_world.norm(dim=-1, keepdim=True)
-
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Pixel positions [P, 2] and depths [P] (camera z) of world points [P, 3]."""
         in_camera = points @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]
