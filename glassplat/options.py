@@ -121,7 +121,7 @@ T = TypeVar("T")
 Internal = Annotated[T, tyro.conf.Fixed, tyro.conf.Suppress]
 """A value that recipes hold and the command line does not set: a constant of a method, or what its preset decides."""
 
-LONGEST_SHOWN = 60
+LONGEST_SHOWN = 80
 """Characters of a wrong value that a message repeats."""
 UNIONS = (typing.Union, types.UnionType)
 PLAIN = {bool: "True or False", int: "a whole number", float: "a number", str: "a text", Path: "a path"}
@@ -230,7 +230,7 @@ def _in_type(hint: Any, value: Any, name: str, requirements: tuple[Requirement, 
 def _is_of(hint: Any, value: Any) -> bool:
     """Return whether a single value is of a type; a whole number is a number too, but True is not, nor is infinity."""
     if hint is float:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and _is_finite(value)
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and is_finite(value)
     if hint is int:
         return isinstance(value, int) and not isinstance(value, bool)
     if hint is Path:
@@ -238,10 +238,11 @@ def _is_of(hint: Any, value: Any) -> bool:
     return isinstance(value, hint)
 
 
-def _is_finite(value: float) -> bool:
+def is_finite(value: float) -> bool:
+    """Return whether a number is neither NaN nor infinite, nor a whole one beyond all floats."""
     try:
         return math.isfinite(value)
-    except OverflowError:  # A whole number of hundreds of digits.
+    except OverflowError:
         return False
 
 

@@ -27,6 +27,7 @@ from glassplat.files.ply import CHANNEL_PREFIXES, is_channel
 from glassplat.files.writing import atomic_write
 from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.kernels.project.reference import sh_basis
+from glassplat.options import shown
 from glassplat.scene import SH_ZERO
 from glassplat.scene.camera import quat_product, rotation_from_quat
 from glassplat.scene.gaussians import DISC_SCALES, Gaussians
@@ -153,7 +154,7 @@ class GltfReader:
         text, self._buffer = _chunks(data, path)
         document = records.parse_json(text, str(path))
         if not isinstance(document, dict):
-            raise ValueError(f"{path} holds {records.shown(document)}; expected a glTF document")
+            raise ValueError(f"{path} holds {shown(document)}; expected a glTF document")
         self.document: dict[str, Any] = document
         version = records.checked(document.get("asset"), ASSET, f"asset of {path}")["version"]
         if version.partition(".")[0] != str(VERSION):
@@ -163,7 +164,7 @@ class GltfReader:
         """The list of that name in the document; empty where there is none."""
         found = self.document.get(kind, [])
         if not isinstance(found, list):
-            raise ValueError(f"{kind} of {self.path} is {records.shown(found)}; expected a list")
+            raise ValueError(f"{kind} of {self.path} is {shown(found)}; expected a list")
         return found
 
     def entry(self, kind: str, index: int, fields: Mapping[str, records.Field]) -> dict[str, Any]:

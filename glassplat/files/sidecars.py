@@ -23,6 +23,7 @@ from glassplat.files import records
 from glassplat.files.images import read_image_float, write_image
 from glassplat.files.writing import atomic_write, make_folder
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
+from glassplat.options import shown
 from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import Exposures, PoseCorrections
 from glassplat.scene.panes import Planes
@@ -213,7 +214,7 @@ def _load_entries(path: Path) -> list[Any]:
         raise FileNotFoundError(f"no planes file at {path}; expected the planes.json of a run")
     entries = records.read_json(path)
     if not isinstance(entries, list):
-        raise ValueError(f"{path} holds {records.shown(entries)}; expected a list with one object per plane")
+        raise ValueError(f"{path} holds {shown(entries)}; expected a list with one object per plane")
     return entries
 
 
@@ -310,7 +311,7 @@ def read_cameras(path: Path | str) -> list[tuple[str, Camera]]:
     path = Path(path)
     entries = records.read_json(path)
     if not isinstance(entries, list):
-        raise ValueError(f"{path} holds {records.shown(entries)}; expected a list with one object per camera")
+        raise ValueError(f"{path} holds {shown(entries)}; expected a list with one object per camera")
     return [_camera(entry, f"camera {index} in {path}") for index, entry in enumerate(entries, start=1)]
 
 
