@@ -30,9 +30,11 @@ OPAQUE_SHEET = 0.9
 """Opacity of discs that cover a pane which nobody trains."""
 
 
-def glass_gaussians(
-    planes: Planes, *, count: int = 1000, seed: int = 0, opacity: float = 0.5, mark: float = 0.99
-) -> Gaussians:
+MARK = 0.99
+"""m of glass that nobody has trained; the paper's 1 has no finite logit."""
+
+
+def glass_gaussians(planes: Planes, *, count: int = 1000, seed: int = 0, opacity: float = 0.5) -> Gaussians:
     """Glass Gaussians on every pane's rectangle.
 
     They are spread by a scrambled Sobol sequence, so that chance leaves no holes. At the default
@@ -44,7 +46,6 @@ def glass_gaussians(
         count: Gaussians on each pane.
         seed: of the places.
         opacity: of each Gaussian, in (0, 1).
-        mark: m of each Gaussian, in (0, 1); the paper's 1 has no finite logit.
     """
     panes = [_pane_discs(planes, index, count=count, seed=seed) for index in range(len(planes))]
     if not panes:
@@ -57,7 +58,7 @@ def glass_gaussians(
         log_scales=log_scales,
         logit_opacities=torch.full((number,), logit(opacity)),
         sh=torch.zeros(number, 0, 3),
-        channels={"logit_mark": torch.full((number,), logit(mark))},
+        channels={"logit_mark": torch.full((number,), logit(MARK))},
     ).to(planes.centers.device)
 
 

@@ -17,6 +17,8 @@ from glassplat.scene.panes import PANE_TENSORS, Planes
 
 ENVIRONMENT_TENSORS = ("raw",)
 FACES = 6
+NOISE = 5.0
+"""Of the logits of an environment before training."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +77,8 @@ class Environment:
         return Environment(torch.zeros(FACES, 0, 0, 3))
 
     @staticmethod
-    def random(size: int, *, generator: torch.Generator, spread: float = 5.0) -> Environment:
-        """Noise to start training from: raw values uniform in [-spread, spread], on the generator's device.
+    def random(size: int, *, generator: torch.Generator) -> Environment:
+        """Noise to start training from: raw values uniform in [-NOISE, NOISE], on the generator's device.
 
         Raises:
             ValueError: the size is below 1.
@@ -84,7 +86,7 @@ class Environment:
         if size < 1:
             raise ValueError(f"the environment's size is {size}; expected at least 1 texel along a face")
         uniform = torch.rand(FACES, size, size, 3, generator=generator, device=generator.device)
-        return Environment((2 * uniform - 1) * spread)
+        return Environment((2 * uniform - 1) * NOISE)
 
 
 GAUSSIAN_SETS = ("primary", "glass", "surroundings", "photographer")

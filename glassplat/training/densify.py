@@ -157,32 +157,33 @@ def clone(count: int, index: Tensor) -> Edit:
     return Edit(source, torch.arange(source.shape[0], device=index.device) >= count)
 
 
+CHILDREN = 2
+"""Gaussians that take the place of one that is split."""
+SHRINK = 1.6
+"""Factor by which their axes are shorter."""
+
+
 @torch.no_grad()
-def split(
-    gaussians: Gaussians, index: Tensor, *, generator: torch.Generator, children: int = 2, shrink: float = 1.6
-) -> Edit:
+def split(gaussians: Gaussians, index: Tensor, *, generator: torch.Generator) -> Edit:
     """Replaces each Gaussian in `index` [I] by smaller ones drawn from it (3DGS, Section 5.2).
 
-    The survivors come first, in their order; then the first child of every parent, the second of
-    every parent, and so on.
+    The survivors come first, in their order; then the first child of every parent and the second of every parent.
 
     Args:
         gaussians: the set that is edited.
         index: rows to split, each at most once.
         generator: source of the children's positions, on the device of `gaussians`.
-        children: how many take the place of one parent.
-        shrink: factor by which a child's axes are shorter than its parent's.
     """
     count = len(gaussians)
     survives = torch.ones(count, dtype=torch.bool, device=index.device)
     survives[index] = False
-    parents = index.repeat(children)
+    parents = index.repeat(CHILDREN)
     source = torch.cat([survives.nonzero().squeeze(1), parents])
     fresh = torch.arange(source.shape[0], device=index.device) >= count - index.shape[0]
 
     means, log_scales = gaussians.means[source], gaussians.log_scales[source]
     means[fresh] += _drawn_offsets(gaussians.quats[parents], gaussians.deviations[parents], generator)
-    log_scales[fresh] -= math.log(shrink)
+    log_scales[fresh] -= math.log(SHRINK)
     return Edit(source, fresh, {"means": means, "log_scales": log_scales})
 
 
@@ -218,9 +219,9 @@ def apply_edit(
 
 @torch.no_grad()
 def append(
-    gaussians: Gaussians, moments: Moments, new: Gaussians, *, part: str = "primary"
+    gaussians: Gaussians, moments: Moments, new: Gaussians
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
-    """The Gaussians followed by `new` ones, whose moments are zero.
+    """The primary Gaussians followed by `new` ones, whose moments are zero.
 
     Raises:
         ValueError: the two sets do not hold the same tensors.
@@ -231,9 +232,9 @@ def append(
     joined = gaussians.with_tensors({name: torch.cat([old_tensors[name], new_tensors[name]]) for name in old_tensors})
 
     def extended(name: str, moment: Tensor) -> Tensor:
-        return torch.cat([moment, torch.zeros_like(new_tensors[name.removeprefix(f"{part}.")])])
+        return torch.cat([moment, torch.zeros_like(new_tensors[name.removeprefix("primary.")])])
 
-    owned = {f"{part}.{name}" for name in old_tensors}
+    owned = {f"primary.{name}" for name in old_tensors}
     return joined, {
         name: (extended(name, m), extended(name, v)) if name in owned else (m, v) for name, (m, v) in moments.items()
     }
@@ -442,7 +443,6 @@ def resampled(
     *,
     cap: int,
     generator: torch.Generator,
-    part: str = "primary",
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
     """A set of Gaussians and their moments after relocation and growth; what it renders stays nearly the same.
 
@@ -451,14 +451,13 @@ def resampled(
 
     Args:
         options: when and how.
-        gaussians: the set to edit.
+        gaussians: the primary ones.
         moments: optimiser moments by dotted name; those of other parts pass through.
         cap: largest number of Gaussians to grow to; a set that is larger stays as large.
         generator: source of randomness, on the device of `gaussians`.
-        part: the scene part that `gaussians` is.
     """
-    relocated, moments = apply_edit(gaussians, moments, relocation(options, gaussians, generator), part=part)
-    return apply_edit(relocated, moments, addition(options, relocated, cap, generator), part=part)
+    relocated, moments = apply_edit(gaussians, moments, relocation(options, gaussians, generator))
+    return apply_edit(relocated, moments, addition(options, relocated, cap, generator))
 
 
 def relocation(options: McmcDensify, gaussians: Gaussians, generator: torch.Generator) -> Edit:
@@ -591,8 +590,8 @@ def perturb_opacities(
     selected: Tensor,
     *,
     generator: torch.Generator,
-    amplitude: float = 0.4,
-    bounds: tuple[float, float] = (0.01, 0.99),
+    amplitude: float,
+    bounds: tuple[float, float],
 ) -> Gaussians:
     """Adds uniform noise to the opacity of the Gaussians that are seen through a pane.
 
