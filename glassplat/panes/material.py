@@ -17,7 +17,7 @@ from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene import logit
-from glassplat.scene.camera import Camera, mirror_matrices
+from glassplat.scene.camera import Camera, mirror_matrices, quat_from_rotation
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes, crosses_pane, in_image
 from glassplat.scene.scene import Scene
@@ -100,10 +100,7 @@ def _pane_discs(planes: Planes, index: int, *, count: int, seed: int) -> tuple[T
     means = planes.centers[index].detach().cpu() + in_plane @ torch.stack([tangent, bitangent])
 
     frame = torch.stack([tangent, bitangent, planes.normals[index].detach().cpu()], dim=1)
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(frame.double().numpy()).as_quat()
-    quat = torch.tensor([w, x, y, z], dtype=torch.float32)
+    quat = quat_from_rotation(frame).float()
     along = OVERLAP * math.sqrt(float(4 * half.prod()) / count)
     log_scales = torch.tensor([along, along, THICKNESS * along]).log()
     return means, quat.repeat(len(means), 1), log_scales.repeat(len(means), 1)

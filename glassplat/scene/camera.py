@@ -50,6 +50,14 @@ def rotation_from_quat(quats: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).reshape(*quats.shape[:-1], 3, 3)
 
 
+def quat_from_rotation(rotation: Tensor) -> Tensor:
+    """One of the two unit quaternions [4], `wxyz`, of a rotation [3, 3]; float64, on the CPU, without a gradient."""
+    from scipy.spatial.transform import Rotation  # Slow to import, and few runs need it.
+
+    x, y, z, w = Rotation.from_matrix(rotation.detach().double().cpu().numpy()).as_quat().tolist()
+    return torch.tensor([w, x, y, z], dtype=torch.float64)
+
+
 def quat_product(left: Tensor, right: Tensor) -> Tensor:
     """Quaternions [..., 4], `wxyz`, of the rotations by `right` followed by `left`."""
     left_real, left_vector = left[..., :1], left[..., 1:]
