@@ -10,6 +10,7 @@ from pathlib import PurePosixPath
 import torch
 from torch import Tensor
 
+from glassplat.scene import among_known
 from glassplat.scene.camera import Camera
 
 
@@ -99,10 +100,7 @@ class Exposures:
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Exposures:
         """The same with its tensors replaced by name."""
-        unknown = set(tensors) - set(EXPOSURE_TENSORS)
-        if unknown:
-            raise ValueError(f"unknown tensors {sorted(unknown)}; exposures have {sorted(EXPOSURE_TENSORS)}")
-        return replace(self, affine=tensors.get("affine", self.affine))
+        return replace(self, **among_known(tensors, EXPOSURE_TENSORS, "exposures"))
 
     def to(self, device: torch.device | str) -> Exposures:
         """The same on another device."""
@@ -176,10 +174,7 @@ class PoseCorrections:
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> PoseCorrections:
         """The same with its tensors replaced by name."""
-        unknown = set(tensors) - set(POSE_TENSORS)
-        if unknown:
-            raise ValueError(f"unknown tensors {sorted(unknown)}; pose corrections have {sorted(POSE_TENSORS)}")
-        return replace(self, twists=tensors.get("twists", self.twists))
+        return replace(self, **among_known(tensors, POSE_TENSORS, "pose corrections"))
 
     def to(self, device: torch.device | str) -> PoseCorrections:
         """The same on another device."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from glassplat.scene import among_known
 from glassplat.scene.camera import Camera, constant
 
 LEAST_SINE = 1e-6
@@ -102,10 +103,7 @@ class Planes:
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Planes:
         """The same planes with some tensors replaced by name."""
-        unknown = set(tensors) - set(self.tensors())
-        if unknown:
-            raise ValueError(f"unknown tensors {sorted(unknown)}; planes have {sorted(self.tensors())}")
-        return Planes(**(self.tensors() | dict(tensors)), labels=self.labels, mirrors=self.mirrors)
+        return replace(self, **among_known(tensors, self.tensors(), "planes"))
 
     def select(self, rows: Sequence[int]) -> Planes:
         """The planes at the given positions, in that order."""

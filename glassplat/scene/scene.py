@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from glassplat.scene import among_known
 from glassplat.scene.camera import quat_product, rotation_from_quat
 from glassplat.scene.corrections import Direction, Exposures, PoseCorrections
 from glassplat.scene.gaussians import Gaussians
@@ -62,10 +63,7 @@ class Environment:
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Environment:
         """The same environment with its tensors replaced by name."""
-        unknown = set(tensors) - set(self.tensors())
-        if unknown:
-            raise ValueError(f"unknown tensors {sorted(unknown)}; an environment has {sorted(self.tensors())}")
-        return replace(self, raw=tensors.get("raw", self.raw))
+        return replace(self, **among_known(tensors, ENVIRONMENT_TENSORS, "environments"))
 
     def to(self, device: torch.device | str) -> Environment:
         """The same environment on another device."""
