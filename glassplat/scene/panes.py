@@ -210,6 +210,24 @@ def _coplanar(planes: Planes, one: int, other: int) -> bool:
     return bool(angle <= LARGEST_ANGLE) and bool(offset <= LARGEST_OFFSET * planes.half_sizes[[one, other]].amax())
 
 
+def rectangle_offsets(points: Tensor, planes: Planes) -> Tensor:
+    """[N, K, 3] how far points [N, 3] lie beyond the sides of each rectangle, and off its plane; world units.
+
+    The length of a row is the distance from the rectangle.
+    """
+    offsets = points[:, None] - planes.centers
+    along = torch.stack([(offsets * axis).sum(-1) for axis in planes.axes()], dim=-1)
+    outside = (along.abs() - planes.half_sizes).clamp(min=0)
+    across = (offsets * planes.normals).sum(-1, keepdim=True)
+    return torch.cat([outside, across], dim=-1)
+
+
+@torch.no_grad()
+def nearest_panes(points: Tensor, planes: Planes) -> Tensor:
+    """[N] the plane whose rectangle is nearest to each of the points [N, 3], position in `planes`."""
+    return rectangle_offsets(points, planes).square().sum(-1).argmin(dim=1)
+
+
 @torch.no_grad()
 def behind_panes(points: Tensor, planes: Planes, cameras: Sequence[Camera]) -> Tensor:
     """[N] bool: which points some camera sees through some pane.

@@ -14,7 +14,7 @@ from glassplat.scene import among_known
 from glassplat.scene.camera import quat_product, rotation_from_quat
 from glassplat.scene.corrections import Direction, Exposures, PoseCorrections
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.panes import PANE_TENSORS, Planes
+from glassplat.scene.panes import PANE_TENSORS, Planes, nearest_panes
 
 ENVIRONMENT_TENSORS = ("raw",)
 FACES = 6
@@ -306,8 +306,7 @@ def moved(scene: Scene, label: int, turn: Sequence[float], step: Sequence[float]
 
 def glass_of_pane(scene: Scene, row: int) -> Tensor:
     """[N] bool: the glass Gaussians that are nearer to this pane's rectangle than to any other."""
-    distances = torch.stack([_distances(scene.planes, k, scene.glass) for k in range(len(scene.planes))])
-    return distances.argmin(dim=0) == row
+    return nearest_panes(scene.glass.means, scene.planes) == row
 
 
 def row_of(planes: Planes, label: int) -> int:
@@ -343,16 +342,6 @@ def _translated(scene: Scene, row: int, step: Tensor) -> Scene:
     placed = torch.where(glass_of_pane(scene, row)[:, None], means + step.to(means), means)
     planes = scene.planes.with_tensors({"centers": centers})
     return replace(scene, glass=scene.glass.with_tensors({"means": placed}), planes=planes)
-
-
-def _distances(planes: Planes, row: int, glass: Gaussians) -> Tensor:
-    """[N] distance of every glass Gaussian's centre from one rectangle; world units."""
-    offsets = glass.means - planes.centers[row].to(glass.means)
-    inside = torch.zeros_like(offsets)
-    for axes, half in zip(planes.axes(), planes.half_sizes[row].tolist(), strict=True):
-        axis = axes[row].to(offsets)
-        inside = inside + (offsets @ axis).clamp(-half, half)[:, None] * axis
-    return (offsets - inside).norm(dim=1)
 
 
 def _with_row(vectors: Tensor, row: int, rotation: Tensor) -> Tensor:
