@@ -12,7 +12,7 @@ import logging
 import math
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
@@ -125,7 +125,7 @@ T = TypeVar("T")
 Internal = Annotated[T, tyro.conf.Fixed, tyro.conf.Suppress]
 """A value that recipes hold and the command line does not set: a constant of a method, or what its preset decides."""
 
-LONGEST_SHOWN = 60
+LONGEST_SHOWN = 80
 """Characters of a wrong value that a message repeats."""
 UNIONS = (typing.Union, types.UnionType)
 PLAIN = {bool: "True or False", int: "a whole number", float: "a number", str: "a text", Path: "a path"}
@@ -234,7 +234,7 @@ def _in_type(hint: Any, value: Any, name: str, requirements: tuple[Requirement, 
 def _is_of(hint: Any, value: Any) -> bool:
     """Return whether a single value is of a type; a whole number is a number too, but True is not, nor is infinity."""
     if hint is float:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and _is_finite(value)
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and is_finite(value)
     if hint is int:
         return isinstance(value, int) and not isinstance(value, bool)
     if hint is Path:
@@ -242,10 +242,11 @@ def _is_of(hint: Any, value: Any) -> bool:
     return isinstance(value, hint)
 
 
-def _is_finite(value: float) -> bool:
+def is_finite(value: float) -> bool:
+    """Return whether a number is neither NaN nor infinite, nor a whole one beyond all floats."""
     try:
         return math.isfinite(value)
-    except OverflowError:  # A whole number of hundreds of digits.
+    except OverflowError:
         return False
 
 
@@ -262,7 +263,7 @@ def _fields(kind: type, value: Any, name: str) -> Any:
     missing = [field.name for field in fields(kind) if _is_needed(field) and field.name not in value]
     if missing:
         raise InputError(f"fields {missing} of {name or 'the options'} are missing")
-    values = {key: checked(hints[key], value[key], _inner_name(name, key, hints[key])) for key in known if key in value}
+    values = {key: checked(hints[key], value[key], inner_name(name, key, hints[key])) for key in known if key in value}
     made = kind(**values)
     contradiction = made.contradiction() if hasattr(made, "contradiction") else None
     if contradiction:
@@ -282,7 +283,7 @@ def _is_needed(field: dataclasses.Field) -> bool:
     return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
 
 
-def _inner_name(outer: str, field: str, hint: Any) -> str:
+def inner_name(outer: str, field: str, hint: Any) -> str:
     """The name of a field of a field; one that the command line does not name has no name of its own."""
     nameless = any(getattr(data, "name", None) == "" for data in typing.get_args(hint)[1:])
     return outer if nameless else f"{outer}.{field}".removeprefix(".")
@@ -342,24 +343,6 @@ def shown(value: Any) -> str:
     except ValueError:  # A whole number of too many digits to print.
         text = "a number of thousands of digits"
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
-
-
-def number_fields(kind: type, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Every option of a dataclass and of those in it that holds numbers: its name and the annotation of each number."""
-    for field, hint in typing.get_type_hints(kind, include_extras=True).items():
-        if typing.get_origin(hint) is not typing.ClassVar:
-            yield from _numbers(hint, _inner_name(name, field, hint))
-
-
-def _numbers(hint: Any, name: str) -> Iterator[tuple[str, Any]]:
-    inner, _ = unwrapped(hint)
-    if inner in (int, float):
-        yield name, hint
-    elif isinstance(inner, type) and dataclasses.is_dataclass(inner):
-        yield from number_fields(inner, name)
-    elif typing.get_origin(inner) is not typing.Literal:
-        for part in typing.get_args(inner):
-            yield from _numbers(part, name)
 
 
 Rgb = tuple[float, float, float]

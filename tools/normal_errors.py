@@ -21,6 +21,7 @@ from glassplat.cli.runs import StoredRun, open_run
 from glassplat.evaluate.evaluate import timed_render
 from glassplat.evaluate.metrics import REFLECTIVE, angular_errors_deg
 from glassplat.evaluate.truth import true_surface
+from glassplat.render.deferred import view_directions
 
 EDGES = (-1.0, -0.5, 0.0, 0.5, 1.0)
 """Bounds of the bands: the upward share of the mirrored ray."""
@@ -55,7 +56,7 @@ def mirrored_errors(stored: StoredRun) -> tuple[Tensor, Tensor]:
 
 def mirrored_rays(view: View, normals: Tensor) -> Tensor:
     """Unit directions [H, W, 3] in world axes in which the rays of a view leave a surface with these normals."""
-    rays = view.camera.ray_directions().to(normals)
+    rays = torch.nn.functional.normalize(view_directions(view.camera), dim=-1).to(normals)
     return rays - 2 * (rays * normals).sum(dim=-1, keepdim=True) * normals
 
 

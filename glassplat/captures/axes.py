@@ -11,6 +11,7 @@ from torch import Tensor
 
 from glassplat.captures.view import View
 from glassplat.scene.camera import Camera
+from glassplat.scene.panes import in_image
 
 Item = TypeVar("Item")
 LEAST_SEEN = 0.05
@@ -129,9 +130,7 @@ def _share_of_points(cameras: Sequence[Camera], points: Tensor) -> float:
     """Share of the points that lie in the image of at least one camera."""
     seen = torch.zeros(len(points), dtype=torch.bool)
     for camera in cameras:
-        pixels, depth = camera.project(points)
-        size = torch.tensor([camera.width, camera.height], dtype=pixels.dtype)
-        seen |= (depth > 0) & (pixels >= 0).all(dim=1) & (pixels <= size).all(dim=1)
+        seen |= in_image(points, camera)
     return float(seen.double().mean())
 
 

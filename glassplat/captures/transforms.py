@@ -37,22 +37,22 @@ AHEAD = 3.0
 """How far ahead points are placed otherwise, in radii of the camera path."""
 
 
-def points_in_box(count: int = BOX_COUNT, half_size: float = BOX_HALF_SIZE) -> RawPoints:
-    """Uniform points in a cube about the origin; the default is what synthetic Blender scenes fit in."""
-    positions = np.random.default_rng(SEED).uniform(-half_size, half_size, (count, 3))
+def points_in_box(count: int = BOX_COUNT) -> RawPoints:
+    """Uniform points in the cube about the origin that synthetic Blender scenes fit in."""
+    positions = np.random.default_rng(SEED).uniform(-BOX_HALF_SIZE, BOX_HALF_SIZE, (count, 3))
     return RawPoints.from_arrays(positions, np.full((count, 3), GREY))
 
 
-def points_in_view(cameras: Sequence[Camera], count: int = SPHERE_COUNT) -> RawPoints:
+def points_in_view(cameras: Sequence[Camera]) -> RawPoints:
     """Uniform points in a ball about what the cameras look at, reaching as far as the cameras stand away."""
     centers = np.stack([camera.center.double().numpy() for camera in cameras])
     forward = np.stack([camera.cam_from_world[2, :3].double().numpy() for camera in cameras])
     target, radius = _ball(centers, forward)
     generator = np.random.default_rng(SEED)
-    directions = generator.normal(size=(count, 3))
+    directions = generator.normal(size=(SPHERE_COUNT, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    distances = radius * generator.uniform(size=(count, 1)) ** (1 / 3)
-    return RawPoints.from_arrays(target + distances * directions, np.full((count, 3), GREY))
+    distances = radius * generator.uniform(size=(SPHERE_COUNT, 1)) ** (1 / 3)
+    return RawPoints.from_arrays(target + distances * directions, np.full((SPHERE_COUNT, 3), GREY))
 
 
 def _ball(centers: NDArray[np.float64], forward: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:

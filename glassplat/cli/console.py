@@ -387,15 +387,9 @@ LINE = "loading PyTorch ..."
 """Shown in a terminal only, and gone when the work begins. The cursor stays: Ctrl-C may end the process at once."""
 
 
-def import_now(module: str, console: Console | None = None) -> Any:
-    """A module of `glassplat` that imports PyTorch, imported now if it is not there yet.
-
-    Args:
-        module: its dotted name.
-        console: where the line appears; that of standard error if not given.
-    """
-    console = console or message_console(stderr=True)
-    with _uncollected(), _announced(console, module):
+def import_now(module: str) -> Any:
+    """A module of `glassplat` that imports PyTorch, by its dotted name, imported now if it is not there yet."""
+    with _uncollected(), _announced(message_console(stderr=True), module):
         return importlib.import_module(module)
 
 

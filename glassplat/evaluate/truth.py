@@ -28,7 +28,8 @@ from torch import Tensor
 from glassplat.captures.view import View
 from glassplat.errors import InputError, input_checked
 from glassplat.files.images import image_size, read_image, read_image_float
-from glassplat.files.records import COORDINATE, Field, Flag, Items, Number, Whole, checked, read_json, shown
+from glassplat.files.records import COORDINATE, Field, Flag, Items, Number, Whole, checked, read_json
+from glassplat.options import shown
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,9 @@ from glassplat.files.ply import CHANNEL_PREFIXES, is_channel
 from glassplat.files.writing import atomic_write
 from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.kernels.project.reference import sh_basis
+from glassplat.options import shown
 from glassplat.scene import SH_ZERO
-from glassplat.scene.camera import quat_product, rotation_from_quat
+from glassplat.scene.camera import quat_from_rotation, quat_product, rotation_from_quat
 from glassplat.scene.gaussians import DISC_SCALES, Gaussians
 
 DIRECTIONS = 64
@@ -153,7 +154,7 @@ class GltfReader:
         text, self._buffer = _chunks(data, path)
         document = records.parse_json(text, str(path))
         if not isinstance(document, dict):
-            raise ValueError(f"{path} holds {records.shown(document)}; expected a glTF document")
+            raise ValueError(f"{path} holds {shown(document)}; expected a glTF document")
         self.document: dict[str, Any] = document
         version = records.checked(document.get("asset"), ASSET, f"asset of {path}")["version"]
         if version.partition(".")[0] != str(VERSION):
@@ -163,7 +164,7 @@ class GltfReader:
         """The list of that name in the document; empty where there is none."""
         found = self.document.get(kind, [])
         if not isinstance(found, list):
-            raise ValueError(f"{kind} of {self.path} is {records.shown(found)}; expected a list")
+            raise ValueError(f"{kind} of {self.path} is {shown(found)}; expected a list")
         return found
 
     def entry(self, kind: str, index: int, fields: Mapping[str, records.Field]) -> dict[str, Any]:
@@ -311,7 +312,7 @@ def _of_matrix(matrix: Tensor, where: str) -> Placement:
     shear = float((unit @ unit.T - torch.eye(3, dtype=torch.float64)).abs().max())
     if not is_affine or not shear < TOLERANCE or float(torch.linalg.det(unit)) < 0:
         raise ValueError(_unlike(where))
-    return _checked(_quat_of(unit), torch.full((3,), scale, dtype=torch.float64), matrix[:3, 3], where)
+    return _checked(quat_from_rotation(unit), torch.full((3,), scale, dtype=torch.float64), matrix[:3, 3], where)
 
 
 def _checked(quat: Tensor, scales: Tensor, shift: Tensor, where: str) -> Placement:
@@ -326,20 +327,6 @@ def _unlike(where: str) -> str:
     return (
         f"{where} skews, mirrors or stretches splats; expected a turn, a shift and one scale: apply the transform first"
     )
-
-
-def _quat_of(rotation: Tensor) -> Tensor:
-    """A quaternion `wxyz` of a rotation: the eigenvector of Bar-Itzhack's matrix (2000), which has no special cases."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
-    rows = [
-        [xx - yy - zz, yx + xy, zx + xz, zy - yz],
-        [yx + xy, yy - xx - zz, zy + yz, xz - zx],
-        [zx + xz, zy + yz, zz - xx - yy, yx - xy],
-        [zy - yz, xz - zx, yx - xy, xx + yy + zz],
-    ]
-    vectors = torch.linalg.eigh(torch.tensor(rows, dtype=torch.float64)).eigenvectors
-    x, y, z, w = vectors[:, -1].tolist()
-    return torch.tensor([w, x, y, z], dtype=torch.float64)
 
 
 EXTENSION = "KHR_gaussian_splatting"

@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from glassplat.options import is_finite, shown
+
 LARGEST_TEXT = 2**28
 """Bytes of a text file; a list of a hundred thousand photographs with their poses has a quarter of it."""
 
@@ -137,7 +139,6 @@ def _too_deep(where: str) -> str:
     return f"{where} is nested more than {DEEPEST} levels deep; expected a file that such a program wrote"
 
 
-LARGEST_SHOWN = 80
 LEAST_WHOLE, MOST_WHOLE = -(2**63), 2**63 - 1
 LARGEST_COORDINATE = 1e12
 """World units. The square of a greater one, and what is summed up of them, does not fit float32."""
@@ -176,7 +177,7 @@ class Number:
     def read(self, value: Any, where: str) -> float:
         """Refuses text and truth values too."""
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not is_number or not (_is_finite(value) and self.least <= value <= self.most and value > self.above):
+        if not is_number or not (is_finite(value) and self.least <= value <= self.most and value > self.above):
             raise mismatch(value, where, self)
         return float(value)
 
@@ -342,17 +343,6 @@ def checked(value: Any, fields: Mapping[str, Field], where: str) -> dict[str, An
 def mismatch(value: Any, where: str, field: Field) -> ValueError:
     """The error of a value that is not what was expected."""
     return ValueError(f"{where} is {shown(value)}; expected {field.expected}")
-
-
-def shown(value: Any) -> str:
-    """A value for a message, cut short."""
-    text = repr(value)
-    return text if len(text) <= LARGEST_SHOWN else f"{text[:LARGEST_SHOWN]}..."
-
-
-def _is_finite(value: float) -> bool:
-    """Also for whole numbers beyond the range of floats, which `math.isfinite` cannot take."""
-    return -1.7e308 < value < 1.7e308
 
 
 def _range_text(least: float, most: float, above: float = -math.inf) -> str:

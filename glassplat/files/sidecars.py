@@ -23,7 +23,8 @@ from glassplat.files import records
 from glassplat.files.images import read_image_float, write_image
 from glassplat.files.writing import atomic_write, make_folder
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
-from glassplat.scene.camera import Camera
+from glassplat.options import shown
+from glassplat.scene.camera import Camera, quat_from_rotation
 from glassplat.scene.corrections import ByPhotograph, Exposures, PoseCorrections
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Environment
@@ -213,7 +214,7 @@ def _load_entries(path: Path) -> list[Any]:
         raise FileNotFoundError(f"no planes file at {path}; expected the planes.json of a run")
     entries = records.read_json(path)
     if not isinstance(entries, list):
-        raise ValueError(f"{path} holds {records.shown(entries)}; expected a list with one object per plane")
+        raise ValueError(f"{path} holds {shown(entries)}; expected a list with one object per plane")
     return entries
 
 
@@ -310,7 +311,7 @@ def read_cameras(path: Path | str) -> list[tuple[str, Camera]]:
     path = Path(path)
     entries = records.read_json(path)
     if not isinstance(entries, list):
-        raise ValueError(f"{path} holds {records.shown(entries)}; expected a list with one object per camera")
+        raise ValueError(f"{path} holds {shown(entries)}; expected a list with one object per camera")
     return [_camera(entry, f"camera {index} in {path}") for index, entry in enumerate(entries, start=1)]
 
 
@@ -388,7 +389,8 @@ def write_colmap(
     images = []
     for number, (name, camera) in enumerate(cameras, start=1):
         lens = f"PINHOLE {camera.width} {camera.height} {camera.fx!r} {camera.fy!r} {camera.cx!r} {camera.cy!r}"
-        pose = " ".join(f"{value:.9f}" for value in (*quat_wxyz(camera), *camera.cam_from_world[:3, 3].tolist()))
+        quat = quat_from_rotation(camera.cam_from_world[:3, :3])
+        pose = " ".join(f"{value:.9f}" for value in (*quat.tolist(), *camera.cam_from_world[:3, 3].tolist()))
         images.append(f"{number} {pose} {lenses.setdefault(lens, len(lenses) + 1)} {name}\n\n")
     points = [
         f"{number} {x:.9g} {y:.9g} {z:.9g} {r} {g} {b} 0\n"
@@ -398,14 +400,6 @@ def write_colmap(
     _write(folder / "cameras.txt", [f"{number} {lens}\n" for lens, number in lenses.items()])
     _write(folder / "images.txt", images)
     _write(folder / "points3D.txt", points)
-
-
-def quat_wxyz(camera: Camera) -> list[float]:
-    """The camera's orientation, cam from world."""
-    from scipy.spatial.transform import Rotation  # Slow to import, and few runs need it.
-
-    x, y, z, w = Rotation.from_matrix(camera.cam_from_world[:3, :3].double().cpu().numpy()).as_quat().tolist()
-    return [w, x, y, z]
 
 
 def _write(path: Path, lines: list[str]) -> None:

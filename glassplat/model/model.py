@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from PIL import Image
@@ -349,31 +349,7 @@ SETTINGS = "settings.json"
 PANORAMA, ENVIRONMENT = "environment.png", "environment.json"
 
 
-class Savable(Protocol):
-    """Parts of a model that are written."""
-
-    @property
-    def scene(self) -> Scene:
-        """Gaussians and panes."""
-
-    @property
-    def recipe(self) -> Any:
-        """Recipe that renders it."""
-
-    @property
-    def renderer(self) -> Renderer:
-        """The renderer of the recipe."""
-
-    @property
-    def cameras(self) -> Mapping[str, Camera]:
-        """By name."""
-
-    @property
-    def name(self) -> str:
-        """Name of the model."""
-
-
-def save_model(model: Savable, path: Path, *, overwrite: bool) -> Path:
+def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
     """Writes a model in the format that the path's suffix names, see `Model.save`; returns the path.
 
     Raises:
@@ -406,7 +382,7 @@ def save_model(model: Savable, path: Path, *, overwrite: bool) -> Path:
     return path
 
 
-def save_page(model: Savable, path: Path, title: str, *, sharing: Sharing = PRIVATE) -> None:
+def save_page(model: Model, path: Path, title: str, *, sharing: Sharing = PRIVATE) -> None:
     """Writes the page that shows a model with live panes in any browser."""
     with input_checked():
         write_page(path, model.scene, model.renderer, tuple(model.cameras.items()), title, sharing=sharing)
@@ -441,7 +417,7 @@ def write_environment_files(folder: Path, scene: Scene) -> None:
         temporary.write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
 
 
-def write_as_run(folder: Path, model: Savable, source: Path | None) -> None:
+def write_as_run(folder: Path, model: Model, source: Path | None) -> None:
     """Writes a scene as a run that was not trained; the record comes last, so that a part of one is none.
 
     What comes of a run knows its capture, as far as the run does.
@@ -462,7 +438,7 @@ def write_as_run(folder: Path, model: Savable, source: Path | None) -> None:
     write_text(folder / "recipe.json", recipe_to_json(model.recipe))
 
 
-def save_folder(model: Savable, folder: Path) -> Path:
+def save_folder(model: Model, folder: Path) -> Path:
     """Writes a model as a run of its own, whose tensors are loaded bit for bit; returns the folder.
 
     Raises:
@@ -470,7 +446,7 @@ def save_folder(model: Savable, folder: Path) -> Path:
     """
     if os.path.lexists(folder) and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder} is already there and not empty; nothing was written. Choose a new folder")
-    write_as_run(folder, model, getattr(model, "path", None))
+    write_as_run(folder, model, model.path)
     return folder
 
 

@@ -367,9 +367,12 @@ def _far_apart(positions: Array, values: Array, count: int) -> list[int]:
     return chosen
 
 
-def plane_candidates(
-    points: Array, views: Sequence[PaneView], *, band: float, agreement: float = 0.5
-) -> NDArray[np.bool_]:
+CANDIDATE_AGREEMENT = 0.5
+"""Share of the views whose image holds a point in which it must lie along the edge. Not all: something may stand before
+the edge."""
+
+
+def plane_candidates(points: Array, views: Sequence[PaneView], *, band: float) -> NDArray[np.bool_]:
     """[N] bool: which points lie along the pane's edge (TR-Gaussians, Appendix A, steps 1 and 2).
 
     A point on the frame projects close to the mask's edge in every view; a point before or behind
@@ -379,17 +382,17 @@ def plane_candidates(
         points: [N, 3] world positions.
         views: annotated views of the pane.
         band: half width of the band along the mask's edge, as a share of the image diagonal.
-        agreement: share of the views whose image holds the point in which it must lie in the band.
-            Not all of them, since something may stand before the edge.
     """
     votes, held_count = np.zeros(len(points)), np.zeros(len(points))
     for view in views:
         pixels, held = view.project(points)
         votes[held] += np.abs(view.edge_distance(pixels[held])) <= band * view.diagonal
         held_count += held
-    return (votes >= min(2, len(views))) & (votes >= agreement * held_count)
+    return (votes >= min(2, len(views))) & (votes >= CANDIDATE_AGREEMENT * held_count)
 
 
+RAYS_PER_VIEW = 400
+"""Pixels of each mask that are followed into the others."""
 UNKNOWN_WEIGHT = 0.05
 """Weight of what leaves the other image, against planes on which hardly anything can be compared."""
 
@@ -409,7 +412,7 @@ def meet(planes: PlaneEquations, origin: Array, directions: Array) -> tuple[Arra
     return origin + np.where(hit, along, 0)[..., None] * directions, hit
 
 
-def mask_agreement(planes: PlaneEquations, views: Sequence[PaneView], *, pixels_per_view: int = 400) -> Array:
+def mask_agreement(planes: PlaneEquations, views: Sequence[PaneView], *, pixels_per_view: int = RAYS_PER_VIEW) -> Array:
     """[H] how well the masks agree on each plane: intersection over union, pooled over pairs of views.
 
     Args:
@@ -422,9 +425,9 @@ def mask_agreement(planes: PlaneEquations, views: Sequence[PaneView], *, pixels_
     return agreement
 
 
-def agreement_of_each(plane: PlaneEquations, views: Sequence[PaneView], *, pixels_per_view: int = 400) -> Array:
+def agreement_of_each(plane: PlaneEquations, views: Sequence[PaneView]) -> Array:
     """[V] how well the mask of each view agrees with those of all others on one plane; as `mask_agreement`."""
-    both, either = (pairs[..., 0] + pairs[..., 0].T for pairs in _overlaps(plane, views, pixels_per_view))
+    both, either = (pairs[..., 0] + pairs[..., 0].T for pairs in _overlaps(plane, views, RAYS_PER_VIEW))
     agreement: Array = both.sum(axis=1) / np.maximum(either.sum(axis=1), 1)
     return agreement
 

@@ -17,7 +17,7 @@ from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene import logit
-from glassplat.scene.camera import Camera, mirror_matrices
+from glassplat.scene.camera import Camera, mirror_matrices, quat_from_rotation
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes, crosses_pane, in_image
 from glassplat.scene.scene import Scene
@@ -30,9 +30,11 @@ OPAQUE_SHEET = 0.9
 """Opacity of discs that cover a pane which nobody trains."""
 
 
-def glass_gaussians(
-    planes: Planes, *, count: int = 1000, seed: int = 0, opacity: float = 0.5, mark: float = 0.99
-) -> Gaussians:
+MARK = 0.99
+"""m of glass that nobody has trained; the paper's 1 has no finite logit."""
+
+
+def glass_gaussians(planes: Planes, *, count: int = 1000, seed: int = 0, opacity: float = 0.5) -> Gaussians:
     """Glass Gaussians on every pane's rectangle.
 
     They are spread by a scrambled Sobol sequence, so that chance leaves no holes. At the default
@@ -44,7 +46,6 @@ def glass_gaussians(
         count: Gaussians on each pane.
         seed: of the places.
         opacity: of each Gaussian, in (0, 1).
-        mark: m of each Gaussian, in (0, 1); the paper's 1 has no finite logit.
     """
     panes = [_pane_discs(planes, index, count=count, seed=seed) for index in range(len(planes))]
     if not panes:
@@ -57,7 +58,7 @@ def glass_gaussians(
         log_scales=log_scales,
         logit_opacities=torch.full((number,), logit(opacity)),
         sh=torch.zeros(number, 0, 3),
-        channels={"logit_mark": torch.full((number,), logit(mark))},
+        channels={"logit_mark": torch.full((number,), logit(MARK))},
     ).to(planes.centers.device)
 
 
@@ -99,10 +100,7 @@ def _pane_discs(planes: Planes, index: int, *, count: int, seed: int) -> tuple[T
     means = planes.centers[index].detach().cpu() + in_plane @ torch.stack([tangent, bitangent])
 
     frame = torch.stack([tangent, bitangent, planes.normals[index].detach().cpu()], dim=1)
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(frame.double().numpy()).as_quat()
-    quat = torch.tensor([w, x, y, z], dtype=torch.float32)
+    quat = quat_from_rotation(frame).float()
     along = OVERLAP * math.sqrt(float(4 * half.prod()) / count)
     log_scales = torch.tensor([along, along, THICKNESS * along]).log()
     return means, quat.repeat(len(means), 1), log_scales.repeat(len(means), 1)
@@ -209,13 +207,6 @@ def reduced_photograph(scene: Scene, view: View) -> Photograph:
     if labels is not None:
         labels = torch.nn.functional.interpolate(labels[None, None].float(), size, mode="nearest-exact")[0, 0]
     return Photograph(camera.resized(size[1], size[0]), pixels, told == 1, labels)
-
-
-def mirror_labels(scene: Scene, views: Sequence[View]) -> tuple[int, ...]:
-    """Labels of the panes that are mirrors; see `judged_pane`."""
-    photographs = photographs_of(scene, views)
-    judged = {label: judged_pane(scene, label, photographs) for label in scene.planes.labels}
-    return tuple(label for label, found in judged.items() if found.is_mirror)
 
 
 def judged_pane(scene: Scene, label: int, photographs: Sequence[Photograph]) -> JudgedPane:

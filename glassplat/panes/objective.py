@@ -362,6 +362,7 @@ class JointObjective:
         return mean
 
 
+OUTLINE_PIXELS = 4000  # Of the mask of each view, that are followed onto the plane.
 CELLS = 128  # Along the longer side of the map of the plane.
 GRAZING = 0.06  # Cosine to the normal below which a pixel covers too much of the plane to say where the pane ends.
 SMALLEST_PART = 0.05  # Of the largest connected part; below it a part is an error in a mask.
@@ -397,9 +398,9 @@ def pane_rectangle(plane: PlaneEquations, views: Sequence[PaneView], axes: Array
     return min_area_rectangle(grid[_without_specks(inside.reshape(grid.shape[:2]))])
 
 
-def _pixels_on_plane(plane: PlaneEquations, view: PaneView, count: int = 4000) -> Array:
+def _pixels_on_plane(plane: PlaneEquations, view: PaneView) -> Array:
     """[P, 3] where the plane is seen through the pixels of a mask."""
-    pixels = view.grid(count)
+    pixels = view.grid(OUTLINE_PIXELS)
     directions = view.directions(pixels[view.covers(pixels, np.ones(len(pixels), dtype=bool))])
     points, hit = meet(plane, view.center, directions)
     return points[0, hit[0]]

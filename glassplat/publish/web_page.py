@@ -29,11 +29,11 @@ from glassplat.files.writing import atomic_write
 from glassplat.kernels.environment import cube_lookup
 from glassplat.render.frame import NEAR_PER_EXTENT, Renderer
 from glassplat.render.layers import contributions
-from glassplat.render.panes import glass_owners, nearest_hits, panes_in_camera
+from glassplat.render.panes import nearest_hits, panes_in_camera
 from glassplat.render.traced import traced_colors
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.panes import Planes
+from glassplat.scene.panes import Planes, nearest_panes
 from glassplat.scene.scene import Scene, without_glass
 
 COUNT = 24
@@ -379,7 +379,7 @@ def channel_bytes(scene: Scene) -> tuple[bytes, list[float]]:
     step = (high - low) / 255
     intensities = torch.round((logs - low) / (step or 1)).clamp(0, 255)
     marks = torch.round(255 * torch.sigmoid(scene.glass.channels["logit_mark"]))
-    owners = glass_owners(scene.glass, scene.planes) if len(scene.planes) else torch.zeros(len(scene.glass))
+    owners = nearest_panes(scene.glass.means, scene.planes) if len(scene.planes) else torch.zeros(len(scene.glass))
     parts = [part.to(torch.uint8).numpy().tobytes() for part in (intensities, marks, owners)]
     return b"".join(parts), [low, step]
 

@@ -111,16 +111,6 @@ def _joined_windows(hits: list[PaneHits]) -> Tensor:
     return torch.where(empty.all(dim=0), 0, joined)
 
 
-@torch.no_grad()
-def glass_owners(glass: Gaussians, planes: Planes) -> Tensor:
-    """[M] the plane whose rectangle is nearest to each glass Gaussian, position in `planes`."""
-    offsets = glass.means[:, None] - planes.centers
-    along = torch.stack([(offsets * axis).sum(-1) for axis in planes.axes()], dim=-1)
-    outside = (along.abs() - planes.half_sizes).clamp(min=0)
-    across = (offsets * planes.normals).sum(-1, keepdim=True)
-    return torch.cat([outside, across], dim=-1).square().sum(-1).argmin(dim=1)
-
-
 def project_mirrored(
     gaussians: Gaussians, camera: Camera, seen: SeenPanes, *, near: float, total: GradientSum | None = None
 ) -> Projected:

@@ -35,7 +35,6 @@ from glassplat.render.panes import (
     Glazed,
     SeenPanes,
     curves,
-    glass_owners,
     glazed,
     nearest_hits,
     own_masks,
@@ -49,6 +48,7 @@ from glassplat.render.splat import WithNormals
 from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import Exposures
 from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.panes import nearest_panes
 from glassplat.scene.scene import Scene
 
 DEPTH_CHANNEL = 3
@@ -288,7 +288,7 @@ class Planar:
         """[H, W] for each of `seen.order`: how much of that pane is visible."""
         if len(seen.order) == 1:
             return [first.mask]
-        owners = glass_owners(scene.glass, scene.planes)
+        owners = nearest_panes(scene.glass.means, scene.planes)
         own = own_masks(seen, first.splats, first.marks, owners, (camera.height, camera.width))
         return visibilities(seen, first.mask, own)
 

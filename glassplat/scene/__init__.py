@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 SH_ZERO = 0.28209479177387814
 """Value of the constant spherical harmonic: a colour is 0.5 more than its raw coefficient times this."""
@@ -11,3 +13,15 @@ SH_ZERO = 0.28209479177387814
 def logit(share: float) -> float:
     """The raw parameter whose sigmoid is `share`, strictly between 0 and 1."""
     return math.log(share / (1 - share))
+
+
+def among_known(tensors: Mapping[str, Any], known: Iterable[str], owner: str) -> dict[str, Any]:
+    """The tensors by name, all of which the `owner` has.
+
+    Raises:
+        ValueError: a name is not among those that are `known`.
+    """
+    unknown = set(tensors) - set(known)
+    if unknown:
+        raise ValueError(f"unknown tensors {sorted(unknown)}; {owner} have {sorted(known)}")
+    return dict(tensors)

@@ -50,6 +50,14 @@ def rotation_from_quat(quats: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).reshape(*quats.shape[:-1], 3, 3)
 
 
+def quat_from_rotation(rotation: Tensor) -> Tensor:
+    """One of the two unit quaternions [4], `wxyz`, of a rotation [3, 3]; float64, on the CPU, without a gradient."""
+    from scipy.spatial.transform import Rotation  # Slow to import, and few runs need it.
+
+    x, y, z, w = Rotation.from_matrix(rotation.detach().double().cpu().numpy()).as_quat().tolist()
+    return torch.tensor([w, x, y, z], dtype=torch.float64)
+
+
 def quat_product(left: Tensor, right: Tensor) -> Tensor:
     """Quaternions [..., 4], `wxyz`, of the rotations by `right` followed by `left`."""
     left_real, left_vector = left[..., :1], left[..., 1:]
@@ -183,18 +191,6 @@ class Camera:
         return replace(
             self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
         )
-
-    def ray_directions(self) -> Tensor:
-        """[H, W, 3] unit world-space directions through the pixel centres."""
-        matrix = self.cam_from_world
-        x = (torch.arange(self.width, dtype=matrix.dtype, device=matrix.device) + 0.5 - self.cx) / self.fx
-        y = (torch.arange(self.height, dtype=matrix.dtype, device=matrix.device) + 0.5 - self.cy) / self.fy
-        in_camera = torch.stack(
-            [x.expand(self.height, -1), y[:, None].expand(-1, self.width), torch.ones_like(x).expand(self.height, -1)],
-            dim=-1,
-        )
-        in_world = in_camera @ matrix[:3, :3]
-        return in_world / in_world.norm(dim=-1, keepdim=True)
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Pixel positions [P, 2] and depths [P] (camera z) of world points [P, 3]."""

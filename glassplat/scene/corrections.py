@@ -11,6 +11,7 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
+from glassplat.scene import among_known
 from glassplat.scene.camera import Camera
 
 
@@ -86,10 +87,8 @@ class ByPhotograph:
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Self:
         """The same with its tensors replaced by name."""
-        unknown = set(tensors) - {self.TENSOR}
-        if unknown:
-            raise ValueError(f"unknown tensors {sorted(unknown)}; {type(self).__name__} has {self.TENSOR}")
-        return replace(self, values=tensors.get(self.TENSOR, self.values))
+        known = among_known(tensors, self.tensors(), "these corrections")
+        return replace(self, values=known.get(self.TENSOR, self.values))
 
     def to(self, device: torch.device | str) -> Self:
         """The same on another device."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
+
+from glassplat.scene import among_known
 
 DISC_SCALES = 2
 """Scales of a disc; an ellipsoid has one more."""
@@ -79,12 +81,9 @@ class Gaussians:
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Gaussians:
         """The same set with some tensors, channels included, replaced by name."""
-        unknown = set(tensors) - set(self.tensors())
-        if unknown:
-            raise ValueError(f"unknown tensors {sorted(unknown)}; this set has {sorted(self.tensors())}")
-        merged = self.tensors() | dict(tensors)
-        channels = {name: merged.pop(name) for name in self.channels}
-        return Gaussians(**merged, channels=channels, active_sh_degree=self.active_sh_degree)
+        changed = among_known(tensors, self.tensors(), "these Gaussians")
+        channels = {name: changed.pop(name, tensor) for name, tensor in self.channels.items()}
+        return replace(self, **changed, channels=channels)
 
     def select(self, index: Tensor) -> Gaussians:
         """The Gaussians at `index` (a boolean mask [N] or integer indices)."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from glassplat.scene import among_known
 from glassplat.scene.camera import Camera, constant
 
 LEAST_SINE = 1e-6
@@ -102,10 +103,7 @@ class Planes:
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Planes:
         """The same planes with some tensors replaced by name."""
-        unknown = set(tensors) - set(self.tensors())
-        if unknown:
-            raise ValueError(f"unknown tensors {sorted(unknown)}; planes have {sorted(self.tensors())}")
-        return Planes(**(self.tensors() | dict(tensors)), labels=self.labels, mirrors=self.mirrors)
+        return replace(self, **among_known(tensors, self.tensors(), "planes"))
 
     def select(self, rows: Sequence[int]) -> Planes:
         """The planes at the given positions, in that order."""
@@ -210,6 +208,24 @@ def _coplanar(planes: Planes, one: int, other: int) -> bool:
     angle = torch.linalg.cross(normals[0], normals[1]).norm().clamp(max=1).asin()
     offset = (normals @ between).abs().amax()
     return bool(angle <= LARGEST_ANGLE) and bool(offset <= LARGEST_OFFSET * planes.half_sizes[[one, other]].amax())
+
+
+def rectangle_offsets(points: Tensor, planes: Planes) -> Tensor:
+    """[N, K, 3] how far points [N, 3] lie beyond the sides of each rectangle, and off its plane; world units.
+
+    The length of a row is the distance from the rectangle.
+    """
+    offsets = points[:, None] - planes.centers
+    along = torch.stack([(offsets * axis).sum(-1) for axis in planes.axes()], dim=-1)
+    outside = (along.abs() - planes.half_sizes).clamp(min=0)
+    across = (offsets * planes.normals).sum(-1, keepdim=True)
+    return torch.cat([outside, across], dim=-1)
+
+
+@torch.no_grad()
+def nearest_panes(points: Tensor, planes: Planes) -> Tensor:
+    """[N] the plane whose rectangle is nearest to each of the points [N, 3], position in `planes`."""
+    return rectangle_offsets(points, planes).square().sum(-1).argmin(dim=1)
 
 
 @torch.no_grad()

@@ -10,13 +10,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from glassplat.scene import among_known
 from glassplat.scene.camera import quat_product, rotation_from_quat
 from glassplat.scene.corrections import Direction, Exposures, PoseCorrections
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.panes import PANE_TENSORS, Planes
+from glassplat.scene.panes import PANE_TENSORS, Planes, nearest_panes
 
 ENVIRONMENT_TENSORS = ("raw",)
 FACES = 6
+NOISE = 5.0
+"""Of the logits of an environment before training."""
 
 
 @dataclass(frozen=True)
@@ -60,10 +63,7 @@ class Environment:
 
     def with_tensors(self, tensors: Mapping[str, Tensor]) -> Environment:
         """The same environment with its tensors replaced by name."""
-        unknown = set(tensors) - set(self.tensors())
-        if unknown:
-            raise ValueError(f"unknown tensors {sorted(unknown)}; an environment has {sorted(self.tensors())}")
-        return replace(self, raw=tensors.get("raw", self.raw))
+        return replace(self, **among_known(tensors, ENVIRONMENT_TENSORS, "environments"))
 
     def to(self, device: torch.device | str) -> Environment:
         """The same environment on another device."""
@@ -75,8 +75,8 @@ class Environment:
         return Environment(torch.zeros(FACES, 0, 0, 3))
 
     @staticmethod
-    def random(size: int, *, generator: torch.Generator, spread: float = 5.0) -> Environment:
-        """Noise to start training from: raw values uniform in [-spread, spread], on the generator's device.
+    def random(size: int, *, generator: torch.Generator) -> Environment:
+        """Noise to start training from: raw values uniform in [-NOISE, NOISE], on the generator's device.
 
         Raises:
             ValueError: the size is below 1.
@@ -84,7 +84,7 @@ class Environment:
         if size < 1:
             raise ValueError(f"the environment's size is {size}; expected at least 1 texel along a face")
         uniform = torch.rand(FACES, size, size, 3, generator=generator, device=generator.device)
-        return Environment((2 * uniform - 1) * spread)
+        return Environment((2 * uniform - 1) * NOISE)
 
 
 GAUSSIAN_SETS = ("primary", "glass", "surroundings", "photographer")
@@ -307,8 +307,7 @@ def moved(scene: Scene, label: int, turn: Sequence[float], step: Sequence[float]
 
 def glass_of_pane(scene: Scene, row: int) -> Tensor:
     """[N] bool: the glass Gaussians that are nearer to this pane's rectangle than to any other."""
-    distances = torch.stack([_distances(scene.planes, k, scene.glass) for k in range(len(scene.planes))])
-    return distances.argmin(dim=0) == row
+    return nearest_panes(scene.glass.means, scene.planes) == row
 
 
 def row_of(planes: Planes, label: int) -> int:
@@ -344,16 +343,6 @@ def _translated(scene: Scene, row: int, step: Tensor) -> Scene:
     placed = torch.where(glass_of_pane(scene, row)[:, None], means + step.to(means), means)
     planes = scene.planes.with_tensors({"centers": centers})
     return replace(scene, glass=scene.glass.with_tensors({"means": placed}), planes=planes)
-
-
-def _distances(planes: Planes, row: int, glass: Gaussians) -> Tensor:
-    """[N] distance of every glass Gaussian's centre from one rectangle; world units."""
-    offsets = glass.means - planes.centers[row].to(glass.means)
-    inside = torch.zeros_like(offsets)
-    for axes, half in zip(planes.axes(), planes.half_sizes[row].tolist(), strict=True):
-        axis = axes[row].to(offsets)
-        inside = inside + (offsets @ axis).clamp(-half, half)[:, None] * axis
-    return (offsets - inside).norm(dim=1)
 
 
 def _with_row(vectors: Tensor, row: int, rotation: Tensor) -> Tensor:

@@ -282,8 +282,8 @@ class PerturbOpacity:
     """Adds noise to the opacity of what is seen through a pane (TR-Gaussians, Section III-C3)."""
 
     when: Every
-    amplitude: float = 0.4
-    bounds: tuple[float, float] = (0.01, 0.99)
+    amplitude: float
+    bounds: tuple[float, float]
     name: str = "perturb opacity"
 
     def due(self, clock: Clock) -> bool:

@@ -16,7 +16,6 @@ from functools import cache
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from glassplat.captures.view import PointCloud
@@ -30,7 +29,6 @@ from glassplat.training.options import DefaultDensify, McmcDensify
 NEIGHBOURS = 3
 SMALLEST_SCALE = 1e-6
 """Floor of the standard deviation, as a share of the cloud's size: points that coincide would have none."""
-MORTON_BITS = 21
 
 
 def gaussians_from_points(
@@ -60,8 +58,9 @@ def gaussians_from_points(
         raise ValueError(f"sh_degree is {sh_degree} and opacity {opacity}; expected 0..3 and a number between 0 and 1")
     if not spread > 0:
         raise ValueError(f"spread is {spread}; expected a positive share of the distance between points")
-    order = torch.from_numpy(morton_order(points.positions.numpy()))
-    means = points.positions[order].clone()
+    # In float64, so that the size of the cloud is not rounded.
+    order = in_morton_order(points.positions.double()).source
+    means = points.positions[order]
     count, device = len(points), means.device
     sh = torch.zeros(count, (sh_degree + 1) ** 2, 3, device=device)
     sh[:, 0] = (points.colors[order].float() / 255 - 0.5) / SH_ZERO
@@ -81,26 +80,6 @@ def as_discs(spheres: Gaussians, *, seed: int = 0) -> Gaussians:
     quats = torch.randn(spheres.quats.shape, generator=generator).to(spheres.quats)
     log_scales = spheres.log_scales[:, :DISC_SCALES].contiguous()
     return replace(spheres, quats=torch.nn.functional.normalize(quats, dim=1), log_scales=log_scales)
-
-
-def morton_order(positions: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Indices [P] that sort points [P, 3] along a Z-order curve over their bounding box; ties keep their order."""
-    low = positions.min(axis=0).astype(np.float64)
-    size = float((positions.max(axis=0) - low).max()) or 1.0
-    cells = ((positions - low) / size * (2**MORTON_BITS - 1)).astype(np.uint64)
-    codes = _spread(cells[:, 0]) | (_spread(cells[:, 1]) << np.uint64(1)) | (_spread(cells[:, 2]) << np.uint64(2))
-    return np.argsort(codes, kind="stable")
-
-
-def _spread(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Move bit i of 21-bit values to bit 3 i."""
-    steps = (
-        (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    )  # fmt: skip
-    for shift, mask in steps:
-        values = (values | (values << np.uint64(shift))) & np.uint64(mask)
-    return values
 
 
 def _spacing(means: Tensor) -> Tensor:
@@ -178,32 +157,33 @@ def clone(count: int, index: Tensor) -> Edit:
     return Edit(source, torch.arange(source.shape[0], device=index.device) >= count)
 
 
+CHILDREN = 2
+"""Gaussians that take the place of one that is split."""
+SHRINK = 1.6
+"""Factor by which their axes are shorter."""
+
+
 @torch.no_grad()
-def split(
-    gaussians: Gaussians, index: Tensor, *, generator: torch.Generator, children: int = 2, shrink: float = 1.6
-) -> Edit:
+def split(gaussians: Gaussians, index: Tensor, *, generator: torch.Generator) -> Edit:
     """Replaces each Gaussian in `index` [I] by smaller ones drawn from it (3DGS, Section 5.2).
 
-    The survivors come first, in their order; then the first child of every parent, the second of
-    every parent, and so on.
+    The survivors come first, in their order; then the first child of every parent and the second of every parent.
 
     Args:
         gaussians: the set that is edited.
         index: rows to split, each at most once.
         generator: source of the children's positions, on the device of `gaussians`.
-        children: how many take the place of one parent.
-        shrink: factor by which a child's axes are shorter than its parent's.
     """
     count = len(gaussians)
     survives = torch.ones(count, dtype=torch.bool, device=index.device)
     survives[index] = False
-    parents = index.repeat(children)
+    parents = index.repeat(CHILDREN)
     source = torch.cat([survives.nonzero().squeeze(1), parents])
     fresh = torch.arange(source.shape[0], device=index.device) >= count - index.shape[0]
 
     means, log_scales = gaussians.means[source], gaussians.log_scales[source]
     means[fresh] += _drawn_offsets(gaussians.quats[parents], gaussians.deviations[parents], generator)
-    log_scales[fresh] -= math.log(shrink)
+    log_scales[fresh] -= math.log(SHRINK)
     return Edit(source, fresh, {"means": means, "log_scales": log_scales})
 
 
@@ -239,9 +219,9 @@ def apply_edit(
 
 @torch.no_grad()
 def append(
-    gaussians: Gaussians, moments: Moments, new: Gaussians, *, part: str = "primary"
+    gaussians: Gaussians, moments: Moments, new: Gaussians
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
-    """The Gaussians followed by `new` ones, whose moments are zero.
+    """The primary Gaussians followed by `new` ones, whose moments are zero.
 
     Raises:
         ValueError: the two sets do not hold the same tensors.
@@ -252,9 +232,9 @@ def append(
     joined = gaussians.with_tensors({name: torch.cat([old_tensors[name], new_tensors[name]]) for name in old_tensors})
 
     def extended(name: str, moment: Tensor) -> Tensor:
-        return torch.cat([moment, torch.zeros_like(new_tensors[name.removeprefix(f"{part}.")])])
+        return torch.cat([moment, torch.zeros_like(new_tensors[name.removeprefix("primary.")])])
 
-    owned = {f"{part}.{name}" for name in old_tensors}
+    owned = {f"primary.{name}" for name in old_tensors}
     return joined, {
         name: (extended(name, m), extended(name, v)) if name in owned else (m, v) for name, (m, v) in moments.items()
     }
@@ -467,7 +447,6 @@ def resampled(
     *,
     cap: int,
     generator: torch.Generator,
-    part: str = "primary",
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
     """A set of Gaussians and their moments after relocation and growth; what it renders stays nearly the same.
 
@@ -476,14 +455,13 @@ def resampled(
 
     Args:
         options: when and how.
-        gaussians: the set to edit.
+        gaussians: the primary ones.
         moments: optimiser moments by dotted name; those of other parts pass through.
         cap: largest number of Gaussians to grow to; a set that is larger stays as large.
         generator: source of randomness, on the device of `gaussians`.
-        part: the scene part that `gaussians` is.
     """
-    relocated, moments = apply_edit(gaussians, moments, relocation(options, gaussians, generator), part=part)
-    return apply_edit(relocated, moments, addition(options, relocated, cap, generator), part=part)
+    relocated, moments = apply_edit(gaussians, moments, relocation(options, gaussians, generator))
+    return apply_edit(relocated, moments, addition(options, relocated, cap, generator))
 
 
 def relocation(options: McmcDensify, gaussians: Gaussians, generator: torch.Generator) -> Edit:
@@ -616,8 +594,8 @@ def perturb_opacities(
     selected: Tensor,
     *,
     generator: torch.Generator,
-    amplitude: float = 0.4,
-    bounds: tuple[float, float] = (0.01, 0.99),
+    amplitude: float,
+    bounds: tuple[float, float],
 ) -> Gaussians:
     """Adds uniform noise to the opacity of the Gaussians that are seen through a pane.
 

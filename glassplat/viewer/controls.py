@@ -255,9 +255,7 @@ class MeasureControls:
         if not self._on.value or self._is_listening:
             return
         self._is_listening = True
-        scene = self._handle.scene
-        # Before 1.1, viser had one way to hear of clicks and drawn rectangles.
-        register = scene.on_click() if hasattr(scene, "on_click") else scene.on_pointer_event("click")
+        register = self._handle.scene.on_click()
         register(survived(lambda event: clicked(np.array(event.ray_direction)) if self._on.value else None))
 
     def _distance(self) -> str:

@@ -14,7 +14,7 @@ from torch import Tensor
 from glassplat.render.frame import Frame, Renderer
 from glassplat.render.layers import error_colors, layer_image
 from glassplat.render.planar import PHOTOGRAPHED
-from glassplat.scene.camera import Camera, rotation_from_quat
+from glassplat.scene.camera import Camera, quat_from_rotation, rotation_from_quat
 from glassplat.scene.scene import Scene, as_mirrors, moved, with_reflectance, without_glass
 
 
@@ -26,10 +26,8 @@ def matrix_of(wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def wxyz_of(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """[4] of a rotation [3, 3], with w >= 0."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(matrix).as_quat(canonical=True)
-    return np.array([w, x, y, z])
+    quat: NDArray[np.float64] = quat_from_rotation(torch.from_numpy(matrix)).numpy()
+    return quat if quat[0] >= 0 else -quat
 
 
 Photograph = Callable[[], Tensor]

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -39,24 +39,10 @@ WAITING = ("Drawing", "The first picture may take a minute or two: kernels are c
 """Title and text of what stands there until there is a picture."""
 
 
-class Host(Protocol):
-    """Requirements of a client on the viewer."""
-
-    shown: Shown
-    viewpoints: Viewpoints
-    loop: RenderLoop[Wish]
-    focus: NDArray[np.float64]
-    first: int
-
-    @property
-    def buttons(self) -> Any:
-        """Further buttons by what is written on them."""
-
-
 class Client:
     """One browser."""
 
-    def __init__(self, handle: Any, viewer: Host) -> None:
+    def __init__(self, handle: Any, viewer: Viewer) -> None:
         """Lays out the controls and goes to the first view; `ask` is for who has made it."""
         self._handle, self._viewer = handle, viewer
         self._status, self._nearest = "", viewer.first

@@ -24,10 +24,10 @@ from glassplat.options import (
     as_typed,
     check_options,
     expectation,
-    number_fields,
     options_from_json,
     unwrapped,
 )
+from tests.methods.number_fields import number_fields
 
 
 @dataclass(frozen=True)

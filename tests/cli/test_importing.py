@@ -18,6 +18,12 @@ def terminal() -> Console:
     return Console(file=io.StringIO(), force_terminal=True, legacy_windows=False, _environ={"TERM": "xterm"})
 
 
+def standard_error(monkeypatch: pytest.MonkeyPatch, console: Console) -> Console:
+    """The console, on which from now on appears what is written for standard error."""
+    monkeypatch.setattr("glassplat.cli.console.message_console", lambda *, stderr: console)
+    return console
+
+
 def shown(console: Console) -> str:
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
@@ -25,28 +31,28 @@ def shown(console: Console) -> str:
 
 def test_a_terminal_shows_a_line_that_is_gone_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, MODULE, raising=False)
-    console = terminal()
-    assert import_now(MODULE, console).__name__ == MODULE
+    console = standard_error(monkeypatch, terminal())
+    assert import_now(MODULE).__name__ == MODULE
     assert shown(console) == f"{LINE}\r\x1b[2K"
 
 
-def test_what_is_there_is_not_announced() -> None:
-    console = terminal()
-    assert import_now("glassplat.cli.console", console).LINE is LINE
+def test_what_is_there_is_not_announced(monkeypatch: pytest.MonkeyPatch) -> None:
+    console = standard_error(monkeypatch, terminal())
+    assert import_now("glassplat.cli.console").LINE is LINE
     assert shown(console) == ""
 
 
 def test_a_file_gets_no_such_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, MODULE, raising=False)
-    console = Console(file=io.StringIO())
-    import_now(MODULE, console)
+    console = standard_error(monkeypatch, Console(file=io.StringIO()))
+    import_now(MODULE)
     assert shown(console) == ""
 
 
-def test_the_line_is_gone_before_an_error_is_printed() -> None:
-    console = terminal()
+def test_the_line_is_gone_before_an_error_is_printed(monkeypatch: pytest.MonkeyPatch) -> None:
+    console = standard_error(monkeypatch, terminal())
     with pytest.raises(ModuleNotFoundError):
-        import_now("glassplat.no_such_module", console)
+        import_now("glassplat.no_such_module")
     assert shown(console).endswith("\x1b[2K")
 
 
@@ -57,5 +63,5 @@ def test_garbage_is_collected_afterwards_as_before(enabled: bool, monkeypatch: p
     for name in ("disable", "freeze", "enable"):
         monkeypatch.setattr(gc, name, lambda name=name: asked.append(name))
     with pytest.raises(ModuleNotFoundError):
-        import_now("glassplat.no_such_module", terminal())
+        import_now("glassplat.no_such_module")
     assert asked == (["disable", "freeze", "enable"] if enabled else [])

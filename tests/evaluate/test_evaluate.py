@@ -12,6 +12,7 @@ from glassplat.errors import InputError
 from glassplat.evaluate.evaluate import EvaluatedView, evaluate, peak_memory_mib
 from glassplat.evaluate.metrics import json_values, plane_table, psnr
 from glassplat.evaluate.truth import load_truth
+from glassplat.render.deferred import view_directions
 from glassplat.render.frame import Frame
 from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import Exposures
@@ -159,7 +160,7 @@ def test_the_first_frame_is_rendered_once_more_than_it_is_timed(case) -> None:
 
 def ball_frame(scene: Scene, camera: Camera) -> Frame:
     """A ball with normals turned by 90 degrees about z, and a strength 0.1 too high."""
-    rays = camera.ray_directions()
+    rays = torch.nn.functional.normalize(view_directions(camera), dim=-1)
     along = -(rays @ camera.center)
     beyond = RADIUS**2 - (camera.center.square().sum() - along.square())
     normals = (camera.center + (along - beyond.clamp(min=0).sqrt())[..., None] * rays) / RADIUS

@@ -18,7 +18,8 @@ from glassplat.errors import InputError
 from glassplat.methods.recipe import RECIPES, recipe_from_json, recipe_of, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory, RunSettings
-from glassplat.options import Range, as_typed, check_options, number_fields, unwrapped
+from glassplat.options import Range, as_typed, check_options, unwrapped
+from tests.methods.number_fields import number_fields
 
 COMMANDS = [Train, Demo, Render, RunSettings]
 DECLARED = [(kind, name, hint) for kind in (*RECIPES.values(), *COMMANDS) for name, hint in number_fields(kind)]

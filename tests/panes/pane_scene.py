@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
+from glassplat.render.deferred import view_directions
 from glassplat.scene.camera import Camera
 from glassplat.scene.panes import Planes
 
@@ -54,7 +55,7 @@ def camera_from(eye: Sequence[float], target: np.ndarray) -> Camera:
 
 def label_image(camera: Camera, panes: Sequence[Pane]) -> torch.Tensor:
     """[H, W] number of the nearest pane through each pixel, counted from 1; 0 where there is none."""
-    rays, eye = camera.ray_directions().numpy(), camera.center.numpy()
+    rays, eye = view_directions(camera).numpy(), camera.center.numpy()
     labels, nearest = np.zeros(rays.shape[:2], dtype=np.uint8), np.full(rays.shape[:2], np.inf)
     for number, pane in enumerate(panes, start=1):
         slope = rays @ pane.normal

@@ -46,9 +46,9 @@ def test_discs_lie_flat_in_the_pane() -> None:
 
 
 def test_glass_has_a_mark_but_no_colour() -> None:
-    glass = glass_gaussians(PLANES, count=50, opacity=0.3, mark=0.9)
+    glass = glass_gaussians(PLANES, count=50, opacity=0.3)
     assert glass.sh.shape == (len(glass), 0, 3)
-    assert torch.sigmoid(glass.channels["logit_mark"]).tolist() == pytest.approx([0.9] * len(glass))
+    assert torch.sigmoid(glass.channels["logit_mark"]).tolist() == pytest.approx([0.99] * len(glass))
     assert torch.sigmoid(glass.logit_opacities).tolist() == pytest.approx([0.3] * len(glass))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -22,7 +23,6 @@ from glassplat.panes.material import (
     glass_gaussians,
     judged_pane,
     likeness,
-    mirror_labels,
     photographs_of,
     reduced_photograph,
     window_sums,
@@ -54,6 +54,13 @@ def photographs(scene: Scene) -> list[View]:
         labels = shown_panes(scene.planes, camera)[0].to(torch.uint8)
         views.append(View.in_memory(f"{x}", camera, photo=photo, pane_labels=labels))
     return views
+
+
+def mirror_labels(scene: Scene, views: Sequence[View]) -> tuple[int, ...]:
+    """Labels of the panes that are mirrors."""
+    photographed = photographs_of(scene, views)
+    judged = {label: judged_pane(scene, label, photographed) for label in scene.planes.labels}
+    return tuple(label for label, found in judged.items() if found.is_mirror)
 
 
 @pytest.mark.parametrize(("base_reflectance", "expected"), [(0.995, (1,)), (0.08, ())])

@@ -12,6 +12,7 @@ from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.kernels.maths.pane import LAWS
 from glassplat.kernels.panes.reference import REFLECTANCE
 from glassplat.options import Blend
+from glassplat.render.deferred import view_directions
 from glassplat.render.planar import Planar, detached
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera, mirror_matrices, rotation_from_quat
@@ -194,7 +195,8 @@ def test_a_pane_behind_the_camera_is_not_hit() -> None:
 def test_the_strength_of_each_pixel_is_that_of_its_angle(fresnel: Fresnel) -> None:
     scene = showcase(planes := pane(2.0, base_reflectance=0.2))
     layers = Planar(fresnel=fresnel)(scene, CAMERA).layers
-    cosine = (CAMERA.ray_directions() @ planes.normals[0]).abs()
+    rays = torch.nn.functional.normalize(view_directions(CAMERA), dim=-1)
+    cosine = (rays @ planes.normals[0]).abs()
     expected = REFLECTANCE[fresnel](planes.base_reflectances[0], cosine)
     torch.testing.assert_close(layers["strength"], layers["mask"] * expected)
     assert float(layers["mask"].max()) > 0.5

@@ -12,10 +12,10 @@ from torch import Tensor
 from glassplat.kernels.maths.images import linear_from_srgb
 from glassplat.options import Blend
 from glassplat.render.layers import contributions
-from glassplat.render.panes import FAINT, curves, glass_owners, nearest_hits, panes_in_camera, seen_panes
+from glassplat.render.panes import FAINT, curves, nearest_hits, panes_in_camera, seen_panes
 from glassplat.render.planar import Planar
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.panes import Planes
+from glassplat.scene.panes import Planes, nearest_panes
 from glassplat.scene.scene import Scene
 from glassplat.training.losses import gradient_conflict
 from tests.render.tiny_scene import camera_at, concatenated, joined, pane, random_gaussians, showcase
@@ -141,7 +141,7 @@ def test_any_number_of_panes_may_stand_one_behind_another(count: int) -> None:
     share = Planar()(scene, CAMERA).layers["share"]
     passed = torch.ones_like(share)
     for k in range(count):
-        own = glass.select(glass_owners(glass, planes) == k)
+        own = glass.select(nearest_panes(glass.means, planes) == k)
         alone = replace(scene, planes=planes.select([k]), glass=own)
         passed = passed * (1 - Planar()(alone, CAMERA).layers["strength"])
     torch.testing.assert_close(1 - share, passed)
@@ -177,7 +177,7 @@ def test_glass_belongs_to_the_pane_it_lies_on() -> None:
     beside = FRONT.with_tensors({"centers": torch.tensor([[5.0, 0.0, 2.0]]), "half_sizes": torch.tensor([[1.0, 1.0]])})
     glass = concatenated(glass_at(2.0, 3), glass_at(4.0, 4))
     planes = joined(BACK, pane(2.0, half=3.0), replace(beside, labels=(3,)))
-    assert glass_owners(glass, planes).tolist() == [1] * 12 + [0] * 12
+    assert nearest_panes(glass.means, planes).tolist() == [1] * 12 + [0] * 12
 
 
 @pytest.mark.parametrize("name", ["planes.centers", "planes.logit_reflectances", "glass.logit_mark", "glass.means"])

@@ -1,5 +1,7 @@
 """Opacity perturbation of what is seen through a pane."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -28,6 +30,7 @@ def camera_at(z: float, *, backwards: bool = False, focal: float = 50.0) -> Came
 
 
 FRONT = camera_at(-2.0)
+PUBLISHED: dict[str, Any] = {"amplitude": 0.4, "bounds": (0.01, 0.99)}
 
 
 @pytest.mark.parametrize(
@@ -79,7 +82,7 @@ def make_gaussians(count: int) -> Gaussians:
 def test_noise_is_uniform_on_the_activated_opacity_of_the_selected() -> None:
     gaussians = make_gaussians(20_000)
     selected = behind_panes(gaussians.means, PANE, [FRONT])
-    after = perturb_opacities(gaussians, selected, generator=torch.Generator().manual_seed(0))
+    after = perturb_opacities(gaussians, selected, generator=torch.Generator().manual_seed(0), **PUBLISHED)
     assert torch.equal(selected, torch.arange(20_000) % 2 == 0)
     noise = torch.sigmoid(after.logit_opacities)[selected] - 0.5
     assert noise.abs().max() <= 0.4 + 1e-6
@@ -92,9 +95,9 @@ def test_opacities_stay_within_bounds_and_finite() -> None:
     gaussians = make_gaussians(1000)
     extreme = gaussians.with_tensors({"logit_opacities": torch.linspace(-60, 60, 1000)})
     selected = behind_panes(extreme.means, PANE, [FRONT])
-    after = perturb_opacities(extreme, selected, generator=torch.Generator().manual_seed(0))
+    after = perturb_opacities(extreme, selected, generator=torch.Generator().manual_seed(0), **PUBLISHED)
     opacities = torch.sigmoid(after.logit_opacities)[selected]
     assert opacities.min() >= 0.01 - 1e-6
     assert opacities.max() <= 0.99 + 1e-6
-    again = perturb_opacities(extreme, selected, generator=torch.Generator().manual_seed(0))
+    again = perturb_opacities(extreme, selected, generator=torch.Generator().manual_seed(0), **PUBLISHED)
     assert torch.equal(again.logit_opacities, after.logit_opacities)

@@ -11,7 +11,7 @@ import torch
 from glassplat.captures.capture import RawPoints
 from glassplat.captures.view import PointCloud
 from glassplat.scene import SH_ZERO
-from glassplat.training.densify import gaussians_from_points, morton_order
+from glassplat.training.densify import gaussians_from_points
 
 
 def cloud(count: int, seed: int = 0) -> PointCloud:
@@ -72,10 +72,10 @@ def interleaved(cell: tuple[int, int, int]) -> int:
 def test_order_follows_the_z_curve(cells: list[tuple[int, int, int]]) -> None:
     corners = [(0, 0, 0), (2**21 - 1,) * 3]  # They make the bounding box the whole grid, so that cells are exact.
     cells = corners + cells
-    order = morton_order(np.array(cells, dtype=np.float32))
-    codes = [interleaved(cells[index]) for index in order]
-    assert codes == sorted(codes)
-    assert sorted(order.tolist()) == list(range(len(cells)))
+    points = PointCloud.of(RawPoints.from_arrays(np.array(cells, np.float64), np.zeros((len(cells), 3))))
+    placed = [tuple(map(int, mean)) for mean in gaussians_from_points(points).means.tolist()]
+    assert [interleaved(cell) for cell in placed] == sorted(map(interleaved, cells))
+    assert sorted(placed) == sorted(cells)
 
 
 def test_the_spread_is_a_share_of_the_distance() -> None:
