@@ -41,7 +41,7 @@ from tests.kernels.cuda.agreement import (
     on_a_device_or_skipped,
     on_device,
 )
-from tests.kernels.gaussians_and_cameras import draw, random_cameras, random_gaussians
+from tests.kernels.gaussians_and_cameras import draw, needle_before_camera, random_cameras, random_gaussians
 
 on_a_device_or_skipped()
 
@@ -67,6 +67,18 @@ def test_project(count: int, cameras: int, degree: int, dtype: torch.dtype) -> N
         close(getattr(found, name), value, 10)
     leaves = [*gaussians, batch.cam_from_world]
     check_gradients(found[:5], expected[:5], [*own, own_batch.cam_from_world], leaves)
+
+
+def test_gradients_of_needles_do_not_cancel_in_single_precision() -> None:
+    found = {}
+    for dtype in (torch.float32, torch.float64):
+        needle, camera = needle_before_camera(0.785, dtype)
+        own, own_camera = on_device(needle), on_device(camera)
+        conics = project_operation.project(own, own_camera, sh_degree=0, near=0.1).conics
+        cotangent = torch.tensor([[[700.0, 650.0, 690.0]]], dtype=dtype, device=DEVICE)
+        found[dtype] = torch.autograd.grad(conics, own[:3], cotangent)
+    for ours, exact in zip(found[torch.float32], found[torch.float64], strict=True):
+        assert (ours - exact).norm() < 1e-3 * exact.norm()
 
 
 def test_project_without_colours_culls_what_is_not_finite() -> None:
