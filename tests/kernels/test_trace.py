@@ -259,10 +259,12 @@ def test_moving_rays_and_gaussians_together_changes_nothing() -> None:
     torch.testing.assert_close(moved.colors, traced(gaussians, rays).colors)
 
 
-def test_the_length_of_a_direction_changes_nothing() -> None:
-    gaussians, rays = cloud(200, DISCS), rays_around(100)
-    longer = traced(gaussians, Rays(rays.origins, 7 * rays.directions))
-    for tensor, other in zip(longer, traced(gaussians, rays), strict=True):
+@pytest.mark.parametrize(("dtype", "factor"), [(torch.float64, 7.0), (torch.float32, 2.0**-61)])
+@pytest.mark.parametrize("scales", [DISCS, ELLIPSOIDS])
+def test_the_length_of_a_direction_changes_nothing(scales: int, dtype: torch.dtype, factor: float) -> None:
+    gaussians, rays = cloud(200, scales, dtype=dtype), rays_around(100, dtype=dtype)
+    other_length = traced(gaussians, Rays(rays.origins, factor * rays.directions))
+    for tensor, other in zip(other_length, traced(gaussians, rays), strict=True):
         torch.testing.assert_close(tensor, other)
 
 
