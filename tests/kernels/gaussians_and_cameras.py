@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -36,6 +38,21 @@ def random_cameras(count: int, *, clip: bool = False, dtype: torch.dtype = torch
     return CameraBatch(
         poses.to(dtype).requires_grad_(), intrinsics.to(dtype), WIDTH, HEIGHT, planes.to(dtype) if clip else None
     )
+
+
+def needle_before_camera(angle: float, dtype: torch.dtype) -> tuple[RawGaussians, CameraBatch]:
+    """One thin Gaussian without colours, at an angle, whose deviation on screen is 300 px; and its camera."""
+    focal, size = 100.0, 96
+    tensors = (
+        torch.tensor([[0.013, -0.021, 1.0]], dtype=torch.float64),
+        torch.tensor([[math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)]], dtype=torch.float64),
+        torch.tensor([[300 / focal, 1e-4, 1e-4]], dtype=torch.float64).log(),
+        torch.tensor([2.0], dtype=torch.float64),
+        torch.zeros(1, 0, 3, dtype=torch.float64),
+    )
+    needle = RawGaussians(*(tensor.to(dtype).requires_grad_() for tensor in tensors))
+    intrinsics = torch.tensor([[focal, focal, size / 2, size / 2]], dtype=dtype)
+    return needle, CameraBatch(torch.eye(4, dtype=dtype)[None].requires_grad_(), intrinsics, size, size)
 
 
 def as_splats(projected: Projected) -> Splats:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -135,6 +136,18 @@ def test_a_surface_deviates_nowhere(random_splats: MakeSplats) -> None:
     assert float(case(composite).deviation.max()) < 1e-12
 
 
+@pytest.mark.parametrize("channels", [1, 6])
+@pytest.mark.parametrize("function", [composite, composite_twin])
+def test_the_deviation_of_a_splat_alone_has_no_gradient(function: Callable[..., Composite], channels: int) -> None:
+    """Where its coverage is small its mean is uncertain, but it has hardly any weight there."""
+    fields = (torch.tensor([20.3, 15.2]), torch.tensor([0.01, 0.0, 0.01]), torch.tensor(0.8), torch.tensor(3.0))
+    splats = Splats(*(field[None, None] for field in fields), torch.full((1, 1, 2), 40.0))
+    values = torch.full((1, 1, channels), 3.1, requires_grad=True)
+    asked = Deviation(channels - 1, torch.ones(1, 36, 44))
+    found = function(splats, values, bin_tiles(splats, 44, 36), deviation=asked)
+    assert float(torch.autograd.grad(found.deviation.sum(), values)[0].abs().sum()) < 1e-3 * float(found.alpha.sum())
+
+
 def test_two_layers_deviate_by_their_weighted_distance_from_the_mean() -> None:
     splats = two_discs(depths=(1.0, 3.0), opacities=(0.5, 0.8))
     bins = bin_tiles(splats, 16, 16)
@@ -181,6 +194,20 @@ def test_a_needle_reaches_all_its_pixels(dtype: torch.dtype) -> None:
     grazed = (expected > 0.98 / 255) & (expected < 1.02 / 255) | (expected == 0) & (found < 1.02 / 255)
     torch.testing.assert_close(found[~grazed], expected[~grazed], atol=1e-4, rtol=1e-3)
     assert int((expected > 0).sum()) > 20_000
+
+
+def test_a_needle_whose_determinant_cancels_in_single_precision_is_drawn() -> None:
+    """Its deviations are 10,000 px and 0.55 px."""
+    angle, length, thickness = 0.3, 1e4, 0.55
+    c, s = math.cos(angle), math.sin(angle)
+    xx, yy = ((x / length) ** 2 + (y / thickness) ** 2 for x, y in ((c, s), (s, c)))
+    conic = torch.tensor([xx, c * s * (length**-2 - thickness**-2), yy])
+    assert not conic[0] * conic[2] - conic[1] * conic[1] > 0
+    fields = torch.tensor([10.0, 9.0]), conic, torch.tensor(0.8), torch.tensor(1.0), torch.tensor([1e4, 1e4])
+    case = blend(Splats(*(field[None, None] for field in fields)), (24, 20))
+    found, expected = with_gradients(case, composite), with_gradients(case, composite_twin)
+    assert float(found["alpha"].max()) > 0.7
+    assert_close(found, expected, 1e-3)
 
 
 def test_a_pile_of_glass_leaves_finite_gradients(random_splats: MakeSplats) -> None:

@@ -14,7 +14,14 @@ from torch import Tensor
 from glassplat.kernels.project import GradientSum, project
 from glassplat.kernels.project.reference import project as reference_project
 from glassplat.kernels.records import CameraBatch, Projected, RawGaussians
-from tests.kernels.gaussians_and_cameras import HEIGHT, WIDTH, draw, random_cameras, random_gaussians
+from tests.kernels.gaussians_and_cameras import (
+    HEIGHT,
+    WIDTH,
+    draw,
+    needle_before_camera,
+    random_cameras,
+    random_gaussians,
+)
 
 NEAR = 0.2
 TOLERANCE = {torch.float32: 5e-6, torch.float64: 1e-12}
@@ -203,6 +210,20 @@ def test_needles_stay_positive_definite_in_single_precision() -> None:
     assert (xx > 0).all()
     assert (yy > 0).all()
     assert (xx * yy - xy * xy > -1e-5 * xx * yy).all()
+
+
+@pytest.mark.parametrize("angle", [0.3, 0.785, 1.2])
+def test_gradients_of_needles_do_not_cancel_in_single_precision(angle: float) -> None:
+    """A splat of 300 px by 0.5 px, whose image turns a lot with its angle."""
+    found = {}
+    for dtype in (torch.float32, torch.float64):
+        needle, camera = needle_before_camera(angle, dtype)
+        conics = project(needle, camera, sh_degree=0, near=NEAR).conics
+        cotangent = torch.tensor([[[700.0, 650.0, 690.0]]], dtype=dtype)
+        inputs = [needle.means, needle.quats, needle.log_scales, camera.cam_from_world]
+        found[dtype] = torch.autograd.grad(conics, inputs, cotangent)
+    for ours, exact in zip(found[torch.float32], found[torch.float64], strict=True):
+        assert_parallel(ours.double(), exact, 1e-3, "gradient")
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -259,11 +259,32 @@ def test_moving_rays_and_gaussians_together_changes_nothing() -> None:
     torch.testing.assert_close(moved.colors, traced(gaussians, rays).colors)
 
 
-def test_the_length_of_a_direction_changes_nothing() -> None:
-    gaussians, rays = cloud(200, DISCS), rays_around(100)
-    longer = traced(gaussians, Rays(rays.origins, 7 * rays.directions))
-    for tensor, other in zip(longer, traced(gaussians, rays), strict=True):
+@pytest.mark.parametrize(("dtype", "factor"), [(torch.float64, 7.0), (torch.float32, 2.0**-61)])
+@pytest.mark.parametrize("scales", [DISCS, ELLIPSOIDS])
+def test_the_length_of_a_direction_changes_nothing(scales: int, dtype: torch.dtype, factor: float) -> None:
+    gaussians, rays = cloud(200, scales, dtype=dtype), rays_around(100, dtype=dtype)
+    other_length = traced(gaussians, Rays(rays.origins, factor * rays.directions))
+    for tensor, other in zip(other_length, traced(gaussians, rays), strict=True):
         torch.testing.assert_close(tensor, other)
+
+
+def far_discs(count: int) -> tuple[RawGaussians, Rays]:
+    """Small opaque discs far from the origin of the world in single precision, and a ray towards each."""
+    generator = torch.Generator().manual_seed(3)
+    draws = torch.randn(3, count, 3, generator=generator, dtype=torch.float64)
+    means = (torch.tensor([1e4, -1e4, 0.7e4]) + 0.05 * draws[0]).float()
+    origins = (means.double() + torch.nn.functional.normalize(draws[1], dim=1)).float()
+    directions = (means.double() + 1e-3 * draws[2] - origins.double()).float()
+    quats = torch.randn(count, 4, generator=generator)
+    discs = means, quats, torch.full((count, 2), math.log(1e-3)), torch.full((count,), 3.0), torch.zeros(count, 1, 3)
+    return RawGaussians(*discs), Rays(origins, directions)
+
+
+def test_boxes_far_from_the_origin_lose_no_hit_to_rounding() -> None:
+    discs, rays = far_discs(400)
+    found, expected = traced(discs, rays, sh_degree=0), twin(discs, rays, None, sh_degree=0, near=0.0)
+    assert int(expected.hits.sum()) > 300
+    assert torch.equal(found.hits, expected.hits)
 
 
 def test_a_hierarchy_of_other_gaussians_is_refused() -> None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
-from glassplat.kernels.maths.projection import vector_maths
+from glassplat.kernels.maths.projection import cross, vector_maths
 
 EDGE_ON = 1e-3
 """Cosine between ray and normal below which a disc is seen from its edge and not met."""
@@ -156,23 +156,13 @@ class DiscMaths(NamedTuple):
     map_gradient: Scalar
 
 
-def cross_maths() -> Scalar:
-    """Builds the cross product of two tuples."""
-
-    @inlined
-    def cross(a, b):  # type: ignore[no-untyped-def]
-        return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-    return cross
-
-
 def disc_maths(real: type) -> DiscMaths:
     """Builds the functions for `real`, np.float32 or np.float64."""
     return DiscMaths(*_shape(real), _map_gradient(real))
 
 
 def _shape(real: type) -> tuple[Scalar, Scalar, Scalar]:
-    dot, cross = vector_maths().dot, cross_maths()
+    dot = vector_maths().dot
     edge_on, largest = real(EDGE_ON), real(np.finfo(real).max)
 
     @inlined
@@ -202,7 +192,7 @@ def _shape(real: type) -> tuple[Scalar, Scalar, Scalar]:
 
 
 def _map_gradient(real: type) -> Scalar:
-    dot, blend, cross = vector_maths().dot, vector_maths().blend, cross_maths()
+    dot, blend = vector_maths().dot, vector_maths().blend
     zero, one = real(0.0), real(1.0)
 
     @inlined

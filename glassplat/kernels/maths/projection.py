@@ -24,6 +24,12 @@ TANGENT_MARGIN = 0.3
 Scalar = Callable[..., Any]
 
 
+@inlined
+def cross(a, b):
+    """The cross product a x b of two tuples."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
 class VectorMaths(NamedTuple):
     """Functions of 3-vectors, which are tuples (x, y, z).
 
@@ -156,8 +162,8 @@ class ScreenMaths(NamedTuple):
         screen_covariance: (xx, xy, yy, determinant), low-pass included, from the axes seen along w_x and w_y.
         half_extents: pixels from the centre to where the coverage sinks to `ALPHA_MIN`, along x and y; (0, 0)
             where it never rises above.
-        covariance_gradient: gradients (xx, xy, yy) of the covariance from those of its inverse.
-        footprint_gradient: gradients of w_x and w_y from those of the covariance, and of the three axes.
+        covariance_gradient: gradients of what `screen_covariance` gives, from those (xx, xy, yy) of its inverse.
+        footprint_gradient: gradients of w_x and w_y from these, and of the three axes.
     """
 
     tangent_limits: Scalar
@@ -227,24 +233,24 @@ def _screen_covariance(real: type) -> tuple[Scalar, Scalar]:
 def _screen_gradients(real: type) -> tuple[Scalar, Scalar]:
     vectors = vector_maths()
     blend, scaled_sum = vectors.blend, vectors.scaled_sum
-    half, two = real(0.5), real(2.0)
+    one, two, low_pass = real(1.0), real(2.0), real(LOW_PASS)
 
     @inlined
-    def covariance_gradient(xx, xy, yy, g_xx, g_xy, g_yy):
-        # d(inverse) = -inverse d(matrix) inverse; the off-diagonal entry stands for two.
-        mixed = half * g_xy
-        left_xx, left_xy = xx * g_xx + xy * mixed, xx * mixed + xy * g_yy
-        left_yx, left_yy = xy * g_xx + yy * mixed, xy * mixed + yy * g_yy
-        return (
-            -(left_xx * xx + left_xy * xy),
-            -two * (left_xx * xy + left_xy * yy),
-            -(left_yx * xy + left_yy * yy),
-        )
+    def covariance_gradient(covariance, g_xx, g_xy, g_yy):
+        # The inverse is (yy, -xy, xx) over the determinant. In products of two inverses the terms of needles cancel, as
+        # they would in the determinant if it were taken from the covariance.
+        xx, xy, yy, determinant = covariance
+        inverse = one / determinant
+        g_determinant = -(g_xx * (yy * inverse) - g_xy * (xy * inverse) + g_yy * (xx * inverse)) * inverse
+        by_trace = low_pass * g_determinant
+        return g_yy * inverse + by_trace, -g_xy * inverse, g_xx * inverse + by_trace, g_determinant
 
     @inlined
-    def footprint_gradient(w_x, w_y, v_x, v_y, axes, g_xx, g_xy, g_yy):
-        gv_x = blend(two * g_xx, v_x, g_xy, v_y)
-        gv_y = blend(g_xy, v_x, two * g_yy, v_y)
+    def footprint_gradient(w_x, w_y, v_x, v_y, axes, g_covariance):
+        g_xx, g_xy, g_yy, g_determinant = g_covariance
+        normal = cross(v_x, v_y)
+        gv_x = blend(one, blend(two * g_xx, v_x, g_xy, v_y), two * g_determinant, cross(v_y, normal))
+        gv_y = blend(one, blend(g_xy, v_x, two * g_yy, v_y), two * g_determinant, cross(normal, v_x))
         gw_x = scaled_sum(gv_x, axes[0], axes[1], axes[2])
         gw_y = scaled_sum(gv_y, axes[0], axes[1], axes[2])
         g_axes = (

@@ -142,8 +142,8 @@ class _Project(torch.autograd.Function):
         degree = sh_degree if sh.shape[1] else -1
         kernels = kernels_for("project", means.device)
         outputs: tuple[Tensor, ...] = kernels.project(tensors, width, height, degree=degree, near=near)
-        conics, radii = outputs[1], outputs[5]
-        ctx.save_for_backward(*tensors[:7], radii, conics)
+        radii = outputs[5]
+        ctx.save_for_backward(*tensors[:7], radii)
         ctx.size_and_degree = (width, height, degree)
         ctx.shared = shared
         ctx.mark_non_differentiable(radii)
@@ -153,14 +153,14 @@ class _Project(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        *inputs, radii, conics = ctx.saved_tensors
-        seen = (radii, conics)
+        *inputs, radii = ctx.saved_tensors
         # Only a projection that was asked in this very pass has handed back its token.
         known = None if gradients[6] is None else list(ctx.shared)
         ctx.shared.clear()
         found, cameras = kernels_for("project", radii.device).project_gradients(
             inputs, *ctx.size_and_degree,
-            seen=seen, cotangents=_cotangents(gradients, seen), needs_camera=bool(ctx.needs_input_grad[5]), known=known,
+            radii=radii, cotangents=_cotangents(gradients, radii), needs_camera=bool(ctx.needs_input_grad[5]),
+            known=known,
         )  # fmt: skip
         pose_gradient, v_token = None, None
         if ctx.needs_input_grad[5]:
@@ -172,13 +172,11 @@ class _Project(torch.autograd.Function):
         return *found, pose_gradient, None, None, None, v_token, None, None, None, None, None
 
 
-def _cotangents(gradients: Sequence[Tensor | None], seen: tuple[Tensor, Tensor]) -> list[Tensor]:
+def _cotangents(gradients: Sequence[Tensor | None], radii: Tensor) -> list[Tensor]:
     """Gradients of means2d, conics, depths, opacities and colors; zeros for those that nothing comes from."""
-    radii, conics = seen
-    like = (radii, conics, radii[..., 0], radii[..., 0], conics)
     return [
-        torch.zeros(fits.shape, dtype=fits.dtype, device=fits.device) if gradient is None else gradient.contiguous()
-        for gradient, fits in zip(gradients[:5], like, strict=True)
+        radii.new_zeros(*radii.shape[:2], *rest) if gradient is None else gradient.contiguous()
+        for gradient, rest in zip(gradients[:5], ((2,), (3,), (), (), (3,)), strict=True)
     ]
 
 

@@ -171,7 +171,7 @@ def _place_backward(real: type) -> Callable[..., Any]:
 
     @inlined
     def place_backward(
-        listed, shown, columns, c, means, quats, log_scales, logit_opacities, cam_from_world, intrinsics, lens, conics,
+        listed, shown, columns, c, means, quats, log_scales, logit_opacities, cam_from_world, intrinsics, lens,
         g_means2d, g_conics, g_depths, g_opacities, needs_camera, total,
         g_means, g_quats, g_log_scales, g_logit_opacities,
     ):  # fmt: skip
@@ -182,7 +182,7 @@ def _place_backward(real: type) -> Callable[..., Any]:
             for i in range(LANES):
                 n = listed[min(first + i, last)]
                 for k in range(3):
-                    columns[(13 + k) * LANES + i], columns[(18 + k) * LANES + i] = g_conics[c, n, k], conics[c, n, k]
+                    columns[(13 + k) * LANES + i] = g_conics[c, n, k]
                 columns[11 * LANES + i], columns[12 * LANES + i] = g_means2d[c, n, 0], g_means2d[c, n, 1]
                 columns[16 * LANES + i], columns[17 * LANES + i] = g_depths[c, n], g_opacities[c, n]
             own, shared = place_gradient(columns, c, cam_from_world, intrinsics, lens)
@@ -282,7 +282,7 @@ def project_backward(real: type) -> Kernel:
 
     @kernel("project_backward", real)
     def backward(
-        means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, width, height, degree, radii, conics,
+        means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, width, height, degree, radii,
         g_means2d, g_conics, g_depths, g_opacities, g_colors, needs_camera, fresh,
         g_means, g_quats, g_log_scales, g_logit_opacities, g_sh, g_cameras,
     ):  # fmt: skip
@@ -308,7 +308,7 @@ def project_backward(real: type) -> Kernel:
                     shown += radii[c, n, 0] > zero
                 place_backward(
                     listed, shown, columns, c, means, quats, log_scales, logit_opacities, cam_from_world, intrinsics,
-                    lens, conics, g_means2d, g_conics, g_depths, g_opacities, needs_camera, totals[chunk, c],
+                    lens, g_means2d, g_conics, g_depths, g_opacities, needs_camera, totals[chunk, c],
                     g_means, g_quats, g_log_scales, g_logit_opacities,
                 )  # fmt: skip
                 if degree >= 0:
@@ -338,10 +338,10 @@ def project(inputs: Sequence[Tensor], width: int, height: int, *, degree: int, n
 
 def project_gradients(
     inputs: Sequence[Tensor], width: int, height: int, degree: int,
-    *, seen: tuple[Tensor, Tensor], cotangents: Sequence[Tensor], needs_camera: bool,
+    *, radii: Tensor, cotangents: Sequence[Tensor], needs_camera: bool,
     known: list[Tensor] | None = None,
 ) -> tuple[list[Tensor], Tensor]:  # fmt: skip
-    """Gradients of raw Gaussians and of each camera [C, 12]; `seen` are the radii and conics of the forward pass.
+    """Gradients of raw Gaussians and of each camera [C, 12]; `radii` are those of the forward pass.
 
     Those of the Gaussians are added to what is `known`, in place.
     """
@@ -350,7 +350,7 @@ def project_gradients(
     cameras = torch.zeros(inputs[5].shape[0], 12, dtype=torch.float64)
     project_backward(real)(
         *(tensor.numpy() for tensor in inputs), real(width), real(height), degree,
-        *(tensor.numpy() for tensor in (*seen, *cotangents)), needs_camera, known is None,
+        *(tensor.numpy() for tensor in (radii, *cotangents)), needs_camera, known is None,
         *(tensor.numpy() for tensor in (*found, cameras)),
     )  # fmt: skip
     return found, cameras

@@ -265,7 +265,7 @@ class GradientSteps(NamedTuple):
     Attributes:
         place_gradient: gradients of means (3), quaternions (4), log scales (3) and logits of opacities, and what each
             Gaussian adds to that of the camera (12); from columns of these, followed by the gradients of the means on
-            screen (2), conics (3), depths and opacities, and the conics (3).
+            screen (2), conics (3), depths and opacities.
         color_gradient: from a table of coefficients and columns of means and of the gradients of colours, puts those of
             the coefficients into another table, and returns those of the vector from the camera to the mean.
     """
@@ -300,10 +300,9 @@ def _place_gradient(real: type) -> Step:
         rows = row_x, row_y, row_z
         g_mean2d = load(columns, 11 * LANES), load(columns, 12 * LANES)
         g_conic = load(columns, 13 * LANES), load(columns, 14 * LANES), load(columns, 15 * LANES)
-        conic = load(columns, 18 * LANES), load(columns, 19 * LANES), load(columns, 20 * LANES)
         seen = view(rows, position, axes, intrinsics, lens, c)
         g, (r_x, r_y, r_z), (a_x, a_y, a_z) = placed(
-            rows, position, seen, axes, intrinsics, c, g_mean2d, g_conic, load(columns, 16 * LANES), conic
+            rows, position, seen, axes, intrinsics, c, g_mean2d, g_conic, load(columns, 16 * LANES)
         )
         g_mean = scaled_sum(g, row_x, row_y, row_z)
         turned = (

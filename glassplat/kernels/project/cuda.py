@@ -56,13 +56,13 @@ def project_discs(inputs: Sequence[Tensor], width: int, height: int, *, degree: 
 
 def project_gradients(
     inputs: Sequence[Tensor], width: int, height: int, degree: int,
-    *, seen: tuple[Tensor, Tensor], cotangents: Sequence[Tensor], needs_camera: bool,
+    *, radii: Tensor, cotangents: Sequence[Tensor], needs_camera: bool,
     known: list[Tensor] | None = None,
 ) -> tuple[list[Tensor], Tensor]:  # fmt: skip
     """As `glassplat.kernels.project.cpu.project_gradients`."""
     found = _zeros_like(inputs[:5]) if known is None else known
     lens = _lenses(inputs[5], inputs[6], width, height)
-    return _gradients(project_backward, inputs, lens, degree, (*seen, *cotangents), needs_camera, found)
+    return _gradients(project_backward, inputs, lens, degree, (radii, *cotangents), needs_camera, found)
 
 
 def project_discs_gradients(
@@ -180,7 +180,7 @@ def _back(real: type, footprint: Footprint) -> Scalar:
     ):  # fmt: skip
         block_sums = cuda.shared.array((threads, pose), np.float64)
         total = cuda.local.array(pose, np.float64)
-        radii, known = seen
+        radii, maps = seen
         g_means, g_quats, g_log_scales, g_logit_opacities, g_sh = found
         n, t = cuda.grid(1), cuda.threadIdx.x
         inside = n < means.shape[0]
@@ -195,7 +195,7 @@ def _back(real: type, footprint: Footprint) -> Scalar:
             if inside and radii[c, n, 0] > zero:
                 touched = True
                 sums = project_back(
-                    c, n, mean, shaped, inputs, lens, degree, known, cotangents, needs_camera, total, sums, g_sh
+                    c, n, mean, shaped, inputs, lens, degree, maps, cotangents, needs_camera, total, sums, g_sh
                 )
             if needs_camera:
                 for i in range(pose):
@@ -221,16 +221,16 @@ def project_backward(real: type) -> Kernel:
     @kernel(
         "project_backward",
         real,
-        "real2 real2 real2 real1 real3 real3 real2 real2 int real3 real3 "
+        "real2 real2 real2 real1 real3 real3 real2 real2 int real3 "
         "real3 real3 real2 real2 real3 bool real2 real2 real2 real1 real3 double3",
     )
     def backward(
-        means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, lens, degree, radii, conics,
+        means, quats, log_scales, logit_opacities, sh, cam_from_world, intrinsics, lens, degree, radii,
         g_means2d, g_conics, g_depths, g_opacities, g_colors, needs_camera,
         g_means, g_quats, g_log_scales, g_logit_opacities, g_sh, partial,
     ):  # fmt: skip
         back(
-            means, quats, log_scales, logit_opacities, (sh, cam_from_world, intrinsics), lens, degree, (radii, conics),
+            means, quats, log_scales, logit_opacities, (sh, cam_from_world, intrinsics), lens, degree, (radii, None),
             (g_means2d, g_conics, g_depths, g_opacities, g_colors), needs_camera,
             (g_means, g_quats, g_log_scales, g_logit_opacities, g_sh), partial,
         )  # fmt: skip

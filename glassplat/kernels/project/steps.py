@@ -219,13 +219,13 @@ def place_gradients(real: type, free: Callable[..., Any] | None = None) -> Calla
     free = free_number if free is None else free
 
     @inlined
-    def place_gradient(rows, position, seen, axes, intrinsics, c, g_mean2d, g_conic, g_depth, conic):
+    def place_gradient(rows, position, seen, axes, intrinsics, c, g_mean2d, g_conic, g_depth):
         """Gradients of the camera-space position, of the three rows (through the footprint) and of the axes."""
-        tangent, held, (w_x, w_y), (v_x, v_y), _ = seen
+        tangent, held, (w_x, w_y), (v_x, v_y), covariance = seen
         fx, fy, inverse_depth = intrinsics[c, 0], intrinsics[c, 1], one / position[2]
         scale_x, scale_y = fx * inverse_depth, fy * inverse_depth
-        g_xx, g_xy, g_yy = covariance_gradient(conic[0], conic[1], conic[2], g_conic[0], g_conic[1], g_conic[2])
-        gw_x, gw_y, g_axes = footprint_gradient(w_x, w_y, v_x, v_y, axes, g_xx, g_xy, g_yy)
+        g_covariance = covariance_gradient(covariance, g_conic[0], g_conic[1], g_conic[2])
+        gw_x, gw_y, g_axes = footprint_gradient(w_x, w_y, v_x, v_y, axes, g_covariance)
         # w_x = (fx / z) (row_x - held_x row_z); where the tangent is held at its limit it passes no gradient.
         g_held_x = free(-scale_x * dot(gw_x, rows[2]), held[0], tangent[0])
         g_held_y = free(-scale_y * dot(gw_y, rows[2]), held[1], tangent[1])
@@ -330,7 +330,7 @@ def _ellipsoid_gradient(real: type) -> Callable[..., Any]:
     dot, placed, zero = vector_maths().dot, place_gradients(real), real(0.0)
 
     @inlined
-    def place_gradient(c, n, mean, shaped, cam_from_world, intrinsics, lens, conics, cotangents):
+    def place_gradient(c, n, mean, shaped, cam_from_world, intrinsics, lens, maps, cotangents):
         g_means2d, g_conics, g_depths, _, _ = cotangents
         axes = shaped[4]
         row_x, row_y, row_z, offset = pose(cam_from_world, c)
@@ -339,7 +339,7 @@ def _ellipsoid_gradient(real: type) -> Callable[..., Any]:
         g_position, g_rows, g_axes = placed(
             rows, position, view(rows, position, axes, intrinsics, lens, c), axes, intrinsics, c,
             (g_means2d[c, n, 0], g_means2d[c, n, 1]), (g_conics[c, n, 0], g_conics[c, n, 1], g_conics[c, n, 2]),
-            g_depths[c, n], (conics[c, n, 0], conics[c, n, 1], conics[c, n, 2]),
+            g_depths[c, n],
         )  # fmt: skip
         return g_position, g_rows, g_axes, (zero, zero)
 
@@ -422,13 +422,13 @@ def projecting_back(real: type, footprint: Footprint) -> Callable[..., Any]:
     blend, scaled_sum, zero, one = vector_maths().blend, vector_maths().scaled_sum, real(0.0), real(1.0)
 
     @inlined
-    def project_back(c, n, mean, shaped, inputs, lens, degree, found, cotangents, needs_camera, total, sums, g_sh):
-        """`inputs` are coefficients, poses and intrinsics, `found` the conics or maps of the forward pass."""
+    def project_back(c, n, mean, shaped, inputs, lens, degree, maps, cotangents, needs_camera, total, sums, g_sh):
+        """`inputs` are coefficients, poses and intrinsics; `maps` are those of discs, or None."""
         sh, cam_from_world, intrinsics = inputs
         g_opacities, g_colors = cotangents[3], cotangents[4]
         g_mean, g_opacity, (ga_x, ga_y, ga_z), (g_u, g_v) = sums
         g_center, g_rows, g_axes, g_scales = place_gradient(
-            c, n, mean, shaped, cam_from_world, intrinsics, lens, found, cotangents
+            c, n, mean, shaped, cam_from_world, intrinsics, lens, maps, cotangents
         )
         row_x, row_y, row_z, _ = pose(cam_from_world, c)
         g_mean = blend(one, g_mean, one, scaled_sum(g_center, row_x, row_y, row_z))

@@ -20,8 +20,8 @@ LEVEL_BITS = 4
 """Of what stands on the stack: a node's number lies above its level."""
 SLACK = 1e-5
 """Share by which boxes begin earlier and end later, so that rounding loses no hit."""
-LARGEST_INVERSE = 1e18
-"""In place of 1 / 0 in the direction of a ray."""
+LARGEST_INVERSE = 1e15
+"""In place of 1 / 0 in the direction of a ray of length 1: for all that are not too short to be squared in float32."""
 FRAME_AT, OPACITY_AT, PROBE_AT, GEOMETRY = 3, 12, 13, 15
 """Columns of a row: gradients of mean (3), frame (9), opacity and probe (2); harmonics have rows of their own."""
 
@@ -31,10 +31,10 @@ def ray_reader(real: type) -> Scalar:
     zero, one, largest, most = real(0.0), real(1.0), real(LARGEST_INVERSE), real("inf")
 
     @inlined
-    def inverse(x):  # type: ignore[no-untyped-def]
-        if x > one / largest or x < -one / largest:
+    def inverse(x, length):  # type: ignore[no-untyped-def]
+        if abs(x) * largest > length:
             return one / x
-        return -largest if x < zero else largest
+        return (-largest if x < zero else largest) / length
 
     @inlined
     def ray(origins, directions, r):  # type: ignore[no-untyped-def]
@@ -43,7 +43,8 @@ def ray_reader(real: type) -> Scalar:
         squared = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
         # NaN and infinity fail one of the comparisons.
         usable = squared > zero and squared < most and abs(o[0]) + abs(o[1]) + abs(o[2]) < most
-        return o, d, (inverse(d[0]), inverse(d[1]), inverse(d[2])), real(math.sqrt(squared)), usable
+        length = real(math.sqrt(squared))
+        return o, d, (inverse(d[0], length), inverse(d[1], length), inverse(d[2], length)), length, usable
 
     return ray
 

@@ -41,7 +41,7 @@ from tests.kernels.cuda.agreement import (
     on_a_device_or_skipped,
     on_device,
 )
-from tests.kernels.gaussians_and_cameras import draw, random_cameras, random_gaussians
+from tests.kernels.gaussians_and_cameras import draw, needle_before_camera, random_cameras, random_gaussians
 
 on_a_device_or_skipped()
 
@@ -67,6 +67,18 @@ def test_project(count: int, cameras: int, degree: int, dtype: torch.dtype) -> N
         close(getattr(found, name), value, 10)
     leaves = [*gaussians, batch.cam_from_world]
     check_gradients(found[:5], expected[:5], [*own, own_batch.cam_from_world], leaves)
+
+
+def test_gradients_of_needles_do_not_cancel_in_single_precision() -> None:
+    found = {}
+    for dtype in (torch.float32, torch.float64):
+        needle, camera = needle_before_camera(0.785, dtype)
+        own, own_camera = on_device(needle), on_device(camera)
+        conics = project_operation.project(own, own_camera, sh_degree=0, near=0.1).conics
+        cotangent = torch.tensor([[[700.0, 650.0, 690.0]]], dtype=dtype, device=DEVICE)
+        found[dtype] = torch.autograd.grad(conics, own[:3], cotangent)
+    for ours, exact in zip(found[torch.float32], found[torch.float64], strict=True):
+        assert (ours - exact).norm() < 1e-3 * exact.norm()
 
 
 def test_project_without_colours_culls_what_is_not_finite() -> None:
@@ -210,6 +222,17 @@ def test_composite(random_splats: SplatMaker, mean: bool | None, dtype: torch.dt
     shape = (2, many(22, 300))
     splats = random_splats(shape, size, dtype=dtype, opacities=(0.3, 0.999), sigmas=(2.0, 9.0))
     check_composite(splats, many(6, 80), mean, size)
+
+
+def test_the_deviation_of_a_splat_alone_has_no_gradient() -> None:
+    fields = (torch.tensor([9.3, 1.2]), torch.tensor([0.01, 0.0, 0.01]), torch.tensor(0.8), torch.tensor(3.0))
+    splats = on_device(Splats(*(field[None, None] for field in fields), torch.full((1, 1, 2), 40.0)))
+    values = torch.full((1, 1, 1), 3.1, device=DEVICE, requires_grad=True)
+    asked = Deviation(0, torch.ones(1, 2, 18, device=DEVICE))
+    bins = tiles_operation.bin_tiles(splats, 18, 2)
+    found = composite_operation.composite(splats, values, bins, deviation=asked)
+    assert float(found.alpha.sum()) > 20
+    assert float(torch.autograd.grad(found.deviation.sum(), values)[0].abs()) < 1e-2
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
