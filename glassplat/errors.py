@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 
 class InputError(ValueError):
-    """The data set cannot be used as it is; the message says what was expected, what came and what to do."""
+    """An input, an option or a name cannot be used; the message says what was expected, what came and what to do."""
 
 
 class UnknownFormatError(InputError):

@@ -244,7 +244,7 @@ class Info:
     Attributes:
         path: anything that glassplat reads or writes.
         json: print it for programs.
-        page: of a capture from `prepare`, its report anew, with the panes and the points behind them, as an HTML file.
+        page: write the report of `prepare` again, now with the panes and the points behind them, as this HTML file.
     """
 
     path: tyro.conf.Positional[Path]

@@ -150,7 +150,7 @@ def parsed(arguments: list[str]) -> Any:
     """
     import tyro
 
-    from glassplat.cli.console import check_arguments, versions
+    from glassplat.cli.console import check_arguments, message_console, say, versions
     from glassplat.options import check_options
 
     if arguments[:1] == ["--version"]:
@@ -161,7 +161,14 @@ def parsed(arguments: list[str]) -> Any:
     if name in COMMANDS:
         check_arguments(arguments)
         kind, options = command_line(name, arguments[1:])
-        command = tyro.cli(kind, prog=f"glassplat {name}", args=options, config=config)
+        try:
+            command = tyro.cli(kind, prog=f"glassplat {name}", args=options, config=config)
+        except SystemExit as end:
+            if end.code and name == "train":
+                from glassplat.cli.train import help_of_method
+
+                say(message_console(stderr=True), help_of_method(options))
+            raise
         check_options(command)
         return command
     # Nothing is left to run after the list of commands; only a shell's completions need to know every option.

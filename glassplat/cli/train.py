@@ -38,7 +38,7 @@ class Train(Generic[RecipeKind]):
     """Train a scene from photographs.
 
     Attributes:
-        recipe: method and its options; `train_options` tells the command line which there are.
+        recipe: method and its options; `glassplat train planar --help` lists them.
         preset: what the options are unless they are given: the best that this project found, or those of the paper.
         data: directory of the capture: COLMAP or transforms.json, panes in panes/.
         output: directory of the run.
@@ -47,9 +47,9 @@ class Train(Generic[RecipeKind]):
         seed: fixes every random choice.
         device: where to train; auto takes an NVIDIA GPU where one can be used.
         resume: go on with the run in `output`.
-        mask_polarity: which value of black-and-white masks is the pane.
+        mask_polarity: which value of masks is the pane.
         checkpoint_every: seconds between checkpoints.
-        memory: gigabytes for photographs.
+        memory: gigabytes for photographs; a quarter of the machine's if not given.
         config: a recipe.json to begin from.
         view: look at it in the browser meanwhile.
     """
@@ -113,6 +113,12 @@ class Train(Generic[RecipeKind]):
 
 HELP, FULL_HELP = ("-h", "--help"), "--help-advanced"
 POINTER = f"These are the options that most runs need; {FULL_HELP} in place of --help shows all of them."
+
+
+def help_of_method(arguments: Sequence[str]) -> str:
+    """A pointer to all options of the method that arguments name; tyro points to a list that has none of them."""
+    method = next((argument for argument in arguments if argument in RECIPES), PlanarRecipe.method)
+    return f"all options of a method: glassplat train {method} {FULL_HELP}"
 
 
 def train_command(arguments: Sequence[str]) -> tuple[Any, list[str]]:

@@ -62,8 +62,8 @@ class GlossyOptions:
         first_texels: edge length at the start.
         first_strength: reflection strength of every Gaussian at the start.
         search: what is taken for a mirror at once when reflections begin.
-        region: only what lies in this sphere may reflect: centre and radius, world units. None leaves it to
-            `find_region`.
+        region: only what lies in this sphere may reflect: centre and radius, world units; if not given, what the
+            cameras stand around.
         find_region: look for the place that the cameras stand around; if not, everything may reflect unless `region`
             says otherwise, as in the paper.
         outside_weight: weight of the mean strength outside of the region in the objective.

@@ -90,7 +90,7 @@ class PlanarRecipe:
         intensity: False drops the reflection intensity a(u) (ablation).
         blend: space in which transmission and reflection are blended: linear radiance, or sRGB as in the paper.
         panes: which panes on a ray reflect: all of them, one behind the other, or the nearest one as in the paper.
-        detect_mirrors: treat panes that look like mirrors as mirrors, unless `plane_fit` names the mirrors.
+        detect_mirrors: treat panes that look like mirrors as mirrors, unless `--plane-fit.mirror-labels` names them.
         fixed_mirrors: mirrors keep their reflectance, and what the first stage built behind them moves to their front;
             if not, they only start at that reflectance, as in the paper.
         seed_reflections: start what no photograph shows directly from the virtual points behind the panes.

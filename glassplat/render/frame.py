@@ -140,8 +140,8 @@ def check_layers(renderer: Renderer, scene: Scene, layers: Sequence[str], method
     known = renderer.layers(scene)
     foreign = [layer for layer in layers if layer not in known]
     if foreign or not layers:
-        asked = f"renders no layer {', '.join(foreign)}" if foreign else "renders nothing without --layers"
-        raise InputError(f"{method} {asked}; expected --layers out of {', '.join(known)}")
+        asked = f"renders no layer {', '.join(foreign)}" if foreign else "renders nothing without layers"
+        raise InputError(f"{method} {asked}; expected layers out of {', '.join(known)}")
 
 
 NEAR_PER_EXTENT = 0.01

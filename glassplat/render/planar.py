@@ -97,7 +97,7 @@ class Planar:
 
     Where panes are seen through one another, Eq. 1 holds for one after the other, from the farthest on: the C_t of a
     pane is the C of the pane behind it (the paper shows the nearest only). The layers R, C_r and C_t are those of the
-    nearest one that is more than `FAINT`ly visible; see `glazing`.
+    nearest one that is more than `FAINT`ly visible; see `glassplat.render.panes.glazed`.
 
     Layers: `transmission`, `reflection` [H, W, 3]; `strength`, `mask`, `depth`, `alpha` [H, W]; `hit` [H, W], 1 in
     the panes' rectangles, and `inner` [H, W], without the rim of what reflects; `without_panes` [H, W, 3], the image

@@ -27,7 +27,7 @@ class Environment:
     """Light from infinitely far away, one colour for each direction.
 
     The colour in a world direction d is sigmoid(bilinear(raw, d)): the sigmoid comes after the lookup. Faces and their
-    axes are those of `kernels.cube_lookup`.
+    axes are those of `glassplat.kernels.environment.cube_lookup`.
 
     Attributes:
         raw: [6, S, S, 3] logits of sRGB colour; S = 0 for a scene without an environment.

@@ -180,7 +180,7 @@ class DefaultDensify:
         prune_radius_fraction: with `prune_large`, Gaussians that any view saw with a radius above
             this share of its longer side are removed; None keeps them. 3DGS states a limit of 20
             pixels but clears the radii before it looks at them, so its published results have none.
-        cap: largest number of Gaussians to grow to; None takes `per_pixel`.
+        cap: largest number of Gaussians to grow to; None takes `--densify.per-pixel`.
         per_pixel: largest number of Gaussians to grow to for each pixel of all training photographs, which is reached
             where these contradict each other, by cars and leaves, and never stop asking for more; 0 for no limit.
         least_contribution: Gaussians that add less than so many pixels to every training view, directly and mirrored,

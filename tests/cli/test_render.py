@@ -63,10 +63,10 @@ def test_every_layer_that_is_listed_can_be_rendered(method: str, tmp_path: Path)
 @pytest.mark.parametrize(
     ("method", "layers", "words"),
     [
-        ("splat", ["base"], "splat renders no layer base; expected --layers out of rgb, normal, depth, alpha"),
+        ("splat", ["base"], "splat renders no layer base; expected layers out of rgb, normal, depth, alpha"),
         ("splat", ["rgb", "mask", "depth", "base"], "splat renders no layer mask, base; expected"),
-        ("planar", ["rgb", "environment"], "planar renders no layer environment; expected --layers out of rgb, "),
-        ("planar", [], "planar renders nothing without --layers; expected --layers out of rgb, "),
+        ("planar", ["rgb", "environment"], "planar renders no layer environment; expected layers out of rgb, "),
+        ("planar", [], "planar renders nothing without layers; expected layers out of rgb, "),
     ],
 )
 def test_layers_that_a_method_lacks_are_refused_before_anything_is_rendered(

@@ -150,6 +150,21 @@ def test_help_shows_what_most_runs_need_and_says_how_to_see_the_rest(
     assert len(settings(brief)) <= 25 and len(settings(full)) <= 60
 
 
+@pytest.mark.parametrize("method", list(RECIPES))
+def test_help_speaks_of_options_and_not_of_what_lies_behind_them(
+    method: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = help_of([method, "--help-advanced"], capsys, monkeypatch) + help_of(["--help"], capsys, monkeypatch)
+    assert not re.search("train_options|find_region|`plane_fit|`per_pixel", shown)
+
+
+def test_the_help_of_the_method_is_named_beside_an_unknown_option(capsys: pytest.CaptureFixture[str]) -> None:
+    for method in ("planar", "traced"):
+        with pytest.raises(SystemExit):
+            main(["train", method, "--data", "x", "--output", "y", "--iteratons", "5"])
+        assert capsys.readouterr().err.endswith(f"glassplat train {method} --help-advanced\n")
+
+
 @pytest.mark.parametrize("option", [["--rhythm.beat", "0.1"], ["--densify.split-by", "pull"], ["--blend", "srgb"]])
 def test_what_a_preset_decides_is_no_option(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stopped:
@@ -163,7 +178,8 @@ def settings(text: str) -> set[str]:
 
 
 def options(text: str) -> set[str]:
-    return set(re.findall(r"(?<![\w-])--[a-z0-9.-]+", text))
+    """Those that a help text lists; what it says of one may name another, in backquotes."""
+    return set(re.findall(r"(?<![\w`-])--[a-z0-9.-]+", text))
 
 
 def test_help_shows_the_defaults_of_the_preset(
