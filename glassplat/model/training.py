@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 import zlib
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +19,7 @@ import torch
 
 from glassplat import __version__
 from glassplat.captures.dataset import Dataset, photographs_read, with_corrected_cameras
-from glassplat.errors import InputError, RankLostError
+from glassplat.errors import InputError, RankLostError, first_names
 from glassplat.files.writing import make_folder
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
 from glassplat.methods.recipe import RECIPES, Recipe, recipe_to_json, settled
@@ -237,10 +237,10 @@ def resumed_state(
     # A run may go on on another device.
     recorded = replace(directory.settings(), device=settings.device)
     if recorded != settings or not directory.was_begun_with(recipe):
+        changes = differences(vars(recorded), vars(settings)) + changes_of_recipe(directory, recipe)
         raise InputError(
-            f"{directory.path} was started with {directory.settings()} and its own recipe; expected the same to "
-            f"resume it, got {settings}. Repeat the original options, with the version of glassplat that began "
-            "it, or choose another --output"
+            f"{directory.path} was started with other options: {first_names(changes)}; expected the same to resume it. "
+            "Repeat the original options, with the version of glassplat that began it, or choose another --output"
         )
     directory.check_photographs(dataset)
     state = load_checkpoint(
@@ -267,6 +267,21 @@ def traits(recipe: Any, settings: run_directory.RunSettings, dataset: Dataset) -
     }
 
 
+def changes_of_recipe(directory: run_directory.RunDirectory, recipe: Any) -> list[str]:
+    """What differs between the recipe that a run was begun with, as it was written, and another one."""
+    recorded = directory.recipe()
+    if recorded.method != recipe.method:  # The options of two methods have little in common.
+        return differences({"method": recorded.method}, {"method": recipe.method})
+    of_both = (recorded, directory.written_recipe()), (recipe, json.loads(recipe_to_json(recipe)))
+    return differences(*({**dict(_values(options, "")), "recipe": type(one).__name__} for one, options in of_both))
+
+
+def differences(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
+    """The options that differ, each with both values."""
+    names = [name for name in dict.fromkeys((*before, *now)) if before.get(name, UNKNOWN) != now.get(name, UNKNOWN)]
+    return [f"{name} was {before.get(name, UNKNOWN)} and is {now.get(name, UNKNOWN)}" for name in names]
+
+
 def _values(options: Any, name: str) -> Iterator[tuple[str, object]]:
     """Every value of nested options by its dotted name."""
     if isinstance(options, dict):
@@ -274,6 +289,10 @@ def _values(options: Any, name: str) -> Iterator[tuple[str, object]]:
             yield from _values(inner, f"{name}.{key}" if name else key)
     else:
         yield name, options
+
+
+UNKNOWN = "unknown"
+"""Said of an option that a version does not have."""
 
 
 class Record(NamedTuple):

@@ -23,6 +23,7 @@ import torch
 
 from glassplat.captures.dataset import load_dataset
 from glassplat.errors import InputError
+from glassplat.methods.glossy_recipes import DeferredRecipe
 from glassplat.methods.planar_recipe import PlanarRecipe, ReflectionWeights
 from glassplat.methods.recipe import recipe_from_json, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
@@ -359,6 +360,46 @@ def test_a_rank_that_does_not_lead_saves_nothing(tmp_path: Path) -> None:
             following.save()
     assert following.state.step == 12
     assert list(tmp_path.rglob("*.*")) == []
+
+
+@pytest.mark.parametrize(
+    ("recipe", "settings", "told"),
+    [
+        (RECIPE, replace(SETTINGS, iterations=13), "iterations was 12 and is 13"),
+        (
+            replace(RECIPE, rhythm=replace(RECIPE.rhythm, sh=0.5), sh_degree=2),
+            replace(SETTINGS, seed=3),
+            f"seed was 0 and is 3, sh_degree was 1 and is 2, rhythm.sh was {RECIPE.rhythm.sh} and is 0.5",
+        ),
+        (DeferredRecipe(), SETTINGS, "method was splat and is deferred"),
+    ],
+)
+def test_other_options_are_named_when_a_run_is_to_go_on(recipe: Any, settings: Any, told: str, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, interrupt_at=5)
+    with pytest.raises(InputError) as caught:
+        Run(recipe, settings, RunDirectory(tmp_path), tiny_capture(), resume=True).to_the_end(print)
+    assert f" was started with other options: {told}; expected the same to resume it. Repeat" in str(caught.value)
+
+
+def test_an_option_that_another_version_did_not_have_is_named_when_a_run_is_to_go_on(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, interrupt_at=5)
+    written = json.loads((tmp_path / "recipe.json").read_text())
+    del written["ssim_weight"]
+    (tmp_path / "recipe.json").write_text(json.dumps(written))
+    with pytest.raises(InputError, match=r"options: ssim_weight was unknown and is 0\.2; expected the same"):
+        run(tmp_path, resume=True)
+
+
+def test_a_recipe_of_another_kind_is_named_when_a_run_is_to_go_on(tmp_path: Path) -> None:
+    class Own(SplatRecipe):
+        """With other stages, say."""
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, interrupt_at=5)
+    with pytest.raises(InputError, match="options: recipe was SplatRecipe and is Own; expected the same"):
+        Run(Own(sh_degree=1), SETTINGS, RunDirectory(tmp_path), tiny_capture(), resume=True).to_the_end(print)
 
 
 def test_a_capture_of_other_photographs_is_not_gone_on_with(tmp_path: Path) -> None:
