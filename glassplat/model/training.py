@@ -154,7 +154,7 @@ class Run:
 
         Raises:
             InputError: the run was recorded with other settings or photographs, or a photograph cannot be read, of the
-                test views too.
+                test views too; what was trained by then is saved.
             KeyboardInterrupt: the user stopped the run; the checkpoint is written.
             TrainingDivergedError: training cannot go on; the last checkpoint stays.
             OSError: the disk is full or fails; the last checkpoint stays.
@@ -316,20 +316,29 @@ class TrainingSession:
 
     def trained(self, stages: tuple[Stage, ...], dataset: Dataset, iterations: int) -> Generator[Message, None, None]:
         """Trains to the end, or raises KeyboardInterrupt after the step in which the user asks for it."""
-        is_whole = False
         with stop_on_interrupt() as self._stop, photographs_read(dataset) as check_photographs:
             self._ranks.asked = lambda: self._stop.requested
-            try:
-                for message in train(stages, dataset, self._state, iterations, ranks=self._ranks):
-                    check_photographs()
-                    yield from self.told(message)
-                    is_whole = isinstance(message, StepDone | ActionDone)
-                    if isinstance(message, StepDone):
-                        yield from self._saved_in_time(message, iterations)
-            except RankLostError:
-                if is_whole:
-                    self.save()
+            messages = train(stages, dataset, self._state, iterations, ranks=self._ranks)
+            for message in self._saved_where_it_fails(messages, check_photographs):
+                yield from self.told(message)
+                if isinstance(message, StepDone):
+                    yield from self._saved_in_time(message, iterations)
+
+    def _saved_where_it_fails(self, messages: Iterator[Message], check: Callable[[], None]) -> Iterator[Message]:
+        """Passes messages on; where a rank is lost or a photograph cannot be read, what was trained is saved first."""
+        begun = self._state.step
+        try:
+            for message in messages:
+                check()
+                yield message
+        except (RankLostError, InputError) as error:
+            if not self._state.is_whole or self._state.step == begun:
                 raise
+            self.save()
+            if isinstance(error, RankLostError):
+                raise
+            step = self._state.step
+            raise InputError(f"{error}; step {step} is saved; mend that, then repeat with --resume") from error
 
     def _saved_in_time(self, message: StepDone, iterations: int) -> Generator[Message, None, None]:
         """Writes a checkpoint where it is time for one, and ends training where it was asked to end."""
