@@ -268,7 +268,7 @@ def traits(recipe: Any, settings: run_directory.RunSettings, dataset: Dataset) -
 
 
 def changes_of_recipe(directory: run_directory.RunDirectory, recipe: Any) -> list[str]:
-    """What differs between the recipe that a run was begun with, as it was written, and another one."""
+    """The options of a recipe that differ from those that a run was begun with, as they were written."""
     recorded = directory.recipe()
     if recorded.method != recipe.method:  # The options of two methods have little in common.
         return differences({"method": recorded.method}, {"method": recipe.method})
