@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
+import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -57,8 +59,16 @@ def write_tensors(path: Path | str, tensors: Mapping[str, Tensor], header: Mappi
         try:
             save_file(owned, temporary, metadata={HEADER_KEY: json.dumps(header)})
         except SafetensorError as error:  # What the system says reaches Python in this disguise.
-            raise OSError(str(error)) from error
+            raise system_error(str(error)) from error
         temporary.chmod(usual_mode)
+
+
+def system_error(text: str) -> OSError:
+    """The error of the operating system that a library tells in words, with the number that says what helps."""
+    if told := re.search(r"\(os error (\d+)\)", text):  # As libraries in Rust have it, on Windows with its own numbers.
+        return OSError(int(told[1]), text, None, int(told[1]))
+    number = next((number for number in errno.errorcode if os.strerror(number) in text), None)
+    return OSError(text) if number is None else OSError(number, text)
 
 
 @contextmanager
@@ -497,7 +507,7 @@ def write_equirect(path: Path | str, image: Tensor) -> None:
         try:
             OpenEXR.File(header, {"RGB": radiance}).write(str(temporary))
         except RuntimeError as error:
-            raise OSError(str(error)) from error
+            raise system_error(str(error)) from error
 
 
 def _check_suffix(path: Path) -> None:

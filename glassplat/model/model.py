@@ -443,7 +443,13 @@ def save_folder(model: Model, folder: Path) -> Path:
 
     Raises:
         FileExistsError: something is there; nothing was written.
+        InputError: the model has no cameras, without which nothing reads the folder again.
     """
+    if not model.cameras:
+        raise InputError(
+            f"a model without cameras cannot be saved as the folder {folder}; give it some, such as those of "
+            "`glassplat.Camera.look_at`, or save it as .ply"
+        )
     if os.path.lexists(folder) and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder} is already there and not empty; nothing was written. Choose a new folder")
     write_as_run(folder, model, model.path)

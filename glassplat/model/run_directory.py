@@ -263,8 +263,11 @@ class RunDirectory:
         """
         from glassplat.methods.recipe import recipe_to_json
 
-        written = self._read("recipe.json")
-        return self.recipe() == recipe and parse_json(written, "recipe.json") == json.loads(recipe_to_json(recipe))
+        return self.recipe() == recipe and self.written_recipe() == json.loads(recipe_to_json(recipe))
+
+    def written_recipe(self) -> Any:
+        """The recorded recipe's options as they were written."""
+        return parse_json(self._read("recipe.json"), "recipe.json")
 
     def settings(self) -> RunSettings:
         """The recorded settings."""

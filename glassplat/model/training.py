@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 import zlib
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +19,7 @@ import torch
 
 from glassplat import __version__
 from glassplat.captures.dataset import Dataset, photographs_read, with_corrected_cameras
-from glassplat.errors import InputError, RankLostError
+from glassplat.errors import InputError, RankLostError, first_names
 from glassplat.files.writing import make_folder
 from glassplat.kernels.backend.devices import DeviceName, chosen_device
 from glassplat.methods.recipe import RECIPES, Recipe, recipe_to_json, settled
@@ -154,7 +154,7 @@ class Run:
 
         Raises:
             InputError: the run was recorded with other settings or photographs, or a photograph cannot be read, of the
-                test views too.
+                test views too; what was trained by then is saved.
             KeyboardInterrupt: the user stopped the run; the checkpoint is written.
             TrainingDivergedError: training cannot go on; the last checkpoint stays.
             OSError: the disk is full or fails; the last checkpoint stays.
@@ -237,10 +237,10 @@ def resumed_state(
     # A run may go on on another device.
     recorded = replace(directory.settings(), device=settings.device)
     if recorded != settings or not directory.was_begun_with(recipe):
+        changes = differences(vars(recorded), vars(settings)) + changes_of_recipe(directory, recipe)
         raise InputError(
-            f"{directory.path} was started with {directory.settings()} and its own recipe; expected the same to "
-            f"resume it, got {settings}. Repeat the original options, with the version of glassplat that began "
-            "it, or choose another --output"
+            f"{directory.path} was started with other options: {first_names(changes)}; expected the same to resume it. "
+            "Repeat the original options, with the version of glassplat that began it, or choose another --output"
         )
     directory.check_photographs(dataset)
     state = load_checkpoint(
@@ -267,6 +267,21 @@ def traits(recipe: Any, settings: run_directory.RunSettings, dataset: Dataset) -
     }
 
 
+def changes_of_recipe(directory: run_directory.RunDirectory, recipe: Any) -> list[str]:
+    """The options of a recipe that differ from those that a run was begun with, as they were written."""
+    recorded = directory.recipe()
+    if recorded.method != recipe.method:  # The options of two methods have little in common.
+        return differences({"method": recorded.method}, {"method": recipe.method})
+    of_both = (recorded, directory.written_recipe()), (recipe, json.loads(recipe_to_json(recipe)))
+    return differences(*({**dict(_values(options, "")), "recipe": type(one).__name__} for one, options in of_both))
+
+
+def differences(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
+    """The options that differ, each with both values."""
+    names = [name for name in dict.fromkeys((*before, *now)) if before.get(name, UNKNOWN) != now.get(name, UNKNOWN)]
+    return [f"{name} was {before.get(name, UNKNOWN)} and is {now.get(name, UNKNOWN)}" for name in names]
+
+
 def _values(options: Any, name: str) -> Iterator[tuple[str, object]]:
     """Every value of nested options by its dotted name."""
     if isinstance(options, dict):
@@ -274,6 +289,10 @@ def _values(options: Any, name: str) -> Iterator[tuple[str, object]]:
             yield from _values(inner, f"{name}.{key}" if name else key)
     else:
         yield name, options
+
+
+UNKNOWN = "unknown"
+"""Said of an option that a version does not have."""
 
 
 class Record(NamedTuple):
@@ -297,20 +316,29 @@ class TrainingSession:
 
     def trained(self, stages: tuple[Stage, ...], dataset: Dataset, iterations: int) -> Generator[Message, None, None]:
         """Trains to the end, or raises KeyboardInterrupt after the step in which the user asks for it."""
-        is_whole = False
         with stop_on_interrupt() as self._stop, photographs_read(dataset) as check_photographs:
             self._ranks.asked = lambda: self._stop.requested
-            try:
-                for message in train(stages, dataset, self._state, iterations, ranks=self._ranks):
-                    check_photographs()
-                    yield from self.told(message)
-                    is_whole = isinstance(message, StepDone | ActionDone)
-                    if isinstance(message, StepDone):
-                        yield from self._saved_in_time(message, iterations)
-            except RankLostError:
-                if is_whole:
-                    self.save()
+            messages = train(stages, dataset, self._state, iterations, ranks=self._ranks)
+            for message in self._saved_where_it_fails(messages, check_photographs):
+                yield from self.told(message)
+                if isinstance(message, StepDone):
+                    yield from self._saved_in_time(message, iterations)
+
+    def _saved_where_it_fails(self, messages: Iterator[Message], check: Callable[[], None]) -> Iterator[Message]:
+        """Passes messages on; where a rank is lost or a photograph cannot be read, what was trained is saved first."""
+        begun = self._state.step
+        try:
+            for message in messages:
+                check()
+                yield message
+        except (RankLostError, InputError) as error:
+            if not self._state.is_whole or self._state.step == begun:
                 raise
+            self.save()
+            if isinstance(error, RankLostError):
+                raise
+            step = self._state.step
+            raise InputError(f"{error}; step {step} is saved; mend that, then repeat with --resume") from error
 
     def _saved_in_time(self, message: StepDone, iterations: int) -> Generator[Message, None, None]:
         """Writes a checkpoint where it is time for one, and ends training where it was asked to end."""

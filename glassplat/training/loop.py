@@ -105,8 +105,10 @@ def train(
             continue
         if state.step == start:
             if stage.setup is not None and state.records.get(SET_UP) != start:
+                state.is_whole = False
                 yield from carried_out(stage.setup(state, with_corrected_cameras(dataset, state.scene)))
                 state.records[SET_UP] = start
+                state.is_whole = True
                 ranks.settle(state)
             yield StageEntered(state.step, stage.name, counts_of(state.scene))
         while state.step < end:
@@ -129,6 +131,7 @@ def advance(
     """One optimisation step of some views, and the actions that are due after it."""
     found = step_of(stage, state, views, ranks, probed=state.step < stage.densify_until * iterations)
     visibility.note(found.visible, state.step, len(views))
+    state.is_whole = False
     update(stage, state, found.gradients, iterations, views=len(views))
     for part, added in found.statistics.items():
         statistics_of(state.statistics, part, len(added.max_radius), added.max_radius.device).include(added)
@@ -146,6 +149,7 @@ def advance(
         if (yield from carried_out(action.apply(state, with_corrected_cameras(dataset, state.scene), clock))):
             done.append(action)
     check_population(state)
+    state.is_whole = True
     losses = mean_losses(found.losses)
     names = ", ".join(view.name for view in views)
     yield StepDone(state.step, names, sum(losses.values()), losses, counts_of(state.scene))

@@ -112,6 +112,7 @@ class TrainState:
         records: numbers that an action keeps from one turn to the next, and which setup was carried out last, by name.
         means: running means of the parameters over the last steps of the run, see `AverageLast`.
         method: the name of what is trained, so that a checkpoint tells whose it is; None where nobody said.
+        is_whole: whether it may be saved; not in the middle of a step or an edit.
     """
 
     scene: Scene
@@ -123,6 +124,7 @@ class TrainState:
     records: dict[str, float] = field(default_factory=dict)
     means: dict[str, Tensor] = field(default_factory=dict)
     method: str | None = None
+    is_whole: bool = True
 
     def generator(self, purpose: str) -> torch.Generator:
         """A random generator for one purpose at this step.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import resource
 from collections.abc import Iterator
@@ -12,7 +13,8 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from glassplat.files.sidecars import opened_tensors, write_tensors
+from glassplat.cli.console import described_os_error
+from glassplat.files.sidecars import opened_tensors, system_error, write_equirect, write_tensors
 
 TENSORS = {"a": torch.arange(1000.0), "b": torch.zeros(0, 3)}
 
@@ -26,6 +28,30 @@ def no_file_beyond(size: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize(
+    ("said", "number"),
+    [
+        ("Error while serializing: I/O error: No space left on device (os error 28)", errno.ENOSPC),
+        ('Failed to write pixel data to image file "x.exr". No space left on device.', errno.ENOSPC),
+        ("Error while serializing: HeaderTooLarge", None),
+    ],
+)
+def test_a_full_disk_is_known_by_its_number_whoever_says_so(said: str, number: int | None) -> None:
+    error = system_error(said)
+    assert (error.errno, error.filename) == (number, None) and said in str(error)
+    assert described_os_error(error).endswith("free some space, then repeat the command") == (number is not None)
+
+
+@pytest.mark.parametrize("name", ["a.safetensors", "a.exr"])
+def test_what_the_system_says_keeps_its_number(name: str, tmp_path: Path) -> None:
+    with no_file_beyond(4000), pytest.raises(OSError, match=r"could not write .* is unchanged") as caught:
+        if name == "a.exr":
+            write_equirect(tmp_path / name, torch.rand(64, 128, 3))
+        else:
+            write_tensors(tmp_path / name, {"a": torch.zeros(10_000)}, {})
+    assert caught.value.errno == errno.EFBIG
 
 
 def test_tensors_and_header_survive(tmp_path: Path) -> None:

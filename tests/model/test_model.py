@@ -152,6 +152,14 @@ def test_what_is_saved_is_loaded_again(name: str, tolerance: float, tmp_path: Pa
         whole.save(path)
 
 
+def test_a_model_without_cameras_is_saved_as_a_file_and_as_no_folder(tmp_path: Path) -> None:
+    blind = dataclasses.replace(model(), cameras={})
+    with pytest.raises(InputError, match=r"without cameras cannot be saved as the folder .*; give it some"):
+        blind.save(tmp_path / "folder")
+    assert not (tmp_path / "folder").exists()
+    assert len(glassplat.load(blind.save(tmp_path / "a.ply"), device="cpu").cameras) > 0
+
+
 def test_panes_of_what_was_there_are_not_taken_over(tmp_path: Path) -> None:
     model().save(tmp_path / "a.ply")
     with pytest.raises(FileExistsError, match=r"planes\.json"):

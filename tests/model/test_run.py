@@ -22,7 +22,9 @@ import pytest
 import torch
 
 from glassplat.captures.dataset import load_dataset
+from glassplat.captures.view import Memory, View
 from glassplat.errors import InputError
+from glassplat.methods.glossy_recipes import DeferredRecipe
 from glassplat.methods.planar_recipe import PlanarRecipe, ReflectionWeights
 from glassplat.methods.recipe import recipe_from_json, recipe_to_json
 from glassplat.methods.splat_recipe import SplatRecipe
@@ -34,7 +36,7 @@ from glassplat.scene.scene import Scene
 from glassplat.training.checkpoint import load_checkpoint, recorded_seconds, save_checkpoint
 from glassplat.training.messages import CheckpointWritten, Message, RunBegun, StepDone, Working
 from glassplat.training.ranks import Ranks
-from glassplat.training.stage import TrainState
+from glassplat.training.stage import Clock, TrainState
 from tests.training.tiny_capture import tiny_capture, true_scene, write_tiny_capture
 
 SETTINGS = RunSettings("tiny", iterations=12)
@@ -359,6 +361,92 @@ def test_a_rank_that_does_not_lead_saves_nothing(tmp_path: Path) -> None:
             following.save()
     assert following.state.step == 12
     assert list(tmp_path.rglob("*.*")) == []
+
+
+def test_a_photograph_that_cannot_be_read_any_more_costs_nothing(tmp_path: Path) -> None:
+    gone, memory = threading.Event(), Memory(0.0)
+
+    def guarded(view: View) -> View:
+        def read() -> torch.Tensor:
+            if gone.is_set():
+                raise InputError(f"{view.name} cannot be read")
+            return view.read_photo()
+
+        return replace(view, read_photo=read, memory=memory)
+
+    def listen(message: Message) -> None:
+        if isinstance(message, StepDone) and message.step == 5:
+            gone.set()
+
+    directory = RunDirectory(tmp_path / "run")
+    dataset = replace(tiny_capture(), train=tuple(map(guarded, tiny_capture().train)))
+    with pytest.raises(InputError, match=r"png cannot be read; step \d is saved; .* repeat with --resume") as caught:
+        Run(RECIPE, SETTINGS, directory, dataset, checkpoint_every=math.inf).to_the_end(listen)
+    step = load_checkpoint(directory.checkpoint).step
+    assert step >= 5 and f"step {step} is saved" in str(caught.value)
+    assert_same(run(directory.path, resume=True).scene, run(tmp_path / "whole").scene)
+
+
+class Unreadable:
+    """An action that needs a photograph, of which the file is gone."""
+
+    name = "look"
+
+    def due(self, clock: Clock) -> bool:
+        return clock.step == 5
+
+    def apply(self, state: TrainState, dataset: Any, clock: Clock) -> bool:
+        raise InputError("1.png cannot be read")
+
+
+def test_a_state_in_the_middle_of_a_change_is_not_saved(tmp_path: Path) -> None:
+    """The step is done, and the actions after it are not."""
+    record: Any = Record(tmp_path / "checkpoint.safetensors", SimpleNamespace(write=lambda message: None), math.inf)
+    stages = tuple(replace(stage, actions=(Unreadable(),)) for stage in RECIPE.stages(seed=0, iterations=12))
+    state = training.first_state(RECIPE, SETTINGS, tiny_capture())
+    with pytest.raises(InputError, match=r"^1\.png cannot be read$"):
+        list(TrainingSession(state, Ranks(), record).trained(stages, tiny_capture(), 12))
+    assert state.step == 5 and not record.checkpoint.exists()
+
+
+@pytest.mark.parametrize(
+    ("recipe", "settings", "told"),
+    [
+        (RECIPE, replace(SETTINGS, iterations=13), "iterations was 12 and is 13"),
+        (
+            replace(RECIPE, rhythm=replace(RECIPE.rhythm, sh=0.5), sh_degree=2),
+            replace(SETTINGS, seed=3),
+            f"seed was 0 and is 3, sh_degree was 1 and is 2, rhythm.sh was {RECIPE.rhythm.sh} and is 0.5",
+        ),
+        (DeferredRecipe(), SETTINGS, "method was splat and is deferred"),
+    ],
+)
+def test_other_options_are_named_when_a_run_is_to_go_on(recipe: Any, settings: Any, told: str, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, interrupt_at=5)
+    with pytest.raises(InputError) as caught:
+        Run(recipe, settings, RunDirectory(tmp_path), tiny_capture(), resume=True).to_the_end(print)
+    assert f" was started with other options: {told}; expected the same to resume it. Repeat" in str(caught.value)
+
+
+def test_an_option_that_another_version_did_not_have_is_named_when_a_run_is_to_go_on(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, interrupt_at=5)
+    written = json.loads((tmp_path / "recipe.json").read_text())
+    del written["ssim_weight"]
+    (tmp_path / "recipe.json").write_text(json.dumps(written))
+    with pytest.raises(InputError, match=r"options: ssim_weight was unknown and is 0\.2; expected the same"):
+        run(tmp_path, resume=True)
+
+
+def test_a_recipe_of_another_kind_is_named_when_a_run_is_to_go_on(tmp_path: Path) -> None:
+    class Own(SplatRecipe):
+        """With other stages, say."""
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, interrupt_at=5)
+    with pytest.raises(InputError, match="options: recipe was SplatRecipe and is Own; expected the same"):
+        Run(Own(sh_degree=1), SETTINGS, RunDirectory(tmp_path), tiny_capture(), resume=True).to_the_end(print)
 
 
 def test_a_capture_of_other_photographs_is_not_gone_on_with(tmp_path: Path) -> None:
