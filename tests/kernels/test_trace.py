@@ -268,6 +268,28 @@ def test_the_length_of_a_direction_changes_nothing(scales: int, dtype: torch.dty
         torch.testing.assert_close(tensor, other)
 
 
+def far_discs(count: int) -> tuple[RawGaussians, Rays]:
+    """Discs far from the origin of the world in single precision, and a ray towards each.
+
+    They are so small that their boxes round to nothing, and eight have each centre, so that those above them do too.
+    """
+    generator = torch.Generator().manual_seed(3)
+    draws = torch.randn(3, count, 3, generator=generator, dtype=torch.float64)
+    means = (torch.tensor([1e4, -1e4, 0.7e4]) + 0.5 * draws[0, : count // 8].repeat_interleave(8, 0)).float()
+    origins = (means.double() + torch.nn.functional.normalize(draws[1], dim=1)).float()
+    directions = (means.double() + 1e-4 * draws[2] - origins.double()).float()
+    quats = torch.randn(count, 4, generator=generator)
+    discs = means, quats, torch.full((count, 2), math.log(1e-4)), torch.zeros(count), torch.zeros(count, 1, 3)
+    return RawGaussians(*discs), Rays(origins, directions)
+
+
+def test_boxes_far_from_the_origin_lose_no_hit_to_rounding() -> None:
+    discs, rays = far_discs(400)
+    found, expected = traced(discs, rays, sh_degree=0), twin(discs, rays, None, sh_degree=0, near=0.0)
+    assert int(expected.hits.sum()) > 300
+    assert torch.equal(found.hits, expected.hits)
+
+
 def test_a_hierarchy_of_other_gaussians_is_refused() -> None:
     with pytest.raises(ValueError, match="bvh is over 5 Gaussians and there are 6; build it again"):
         trace(cloud(6, DISCS), rays_around(2), bvh_of(cloud(5, DISCS)), sh_degree=0, near=0.0)

@@ -32,8 +32,11 @@ def level_offsets(count: int) -> list[int]:
 
 
 def half_widths_maths(real: type, flat: bool) -> Scalar:
-    """Builds (x, y, z): half the size of a Gaussian's box, from its frame and how many deviations it reaches."""
-    zero, one = real(0.0), real(1.0)
+    """Builds (x, y, z): half the size of a Gaussian's box, from its frame and how many deviations it reaches.
+
+    Widened by what the faces of the box lose in rounding.
+    """
+    zero, one, slack = real(0.0), real(1.0), real(2.0 * np.finfo(real).eps)
 
     @inlined
     def squares(frames, g, axis):  # type: ignore[no-untyped-def]
@@ -44,11 +47,15 @@ def half_widths_maths(real: type, flat: bool) -> Scalar:
         return x * x, y * y, z * z
 
     @inlined
-    def half_widths(frames, g, extent):  # type: ignore[no-untyped-def]
+    def half_widths(means, frames, g, extent):  # type: ignore[no-untyped-def]
         u, v = squares(frames, g, 0), squares(frames, g, 1)
         w = (zero, zero, zero) if flat else squares(frames, g, 2)
         x, y, z = u[0] + v[0] + w[0], u[1] + v[1] + w[1], u[2] + v[2] + w[2]
-        return extent * real(math.sqrt(x)), extent * real(math.sqrt(y)), extent * real(math.sqrt(z))
+        return (
+            extent * real(math.sqrt(x)) + slack * abs(means[g, 0]),
+            extent * real(math.sqrt(y)) + slack * abs(means[g, 1]),
+            extent * real(math.sqrt(z)) + slack * abs(means[g, 2]),
+        )
 
     return half_widths
 

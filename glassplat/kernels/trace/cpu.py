@@ -82,7 +82,7 @@ def fit_boxes(real: type, flat: bool) -> Kernel:
                     g = order[member]
                     if not extents[g] > zero:
                         continue
-                    half = half_widths(frames, g, extents[g])
+                    half = half_widths(means, frames, g, extents[g])
                     for j in range(3):
                         # NaN and infinity fail the comparison, which leaves the box empty.
                         if abs(means[g, j]) + half[j] < nowhere:

@@ -110,7 +110,7 @@ def fit_leaves(real: type, flat: bool) -> Kernel:
         if i >= order.size or not extents[order[i]] > zero:
             return
         g = order[i]
-        x, y, z = half_widths(frames, g, extents[g])
+        x, y, z = half_widths(means, frames, g, extents[g])
         # NaN and infinity fail the comparison, which leaves the box empty.
         if abs(means[g, 0]) + x < nowhere:
             boxes[node, 0, k], boxes[node, 3, k] = means[g, 0] - x, means[g, 0] + x

@@ -17,7 +17,17 @@ from glassplat.kernels.trace import build_bvh, shapes_of, trace
 from glassplat.kernels.trace import cpu as build_cpu
 from glassplat.kernels.trace.reference import trace as twin
 from tests.kernels.cuda.agreement import DEVICE, DTYPES, close, many, on_a_device_or_skipped, on_device
-from tests.kernels.test_trace import DISCS, ELLIPSOIDS, bvh_of, cloud, one_disc, ray, rays_around, with_gradients
+from tests.kernels.test_trace import (
+    DISCS,
+    ELLIPSOIDS,
+    bvh_of,
+    cloud,
+    far_discs,
+    one_disc,
+    ray,
+    rays_around,
+    with_gradients,
+)
 
 on_a_device_or_skipped()
 
@@ -102,6 +112,23 @@ def test_equal_distances_keep_the_order_of_the_gaussians() -> None:
     pile.sh[:, 0] = torch.randn(40, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     expected = check(pile, ray((0.1, 0.2, 0.0), (0.0, 0.0, 1.0)), 0)
     assert int(expected[3]) == 40
+
+
+@pytest.mark.parametrize("scales", [DISCS, ELLIPSOIDS])
+def test_short_directions_meet_the_same(scales: int) -> None:
+    gaussians, rays = cloud(many(30, 600), scales, dtype=torch.float32), rays_around(many(9, 700), dtype=torch.float32)
+    own, expected = on_device(gaussians), twin(gaussians, rays, None, sh_degree=0, near=0.0)
+    found = trace(own, on_device(Rays(rays.origins, 2.0**-61 * rays.directions)), bvh_of(own), sh_degree=0, near=0.0)
+    assert int(expected.hits.sum()) > 3
+    assert torch.equal(found.hits.cpu(), expected.hits)
+    close(found.colors, expected.colors)
+
+
+def test_boxes_far_from_the_origin_lose_no_hit_to_rounding() -> None:
+    discs, rays = far_discs(many(40, 400))
+    own = on_device(discs)
+    found = trace(own, on_device(rays), bvh_of(own), sh_degree=0, near=0.0)
+    assert torch.equal(found.hits.cpu(), twin(discs, rays, None, sh_degree=0, near=0.0).hits)
 
 
 def test_it_traces_to_the_same_bits_every_time() -> None:
