@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -181,6 +182,20 @@ def test_a_needle_reaches_all_its_pixels(dtype: torch.dtype) -> None:
     grazed = (expected > 0.98 / 255) & (expected < 1.02 / 255) | (expected == 0) & (found < 1.02 / 255)
     torch.testing.assert_close(found[~grazed], expected[~grazed], atol=1e-4, rtol=1e-3)
     assert int((expected > 0).sum()) > 20_000
+
+
+def test_a_needle_whose_determinant_cancels_in_single_precision_is_drawn() -> None:
+    """Its deviations are 10,000 px and 0.55 px."""
+    angle, length, thickness = 0.3, 1e4, 0.55
+    c, s = math.cos(angle), math.sin(angle)
+    xx, yy = ((x / length) ** 2 + (y / thickness) ** 2 for x, y in ((c, s), (s, c)))
+    conic = torch.tensor([xx, c * s * (length**-2 - thickness**-2), yy])
+    assert not conic[0] * conic[2] - conic[1] * conic[1] > 0
+    fields = torch.tensor([10.0, 9.0]), conic, torch.tensor(0.8), torch.tensor(1.0), torch.tensor([1e4, 1e4])
+    case = blend(Splats(*(field[None, None] for field in fields)), (24, 20))
+    found, expected = with_gradients(case, composite), with_gradients(case, composite_twin)
+    assert float(found["alpha"].max()) > 0.7
+    assert_close(found, expected, 1e-3)
 
 
 def test_a_pile_of_glass_leaves_finite_gradients(random_splats: MakeSplats) -> None:

@@ -86,7 +86,9 @@ def alphas_front_to_back(splats: Splats, bins: TileBins, probe: Tensor | None = 
     y = torch.arange(bins.height, dtype=like.dtype)[:, None] + 0.5
     for index in torch.argsort(splats.depths, stable=True).tolist():
         xx, xy, yy = splats.conics[index]
-        if not bool((splats.radii[index] > 0).all() & (xx > 0) & (xx * yy - xy * xy > 0)):
+        # In double precision, as in the kernels: of a needle's conic it is a small difference of large products.
+        determinant = xx.double() * yy.double() - xy.double() ** 2
+        if not bool((splats.radii[index] > 0).all() & (xx > 0) & (determinant > 0)):
             continue
         dx, dy = x - splats.means2d[index, 0], y - splats.means2d[index, 1]
         if probe is not None:
