@@ -17,7 +17,7 @@ class Photometric(NamedTuple):
 
     Attributes:
         l1: absolute difference, 0 for equal images.
-        ssim: structural similarity in [-1, 1], 1 for equal images.
+        ssim: structural similarity, within [-1, 1] up to rounding; 1 for equal images.
     """
 
     l1: Tensor
