@@ -104,6 +104,8 @@ MOST_PAIRS = 2**31 - 1
 
 LEAST_ALPHA = 1e-6
 """Coverage up to which a pixel holds nothing, and the mean of its channels is taken for 0."""
+ON_MEAN = 8
+"""Rounding steps of a mean within which values lie on it: whoever covers a pixel alone deviates by rounding only."""
 
 
 class Deviation(NamedTuple):

@@ -136,6 +136,19 @@ def test_a_surface_deviates_nowhere(random_splats: MakeSplats) -> None:
     assert float(case(composite).deviation.max()) < 1e-12
 
 
+@pytest.mark.parametrize("channels", [1, 6])
+@pytest.mark.parametrize("function", [composite, composite_twin])
+def test_the_deviation_of_a_splat_alone_has_no_gradient(function: Callable[..., Composite], channels: int) -> None:
+    """Where its coverage is small its mean is uncertain, but it has hardly any weight there."""
+    fields = (torch.tensor([20.3, 15.2]), torch.tensor([0.01, 0.0, 0.01]), torch.tensor(0.8), torch.tensor(3.0))
+    splats = Splats(*(field[None, None] for field in fields), torch.full((1, 1, 2), 40.0))
+    values = torch.full((1, 1, channels), 3.1, requires_grad=True)
+    asked = Deviation(channels - 1, torch.ones(1, 36, 44))
+    found = function(splats, values, bin_tiles(splats, 44, 36), deviation=asked)
+    gradient, covered = torch.autograd.grad(found.deviation.sum(), values)[0], found.alpha.detach()
+    assert float(gradient.abs().sum()) < 1e-3 * float(covered.sum())
+
+
 def test_two_layers_deviate_by_their_weighted_distance_from_the_mean() -> None:
     splats = two_discs(depths=(1.0, 3.0), opacities=(0.5, 0.8))
     bins = bin_tiles(splats, 16, 16)

@@ -38,7 +38,7 @@ from glassplat.kernels.composite.cpu_tile import (
     sum_pair_rows,
 )
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
-from glassplat.kernels.records import LEAST_ALPHA, Deviation, Splats, TileBins
+from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN, Deviation, Splats, TileBins
 
 # Planes of a tile's results; SUMS has one per channel. T_AGAIN, CENTER, DEVIATION and LEAN belong to the second
 # traversal, which sums distances from the mean that the first one has found.
@@ -147,6 +147,7 @@ def _deviate_block(real: type) -> Scalar:
     x_centers, y_centers = tile.pixel_centers(real)
     exp2 = tile.tile_functions(real).exp2
     zero, alpha_max, least = real(0.0), real(ALPHA_MAX), real(math.log2(ALPHA_MIN))
+    on_mean = real(ON_MEAN * np.finfo(real).eps)
     MEAN_X, MEAN_Y, ORDER, LAST = tile.MEAN_X, tile.MEAN_Y, tile.ORDER, tile.LAST
 
     @inlined
@@ -155,7 +156,7 @@ def _deviate_block(real: type) -> Scalar:
         xs, ys = x_centers() + x, y_centers() + y
         none, most = full(zero), full(alpha_max)
         t, last, center = load(planes, at + T_AGAIN), load(state, at_state + LAST), load(planes, at + CENTER)
-        deviation, lean = load(planes, at + DEVIATION), load(planes, at + LEAN)
+        deviation, lean, slack = load(planes, at + DEVIATION), load(planes, at + LEAN), on_mean * absolute(center)
         for e in range(count):
             k = item(entries, e)
             if k >= 0:
@@ -166,7 +167,7 @@ def _deviate_block(real: type) -> Scalar:
                 t = t - weight
                 difference = item(batch, splat + column) - center
                 deviation = deviation + weight * absolute(difference)
-                lean = lean + select(difference > zero, weight, select(difference < zero, -weight, none))
+                lean = lean + select(difference > slack, weight, select(difference < -slack, -weight, none))
         store(planes, at + T_AGAIN, t)
         store(planes, at + DEVIATION, deviation)
         store(planes, at + LEAN, lean)

@@ -31,7 +31,7 @@ from glassplat.kernels.backend.cpu_vector import (
 from glassplat.kernels.composite import cpu_tile as tile
 from glassplat.kernels.composite.cpu_tile import PAIR_VALUES, exponent, lane_of
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar
-from glassplat.kernels.records import LEAST_ALPHA
+from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN
 
 # Planes of the backward pass; V_IMAGE has one per channel. T and T_GLASS are transmittances in front of the current
 # splat, BEHIND and BEHIND_GLASS what lies behind it, weighted by the incoming gradients, WEIGHT how much of it shows.
@@ -47,7 +47,7 @@ LEAN = PAIR_VALUES + tile.GROUP
 def _unblend_primary(real: type, probed: bool) -> Scalar:
     full, load = vector_kind(real, tile.LANES)
     x_centers, y_centers = tile.pixel_centers(real)
-    exp2, dot_more = tile.tile_functions(real).exp2, _dot_more(real)
+    exp2, dot_more, sided = tile.tile_functions(real).exp2, _dot_more(real), _sided(real)
     zero, one, two, alpha_max = real(0.0), real(1.0), real(2.0), real(ALPHA_MAX)
     least = real(math.log2(ALPHA_MIN))
     BLOCK, ACROSS, LANES, PIXELS, LAST = tile.BLOCK, tile.ACROSS, tile.LANES, tile.PIXELS, tile.LAST
@@ -84,11 +84,12 @@ def _unblend_primary(real: type, probed: bool) -> Scalar:
                 dot = dot_more(dot, planes, i, batch, splat, groups, deviating)
                 store(planes, WEIGHT + i, weight)
             elif deviating >= 0:
-                difference = item(batch, splat + VALUES + deviating) - load(planes, CENTER + i)
+                center = load(planes, CENTER + i)
+                difference = item(batch, splat + VALUES + deviating) - center
                 v_deviation = load(planes, V_DEVIATION + i)
                 slope = weight * v_deviation
                 dot = dot + v_deviation * absolute(difference)
-                lean = lean + select(difference > zero, slope, select(difference < zero, -slope, none))
+                lean = lean + sided(difference, center, slope)
             behind = load(planes, BEHIND + i)
             v_alpha = t * dot - behind * inverse
             store(planes, BEHIND + i, behind + weight * dot)
@@ -106,6 +107,18 @@ def _unblend_primary(real: type, probed: bool) -> Scalar:
         store(row, row_at, sums_of(sums))
 
     return unblend_primary
+
+
+def _sided(real: type) -> Scalar:
+    full, zero, on_mean = vector_kind(real, tile.LANES).full, real(0.0), real(ON_MEAN * np.finfo(real).eps)
+
+    @inlined
+    def sided(difference, center, slope):
+        """A slope with the sign of the difference from the mean, none for who lies on it."""
+        slack = on_mean * absolute(center)
+        return select(difference > slack, slope, select(difference < -slack, -slope, full(zero)))
+
+    return sided
 
 
 def _dot_more(real: type) -> Scalar:
@@ -130,7 +143,7 @@ def _dot_more(real: type) -> Scalar:
 
 def _sum_more(real: type) -> Scalar:
     full, load = vector_kind(real, tile.LANES)
-    zero, LANES, PIXELS, VALUES = real(0.0), tile.LANES, tile.PIXELS, tile.VALUES
+    zero, LANES, PIXELS, VALUES, sided = real(0.0), tile.LANES, tile.PIXELS, tile.VALUES, _sided(real)
 
     @inlined
     def sum_more(planes, batch, splat, blocks, groups, deviating, rows, row, sums):
@@ -153,9 +166,10 @@ def _sum_more(real: type) -> Scalar:
             while left != 0:
                 i = lowest_bit(left) * LANES
                 left &= left - 1
-                difference = item(batch, splat + VALUES + deviating) - load(planes, CENTER + i)
+                center = load(planes, CENTER + i)
+                difference = item(batch, splat + VALUES + deviating) - center
                 slope = load(planes, WEIGHT + i) * load(planes, V_DEVIATION + i)
-                s0 = s0 + select(difference > zero, slope, select(difference < zero, -slope, none))
+                s0 = s0 + sided(difference, center, slope)
             one = (s0, none, none, none, none, none, none, none, none, none, none, none, none, none, none, none)
             store(sums, 0, sums_of(one))
             rows[row + PAIR_VALUES + deviating] += sums[0]

@@ -28,7 +28,7 @@ from glassplat.kernels.composite.cuda_tile import (
     tile_steps,
 )
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from glassplat.kernels.records import LEAST_ALPHA, REAL_OF, TILE, Deviation, Splats, TileBins
+from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN, REAL_OF, TILE, Deviation, Splats, TileBins
 
 __all__ = ["composite", "composite_discs", "composite_discs_gradients", "composite_gradients"]
 
@@ -255,7 +255,7 @@ def composite_forward(real: type, num_channels: int = 4) -> Kernel:
 def composite_deviation(real: type) -> Kernel:
     """The second traversal: fills the mean of a channel, and the deviation and lean from it, of the active tiles."""
     place, load, coverage = tile_steps(real)
-    zero, one, least_alpha = real(0.0), real(1.0), real(LEAST_ALPHA)
+    zero, one, least_alpha, on_mean = real(0.0), real(1.0), real(LEAST_ALPHA), real(ON_MEAN * np.finfo(real).eps)
     alpha_min, alpha_max = real(ALPHA_MIN), real(ALPHA_MAX)
 
     @kernel(
@@ -313,7 +313,7 @@ def composite_deviation(real: type) -> Kernel:
                     t -= weight
                     difference = channels[at(members[k] * num_channels + channel)] - middle
                     spread += weight * abs(difference)
-                    if difference != zero:
+                    if abs(difference) > on_mean * abs(middle):
                         leaning += weight if difference > zero else -weight
         if inside:
             center[camera, y0 + row, x0 + column] = middle

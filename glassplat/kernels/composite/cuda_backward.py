@@ -20,7 +20,7 @@ from glassplat.kernels.backend.devices import SIMULATED
 from glassplat.kernels.composite.cuda_tile import BUCKET, COLUMNS, MEAN_X, MEAN_Y, MOMENTS, PIXELS, at, tile_steps
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar
 from glassplat.kernels.maths.fast_maths import reciprocal_maths
-from glassplat.kernels.records import TILE
+from glassplat.kernels.records import ON_MEAN, TILE
 
 WARPS = 2
 """Buckets of a block; they have nothing to do with each other."""
@@ -130,7 +130,7 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
     """Fills one gradient row per pair that any pixel blended; all rows start at zero."""
     place, load, coverage = tile_steps(real)
     reciprocal = reciprocal_maths(real)
-    zero, one = real(0.0), real(1.0)
+    zero, one, on_mean = real(0.0), real(1.0), real(ON_MEAN * np.finfo(real).eps)
     alpha_min, alpha_max = real(ALPHA_MIN), real(ALPHA_MAX)
     behinds, lasts, glass_lasts, glass_state, above = BEHIND, LAST, LAST_GLASS, 3 * SLOTS, BUCKET // TILE
     shown, spread, middle, _, _ = _planes(num_channels)
@@ -226,7 +226,7 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
                         if channel >= 0:
                             difference, pull = apart - pulls[pulled + at(middle)], pulls[pulled + at(spread)]
                             dot += pull * abs(difference)
-                            if difference != zero:
+                            if abs(difference) > on_mean * abs(pulls[pulled + at(middle)]):
                                 v_apart += weight * pull if difference > zero else -weight * pull
                         behind = state[mine + behinds] - weight * dot
                         gain = (t * dot - behind * inverse) * a

@@ -11,7 +11,7 @@ from torch import Tensor
 from glassplat.kernels.composite import BlendedDiscs, Composite
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from glassplat.kernels.maths.disc import LOW_PASS, MOST_DEVIATIONS
-from glassplat.kernels.records import LEAST_ALPHA, Deviation, Discs, Splats, TileBins
+from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN, Deviation, Discs, Splats, TileBins
 
 TILE = 16
 
@@ -50,7 +50,12 @@ def _spread(weights: dict[int, Tensor], values: Tensor, total: Tensor, alpha: Te
     covered = alpha > LEAST_ALPHA
     mean = torch.where(covered, total / torch.where(covered, alpha, 1), 0)
     mean = mean if through_mean else mean.detach()
-    return torch.stack([torch.zeros_like(mean), *(w * (values[i] - mean).abs() for i, w in weights.items())]).sum(0)
+    slack = ON_MEAN * torch.finfo(mean.dtype).eps * mean.abs()
+    parts = [torch.zeros_like(mean)]
+    for index, weight in weights.items():
+        distance = (values[index] - mean).abs()
+        parts.append(weight * torch.where(distance > slack, distance, distance.detach()))
+    return torch.stack(parts).sum(0)
 
 
 def _camera_composite(

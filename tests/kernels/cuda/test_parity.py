@@ -224,6 +224,17 @@ def test_composite(random_splats: SplatMaker, mean: bool | None, dtype: torch.dt
     check_composite(splats, many(6, 80), mean, size)
 
 
+def test_the_deviation_of_a_splat_alone_has_no_gradient() -> None:
+    fields = (torch.tensor([9.3, 1.2]), torch.tensor([0.01, 0.0, 0.01]), torch.tensor(0.8), torch.tensor(3.0))
+    splats = on_device(Splats(*(field[None, None] for field in fields), torch.full((1, 1, 2), 40.0)))
+    values = torch.full((1, 1, 1), 3.1, device=DEVICE, requires_grad=True)
+    asked = Deviation(0, torch.ones(1, 2, 18, device=DEVICE))
+    bins = tiles_operation.bin_tiles(splats, 18, 2)
+    found = composite_operation.composite(splats, values, bins, deviation=asked)
+    assert float(found.alpha.detach().sum()) > 20
+    assert float(torch.autograd.grad(found.deviation.sum(), values)[0].abs()) < 1e-2
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_composite_of_many_splats_of_one_tile(random_splats: SplatMaker, dtype: torch.dtype) -> None:
     size, shape = (7, 3), (2, many(100, 1000))
