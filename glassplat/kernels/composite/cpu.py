@@ -35,6 +35,7 @@ from glassplat.kernels.composite.cpu_tile import (
     list_block,
     list_plain_block,
     new_pair_rows,
+    place,
     sum_pair_rows,
 )
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
@@ -274,7 +275,7 @@ def _begin_deviation(real: type) -> Scalar:
 @functools.cache
 def composite_forward(real: type) -> Kernel:
     """Builds the kernel that blends all tiles."""
-    pack, place, fetch, reached, _ = tile.tile_functions(real)
+    pack, fetch, reached, _ = tile.tile_functions(real)
     blend_plain, blend_mixed = _blend_block(real, False), _blend_block(real, True)
     blend_more, deviate_block = _blend_more(real), _deviate_block(real)
     begin, clear, finish, write_tile = tile.begin_state(real), _clear(real), tile.finish_state(real), _write_tile(real)

@@ -77,14 +77,12 @@ class TileFunctions(NamedTuple):
 
     Attributes:
         pack: copies one splat's geometry into its packed row.
-        place: camera, first column, first row, columns and rows of a tile.
         fetch: copies the packed splats of consecutive pairs next to each other, their means relative to the tile.
         reached: bits of the blocks of a tile that a fetched splat reaches.
         exp2: 2^t of a vector for -100 < t < 1; elsewhere anything.
     """
 
     pack: Scalar
-    place: Scalar
     fetch: Scalar
     reached: Scalar
     exp2: Scalar
@@ -92,7 +90,7 @@ class TileFunctions(NamedTuple):
 
 def tile_functions(real: type) -> TileFunctions:
     """Builds the functions for `real`, np.float32 or np.float64."""
-    return TileFunctions(_pack(real), _place(), _fetch(real), _reached(real), _exp2(real))
+    return TileFunctions(_pack(real), _fetch(real), _reached(real), _exp2(real))
 
 
 def groups_of(num_values: int) -> int:
@@ -176,15 +174,13 @@ def _pack(real: type) -> Scalar:
     return pack
 
 
-def _place() -> Scalar:
-    @inlined
-    def place(tile, width, height):
-        tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-        camera, rest = tile // (tiles_x * tiles_y), tile % (tiles_x * tiles_y)
-        x0, y0 = (rest % tiles_x) * TILE, (rest // tiles_x) * TILE
-        return camera, x0, y0, min(TILE, width - x0), min(TILE, height - y0)
-
-    return place
+@inlined
+def place(tile, width, height):
+    """Camera, first column, first row, columns and rows of a tile."""
+    tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    camera, rest = tile // (tiles_x * tiles_y), tile % (tiles_x * tiles_y)
+    x0, y0 = (rest % tiles_x) * TILE, (rest // tiles_x) * TILE
+    return camera, x0, y0, min(TILE, width - x0), min(TILE, height - y0)
 
 
 def _fetch(real: type) -> Scalar:
