@@ -572,7 +572,7 @@ def composite_discs(
     composite_discs_forward(real)(
         *_by_disc(discs), channels.numpy().reshape(-1, num_channels), bins.width, bins.height,
         *_real_options(real, near, low_pass), bins.pair_splats.numpy(), bins.tile_offsets.numpy(),
-        bins.splat_offsets.numpy(), bins.active.numpy(), *saved, tuple(_flat(image) for image in images),
+        bins.splat_offsets.numpy(), bins.active.numpy(), *saved, tuple(tile.flat(image) for image in images),
     )  # fmt: skip
     image, alpha, depth, median, distortion = images
     return image, alpha, depth, median, distortion, saved
@@ -590,7 +590,7 @@ def composite_discs_gradients(
     composite_discs_backward(real)(
         cameras * count, num_channels, bins.width, bins.height, *_real_options(real, near, low_pass),
         bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), *saved,
-        tuple(_flat(v) for v in v_outputs), rows,
+        tuple(tile.flat(v) for v in v_outputs), rows,
     )  # fmt: skip
     widths = ((2,), (MAP,), (), (), (num_channels,), (2,))
     found = [channels.new_zeros(cameras, count, *rest) for rest in widths]
@@ -605,11 +605,6 @@ def composite_discs_gradients(
 def _real_options(real: type, near: float, low_pass: float) -> tuple[Any, Any]:
     """The near plane, and one over the variance of the low-pass."""
     return real(near), real(1 / low_pass**2) if low_pass else real(np.inf)
-
-
-def _flat(tensor: Tensor) -> NDArray[Any]:
-    array: NDArray[Any] = tensor.contiguous().numpy().reshape(-1)
-    return array
 
 
 def _by_disc(discs: Discs) -> tuple[NDArray[Any], ...]:

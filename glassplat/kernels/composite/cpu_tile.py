@@ -35,7 +35,7 @@ from glassplat.kernels.backend.cpu_vector import (
     vector_kind,
 )
 from glassplat.kernels.maths.blending import ALPHA_MIN, EXP2_COEFFICIENTS, Scalar, blend_maths
-from glassplat.kernels.records import TILE, Splats, TileBins
+from glassplat.kernels.records import REAL_OF, TILE, Splats, TileBins
 
 PIXELS = TILE * TILE
 BLOCK = 4
@@ -103,9 +103,10 @@ def packed_width(num_values: int) -> int:
     return LANES * ((VALUES + GROUP * groups_of(num_values) + LANES - 1) // LANES)
 
 
-def real_of(splats: Splats) -> type:
-    """The NumPy type that a kernel for these splats is built with."""
-    return np.float64 if splats.means2d.dtype == torch.float64 else np.float32
+def flat(tensor: Tensor) -> NDArray[Any]:
+    """A tensor as an array of one dimension."""
+    array: NDArray[Any] = tensor.contiguous().numpy().reshape(-1)
+    return array
 
 
 def pixel_centers(real: type) -> tuple[Scalar, Scalar]:
@@ -305,7 +306,7 @@ def sum_pair_rows(
     shape = tuple(splats.opacities.shape)
     widths = ((2,), (3,), (), (num_values,), (probe_width,))
     v_means, v_conics, v_opacities, v_values, v_probe = (splats.opacities.new_empty(*shape, *w) for w in widths)
-    _sum_rows(real_of(splats))(
+    _sum_rows(REAL_OF[splats.means2d.dtype])(
         rows, bins.pair_slots.numpy(), bins.splat_offsets.numpy(),
         splats.conics.numpy().reshape(-1, 3), splats.opacities.numpy().reshape(-1),
         v_means.numpy().reshape(-1, 2), v_conics.numpy().reshape(-1, 3), v_opacities.numpy().reshape(-1),
