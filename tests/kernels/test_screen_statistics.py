@@ -7,7 +7,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.screen_statistics import Sums, Views, add_views, add_views_in_torch
+from glassplat.kernels.screen_statistics import Sums, Views, add_views
+
+
+@torch.no_grad()
+def add_views_in_torch(sums: Sums, views: Views) -> None:
+    """The definition of `add_views`, for tensors that are checked."""
+    visible = (views.radii > 0).all(dim=-1)
+    rows = slice(None) if views.direct else slice(0, 1)
+    for total, gradient in ((sums.gradient_sum, views.v_means2d), (sums.pull_sum, views.v_probe)):
+        across, down = gradient[..., 0] * (views.width / 2), gradient[..., 1] * (views.height / 2)
+        total[rows] += torch.where(visible, torch.hypot(across, down), 0).sum(dim=0)
+    sums.view_count[rows] += (views.weight * visible.to(views.radii.dtype)).sum(dim=0)
+    shares = torch.where(visible, views.radii.amax(dim=-1) / max(views.width, views.height), 0)
+    torch.maximum(sums.max_radius, shares.amax(dim=0).to(sums.max_radius.dtype), out=sums.max_radius)
 
 
 def no_views(count: int, dtype: torch.dtype = torch.float32) -> Sums:

@@ -269,14 +269,17 @@ def test_the_length_of_a_direction_changes_nothing(scales: int, dtype: torch.dty
 
 
 def far_discs(count: int) -> tuple[RawGaussians, Rays]:
-    """Small opaque discs far from the origin of the world in single precision, and a ray towards each."""
+    """Discs far from the origin of the world in single precision, and a ray towards each.
+
+    They are so small that their boxes round to nothing, and eight have each centre, so that those above them do too.
+    """
     generator = torch.Generator().manual_seed(3)
     draws = torch.randn(3, count, 3, generator=generator, dtype=torch.float64)
-    means = (torch.tensor([1e4, -1e4, 0.7e4]) + 0.05 * draws[0]).float()
+    means = (torch.tensor([1e4, -1e4, 0.7e4]) + 0.5 * draws[0, : count // 8].repeat_interleave(8, 0)).float()
     origins = (means.double() + torch.nn.functional.normalize(draws[1], dim=1)).float()
-    directions = (means.double() + 1e-3 * draws[2] - origins.double()).float()
+    directions = (means.double() + 1e-4 * draws[2] - origins.double()).float()
     quats = torch.randn(count, 4, generator=generator)
-    discs = means, quats, torch.full((count, 2), math.log(1e-3)), torch.full((count,), 3.0), torch.zeros(count, 1, 3)
+    discs = means, quats, torch.full((count, 2), math.log(1e-4)), torch.zeros(count), torch.zeros(count, 1, 3)
     return RawGaussians(*discs), Rays(origins, directions)
 
 

@@ -259,10 +259,6 @@ def checked(what: str, answer: tuple[Any, ...]) -> Any:
     return answer[1] if len(answer) > 1 else None
 
 
-if not SIMULATED:
-    # The simulator has no driver.
-    from glassplat.kernels.backend.cuda import LoadedKernel, current_gpu
-
 # Small launches are part of every frame (few cameras, few panes), and Numba warns of each of them.
 config.CUDA_LOW_OCCUPANCY_WARNINGS = 0
 

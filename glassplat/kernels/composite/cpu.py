@@ -35,10 +35,11 @@ from glassplat.kernels.composite.cpu_tile import (
     list_block,
     list_plain_block,
     new_pair_rows,
+    place,
     sum_pair_rows,
 )
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
-from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN, Deviation, Splats, TileBins
+from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN, REAL_OF, Deviation, Splats, TileBins
 
 # Planes of a tile's results; SUMS has one per channel. T_AGAIN, CENTER, DEVIATION and LEAN belong to the second
 # traversal, which sums distances from the mean that the first one has found.
@@ -274,7 +275,7 @@ def _begin_deviation(real: type) -> Scalar:
 @functools.cache
 def composite_forward(real: type) -> Kernel:
     """Builds the kernel that blends all tiles."""
-    pack, place, fetch, reached, _ = tile.tile_functions(real)
+    pack, fetch, reached, _ = tile.tile_functions(real)
     blend_plain, blend_mixed = _blend_block(real, False), _blend_block(real, True)
     blend_more, deviate_block = _blend_more(real), _deviate_block(real)
     begin, clear, finish, write_tile = tile.begin_state(real), _clear(real), tile.finish_state(real), _write_tile(real)
@@ -422,12 +423,12 @@ def composite(
     packed, state = (torch.empty(size, dtype=dtype).numpy() for size in sizes)
     spread = torch.zeros(tiles * 2 * tile.PIXELS if deviation else 0, dtype=dtype).numpy()
     saved = Saved(packed, np.empty(len(bins.pair_splats), np.int32), state, spread)
-    where = _flat(deviation.where.detach()) if deviation else spread
-    composite_forward(tile.real_of(splats))(
+    where = tile.flat(deviation.where.detach()) if deviation else spread
+    composite_forward(REAL_OF[channels.dtype])(
         *_by_splat(splats, channels), marks.numpy(), count, num_primary, bins.width, bins.height,
         deviation.channel if deviation else -1, where,
         bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.splat_offsets.numpy(), bins.active.numpy(),
-        *saved, *(_flat(output) for output in (image, alpha, mask, deviated)),
+        *saved, *(tile.flat(output) for output in (image, alpha, mask, deviated)),
     )  # fmt: skip
     return image, alpha, mask, deviated, saved
 
@@ -440,7 +441,7 @@ def composite_gradients(
 
     Last the probe's, where `probed`.
     """
-    real = tile.real_of(splats)
+    real = REAL_OF[channels.dtype]
     cameras, count, num_channels = channels.shape
     rows = new_pair_rows(bins, num_channels, real)
     *v_images, v_deviation = v_outputs
@@ -451,7 +452,7 @@ def composite_gradients(
     composite_backward(real, probed)(
         cameras * count, num_primary < count, num_channels, bins.width, bins.height, channel, through_mean,
         bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), *saved,
-        *(_flat(v) for v in (*v_images, v_deviation)), rows,
+        *(tile.flat(v) for v in (*v_images, v_deviation)), rows,
     )  # fmt: skip
     v_means, v_conics, v_opacities, v_values, v_probe = sum_pair_rows(rows, bins, splats, num_channels, probed)
     v_marks = torch.zeros_like(marks)
@@ -459,11 +460,6 @@ def composite_gradients(
         v_marks.copy_(v_values[:, num_primary:, 0])
         v_values[:, num_primary:] = 0
     return v_means, v_conics, v_opacities, v_values, v_marks, v_probe if probed else None
-
-
-def _flat(tensor: Tensor) -> NDArray[Any]:
-    array: NDArray[Any] = tensor.contiguous().numpy().reshape(-1)
-    return array
 
 
 def _by_splat(splats: Splats, channels: Tensor) -> tuple[NDArray[Any], ...]:

@@ -29,7 +29,7 @@ from glassplat.kernels.backend.cpu_vector import (
     with_fourths,
 )
 from glassplat.kernels.composite import cpu_tile as tile
-from glassplat.kernels.composite.cpu_tile import PAIR_VALUES, exponent, lane_of
+from glassplat.kernels.composite.cpu_tile import PAIR_VALUES, exponent, lane_of, place
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar
 from glassplat.kernels.records import LEAST_ALPHA, ON_MEAN
 
@@ -331,7 +331,7 @@ def _begin(real: type) -> Scalar:
 @functools.cache
 def composite_backward(real: type, probed: bool) -> Kernel:
     """Builds the kernel that fills one row of sums per pair, given the final state of each tile."""
-    _, place, fetch, _, _ = tile.tile_functions(real)
+    fetch = tile.tile_functions(real).fetch
     unblend_primary, unblend_glass = _unblend_primary(real, probed), _unblend_glass(real, probed)
     begin, sum_more = _begin(real), _sum_more(real)
     load_gradients, load_deviation = _load_gradients(real), _load_deviation(real)

@@ -32,9 +32,9 @@ from glassplat.kernels.backend.cpu_vector import (
     vector_kind,
 )
 from glassplat.kernels.composite import cpu_tile as tile
-from glassplat.kernels.composite.cpu_tile import lane_of, list_block
+from glassplat.kernels.composite.cpu_tile import lane_of, list_block, place
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar
-from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, meet_maths
+from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, meet_maths, meet_slopes
 from glassplat.kernels.records import REAL_OF, Discs, TileBins
 
 # Columns of a packed disc: first its outline as a packed splat, of which ORDER is reused once blocks are known.
@@ -114,7 +114,7 @@ def _fetch(real: type) -> Scalar:
 
 
 def _cover(real: type) -> Scalar:
-    meet, exp2, full = meet_maths(real)[0], tile.tile_functions(real).exp2, vector_kind(real, tile.LANES).full
+    meet, exp2, full = meet_maths(real), tile.tile_functions(real).exp2, vector_kind(real, tile.LANES).full
     x_centers, y_centers = tile.pixel_centers(real)
     zero, one, farthest = real(0.0), real(1.0), real(MOST_DEVIATIONS**2)
     half_bits, least = real(0.5 / math.log(2.0)), real(math.log2(ALPHA_MIN))
@@ -282,8 +282,7 @@ def _write_tile(real: type) -> Scalar:
 @functools.cache
 def composite_discs_forward(real: type) -> Kernel:
     """Builds the kernel that blends all tiles."""
-    place, reached = tile.tile_functions(real).place, tile.tile_functions(real).reached
-    pack, fetch, _ = disc_functions(real)
+    reached, (pack, fetch, _) = tile.tile_functions(real).reached, disc_functions(real)
     blend_block, blend_channels, begin = _blend_block(real), _blend_channels(real), _begin_state(real)
     write_tile, zero = _write_tile(real), real(0.0)
     BLOCK, ACROSS, BLOCKS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.BLOCKS, tile.LANES, tile.PIXELS
@@ -377,16 +376,21 @@ def _value_of(real: type) -> Scalar:
     return value_of
 
 
+NONE, ENDLESS = np.float32(0.0), np.float32(np.inf)
+"""In single precision, which holds them exactly, so that they widen nothing."""
+
+
+@inlined
+def sharpness_of(sharpness):
+    """Endless where there is no low-pass: then no pixel has a gradient through it, and zero times it is none."""
+    return sharpness if sharpness < ENDLESS else NONE
+
+
 def _unblend(real: type) -> Scalar:
     full, load = vector_kind(real, tile.LANES)
-    cover, value_of, slopes = disc_functions(real).cover, _value_of(real), meet_maths(real)[1]
-    zero, one, two, alpha_max, endless = real(0.0), real(1.0), real(2.0), real(ALPHA_MAX), real(np.inf)
+    cover, value_of = disc_functions(real).cover, _value_of(real)
+    zero, one, two, alpha_max = real(0.0), real(1.0), real(2.0), real(ALPHA_MAX)
     BLOCK, ACROSS, LANES = tile.BLOCK, tile.ACROSS, tile.LANES
-
-    @inlined
-    def sharpness_of(sharpness):
-        """Endless where there is no low-pass: then no pixel has a gradient through it, and zero times it is none."""
-        return sharpness if sharpness < endless else zero
 
     @inlined
     def unblend(planes, state, at, batch, splat, blocks, groups, near, sharpness, row, row_at):
@@ -435,7 +439,7 @@ def _unblend(real: type) -> Scalar:
             vp_x, vp_y, vp_1 = vp_x + v_vp * dx, vp_y + v_vp * dy, vp_1 + v_vp
             e_x, e_y, e_1 = e_x + v_e * dx, e_y + v_e * dy, e_1 + v_e
             around_x, around_y = around_x + v_around * dx, around_y + v_around * dy
-            slope_x, slope_y = slopes(found, v_up, v_vp, v_e)
+            slope_x, slope_y = meet_slopes(found, v_up, v_vp, v_e)
             pull_x = pull_x + absolute(slope_x + v_around * dx)
             pull_y = pull_y + absolute(slope_y + v_around * dy)
         sums = (
@@ -500,7 +504,7 @@ def _begin_gradients(real: type) -> Scalar:
 @functools.cache
 def composite_discs_backward(real: type) -> Kernel:
     """Builds the kernel that fills one row of sums per pair, given the final state of each tile."""
-    place, fetch = tile.tile_functions(real).place, disc_functions(real).fetch
+    fetch = disc_functions(real).fetch
     unblend, sum_channels, begin = _unblend(real), _sum_channels(real), _begin_gradients(real)
     zero = real(0.0)
     LANES, PIXELS, CHUNK = tile.LANES, tile.PIXELS, tile.CHUNK
@@ -568,7 +572,7 @@ def composite_discs(
     composite_discs_forward(real)(
         *_by_disc(discs), channels.numpy().reshape(-1, num_channels), bins.width, bins.height,
         *_real_options(real, near, low_pass), bins.pair_splats.numpy(), bins.tile_offsets.numpy(),
-        bins.splat_offsets.numpy(), bins.active.numpy(), *saved, tuple(_flat(image) for image in images),
+        bins.splat_offsets.numpy(), bins.active.numpy(), *saved, tuple(tile.flat(image) for image in images),
     )  # fmt: skip
     image, alpha, depth, median, distortion = images
     return image, alpha, depth, median, distortion, saved
@@ -586,7 +590,7 @@ def composite_discs_gradients(
     composite_discs_backward(real)(
         cameras * count, num_channels, bins.width, bins.height, *_real_options(real, near, low_pass),
         bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.active.numpy(), *saved,
-        tuple(_flat(v) for v in v_outputs), rows,
+        tuple(tile.flat(v) for v in v_outputs), rows,
     )  # fmt: skip
     widths = ((2,), (MAP,), (), (), (num_channels,), (2,))
     found = [channels.new_zeros(cameras, count, *rest) for rest in widths]
@@ -601,11 +605,6 @@ def composite_discs_gradients(
 def _real_options(real: type, near: float, low_pass: float) -> tuple[Any, Any]:
     """The near plane, and one over the variance of the low-pass."""
     return real(near), real(1 / low_pass**2) if low_pass else real(np.inf)
-
-
-def _flat(tensor: Tensor) -> NDArray[Any]:
-    array: NDArray[Any] = tensor.contiguous().numpy().reshape(-1)
-    return array
 
 
 def _by_disc(discs: Discs) -> tuple[NDArray[Any], ...]:

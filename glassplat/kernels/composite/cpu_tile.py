@@ -35,7 +35,7 @@ from glassplat.kernels.backend.cpu_vector import (
     vector_kind,
 )
 from glassplat.kernels.maths.blending import ALPHA_MIN, EXP2_COEFFICIENTS, Scalar, blend_maths
-from glassplat.kernels.records import TILE, Splats, TileBins
+from glassplat.kernels.records import REAL_OF, TILE, Splats, TileBins
 
 PIXELS = TILE * TILE
 BLOCK = 4
@@ -77,14 +77,12 @@ class TileFunctions(NamedTuple):
 
     Attributes:
         pack: copies one splat's geometry into its packed row.
-        place: camera, first column, first row, columns and rows of a tile.
         fetch: copies the packed splats of consecutive pairs next to each other, their means relative to the tile.
         reached: bits of the blocks of a tile that a fetched splat reaches.
         exp2: 2^t of a vector for -100 < t < 1; elsewhere anything.
     """
 
     pack: Scalar
-    place: Scalar
     fetch: Scalar
     reached: Scalar
     exp2: Scalar
@@ -92,7 +90,7 @@ class TileFunctions(NamedTuple):
 
 def tile_functions(real: type) -> TileFunctions:
     """Builds the functions for `real`, np.float32 or np.float64."""
-    return TileFunctions(_pack(real), _place(), _fetch(real), _reached(real), _exp2(real))
+    return TileFunctions(_pack(real), _fetch(real), _reached(real), _exp2(real))
 
 
 def groups_of(num_values: int) -> int:
@@ -105,9 +103,10 @@ def packed_width(num_values: int) -> int:
     return LANES * ((VALUES + GROUP * groups_of(num_values) + LANES - 1) // LANES)
 
 
-def real_of(splats: Splats) -> type:
-    """The NumPy type that a kernel for these splats is built with."""
-    return np.float64 if splats.means2d.dtype == torch.float64 else np.float32
+def flat(tensor: Tensor) -> NDArray[Any]:
+    """A tensor as an array of one dimension."""
+    array: NDArray[Any] = tensor.contiguous().numpy().reshape(-1)
+    return array
 
 
 def pixel_centers(real: type) -> tuple[Scalar, Scalar]:
@@ -176,15 +175,13 @@ def _pack(real: type) -> Scalar:
     return pack
 
 
-def _place() -> Scalar:
-    @inlined
-    def place(tile, width, height):
-        tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-        camera, rest = tile // (tiles_x * tiles_y), tile % (tiles_x * tiles_y)
-        x0, y0 = (rest % tiles_x) * TILE, (rest // tiles_x) * TILE
-        return camera, x0, y0, min(TILE, width - x0), min(TILE, height - y0)
-
-    return place
+@inlined
+def place(tile, width, height):
+    """Camera, first column, first row, columns and rows of a tile."""
+    tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    camera, rest = tile // (tiles_x * tiles_y), tile % (tiles_x * tiles_y)
+    x0, y0 = (rest % tiles_x) * TILE, (rest // tiles_x) * TILE
+    return camera, x0, y0, min(TILE, width - x0), min(TILE, height - y0)
 
 
 def _fetch(real: type) -> Scalar:
@@ -309,7 +306,7 @@ def sum_pair_rows(
     shape = tuple(splats.opacities.shape)
     widths = ((2,), (3,), (), (num_values,), (probe_width,))
     v_means, v_conics, v_opacities, v_values, v_probe = (splats.opacities.new_empty(*shape, *w) for w in widths)
-    _sum_rows(real_of(splats))(
+    _sum_rows(REAL_OF[splats.means2d.dtype])(
         rows, bins.pair_slots.numpy(), bins.splat_offsets.numpy(),
         splats.conics.numpy().reshape(-1, 3), splats.opacities.numpy().reshape(-1),
         v_means.numpy().reshape(-1, 2), v_conics.numpy().reshape(-1, 3), v_opacities.numpy().reshape(-1),

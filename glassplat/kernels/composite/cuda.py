@@ -15,6 +15,7 @@ from numba import cuda
 from torch import Tensor
 
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
+from glassplat.kernels.composite.cpu_tile import place
 from glassplat.kernels.composite.cuda_backward import PULLS, THREADS, WARPS, composite_backward, composite_pulls
 from glassplat.kernels.composite.cuda_discs import composite_discs, composite_discs_gradients
 from glassplat.kernels.composite.cuda_tile import (
@@ -154,7 +155,7 @@ def flat_geometry(splats: Splats) -> tuple[Tensor, Tensor, Tensor]:
 @cache
 def composite_forward(real: type, num_channels: int = 4) -> Kernel:
     """Fills image, alpha and mask of the active tiles, and what the backward pass needs."""
-    place, load, coverage = tile_steps(real)
+    load, coverage = tile_steps(real)
     zero, one, t_min = real(0.0), real(1.0), real(TRANSMITTANCE_MIN)
     alpha_min, alpha_max, stopped = real(ALPHA_MIN), real(ALPHA_MAX), np.int32(PIXELS)
 
@@ -254,7 +255,7 @@ def composite_forward(real: type, num_channels: int = 4) -> Kernel:
 @cache
 def composite_deviation(real: type) -> Kernel:
     """The second traversal: fills the mean of a channel, and the deviation and lean from it, of the active tiles."""
-    place, load, coverage = tile_steps(real)
+    load, coverage = tile_steps(real)
     zero, one, least_alpha, on_mean = real(0.0), real(1.0), real(LEAST_ALPHA), real(ON_MEAN * np.finfo(real).eps)
     alpha_min, alpha_max = real(ALPHA_MIN), real(ALPHA_MAX)
 

@@ -17,6 +17,7 @@ from numba import cuda
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, kernel
 from glassplat.kernels.backend.devices import SIMULATED
+from glassplat.kernels.composite.cpu_tile import place
 from glassplat.kernels.composite.cuda_tile import BUCKET, COLUMNS, MEAN_X, MEAN_Y, MOMENTS, PIXELS, at, tile_steps
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar
 from glassplat.kernels.maths.fast_maths import reciprocal_maths
@@ -40,7 +41,6 @@ def composite_pulls(real: type, num_channels: int = 4) -> Kernel:
     gradients of the mask and of the deviation, the mean that the latter is measured from, and what the pixel gathered
     in all and of glass, each part times its gradient.
     """
-    place = tile_steps(real).place
     shown, spread, middle, total, total_glass = range(num_channels, num_channels + PULLS)
 
     @kernel(
@@ -128,7 +128,7 @@ def _planes(num_channels: int) -> tuple[int, ...]:
 @cache
 def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -> Kernel:
     """Fills one gradient row per pair that any pixel blended; all rows start at zero."""
-    place, load, coverage = tile_steps(real)
+    load, coverage = tile_steps(real)
     reciprocal = reciprocal_maths(real)
     zero, one, on_mean = real(0.0), real(1.0), real(ON_MEAN * np.finfo(real).eps)
     alpha_min, alpha_max = real(ALPHA_MIN), real(ALPHA_MAX)
@@ -227,7 +227,7 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
                             center, pull = pulls[pulled + at(middle)], pulls[pulled + at(spread)]
                             difference = apart - center
                             dot += pull * abs(difference)
-                            if abs(difference) > on_mean * abs(center):
+                            if abs(difference) > on_mean * abs(pulls[pulled + at(middle)]):
                                 v_apart += weight * pull if difference > zero else -weight * pull
                         behind = state[mine + behinds] - weight * dot
                         gain = (t * dot - behind * inverse) * a

@@ -20,9 +20,10 @@ from torch import Tensor
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.backend.devices import SIMULATED
-from glassplat.kernels.composite.cuda_tile import BUCKET, PIXELS, at, tile_steps
+from glassplat.kernels.composite.cpu_tile import place
+from glassplat.kernels.composite.cuda_tile import BUCKET, PIXELS, at
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar, blend_maths
-from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, meet_maths
+from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, meet_slopes
 from glassplat.kernels.maths.fast_maths import exp2_maths, fused_maths, reciprocal_maths
 from glassplat.kernels.records import REAL_OF, TILE, Discs, TileBins
 
@@ -133,7 +134,6 @@ def composite_discs_pulls(real: type, num_channels: int = 6) -> Kernel:
     """Gathers, tile by tile, what each pixel's gradients pull at [A, D + 8, 256]: one plane per channel, then those
     that the constants name. What the pixel gathered in all holds each part times its gradient.
     """
-    place = tile_steps(real).place
     zero, one, two = real(0.0), real(1.0), real(2.0)
 
     @kernel(
@@ -195,7 +195,7 @@ def _enter(real: type, num_channels: int) -> Scalar:
 @cache
 def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
     """Fills one gradient row per pair that any pixel blended; all rows start at zero."""
-    place, (load, cover), slopes = tile_steps(real).place, disc_tile_steps(real), meet_maths(real)[1]
+    load, cover = disc_tile_steps(real)
     reciprocal, enter = reciprocal_maths(real), _enter(real, num_channels)
     zero, one, two, alpha_max, endless = real(0.0), real(1.0), real(2.0), real(ALPHA_MAX), real(np.inf)
     behinds, lasts, middles = BEHIND, BLENDED, MIDDLE
@@ -294,7 +294,7 @@ def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
                         up_x, up_y, up_1 = up_x + v_up * dx, up_y + v_up * dy, up_1 + v_up
                         vp_x, vp_y, vp_1 = vp_x + v_vp * dx, vp_y + v_vp * dy, vp_1 + v_vp
                         e_x, e_y, e_1 = e_x + v_e * dx, e_y + v_e * dy, e_1 + v_e
-                        slope_x, slope_y = slopes(found, v_up, v_vp, v_e)
+                        slope_x, slope_y = meet_slopes(found, v_up, v_vp, v_e)
                         pull_x, pull_y = pull_x + abs(slope_x), pull_y + abs(slope_y)
                     else:
                         moved_x, moved_y = gain * around * dx, gain * around * dy
@@ -417,7 +417,7 @@ def _geometry(discs: Discs) -> tuple[Tensor, ...]:
 @cache
 def composite_discs_forward(real: type, num_channels: int = 6) -> Kernel:
     """Fills the images of the active tiles, and what the backward pass needs."""
-    place, (load, cover) = tile_steps(real).place, disc_tile_steps(real)
+    load, cover = disc_tile_steps(real)
     zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
     t_min, alpha_max, stopped = real(TRANSMITTANCE_MIN), real(ALPHA_MAX), np.int32(PIXELS)
 

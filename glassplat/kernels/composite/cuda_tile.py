@@ -18,7 +18,6 @@ from torch import Tensor
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.backend.devices import SIMULATED
-from glassplat.kernels.composite.cpu_tile import tile_functions
 from glassplat.kernels.maths.blending import Scalar, blend_maths
 from glassplat.kernels.maths.fast_maths import exp2_maths, fused_maths
 from glassplat.kernels.records import REAL_OF, TILE, Splats, TileBins
@@ -47,20 +46,18 @@ class TileFunctions(NamedTuple):
     """Compiled steps that every blending kernel takes.
 
     Attributes:
-        place: camera, first column, first row, columns and rows of a tile.
         load: copies one splat's geometry into row `i` of an array, and returns the rows of pixels that it reaches, a
             bit for each.
         coverage: opacity times falloff of the splat in row `i` at the pixel in column x and row y of the tile.
     """
 
-    place: Scalar
     load: Scalar
     coverage: Scalar
 
 
 def tile_steps(real: type) -> TileFunctions:
     """Builds the functions for `real`, np.float32 or np.float64."""
-    return TileFunctions(tile_functions(real).place, _load(real), _coverage(real))
+    return TileFunctions(_load(real), _coverage(real))
 
 
 def _load(real: type) -> Scalar:

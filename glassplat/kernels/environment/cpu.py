@@ -24,8 +24,8 @@ from torch import Tensor
 
 from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.cube import cube_maths, edge_maths, mirror_maths
-from glassplat.kernels.maths.projection import vector_maths
+from glassplat.kernels.maths.cube import cube_maths, mirrored, mirrored_gradient, over_column, over_row
+from glassplat.kernels.maths.projection import dot
 from glassplat.kernels.maths.surface import surface_maths
 from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, REAL_OF, STRENGTH_AT, SURFACE_CHANNELS, Shaded
 
@@ -127,7 +127,6 @@ def texel_gradients(first_cells: Tensor, fractions: Tensor, gradients: Tensor, s
 @cache
 def pad_faces(real: type) -> Kernel:
     """Fills padded faces from texels."""
-    over_column, over_row = edge_maths()
     third = real(1.0 / 3.0)
 
     @kernel("cube_pad_faces", real)
@@ -218,7 +217,6 @@ def sum_lookups(real: type) -> Kernel:
 @cache
 def fold_faces(real: type) -> Kernel:
     """Fills the gradient of the texels from sums [6, S + 2, 2, S + 2, D], the transpose of `pad_faces`."""
-    over_column, over_row = edge_maths()
     third = real(1.0 / 3.0)
 
     @inlined
@@ -376,7 +374,7 @@ def normal_of(blended, row, column):
 
 
 def _place(real: type) -> Scalar:
-    maths, mirrored = cube_maths(real), mirror_maths(real).mirrored
+    maths = cube_maths(real)
     on_face, cell = maths.on_face, maths.cell
     one, half = real(1.0), real(0.5)
 
@@ -412,7 +410,7 @@ def _place(real: type) -> Scalar:
 @cache
 def shade_environment_forward(real: type) -> Kernel:
     """Fills rgb, base and reflection."""
-    maths, place, dot = cube_maths(real), _place(real), vector_maths().dot
+    maths, place = cube_maths(real), _place(real)
     logistic, between = maths.logistic, maths.between
     shortest = real(NORMAL_MIN**2)
     zero, one = real(0.0), real(1.0)
@@ -490,7 +488,7 @@ def _slopes(real: type) -> Scalar:
 
 
 def _turn(real: type) -> Scalar:
-    from_face, mirrored_gradient = cube_maths(real).from_face, mirror_maths(real).gradient
+    from_face = cube_maths(real).from_face
     half = real(0.5)
 
     @inlined
@@ -511,7 +509,7 @@ def _turn(real: type) -> Scalar:
 @cache
 def shade_environment_backward(real: type) -> Kernel:
     """Fills the gradients of blended, alpha and of what was looked up, and which cells each pixel blends."""
-    place, slopes, turn, dot = _place(real), _slopes(real), _turn(real), vector_maths().dot
+    place, slopes, turn = _place(real), _slopes(real), _turn(real)
     shortest = real(NORMAL_MIN**2)
     zero, one = real(0.0), real(1.0)
 

@@ -21,8 +21,8 @@ from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.environment.cpu import gradients_like
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.cube import cube_maths, edge_maths, mirror_maths
-from glassplat.kernels.maths.projection import vector_maths
+from glassplat.kernels.maths.cube import cube_maths, mirrored, mirrored_gradient, over_column, over_row
+from glassplat.kernels.maths.projection import dot
 from glassplat.kernels.maths.surface import surface_maths
 from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, REAL_OF, STRENGTH_AT, SURFACE_CHANNELS, Shaded
 
@@ -112,7 +112,6 @@ def texel_gradients(first_cells: Tensor, fractions: Tensor, gradients: Tensor, s
 @cache
 def pad_faces(real: type) -> Kernel:
     """Fills padded faces from texels, one thread for each number."""
-    over_column, over_row = edge_maths()
     third = real(1.0 / 3.0)
 
     @kernel("cube_pad_faces", real, "real4 real4")
@@ -334,7 +333,7 @@ def shade_environment_gradients(
 
 
 def _place(real: type) -> Scalar:
-    maths, mirrored, one, half = cube_maths(real), mirror_maths(real).mirrored, real(1.0), real(0.5)
+    maths, one, half = cube_maths(real), real(1.0), real(0.5)
     on_face, cell = maths.on_face, maths.cell
 
     @inlined
@@ -359,7 +358,7 @@ def _place(real: type) -> Scalar:
 @cache
 def shade_environment_forward(real: type) -> Kernel:
     """Fills rgb, base and reflection."""
-    maths, place, dot = cube_maths(real), _place(real), vector_maths().dot
+    maths, place = cube_maths(real), _place(real)
     logistic, between = maths.logistic, maths.between
     shortest, zero, one = real(NORMAL_MIN**2), real(0.0), real(1.0)
 
@@ -391,9 +390,8 @@ def shade_environment_forward(real: type) -> Kernel:
 @cache
 def shade_environment_backward(real: type) -> Kernel:
     """Fills the gradients of blended, alpha and of what was looked up, and which cells each pixel blends."""
-    maths, place, dot = cube_maths(real), _place(real), vector_maths().dot
+    maths, place = cube_maths(real), _place(real)
     from_face, slopes = maths.from_face, maths.slopes
-    mirrored_gradient = mirror_maths(real).gradient
     shortest, zero, half, one = real(NORMAL_MIN**2), real(0.0), real(0.5), real(1.0)
 
     @kernel(

@@ -1,6 +1,6 @@
 """Scalar maths of a cube map: which face a direction meets, where on it, which texels meet at an edge, and mirroring.
 
-Every function is pure and typed by its factory, so that one source compiles for the CPU and for CUDA. Face 2 a + s is
+Every function is pure and compiles for the CPU and for CUDA, typed by its factory where it needs that. Face 2 a + s is
 the one of axis a, on the negative side for s = 1; its columns run along axis a + 1 and its rows along a + 2 (mod 3).
 Cells are texels of faces that are padded by a ring of their neighbours' texels: texel i is cell i + 1.
 """
@@ -13,7 +13,7 @@ import numpy as np
 
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import Scalar, blend_maths
-from glassplat.kernels.maths.projection import vector_maths
+from glassplat.kernels.maths.projection import blend, dot
 
 
 class CubeMaths(NamedTuple):
@@ -120,57 +120,34 @@ def _logistic(real: type) -> Scalar:
     return logistic
 
 
-class MirrorMaths(NamedTuple):
-    """Scalar functions of a mirrored ray for one floating-point type.
-
-    Attributes:
-        mirrored: a ray mirrored by a normal of any length, times the square of that length.
-        gradient: gradient of the normal from that of the mirrored ray.
-    """
-
-    mirrored: Scalar
-    gradient: Scalar
+TWO = np.float32(2.0)
+"""In single precision, which holds it exactly, so that it widens nothing."""
 
 
-def mirror_maths(real: type) -> MirrorMaths:
-    """Builds the functions for `real`, np.float32 or np.float64."""
-    dot, blend, two = vector_maths().dot, vector_maths().blend, real(2.0)
-
-    @inlined
-    def mirrored(ray, normal):  # type: ignore[no-untyped-def]
-        return blend(dot(normal, normal), ray, -two * dot(ray, normal), normal)
-
-    @inlined
-    def gradient(ray, normal, g):  # type: ignore[no-untyped-def]
-        by_square = blend(two * dot(ray, g), normal, -two * dot(normal, g), ray)
-        across = -two * dot(ray, normal)
-        return by_square[0] + across * g[0], by_square[1] + across * g[1], by_square[2] + across * g[2]
-
-    return MirrorMaths(mirrored, gradient)
+@inlined
+def mirrored(ray, normal):  # type: ignore[no-untyped-def]
+    """A ray mirrored by a normal of any length, times the square of that length."""
+    return blend(dot(normal, normal), ray, -TWO * dot(ray, normal), normal)
 
 
-class EdgeMaths(NamedTuple):
-    """Neighbours across the edges of a cube map with S texels a side.
-
-    Attributes:
-        over_column: (face, row, column) of the texel beside `row`, beyond the face's last column for side = 0, or
-            before its first for side = 1.
-        over_row: the same beside `column`, beyond the last or before the first row.
-    """
-
-    over_column: Scalar
-    over_row: Scalar
+@inlined
+def mirrored_gradient(ray, normal, g):  # type: ignore[no-untyped-def]
+    """Gradient of the normal from that of the mirrored ray."""
+    by_square = blend(TWO * dot(ray, g), normal, -TWO * dot(normal, g), ray)
+    across = -TWO * dot(ray, normal)
+    return by_square[0] + across * g[0], by_square[1] + across * g[1], by_square[2] + across * g[2]
 
 
-def edge_maths() -> EdgeMaths:
-    """Builds the functions, of whole numbers."""
+# Neighbours across the edges of a cube map with S texels a side, in whole numbers.
 
-    @inlined
-    def over_column(face, side, row, size):  # type: ignore[no-untyped-def]
-        return 2 * ((face // 2 + 1) % 3) + side, (1 - face % 2) * (size - 1), row
 
-    @inlined
-    def over_row(face, side, column, size):  # type: ignore[no-untyped-def]
-        return 2 * ((face // 2 + 2) % 3) + side, column, (1 - face % 2) * (size - 1)
+@inlined
+def over_column(face, side, row, size):  # type: ignore[no-untyped-def]
+    """(face, row, column) of the texel beside `row`: beyond the last column for side 0, before the first for side 1."""
+    return 2 * ((face // 2 + 1) % 3) + side, (1 - face % 2) * (size - 1), row
 
-    return EdgeMaths(over_column, over_row)
+
+@inlined
+def over_row(face, side, column, size):  # type: ignore[no-untyped-def]
+    """The same beside `column`, beyond the last or before the first row."""
+    return 2 * ((face // 2 + 2) % 3) + side, column, (1 - face % 2) * (size - 1)

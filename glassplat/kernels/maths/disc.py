@@ -7,7 +7,7 @@ The ray through the pixel at offset (dx, dy) from the centre's own pixel meets i
 
 Measured from the centre, none of these cancels, however small the disc. The six numbers are its *map*.
 
-Every function is pure and typed by its factory, so that one source compiles for the CPU and for CUDA.
+Every function is pure and, if it has constants, typed by its factory: one source compiles for the CPU and for CUDA.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
-from glassplat.kernels.maths.projection import cross, vector_maths
+from glassplat.kernels.maths.projection import along, blend, cross, dot, scaled_sum
 
 EDGE_ON = 1e-3
 """Cosine between ray and normal below which a disc is seen from its edge and not met."""
@@ -49,7 +49,6 @@ def ray_hit_maths(real: type, flat: bool) -> RayHitMaths:
 
 
 def _disc(real: type) -> RayHitMaths:
-    dot, blend = vector_maths().dot, vector_maths().blend
     zero, one, two, nowhere, edge_on = real(0.0), real(1.0), real(2.0), real("inf"), real(EDGE_ON)
 
     @inlined
@@ -82,8 +81,6 @@ def _disc(real: type) -> RayHitMaths:
 
 
 def _ellipsoid(real: type) -> RayHitMaths:
-    maths = vector_maths()
-    dot, blend, along, scaled_sum = maths.dot, maths.blend, maths.along, maths.scaled_sum
     zero, one, two, nowhere = real(0.0), real(1.0), real(2.0), real("inf")
 
     @inlined
@@ -162,7 +159,6 @@ def disc_maths(real: type) -> DiscMaths:
 
 
 def _shape(real: type) -> tuple[Scalar, Scalar, Scalar]:
-    dot = vector_maths().dot
     edge_on, largest = real(EDGE_ON), real(np.finfo(real).max)
 
     @inlined
@@ -192,7 +188,6 @@ def _shape(real: type) -> tuple[Scalar, Scalar, Scalar]:
 
 
 def _map_gradient(real: type) -> Scalar:
-    dot, blend = vector_maths().dot, vector_maths().blend
     zero, one = real(0.0), real(1.0)
 
     @inlined
@@ -218,120 +213,98 @@ def _map_gradient(real: type) -> Scalar:
     return map_gradient
 
 
-class OutlineMaths(NamedTuple):
-    """The region of the screen that a disc covers, as an ellipse for `bin_tiles`, in double precision.
-
-    Attributes:
-        reach: squared deviations up to which a disc of some opacity is met; negative where nowhere.
-        outline: (dx, dy, xx, xy, yy, half width, half height): an ellipse that encloses what the disc covers, its
-            centre as an offset from the disc's and its conic such that opacity exp(-q / 2) falls to 1/255 on it. A
-            conic of zeros is the whole image: the disc crosses the near plane.
-        box: (left, right, top, bottom), pixels from the principal point, of what such a disc covers behind that plane.
-    """
-
-    reach: Scalar
-    outline: Scalar
-    box: Scalar
+# The region of the screen that a disc covers, as an ellipse for `bin_tiles`, in double precision.
 
 
-def outline_maths() -> OutlineMaths:
-    """Builds the functions."""
-    most, low_pass = MOST_DEVIATIONS**2, LOW_PASS
-    clamped = _clamped_ellipse()
-
-    @inlined
-    def reach(opacity):  # type: ignore[no-untyped-def]
-        visible = np.float64(opacity) / ALPHA_MIN
-        if not visible > 1.0:
-            return -1.0
-        return min(2.0 * math.log(visible), most)
-
-    @inlined
-    def outline(found, opacity, nearest, near, width, height):  # type: ignore[no-untyped-def]
-        """`nearest` is the smallest depth of what the disc covers."""
-        squared = reach(opacity)
-        u_x, u_y, v_x, v_y = np.float64(found[0]), np.float64(found[1]), np.float64(found[2]), np.float64(found[3])
-        w_x, w_y = np.float64(found[4]), np.float64(found[5])
-        # On the contour |u|^2 + |v|^2 = squared: a quadratic form of the offset, completed to a square.
-        xx = u_x * u_x + v_x * v_x - squared * w_x * w_x
-        xy = u_x * u_y + v_x * v_y - squared * w_x * w_y
-        yy = u_y * u_y + v_y * v_y - squared * w_y * w_y
-        determinant = xx * yy - xy * xy
-        if not (nearest > near and determinant > 0.0 and xx > 0.0):
-            return 0.0, 0.0, 0.0, 0.0, 0.0, np.float64(width), np.float64(height)
-        dx = squared * (yy * w_x - xy * w_y) / determinant
-        dy = squared * (xx * w_y - xy * w_x) / determinant
-        size = (squared + squared * (w_x * dx + w_y * dy)) / determinant
-        least = low_pass * math.sqrt(squared) + math.sqrt(dx * dx + dy * dy)
-        s_xx, s_xy, s_yy = clamped(yy * size, -xy * size, xx * size, least * least)
-        scale = 2.0 * math.log(np.float64(opacity) / ALPHA_MIN) / (s_xx * s_yy - s_xy * s_xy)
-        return dx, dy, s_yy * scale, -s_xy * scale, s_xx * scale, math.sqrt(s_xx), math.sqrt(s_yy)
-
-    return OutlineMaths(reach, outline, _box())
+@inlined
+def reach(opacity):  # type: ignore[no-untyped-def]
+    """Squared deviations up to which a disc of some opacity is met; negative where nowhere."""
+    visible = np.float64(opacity) / ALPHA_MIN
+    if not visible > 1.0:
+        return -1.0
+    return min(2.0 * math.log(visible), MOST_DEVIATIONS * MOST_DEVIATIONS)
 
 
-def _box() -> Scalar:
-    low_pass = LOW_PASS
-
-    @inlined
-    def box(m, p, q, deviations, squared, near, fx, fy):  # type: ignore[no-untyped-def]
-        """The corners of a rectangle in the disc's plane, one side of it along the depth, cut off at the near plane."""
-        a, b = np.float64(p[2] * deviations[0]), np.float64(q[2] * deviations[1])
-        steepness, depth, reach = math.sqrt(a * a + b * b), np.float64(m[2]), math.sqrt(squared)
-        # However near the plane, what lies on it does not project.
-        first, last = -reach, reach
-        if steepness > 0.0:
-            first = max(-reach, (max(near, 1e-6 * depth) - depth) / steepness)
-            a, b = a / steepness, b / steepness
-        u_x, u_y = np.float64(p[0] * deviations[0]), np.float64(p[1] * deviations[0])
-        v_x, v_y = np.float64(q[0] * deviations[1]), np.float64(q[1] * deviations[1])
-        along_x, along_y, across_x, across_y = (
-            a * u_x + b * v_x,
-            a * u_y + b * v_y,
-            a * v_x - b * u_x,
-            a * v_y - b * u_y,
-        )
-        x, y, spot = fx * m[0] / depth, fy * m[1] / depth, low_pass * reach
-        left, right, top, bottom = x - spot, x + spot, y - spot, y + spot
-        for end in range(2):
-            way = first if end == 0 else last
-            behind = depth + way * steepness
-            x, y = fx * (m[0] + way * along_x) / behind, fy * (m[1] + way * along_y) / behind
-            wide, high = abs(fx * reach * across_x / behind), abs(fy * reach * across_y / behind)
-            left, right, top, bottom = (
-                min(left, x - wide),
-                max(right, x + wide),
-                min(top, y - high),
-                max(bottom, y + high),
-            )
-        return left, right, top, bottom
-
-    return box
-
-
-def _clamped_ellipse() -> Scalar:
+@inlined
+def _clamped_ellipse(xx, xy, yy, least):  # type: ignore[no-untyped-def]
     """An ellipse {d : d^T S^-1 d <= 1}, none of its half axes shorter than the root of `least`, and a little wider."""
-
-    @inlined
-    def clamped(xx, xy, yy, least):  # type: ignore[no-untyped-def]
-        middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
-        apart = math.sqrt(half * half + xy * xy)
-        large, small = max(middle + apart, least), max(middle - apart, least)
-        # S = mean of the eigenvalues + half their difference along the axes.
-        center, share = 0.5 * (large + small), 0.0
-        if apart > 0.0:
-            share = 0.5 * (large - small) / apart
-        wider = SLACK * SLACK
-        return wider * (center + share * half), wider * share * xy, wider * (center - share * half)
-
-    return clamped
+    middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    apart = math.sqrt(half * half + xy * xy)
+    large, small = max(middle + apart, least), max(middle - apart, least)
+    # S = mean of the eigenvalues + half their difference along the axes.
+    center, share = 0.5 * (large + small), 0.0
+    if apart > 0.0:
+        share = 0.5 * (large - small) / apart
+    wider = SLACK * SLACK
+    return wider * (center + share * half), wider * share * xy, wider * (center - share * half)
 
 
-def meet_maths(real: type) -> tuple[Scalar, Scalar]:
-    """Builds what pixels need: `meet` and `slopes`; offsets may be vectors of numbers (`backend/cpu_vector.py`).
+@inlined
+def outline(found, opacity, nearest, near, width, height):  # type: ignore[no-untyped-def]
+    """An ellipse that encloses what the disc covers: (dx, dy, xx, xy, yy, half width, half height).
 
-    `meet` gives the numerators of u and v, and e. `slopes` turns the gradients of all three into that of the offset.
+    Its centre is an offset from the disc's, and its conic such that opacity exp(-q / 2) falls to 1/255 on it. A conic
+    of zeros is the whole image: the disc crosses the near plane. `nearest` is the smallest depth of what the disc
+    covers.
     """
+    squared = reach(opacity)
+    u_x, u_y, v_x, v_y = np.float64(found[0]), np.float64(found[1]), np.float64(found[2]), np.float64(found[3])
+    w_x, w_y = np.float64(found[4]), np.float64(found[5])
+    # On the contour |u|^2 + |v|^2 = squared: a quadratic form of the offset, completed to a square.
+    xx = u_x * u_x + v_x * v_x - squared * w_x * w_x
+    xy = u_x * u_y + v_x * v_y - squared * w_x * w_y
+    yy = u_y * u_y + v_y * v_y - squared * w_y * w_y
+    determinant = xx * yy - xy * xy
+    if not (nearest > near and determinant > 0.0 and xx > 0.0):
+        return 0.0, 0.0, 0.0, 0.0, 0.0, np.float64(width), np.float64(height)
+    dx = squared * (yy * w_x - xy * w_y) / determinant
+    dy = squared * (xx * w_y - xy * w_x) / determinant
+    size = (squared + squared * (w_x * dx + w_y * dy)) / determinant
+    least = LOW_PASS * math.sqrt(squared) + math.sqrt(dx * dx + dy * dy)
+    s_xx, s_xy, s_yy = _clamped_ellipse(yy * size, -xy * size, xx * size, least * least)
+    scale = 2.0 * math.log(np.float64(opacity) / ALPHA_MIN) / (s_xx * s_yy - s_xy * s_xy)
+    return dx, dy, s_yy * scale, -s_xy * scale, s_xx * scale, math.sqrt(s_xx), math.sqrt(s_yy)
+
+
+@inlined
+def box(m, p, q, deviations, squared, near, fx, fy):  # type: ignore[no-untyped-def]
+    """(left, right, top, bottom), pixels from the principal point, of what a disc covers that crosses the near plane.
+
+    These are the corners of a rectangle in the disc's plane, one side of it along the depth, cut off at the near plane.
+    """
+    a, b = np.float64(p[2] * deviations[0]), np.float64(q[2] * deviations[1])
+    steepness, depth, reach = math.sqrt(a * a + b * b), np.float64(m[2]), math.sqrt(squared)
+    # However near the plane, what lies on it does not project.
+    first, last = -reach, reach
+    if steepness > 0.0:
+        first = max(-reach, (max(near, 1e-6 * depth) - depth) / steepness)
+        a, b = a / steepness, b / steepness
+    u_x, u_y = np.float64(p[0] * deviations[0]), np.float64(p[1] * deviations[0])
+    v_x, v_y = np.float64(q[0] * deviations[1]), np.float64(q[1] * deviations[1])
+    along_x, along_y, across_x, across_y = (
+        a * u_x + b * v_x,
+        a * u_y + b * v_y,
+        a * v_x - b * u_x,
+        a * v_y - b * u_y,
+    )
+    x, y, spot = fx * m[0] / depth, fy * m[1] / depth, LOW_PASS * reach
+    left, right, top, bottom = x - spot, x + spot, y - spot, y + spot
+    for end in range(2):
+        way = first if end == 0 else last
+        behind = depth + way * steepness
+        x, y = fx * (m[0] + way * along_x) / behind, fy * (m[1] + way * along_y) / behind
+        wide, high = abs(fx * reach * across_x / behind), abs(fy * reach * across_y / behind)
+        left, right, top, bottom = (
+            min(left, x - wide),
+            max(right, x + wide),
+            min(top, y - high),
+            max(bottom, y + high),
+        )
+    return left, right, top, bottom
+
+
+def meet_maths(real: type) -> Scalar:
+    """Builds `meet`: the numerators of u and v, and e, at offsets that may be vectors (`backend/cpu_vector.py`)."""
     one = real(1.0)
 
     @inlined
@@ -339,9 +312,11 @@ def meet_maths(real: type) -> tuple[Scalar, Scalar]:
         u_x, u_y, v_x, v_y, w_x, w_y = found
         return dx * u_x + dy * u_y, dx * v_x + dy * v_y, dx * w_x + dy * w_y + one
 
-    @inlined
-    def slopes(found, g_u, g_v, g_e):  # type: ignore[no-untyped-def]
-        u_x, u_y, v_x, v_y, w_x, w_y = found
-        return g_u * u_x + g_v * v_x + g_e * w_x, g_u * u_y + g_v * v_y + g_e * w_y
+    return meet
 
-    return meet, slopes
+
+@inlined
+def meet_slopes(found, g_u, g_v, g_e):  # type: ignore[no-untyped-def]
+    """The gradient of the offset from those of what `meet` gives."""
+    u_x, u_y, v_x, v_y, w_x, w_y = found
+    return g_u * u_x + g_v * v_x + g_e * w_x, g_u * u_y + g_v * v_y + g_e * w_y

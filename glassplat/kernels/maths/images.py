@@ -39,7 +39,7 @@ class ColorMaths(NamedTuple):
 
 def color_space_maths(real: type) -> ColorMaths:
     """Builds the functions for `real`, np.float32 or np.float64."""
-    power = _fast_power() if real is np.float32 else _exact_power()
+    power = _fast_power() if real is np.float32 else _exact_power
     low, low_linear = real(THRESHOLD_SRGB), real(THRESHOLD_LINEAR)
     offset, inverse_scale, scale = real(OFFSET), real(1 / (1 + OFFSET)), real(1 + OFFSET)
     gamma, inverse_gamma, slope, inverse_slope = real(GAMMA), real(1 / GAMMA), real(SLOPE), real(1 / SLOPE)
@@ -94,12 +94,9 @@ def _fast_power() -> Scalar:
     return power
 
 
-def _exact_power() -> Scalar:
-    @inlined
-    def power(base, exponent):  # type: ignore[no-untyped-def]
-        return base**exponent
-
-    return power
+@inlined
+def _exact_power(base, exponent):  # type: ignore[no-untyped-def]
+    return base**exponent
 
 
 def linear_from_srgb(color: Tensor) -> Tensor:

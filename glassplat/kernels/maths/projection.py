@@ -1,89 +1,74 @@
 """Scalar maths of projection: the shape of a Gaussian in the world and on screen, and the adjoints of both.
 
-Every function is pure, takes and returns scalars and tuples of scalars, and is typed by its factory, so that one source
-compiles for the CPU and for CUDA. A bare float or int literal would promote float32 to float64: constants are typed.
+Every function is pure, takes and returns scalars and tuples of scalars, and compiles for the CPU and for CUDA. A bare
+float or int literal would promote float32 to float64: functions with constants are typed by their factory.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
 
 LOW_PASS = 0.3
 """Variance in px^2 added to every splat, so that none falls between pixel centres (3DGS)."""
-ALPHA_MIN = 1.0 / 255.0
-"""Coverage below this is ignored, which bounds a splat's extent on screen."""
 TANGENT_MARGIN = 0.3
 """How far beyond the image, in half image sizes, the Jacobian of the projection still follows the centre (3DGS)."""
 
-Scalar = Callable[..., Any]
+
+# Functions of 3-vectors, which are tuples (x, y, z) of numbers or of vectors of numbers.
+
+
+@inlined
+def dot(a, b):
+    """The dot product a . b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inlined
+def blend(s, a, t, b):
+    """The combination s a + t b."""
+    return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]
+
+
+@inlined
+def scaled_sum(v, a, b, c):
+    """The sum x a + y b + z c for v = (x, y, z): a matrix of columns a, b, c times a vector."""
+    return (
+        v[0] * a[0] + v[1] * b[0] + v[2] * c[0],
+        v[0] * a[1] + v[1] * b[1] + v[2] * c[1],
+        v[0] * a[2] + v[1] * b[2] + v[2] * c[2],
+    )
+
+
+@inlined
+def along(v, a, b, c):
+    """The products (a . v, b . v, c . v): the transpose of that matrix times a vector."""
+    return dot(a, v), dot(b, v), dot(c, v)
 
 
 @inlined
 def cross(a, b):
-    """The cross product a x b of two tuples."""
+    """The cross product a x b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-class VectorMaths(NamedTuple):
-    """Functions of 3-vectors, which are tuples (x, y, z).
-
-    Attributes:
-        dot: a . b.
-        blend: s a + t b.
-        scaled_sum: x a + y b + z c for coefficients (x, y, z): a matrix of columns a, b, c times a vector.
-        along: (a . v, b . v, c . v): the transpose of that matrix times a vector.
-        cross_squared: |a x b|^2.
-        tangential: s (v - (v . u) u), what of a vector v is across a unit vector u, scaled.
-    """
-
-    dot: Scalar
-    blend: Scalar
-    scaled_sum: Scalar
-    along: Scalar
-    cross_squared: Scalar
-    tangential: Scalar
+@inlined
+def cross_squared(a, b):
+    """The squared length of a x b."""
+    x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    return x * x + y * y + z * z
 
 
-def vector_maths() -> VectorMaths:
-    """Builds the functions; they take the type of their arguments."""
-
-    @inlined
-    def dot(a, b):
-        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-    @inlined
-    def blend(s, a, t, b):
-        return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]
-
-    @inlined
-    def scaled_sum(v, a, b, c):
-        return (
-            v[0] * a[0] + v[1] * b[0] + v[2] * c[0],
-            v[0] * a[1] + v[1] * b[1] + v[2] * c[1],
-            v[0] * a[2] + v[1] * b[2] + v[2] * c[2],
-        )
-
-    @inlined
-    def along(v, a, b, c):
-        return dot(a, v), dot(b, v), dot(c, v)
-
-    @inlined
-    def cross_squared(a, b):
-        x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-        return x * x + y * y + z * z
-
-    @inlined
-    def tangential(s, v, u):
-        radial = dot(v, u)
-        return s * (v[0] - radial * u[0]), s * (v[1] - radial * u[1]), s * (v[2] - radial * u[2])
-
-    return VectorMaths(dot, blend, scaled_sum, along, cross_squared, tangential)
+@inlined
+def tangential(s, v, u):
+    """The part of a vector v across a unit vector u, scaled: s (v - (v . u) u)."""
+    radial = dot(v, u)
+    return s * (v[0] - radial * u[0]), s * (v[1] - radial * u[1]), s * (v[2] - radial * u[2])
 
 
 class ShapeMaths(NamedTuple):
@@ -157,8 +142,6 @@ class ScreenMaths(NamedTuple):
 
     Attributes:
         tangent_limits: (lowest x, highest x, lowest y, highest y) of the tangents for which the Jacobian is taken.
-        clamped: a value held between two limits.
-        footprint: world vectors (w_x, w_y) whose dot products with a displacement are its pixels on screen.
         screen_covariance: (xx, xy, yy, determinant), low-pass included, from the axes seen along w_x and w_y.
         half_extents: pixels from the centre to where the coverage sinks to `ALPHA_MIN`, along x and y; (0, 0)
             where it never rises above.
@@ -167,8 +150,6 @@ class ScreenMaths(NamedTuple):
     """
 
     tangent_limits: Scalar
-    clamped: Scalar
-    footprint: Scalar
     screen_covariance: Scalar
     half_extents: Scalar
     covariance_gradient: Scalar
@@ -177,11 +158,24 @@ class ScreenMaths(NamedTuple):
 
 def screen_maths(real: type) -> ScreenMaths:
     """Builds the functions for `real`, np.float32 or np.float64."""
-    return ScreenMaths(*_footprint(real), *_screen_covariance(real), *_screen_gradients(real))
+    return ScreenMaths(_tangent_limits(real), *_screen_covariance(real), *_screen_gradients(real))
 
 
-def _footprint(real: type) -> tuple[Scalar, Scalar, Scalar]:
-    blend = vector_maths().blend
+@inlined
+def clamped(x, lowest, highest):
+    """A value held between two limits."""
+    return min(max(x, lowest), highest)
+
+
+@inlined
+def footprint(row_x, row_y, row_z, scale_x, scale_y, tangent_x, tangent_y):
+    """World vectors (w_x, w_y) whose dot products with a displacement are its pixels on screen."""
+    w_x = blend(scale_x, row_x, -scale_x * tangent_x, row_z)
+    w_y = blend(scale_y, row_y, -scale_y * tangent_y, row_z)
+    return w_x, w_y
+
+
+def _tangent_limits(real: type) -> Scalar:
     margin = real(TANGENT_MARGIN * 0.5)
 
     @inlined
@@ -193,22 +187,10 @@ def _footprint(real: type) -> tuple[Scalar, Scalar, Scalar]:
             (height - cy + margin * height) / fy,
         )
 
-    @inlined
-    def clamped(x, lowest, highest):
-        return min(max(x, lowest), highest)
-
-    @inlined
-    def footprint(row_x, row_y, row_z, scale_x, scale_y, tangent_x, tangent_y):
-        w_x = blend(scale_x, row_x, -scale_x * tangent_x, row_z)
-        w_y = blend(scale_y, row_y, -scale_y * tangent_y, row_z)
-        return w_x, w_y
-
-    return tangent_limits, clamped, footprint
+    return tangent_limits
 
 
 def _screen_covariance(real: type) -> tuple[Scalar, Scalar]:
-    vectors = vector_maths()
-    dot, cross_squared = vectors.dot, vectors.cross_squared
     low_pass, low_pass_squared = real(LOW_PASS), real(LOW_PASS * LOW_PASS)
     zero, one, two, inverse_alpha_min = real(0.0), real(1.0), real(2.0), real(1.0 / ALPHA_MIN)
 
@@ -231,8 +213,6 @@ def _screen_covariance(real: type) -> tuple[Scalar, Scalar]:
 
 
 def _screen_gradients(real: type) -> tuple[Scalar, Scalar]:
-    vectors = vector_maths()
-    blend, scaled_sum = vectors.blend, vectors.scaled_sum
     one, two, low_pass = real(1.0), real(2.0), real(LOW_PASS)
 
     @inlined
@@ -263,55 +243,43 @@ def _screen_gradients(real: type) -> tuple[Scalar, Scalar]:
     return covariance_gradient, footprint_gradient
 
 
-class EllipseMaths(NamedTuple):
-    """The region of the screen where a splat's coverage is at least `ALPHA_MIN`, an ellipse around its centre.
-
-    In double precision throughout, because the determinant of a needle's conic is a small difference of large products.
-
-    Attributes:
-        half_height: largest |dy| in the ellipse; negative where there is none, infinite where the conic is degenerate.
-        outline: what `band` needs, (slope, widening, half height, dy of the rightmost point).
-        band: lowest and highest dx of the ellipse over dy in [low, high], which must overlap it.
-    """
-
-    half_height: Scalar
-    outline: Scalar
-    band: Scalar
+# The region of the screen where a splat's coverage is at least `ALPHA_MIN`, an ellipse around its centre. In double
+# precision throughout, because the determinant of a needle's conic is a small difference of large products.
 
 
-def ellipse_maths() -> EllipseMaths:
-    """Builds the functions."""
+@inlined
+def half_height(xx, xy, yy, opacity):
+    """Largest |dy| in the ellipse; negative where there is none, infinite where the conic is degenerate."""
+    xx, xy, yy, visible = np.float64(xx), np.float64(xy), np.float64(yy), np.float64(opacity) / ALPHA_MIN
+    if not visible >= 1.0:
+        return -1.0
+    determinant = xx * yy - xy * xy
+    if not (determinant > 0.0 and xx > 0.0):
+        return np.inf
+    # Compositing evaluates the quadratic form in single precision, where its terms cancel the more the longer the
+    # needle: the bound is widened by that error, so that no pixel is lost to rounding.
+    bound = 2.0 * math.log(visible) * (1.0 + 1e-6 * xx * yy / determinant) + 2e-3
+    return math.sqrt(bound * xx / determinant)
 
-    @inlined
-    def half_height(xx, xy, yy, opacity):
-        xx, xy, yy, visible = np.float64(xx), np.float64(xy), np.float64(yy), np.float64(opacity) / ALPHA_MIN
-        if not visible >= 1.0:
-            return -1.0
-        determinant = xx * yy - xy * xy
-        if not (determinant > 0.0 and xx > 0.0):
-            return np.inf
-        # Compositing evaluates the quadratic form in single precision, where its terms cancel the more the longer the
-        # needle: the bound is widened by that error, so that no pixel is lost to rounding.
-        bound = 2.0 * math.log(visible) * (1.0 + 1e-6 * xx * yy / determinant) + 2e-3
-        return math.sqrt(bound * xx / determinant)
 
-    @inlined
-    def outline(xx, xy, yy, height):
-        xx, xy, yy = np.float64(xx), np.float64(xy), np.float64(yy)
-        if not height < np.inf:
-            return 0.0, np.inf, height, 0.0
-        widening = math.sqrt(xx * yy - xy * xy) / xx
-        # At the rightmost point dx = height sqrt(yy / xx), the form's derivative along y vanishes.
-        return -xy / xx, widening, height, -xy / math.sqrt(xx * yy) * height
+@inlined
+def outline(xx, xy, yy, height):
+    """The ellipse as `band` takes it: (slope, widening, half height, dy of the rightmost point)."""
+    xx, xy, yy = np.float64(xx), np.float64(xy), np.float64(yy)
+    if not height < np.inf:
+        return 0.0, np.inf, height, 0.0
+    widening = math.sqrt(xx * yy - xy * xy) / xx
+    # At the rightmost point dx = height sqrt(yy / xx), the form's derivative along y vanishes.
+    return -xy / xx, widening, height, -xy / math.sqrt(xx * yy) * height
 
-    @inlined
-    def band(shape, low, high):
-        slope, widening, height, rightmost = shape
-        if not height < np.inf:
-            return -np.inf, np.inf
-        at_right, at_left = min(max(rightmost, low), high), min(max(-rightmost, low), high)
-        right = slope * at_right + widening * math.sqrt(max(height * height - at_right * at_right, 0.0))
-        left = slope * at_left - widening * math.sqrt(max(height * height - at_left * at_left, 0.0))
-        return left, right
 
-    return EllipseMaths(half_height, outline, band)
+@inlined
+def band(shape, low, high):
+    """Lowest and highest dx of the ellipse over dy in [low, high], which must overlap it."""
+    slope, widening, height, rightmost = shape
+    if not height < np.inf:
+        return -np.inf, np.inf
+    at_right, at_left = min(max(rightmost, low), high), min(max(-rightmost, low), high)
+    right = slope * at_right + widening * math.sqrt(max(height * height - at_right * at_right, 0.0))
+    left = slope * at_left - widening * math.sqrt(max(height * height - at_left * at_left, 0.0))
+    return left, right

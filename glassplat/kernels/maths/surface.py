@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.projection import shape_maths, vector_maths
+from glassplat.kernels.maths.projection import dot, shape_maths
 from glassplat.kernels.records import NORMAL_AT, STRENGTH_AT, SURFACE_CHANNELS
 
 
@@ -35,7 +35,7 @@ def shortest_axis(x, y, z):  # type: ignore[no-untyped-def]
 
 def _facing(real: type) -> tuple[Scalar, Scalar]:
     """The normal of a Gaussian, and its adjoint."""
-    maths, dot = shape_maths(real), vector_maths().dot
+    maths = shape_maths(real)
     unit_quat, rotation, is_finite = maths.unit_quat, maths.rotation, maths.is_finite
     unit_quat_gradient = maths.unit_quat_gradient
     zero, one = real(0.0), real(1.0)

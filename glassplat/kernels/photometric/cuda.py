@@ -14,7 +14,6 @@ from torch import Tensor
 
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, kernel
-from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.images import RADIUS, ssim_maths
 from glassplat.kernels.records import REAL_OF, TILE
 
@@ -50,26 +49,23 @@ def _blocks(image: Tensor) -> int:
     return -(-image.shape[0] // TILE) * -(-image.shape[1] // TILE) * CHANNELS
 
 
-def _places() -> tuple[Scalar, Scalar]:
-    @inlined
-    def place(block, width):
-        """Channel, first row and first column of a block's tile."""
-        tile, columns = block // CHANNELS, (width + TILE - 1) // TILE
-        return block % CHANNELS, tile // columns * TILE, tile % columns * TILE
+@inlined
+def place(block, width):
+    """Channel, first row and first column of a block's tile."""
+    tile, columns = block // CHANNELS, (width + TILE - 1) // TILE
+    return block % CHANNELS, tile // columns * TILE, tile % columns * TILE
 
-    @inlined
-    def around(i, top, left):
-        """Row and column of the i-th pixel of a tile with its margin; it may lie outside of the image."""
-        return top + i // WIDE - RADIUS, left + i % WIDE - RADIUS
 
-    return place, around
+@inlined
+def around(i, top, left):
+    """Row and column of the i-th pixel of a tile with its margin; it may lie outside of the image."""
+    return top + i // WIDE - RADIUS, left + i % WIDE - RADIUS
 
 
 @cache
 def photometric_forward(real: type) -> Kernel:
     """Fills slopes [3, H, W, 3], where they are not empty, and each block's sums of L1 and similarity."""
     blur, compare = ssim_maths(real)
-    place, around = _places()
     zero, white = real(0.0), real(255.0)
 
     @kernel("photometric_forward", real, "real3 byte3 real4 real2")
@@ -131,7 +127,7 @@ def photometric_forward(real: type) -> Kernel:
 @cache
 def photometric_backward(real: type) -> Kernel:
     """Fills the gradient of the image from the slopes and the weights [2] of each pixel's L1 and similarity."""
-    blur, (place, around) = ssim_maths(real).blur, _places()
+    blur = ssim_maths(real).blur
     zero, two, white = real(0.0), real(2.0), real(255.0)
 
     @kernel("photometric_backward", real, "real3 byte3 real4 real1 real3")

@@ -162,14 +162,18 @@ class _Project(torch.autograd.Function):
             radii=radii, cotangents=_cotangents(gradients, radii), needs_camera=bool(ctx.needs_input_grad[5]),
             known=known,
         )  # fmt: skip
-        pose_gradient, v_token = None, None
-        if ctx.needs_input_grad[5]:
-            pose_gradient = torch.zeros_like(inputs[5])
-            pose_gradient[:, :3] = cameras.reshape(-1, 3, 4)
+        pose_gradient, v_token = _pose_gradient(cameras, inputs[5]) if ctx.needs_input_grad[5] else None, None
         if ctx.needs_input_grad[9]:
             ctx.shared.extend(found)
             found, v_token = [None] * 5, radii.new_empty(0)
         return *found, pose_gradient, None, None, None, v_token, None, None, None, None, None
+
+
+def _pose_gradient(cameras: Tensor, cam_from_world: Tensor) -> Tensor:
+    """Gradient of poses [C, 4, 4] from those of their first three rows [C, 12]."""
+    gradient = torch.zeros_like(cam_from_world)
+    gradient[:, :3] = cameras.reshape(-1, 3, 4)
+    return gradient
 
 
 def _cotangents(gradients: Sequence[Tensor | None], radii: Tensor) -> list[Tensor]:
@@ -241,12 +245,9 @@ class _ProjectDiscs(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         *inputs, radii, maps = ctx.saved_tensors
         cotangents = [gradient.contiguous() for gradient in gradients[:SMOOTH]]
-        cam_from_world, needs_camera = inputs[5], bool(ctx.needs_input_grad[5])
+        needs_camera = bool(ctx.needs_input_grad[5])
         found, cameras = kernels_for("project", radii.device).project_discs_gradients(
             inputs, *ctx.size_and_degree, seen=(radii, maps), cotangents=cotangents, needs_camera=needs_camera
         )
-        pose_gradient = None
-        if needs_camera:
-            pose_gradient = torch.zeros_like(cam_from_world)
-            pose_gradient[:, :3] = cameras.reshape(-1, 3, 4)
+        pose_gradient = _pose_gradient(cameras, inputs[5]) if needs_camera else None
         return (*found, pose_gradient, None, None, None, None, None, None, None)

@@ -41,6 +41,7 @@ from glassplat.kernels.project.steps import (
     culling,
     projecting,
     projecting_back,
+    vec3,
     view_steps,
 )
 from glassplat.kernels.records import REAL_OF
@@ -103,7 +104,7 @@ def project_discs_forward(real: type) -> Kernel:
 
 def _disc_backward(real: type) -> Scalar:
     """One disc in all cameras: fills its gradients, which are zero beforehand."""
-    vec3, footprint, zero = view_steps(real).vec3, discs(real), real(0.0)
+    footprint, zero = discs(real), real(0.0)
     shape, finish, project_back = footprint.shape, footprint.finish, projecting_back(real, footprint)
 
     @inlined

@@ -30,8 +30,8 @@ from glassplat.kernels.backend.cpu_vector import (
     vector_kind,
 )
 from glassplat.kernels.maths.harmonics import channel_with, color_gradient_with, harmonic_basis
-from glassplat.kernels.maths.projection import LOW_PASS, shape_maths, vector_maths
-from glassplat.kernels.project.steps import MOST_DEVIATIONS, place_gradients, view_steps, view_with
+from glassplat.kernels.maths.projection import LOW_PASS, dot, scaled_sum, shape_maths, tangential
+from glassplat.kernels.project.steps import MOST_DEVIATIONS, place_gradients, pose, vec3, view_with
 
 LANES = 16
 COLUMNS = 48
@@ -114,8 +114,6 @@ def _exponential(real: type) -> Step:
 
 
 def _may_show(real: type) -> Step:
-    vec3, pose, *_ = view_steps(real)
-    dot = vector_maths().dot
     exponential = _exponential(real)
     zero, one, low_pass, most_deviations = real(0.0), real(1.0), real(LOW_PASS), real(MOST_DEVIATIONS)
 
@@ -186,7 +184,6 @@ def views(real: type) -> Step:
 
 
 def _place(real: type) -> Step:
-    pose, dot = view_steps(real).pose, vector_maths().dot
     shape, view, load = shapes(real), views(real), vector_kind(real, LANES).load
     zero, one, largest = real(0.0), real(1.0), real(np.finfo(real).max)
 
@@ -280,8 +277,6 @@ def gradient_steps(real: type) -> GradientSteps:
 
 
 def _place_gradient(real: type) -> Step:
-    pose = view_steps(real).pose
-    dot, scaled_sum = vector_maths().dot, vector_maths().scaled_sum
     unit_quat_gradient, (full, load) = shape_maths(real).unit_quat_gradient, vector_kind(real, LANES)
     shape, view, zero, one = shapes(real), views(real), real(0.0), real(1.0)
 
@@ -329,7 +324,7 @@ def _place_gradient(real: type) -> Step:
 
 def _color_gradient(real: type) -> Step:
     (full, load), basis, channel = vector_kind(real, LANES), harmonic_basis(real), channel_of(real)
-    tangential, zero, half, one = vector_maths().tangential, real(0.0), real(0.5), real(1.0)
+    zero, half, one = real(0.0), real(0.5), real(1.0)
 
     @inlined
     def put(table, at, k, b, g):

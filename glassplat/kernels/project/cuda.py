@@ -26,6 +26,7 @@ from glassplat.kernels.project.steps import (
     ellipsoids,
     projecting,
     projecting_back,
+    vec3,
     view_steps,
 )
 from glassplat.kernels.records import REAL_OF
@@ -171,7 +172,7 @@ def project_discs_forward(real: type) -> Kernel:
 
 def _back(real: type, footprint: Footprint) -> Scalar:
     """The body of a backward kernel: adds up a Gaussian's gradients over cameras, and each camera's over the block."""
-    vec3, zero, threads, pose = view_steps(real).vec3, real(0.0), THREADS, POSE
+    zero, threads, pose = real(0.0), THREADS, POSE
     shape, finish, project_back = footprint.shape, footprint.finish, projecting_back(real, footprint)
 
     @inlined

@@ -8,14 +8,14 @@ import numpy as np
 
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import ALPHA_MIN, Scalar
-from glassplat.kernels.maths.disc import MAP, MOST_LOG_SCALE, disc_maths, outline_maths
-from glassplat.kernels.maths.projection import shape_maths, vector_maths
-from glassplat.kernels.project.steps import Footprint, view_steps
+from glassplat.kernels.maths.disc import MAP, MOST_LOG_SCALE, box, disc_maths, outline, reach
+from glassplat.kernels.maths.projection import along, blend, dot, scaled_sum, shape_maths
+from glassplat.kernels.project.steps import Footprint, pose
 
 
 def discs(real: type) -> Footprint:
     """The footprint of discs, whose shape ends with two deviations, on the CPU and on a GPU."""
-    return Footprint(_shape(real), _cull(real), _place(real), _place_gradient(real), _finish(real))
+    return Footprint(_shape(real), cull, _place(real), _place_gradient(real), _finish(real))
 
 
 def _shape(real: type) -> Scalar:
@@ -34,55 +34,42 @@ def _shape(real: type) -> Scalar:
     return shape
 
 
-def _cull(real: type) -> Scalar:
-    zero = real(0.0)
-
-    @inlined
-    def cull(c, n, outputs):  # type: ignore[no-untyped-def]
-        means2d, maps, depths, opacities, colors, normals, centers, conics, radii = outputs
-        depths[c, n] = opacities[c, n] = zero
-        for j in range(2):
-            means2d[c, n, j] = centers[c, n, j] = radii[c, n, j] = zero
-        for j in range(3):
-            colors[c, n, j] = normals[c, n, j] = conics[c, n, j] = zero
-        for j in range(MAP):
-            maps[c, n, j] = zero
-
-    return cull
+@inlined
+def cull(c, n, outputs):  # type: ignore[no-untyped-def]
+    """Writes zeros for one disc in one camera."""
+    means2d, maps, depths, opacities, colors, normals, centers, conics, radii = outputs
+    depths[c, n] = opacities[c, n] = 0
+    for j in range(2):
+        means2d[c, n, j] = centers[c, n, j] = radii[c, n, j] = 0
+    for j in range(3):
+        colors[c, n, j] = normals[c, n, j] = conics[c, n, j] = 0
+    for j in range(MAP):
+        maps[c, n, j] = 0
 
 
-def _tangents(real: type) -> Scalar:
-    along = vector_maths().along
-    dot = vector_maths().dot
-
-    @inlined
-    def tangents(rows, offset, mean, axes):  # type: ignore[no-untyped-def]
-        """Both tangents and the centre in camera space."""
-        p = along(axes[0], rows[0], rows[1], rows[2])
-        q = along(axes[1], rows[0], rows[1], rows[2])
-        m = dot(rows[0], mean) + offset[0], dot(rows[1], mean) + offset[1], dot(rows[2], mean) + offset[2]
-        return p, q, m
-
-    return tangents
+@inlined
+def tangents(rows, offset, mean, axes):  # type: ignore[no-untyped-def]
+    """Both tangents and the centre in camera space."""
+    p = along(axes[0], rows[0], rows[1], rows[2])
+    q = along(axes[1], rows[0], rows[1], rows[2])
+    m = dot(rows[0], mean) + offset[0], dot(rows[1], mean) + offset[1], dot(rows[2], mean) + offset[2]
+    return p, q, m
 
 
-def _towards(real: type) -> Scalar:
-    dot = vector_maths().dot
-    zero, one = real(0.0), real(1.0)
+ZERO, ONE = np.float32(0.0), np.float32(1.0)
+"""In single precision, which holds them exactly, so that they widen nothing."""
 
-    @inlined
-    def towards(axis, mean, lens, c):  # type: ignore[no-untyped-def]
-        """1 where a disc's axis points to the camera, else -1."""
-        back = lens[c, 4] - mean[0], lens[c, 5] - mean[1], lens[c, 6] - mean[2]
-        return -one if dot(back, axis) < zero else one
 
-    return towards
+@inlined
+def towards(axis, mean, lens, c):  # type: ignore[no-untyped-def]
+    """1 where a disc's axis points to the camera, else -1."""
+    back = lens[c, 4] - mean[0], lens[c, 5] - mean[1], lens[c, 6] - mean[2]
+    return -ONE if dot(back, axis) < ZERO else ONE
 
 
 def _place(real: type) -> Scalar:
-    tangents, towards, pose = _tangents(real), _towards(real), view_steps(real).pose
     crossed, faces, map_of, _ = disc_maths(real)
-    is_finite, (reach, outline, box) = shape_maths(real).is_finite, outline_maths()
+    is_finite = shape_maths(real).is_finite
     one, alpha_min = real(1.0), real(ALPHA_MIN)
 
     @inlined
@@ -126,15 +113,15 @@ def _place(real: type) -> Scalar:
     return place
 
 
-def _place_gradient(real: type) -> Scalar:
-    tangents, towards, pose = _tangents(real), _towards(real), view_steps(real).pose
-    crossed, _, _, map_gradient = disc_maths(real)
-    blend, scaled_sum = vector_maths().blend, vector_maths().scaled_sum
-    one = real(1.0)
+@inlined
+def six(array, c, n):  # type: ignore[no-untyped-def]
+    """The map of a disc in a camera, or its gradient."""
+    return array[c, n, 0], array[c, n, 1], array[c, n, 2], array[c, n, 3], array[c, n, 4], array[c, n, 5]
 
-    @inlined
-    def six(array, c, n):  # type: ignore[no-untyped-def]
-        return array[c, n, 0], array[c, n, 1], array[c, n, 2], array[c, n, 3], array[c, n, 4], array[c, n, 5]
+
+def _place_gradient(real: type) -> Scalar:
+    crossed, _, _, map_gradient = disc_maths(real)
+    one = real(1.0)
 
     @inlined
     def place_gradient(  # type: ignore[no-untyped-def]

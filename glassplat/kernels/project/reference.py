@@ -7,10 +7,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from glassplat.kernels.maths.blending import ALPHA_MIN
 from glassplat.kernels.maths.disc import EDGE_ON, MOST_DEVIATIONS, MOST_LOG_SCALE, SLACK
 from glassplat.kernels.maths.disc import LOW_PASS as DISC_LOW_PASS
 from glassplat.kernels.maths.harmonics import SH_CONSTANTS
-from glassplat.kernels.maths.projection import ALPHA_MIN, LOW_PASS, TANGENT_MARGIN
+from glassplat.kernels.maths.projection import LOW_PASS, TANGENT_MARGIN
 from glassplat.kernels.records import CameraBatch, Projected, ProjectedDiscs, RawGaussians
 
 

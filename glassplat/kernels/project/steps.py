@@ -9,8 +9,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from glassplat.kernels.backend.cpu import inlined
+from glassplat.kernels.maths.blending import ALPHA_MIN
 from glassplat.kernels.maths.harmonics import color_maths
-from glassplat.kernels.maths.projection import ALPHA_MIN, screen_maths, shape_maths, vector_maths
+from glassplat.kernels.maths.projection import (
+    along,
+    blend,
+    clamped,
+    dot,
+    footprint,
+    scaled_sum,
+    screen_maths,
+    shape_maths,
+    tangential,
+)
 
 CHUNK = 512
 """Gaussians per task; part of the result's rounding, so not to be tuned per machine."""
@@ -18,20 +29,31 @@ LENS_VALUES = 9
 """Tangent limits (4), camera centre (3), and how much longer than a sphere its footprint may get along x and y (2)."""
 
 
+@inlined
+def vec3(array, n):
+    """Row n of an array [N, 3] as a tuple."""
+    return array[n, 0], array[n, 1], array[n, 2]
+
+
+@inlined
+def pose(cam_from_world, c):
+    """Rows of the upper 3x3 block of a camera matrix, and its translation."""
+    row_x = cam_from_world[c, 0, 0], cam_from_world[c, 0, 1], cam_from_world[c, 0, 2]
+    row_y = cam_from_world[c, 1, 0], cam_from_world[c, 1, 1], cam_from_world[c, 1, 2]
+    row_z = cam_from_world[c, 2, 0], cam_from_world[c, 2, 1], cam_from_world[c, 2, 2]
+    return row_x, row_y, row_z, (cam_from_world[c, 0, 3], cam_from_world[c, 1, 3], cam_from_world[c, 2, 3])
+
+
 class ViewSteps(NamedTuple):
     """Parts of the kernels, which read the arrays that the scalar maths does not know.
 
     Attributes:
-        vec3: row n of an array [N, 3] as a tuple.
-        pose: rows of the upper 3x3 block of a camera matrix, and its translation.
         shape: (usable, opacity, unit quaternion, inverse norm, axes) of a Gaussian.
         view: what a camera sees of a Gaussian before its colour.
         fill_lenses: writes `LENS_VALUES` numbers per camera.
         direction: unit vector from a camera's centre to a mean, and its inverse length.
     """
 
-    vec3: Callable[..., Any]
-    pose: Callable[..., Any]
     shape: Callable[..., Any]
     view: Callable[..., Any]
     fill_lenses: Callable[..., Any]
@@ -40,23 +62,7 @@ class ViewSteps(NamedTuple):
 
 def view_steps(real: type) -> ViewSteps:
     """Builds the parts for `real`, np.float32 or np.float64."""
-    vec3, pose = _loads()
-    return ViewSteps(vec3, pose, _shape(real), view_with(real, screen_maths(real).clamped), *_lenses(real))
-
-
-def _loads() -> tuple[Callable[..., Any], Callable[..., Any]]:
-    @inlined
-    def vec3(array, n):
-        return array[n, 0], array[n, 1], array[n, 2]
-
-    @inlined
-    def pose(cam_from_world, c):
-        row_x = cam_from_world[c, 0, 0], cam_from_world[c, 0, 1], cam_from_world[c, 0, 2]
-        row_y = cam_from_world[c, 1, 0], cam_from_world[c, 1, 1], cam_from_world[c, 1, 2]
-        row_z = cam_from_world[c, 2, 0], cam_from_world[c, 2, 1], cam_from_world[c, 2, 2]
-        return row_x, row_y, row_z, (cam_from_world[c, 0, 3], cam_from_world[c, 1, 3], cam_from_world[c, 2, 3])
-
-    return vec3, pose
+    return ViewSteps(_shape(real), view_with(real, clamped), *_lenses(real))
 
 
 def _shape(real: type) -> Callable[..., Any]:
@@ -82,11 +88,7 @@ def _shape(real: type) -> Callable[..., Any]:
 
 
 def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    tangent_limits, *_ = screen_maths(real)
-    vectors = vector_maths()
-    dot, blend = vectors.dot, vectors.blend
-    _, pose = _loads()
-    one = real(1.0)
+    tangent_limits, one = screen_maths(real).tangent_limits, real(1.0)
 
     @inlined
     def skewed(row, row_z, tangent):
@@ -124,9 +126,7 @@ def _lenses(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
 def view_with(real: type, clamped: Callable[..., Any]) -> Callable[..., Any]:
     """Make a record of a camera, of numbers or of vectors, with the function that clamps them."""
-    along = vector_maths().along
-    _, _, footprint, screen_covariance, *_ = screen_maths(real)
-    one = real(1.0)
+    screen_covariance, one = screen_maths(real).screen_covariance, real(1.0)
 
     @inlined
     def view(rows, position, axes, intrinsics, lens, c):
@@ -148,8 +148,7 @@ MOST_DEVIATIONS = 1.01 * 2.0 * math.log(1.0 / ALPHA_MIN)
 
 def placing(real: type) -> Callable[..., Any]:
     """One ellipsoid in one camera: fills everything but the colour, where it is visible."""
-    _, pose, _, view, *_ = view_steps(real)
-    dot = vector_maths().dot
+    view = view_steps(real).view
     half_extents = screen_maths(real).half_extents
     is_finite = shape_maths(real).is_finite
     zero, one = real(0.0), real(1.0)
@@ -181,7 +180,7 @@ def placing(real: type) -> Callable[..., Any]:
 
 def culling(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Writing zeros for one ellipsoid in one camera, and whether a Gaussian is on the kept sides."""
-    vec3, dot, zero = view_steps(real).vec3, vector_maths().dot, real(0.0)
+    zero = real(0.0)
 
     @inlined
     def cull(n, c, means2d, conics, depths, opacities, colors, radii):
@@ -205,11 +204,7 @@ def place_gradients(real: type, free: Callable[..., Any] | None = None) -> Calla
 
     Of vectors, `free(x, held, tangent)` is x where a tangent is not held at a limit, and 0 elsewhere.
     """
-    dot, blend = vector_maths().dot, vector_maths().blend
-    covariance_gradient, footprint_gradient = (
-        screen_maths(real).covariance_gradient,
-        screen_maths(real).footprint_gradient,
-    )
+    *_, covariance_gradient, footprint_gradient = screen_maths(real)
     zero, one = real(0.0), real(1.0)
 
     @inlined
@@ -241,7 +236,6 @@ def place_gradients(real: type, free: Callable[..., Any] | None = None) -> Calla
 
 def camera_sums(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Adding to a camera's gradient [12], rows of (3x3 block, translation), in double precision."""
-    dot, blend = vector_maths().dot, vector_maths().blend
     one = real(1.0)
 
     @inlined
@@ -271,8 +265,7 @@ def camera_sums(real: type) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
 def view_gradients(real: type) -> Callable[..., Any]:
     """The colour of one Gaussian in one camera."""
-    direction, tangential = view_steps(real).direction, vector_maths().tangential
-    color, color_gradient = color_maths(real)
+    direction, (color, color_gradient) = view_steps(real).direction, color_maths(real)
     zero, half = real(0.0), real(0.5)
 
     @inlined
@@ -326,8 +319,7 @@ def ellipsoids(real: type) -> Footprint:
 
 
 def _ellipsoid_gradient(real: type) -> Callable[..., Any]:
-    pose, view = view_steps(real).pose, view_steps(real).view
-    dot, placed, zero = vector_maths().dot, place_gradients(real), real(0.0)
+    view, placed, zero = view_steps(real).view, place_gradients(real), real(0.0)
 
     @inlined
     def place_gradient(c, n, mean, shaped, cam_from_world, intrinsics, lens, maps, cotangents):
@@ -347,7 +339,6 @@ def _ellipsoid_gradient(real: type) -> Callable[..., Any]:
 
 
 def _finish_ellipsoid(real: type) -> Callable[..., Any]:
-    dot, blend = vector_maths().dot, vector_maths().blend
     maths = shape_maths(real)
     rotation, unit_quat_gradient = maths.rotation, maths.unit_quat_gradient
     zero, one = real(0.0), real(1.0)
@@ -379,10 +370,10 @@ def _finish_ellipsoid(real: type) -> Callable[..., Any]:
     return finish
 
 
-def projecting(real: type, footprint: Footprint) -> Callable[..., Any]:
+def projecting(real: type, kind: Footprint) -> Callable[..., Any]:
     """One Gaussian in all cameras: fills its outputs, zeros where it is culled."""
-    vec3, direction, in_front = view_steps(real).vec3, view_steps(real).direction, culling(real)[1]
-    shape, cull, place, *_ = footprint
+    direction, in_front = view_steps(real).direction, culling(real)[1]
+    shape, cull, place, *_ = kind
     is_finite, color = shape_maths(real).is_finite, color_maths(real).color
     zero, half = real(0.0), real(0.5)
 
@@ -415,11 +406,10 @@ def projecting(real: type, footprint: Footprint) -> Callable[..., Any]:
     return project
 
 
-def projecting_back(real: type, footprint: Footprint) -> Callable[..., Any]:
+def projecting_back(real: type, kind: Footprint) -> Callable[..., Any]:
     """One Gaussian in one camera that sees it: adds to the sums that `finish` takes, and to the camera's gradient."""
-    pose, place_gradient = view_steps(real).pose, footprint.place_gradient
-    view_gradient, (add_place, add_view) = view_gradients(real), camera_sums(real)
-    blend, scaled_sum, zero, one = vector_maths().blend, vector_maths().scaled_sum, real(0.0), real(1.0)
+    place_gradient, view_gradient, (add_place, add_view) = kind.place_gradient, view_gradients(real), camera_sums(real)
+    zero, one = real(0.0), real(1.0)
 
     @inlined
     def project_back(c, n, mean, shaped, inputs, lens, degree, maps, cotangents, needs_camera, total, sums, g_sh):

@@ -7,9 +7,7 @@ that they are the same for any number of threads.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import cache
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +15,7 @@ from numba import prange
 from torch import Tensor
 
 from glassplat.kernels.backend.cpu import Kernel, even_stride, inlined, kernel
-from glassplat.kernels.maths.projection import ellipse_maths
+from glassplat.kernels.maths.projection import band, half_height, outline
 from glassplat.kernels.records import REAL_OF, TILE, Splats, TileBins, check_pair_count
 
 KEY_OF = {torch.float32: np.uint32, torch.float64: np.uint64}
@@ -57,6 +55,15 @@ def bin_tiles(splats: Splats, width: int, height: int, active_tiles: Tensor | No
     )
 
 
+@inlined
+def pixel_range(low, high, size):
+    """First and last pixel whose centre lies in [low, high], within an image of that size."""
+    # Clamped before the conversion, so that infinities are well defined.
+    first = np.int64(math.ceil(min(max(low - 0.5, 0.0), float(size))))
+    last = np.int64(math.floor(min(max(high - 0.5, -1.0), float(size - 1))))
+    return first, last
+
+
 @cache
 def tile_spans(real: type) -> Kernel:
     """Finds the splats that are to be seen, and the tile columns that each of them touches, tile row by tile row.
@@ -72,8 +79,6 @@ def tile_spans(real: type) -> Kernel:
         slots [V + 1]: active tiles of all of them before.
         splat_offsets [S + 1]: the same for each splat, seen or not.
     """
-    half_height, outline, band = ellipse_maths()
-    pixel_range = pixel_ranges()
 
     @kernel("tile_spans", real)
     def spans_of(means2d, conics, opacities, radii, active_tiles, num_cameras, width, height):
@@ -151,20 +156,6 @@ def tile_spans(real: type) -> Kernel:
         return kept, starts, spans, span_offsets, first_rows, slots, splat_offsets
 
     return spans_of
-
-
-def pixel_ranges() -> Callable[..., Any]:
-    """Builds the function that finds the pixels between two coordinates."""
-
-    @inlined
-    def pixel_range(low, high, size):
-        """First and last pixel whose centre lies in [low, high], within an image of that size."""
-        # Clamped before the conversion, so that infinities are well defined.
-        first = np.int64(math.ceil(min(max(low - 0.5, 0.0), float(size))))
-        last = np.int64(math.floor(min(max(high - 0.5, -1.0), float(size - 1))))
-        return first, last
-
-    return pixel_range
 
 
 @cache

@@ -18,10 +18,9 @@ from torch import Tensor
 
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
-from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.projection import ellipse_maths
+from glassplat.kernels.maths.projection import band, half_height, outline
 from glassplat.kernels.records import REAL_OF, TILE, Splats, TileBins, check_pair_count
-from glassplat.kernels.tiles.cpu import pixel_ranges
+from glassplat.kernels.tiles.cpu import pixel_range
 
 THREADS = 128
 
@@ -88,62 +87,52 @@ def _sequence(depths: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
     return order, in_order.cumsum(0) - in_order
 
 
-def _spans(real: type) -> tuple[Scalar, Scalar, Scalar]:
-    half_height, outline, band = ellipse_maths()
-    pixel_range = pixel_ranges()
-    zero, endless = real(0.0), real(np.inf)
-
-    @inlined
-    def rows_of(means2d, conics, opacities, radii, s, height):
-        """First and last row of pixels that a splat reaches (last < first: none), and its half height."""
-        if not (radii[s, 0] > zero and abs(means2d[s, 0]) + abs(means2d[s, 1]) < endless):
-            return 0, -1, -1.0
-        y = np.float64(means2d[s, 1])
-        reach = half_height(conics[s, 0], conics[s, 1], conics[s, 2], opacities[s])
-        if not reach >= 0.0:
-            return 0, -1, -1.0
-        first, last = pixel_range(y - reach, y + reach, height)
-        return first, last, reach
-
-    @inlined
-    def shape_of(means2d, conics, s, rows):
-        """Shape of a splat for `columns_of`."""
-        x, y = np.float64(means2d[s, 0]), np.float64(means2d[s, 1])
-        return x, y, rows[0], rows[1], outline(conics[s, 0], conics[s, 1], conics[s, 2], rows[2])
-
-    @inlined
-    def columns_of(shape, row, width):
-        """First and last tile that a splat touches in a row of tiles, last < first where it touches none."""
-        x, y, first, last, ellipse = shape
-        low, high = max(first, row * TILE) + 0.5 - y, min(last, row * TILE + TILE - 1) + 0.5 - y
-        left, right = band(ellipse, low, high)
-        first_pixel, last_pixel = pixel_range(x + left, x + right, width)
-        if first_pixel > last_pixel:
-            return 0, -1
-        return first_pixel // TILE, last_pixel // TILE
-
-    return rows_of, shape_of, columns_of
+@inlined
+def rows_of(means2d, conics, opacities, radii, s, height):
+    """First and last row of pixels that a splat reaches (last < first: none), and its half height."""
+    if not (radii[s, 0] > 0 and abs(means2d[s, 0]) + abs(means2d[s, 1]) < np.inf):
+        return 0, -1, -1.0
+    y = np.float64(means2d[s, 1])
+    reach = half_height(conics[s, 0], conics[s, 1], conics[s, 2], opacities[s])
+    if not reach >= 0.0:
+        return 0, -1, -1.0
+    first, last = pixel_range(y - reach, y + reach, height)
+    return first, last, reach
 
 
-def _active_between() -> Scalar:
-    @inlined
-    def active_between(active_tiles, camera, row, left, right):
-        """Number of active tiles from one column to another, both included."""
-        found = right - left + 1
-        if active_tiles.size > 0:
-            for column in range(left, right + 1):
-                if not active_tiles[camera, row, column]:
-                    found -= 1
-        return found
+@inlined
+def shape_of(means2d, conics, s, rows):
+    """Shape of a splat for `columns_of`."""
+    x, y = np.float64(means2d[s, 0]), np.float64(means2d[s, 1])
+    return x, y, rows[0], rows[1], outline(conics[s, 0], conics[s, 1], conics[s, 2], rows[2])
 
-    return active_between
+
+@inlined
+def columns_of(shape, row, width):
+    """First and last tile that a splat touches in a row of tiles, last < first where it touches none."""
+    x, y, first, last, ellipse = shape
+    low, high = max(first, row * TILE) + 0.5 - y, min(last, row * TILE + TILE - 1) + 0.5 - y
+    left, right = band(ellipse, low, high)
+    first_pixel, last_pixel = pixel_range(x + left, x + right, width)
+    if first_pixel > last_pixel:
+        return 0, -1
+    return first_pixel // TILE, last_pixel // TILE
+
+
+@inlined
+def active_between(active_tiles, camera, row, left, right):
+    """Number of active tiles from one column to another, both included."""
+    found = right - left + 1
+    if active_tiles.size > 0:
+        for column in range(left, right + 1):
+            if not active_tiles[camera, row, column]:
+                found -= 1
+    return found
 
 
 @cache
 def count_tiles(real: type) -> Kernel:
     """Counts the active tiles that each splat touches, and the rows of tiles that it may touch any in [2, S]."""
-    rows_of, shape_of, columns_of = _spans(real)
-    active_between = _active_between()
 
     @kernel("count_tiles", real, "real2 real2 real1 real2 bool3 int int int int2")
     def count(means2d, conics, opacities, radii, active_tiles, per_camera, width, height, counts):
@@ -166,8 +155,6 @@ def count_tiles(real: type) -> Kernel:
 @cache
 def list_spans(real: type) -> Kernel:
     """Lists the rows of tiles of each splat: the row, its first column, and the pairs of the splat up to its end."""
-    rows_of, shape_of, columns_of = _spans(real)
-    active_between = _active_between()
 
     @kernel("list_spans", real, "real2 real2 real1 real2 bool3 int int int long1 int2")
     def fill(means2d, conics, opacities, radii, active_tiles, per_camera, width, height, span_offsets, spans):
@@ -187,26 +174,22 @@ def list_spans(real: type) -> Kernel:
     return fill
 
 
-def _search() -> Scalar:
-    @inlined
-    def search(values, x):
-        """The last of ascending values that is at most x; the first is."""
-        low, high = 0, values.size
-        while high - low > 1:
-            middle = (low + high) // 2
-            if values[middle] <= x:
-                low = middle
-            else:
-                high = middle
-        return low
-
-    return search
+@inlined
+def search(values, x):
+    """The last of ascending values that is at most x; the first is."""
+    low, high = 0, values.size
+    while high - low > 1:
+        middle = (low + high) // 2
+        if values[middle] <= x:
+            low = middle
+        else:
+            high = middle
+    return low
 
 
 @cache
 def emit_tiles(key: type = np.int16) -> Kernel:
     """Writes the tile, the splat and the slot of every pair."""
-    search = _search()
     keys = "short1" if key is np.int16 else "int1"
 
     @kernel("emit_tiles", key, f"bool3 int int int int long1 long1 long1 long1 int2 {keys} int1 int1")

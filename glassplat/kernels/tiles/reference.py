@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from glassplat.kernels.maths.projection import ALPHA_MIN
+from glassplat.kernels.maths.blending import ALPHA_MIN
 from glassplat.kernels.records import Splats, TileBins
 
 TILE = 16

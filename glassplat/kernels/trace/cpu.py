@@ -38,7 +38,7 @@ from glassplat.kernels.trace.steps import (
     STACK,
     WIDTH,
     coverage_maths,
-    shape_reader,
+    shape_of,
 )
 
 
@@ -230,7 +230,7 @@ def _shade(real: type) -> Scalar:
 @cache
 def trace_backward(real: type, flat: bool) -> Kernel:
     """Fills each block's rows and their owners, and the gradients of the rays, which are zero beforehand."""
-    shape, coverage, pull = shape_reader(real), coverage_maths(real, blend_maths(real).exp2), _pull(real, flat)
+    coverage, pull = coverage_maths(real, blend_maths(real).exp2), _pull(real, flat)
     meet, shade = ray_hit_maths(real, flat).meet, _shade(real)
     zero, half, one, nowhere = real(0.0), real(0.5), real(1.0), real("inf")
 
@@ -264,7 +264,7 @@ def trace_backward(real: type, flat: bool) -> Kernel:
                         sh_rows[free] = zero
                         free += 1
                     row = own[g]
-                    offset, frame = shape(means, frames, g, o)
+                    offset, frame = shape_of(means, frames, g, o)
                     t, q, squared = meet(offset, d, frame)
                     # On a threshold, what the search has met may be missed by other roundings.
                     if not t < nowhere:

@@ -26,7 +26,7 @@ from glassplat.kernels.trace.steps import (
     SLACK,
     WIDTH,
     coverage_maths,
-    nearest_maths,
+    insert,
     ray_reader,
 )
 
@@ -171,7 +171,7 @@ def packed_leaves(shapes: Sequence[Tensor], order: Tensor) -> NDArray[Any]:
 
 
 def _next_hits(real: type, flat: bool) -> Scalar:
-    insert, enter, meet = nearest_maths(), _entry(real), _lanes(real, flat)
+    enter, meet = _entry(real), _lanes(real, flat)
     coverage = coverage_maths(real, blend_maths(real).exp2)
     zero, nowhere, sooner = real(0.0), real("inf"), real(1.0 - SLACK)
 

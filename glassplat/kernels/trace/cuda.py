@@ -42,9 +42,9 @@ from glassplat.kernels.trace.steps import (
     STACK,
     WIDTH,
     coverage_maths,
-    nearest_maths,
+    insert,
     ray_reader,
-    shape_reader,
+    shape_of,
 )
 
 THREADS = 128
@@ -144,30 +144,28 @@ def fit_level(real: type) -> Kernel:
     return fit
 
 
-def _entry(real: type) -> Scalar:
+ZERO = np.float32(0.0)
+"""In single precision, which holds it exactly, so that no comparison is widened."""
+
+
+@inlined
+def enter(boxes, at, o, inverse, first, last):
     """Distances at which a ray enters and leaves a box, within two bounds; it meets the box if they are in order."""
-    zero = real(0.0)
-
-    @inlined
-    def enter(boxes, at, o, inverse, first, last):
-        # Faces are chosen by the sign of the direction, so that an empty box, whose lowest corner lies above its
-        # highest, is missed.
-        low, high = at, at + 3 * WIDTH
-        x0, x1 = (low, high) if inverse[0] > zero else (high, low)
-        y0, y1 = (low, high) if inverse[1] > zero else (high, low)
-        z0, z1 = (low, high) if inverse[2] > zero else (high, low)
-        x, y = (boxes[x0] - o[0]) * inverse[0], (boxes[y0 + WIDTH] - o[1]) * inverse[1]
-        near = max(x, y, (boxes[z0 + 2 * WIDTH] - o[2]) * inverse[2], first)
-        x, y = (boxes[x1] - o[0]) * inverse[0], (boxes[y1 + WIDTH] - o[1]) * inverse[1]
-        return near, min(x, y, (boxes[z1 + 2 * WIDTH] - o[2]) * inverse[2], last)
-
-    return enter
+    # Faces are chosen by the sign of the direction, so that an empty box, whose lowest corner lies above its
+    # highest, is missed.
+    low, high = at, at + 3 * WIDTH
+    x0, x1 = (low, high) if inverse[0] > ZERO else (high, low)
+    y0, y1 = (low, high) if inverse[1] > ZERO else (high, low)
+    z0, z1 = (low, high) if inverse[2] > ZERO else (high, low)
+    x, y = (boxes[x0] - o[0]) * inverse[0], (boxes[y0 + WIDTH] - o[1]) * inverse[1]
+    near = max(x, y, (boxes[z0 + 2 * WIDTH] - o[2]) * inverse[2], first)
+    x, y = (boxes[x1] - o[0]) * inverse[0], (boxes[y1 + WIDTH] - o[1]) * inverse[1]
+    return near, min(x, y, (boxes[z1 + 2 * WIDTH] - o[2]) * inverse[2], last)
 
 
 def next_hits_maths(real: type, flat: bool) -> Scalar:
     """Builds `next_hits`, which fills (ts, ids, alphas) with a ray's next hits and returns their number."""
-    meet, insert, enter = ray_hit_maths(real, flat).meet, nearest_maths(), _entry(real)
-    shape, coverage = shape_reader(real), coverage_maths(real, exp2_maths(real))
+    meet, coverage = ray_hit_maths(real, flat).meet, coverage_maths(real, exp2_maths(real))
     zero, nowhere, sooner, later = real(0.0), real("inf"), real(1.0 - SLACK), real(1.0 + SLACK)
 
     @inlined
@@ -202,7 +200,7 @@ def next_hits_maths(real: type, flat: bool) -> Scalar:
                     top += 1
                     continue
                 g = order[child + k]
-                offset, frame = shape(means, frames, g, o)
+                offset, frame = shape_of(means, frames, g, o)
                 t, _, squared = meet(offset, d, frame)
                 if not (t > first or (t == first and g > first_id)):
                     continue
@@ -263,7 +261,7 @@ def _color_pull(real: type) -> Scalar:
 @cache
 def trace_pull_rays(real: type, flat: bool) -> Kernel:
     """Fills rays, weights and pulls of hits, and the gradients of origins and directions, zero where nothing is met."""
-    ray, shape, color_pull = ray_reader(real), shape_reader(real), _color_pull(real)
+    ray, color_pull = ray_reader(real), _color_pull(real)
     meet, meet_gradient = ray_hit_maths(real, flat)
     zero, half, one, most, nowhere = real(0.0), real(0.5), real(1.0), real(ALPHA_MAX), real("inf")
 
@@ -292,7 +290,7 @@ def trace_pull_rays(real: type, flat: bool) -> Kernel:
         by_origin, by_direction, by_unit = (zero, zero, zero), (zero, zero, zero), (zero, zero, zero)
         for place in range(starts[r], starts[r + 1]):
             g, alpha = met[place], met_alphas[place]
-            offset, frame = shape(means, frames, g, o)
+            offset, frame = shape_of(means, frames, g, o)
             t, q, _ = meet(offset, d, frame)
             weight, value, v_squared = alpha * left, zero, zero
             # On the threshold, another fusing of products and sums may find a disc seen from its edge.
@@ -323,7 +321,7 @@ def trace_pull_rays(real: type, flat: bool) -> Kernel:
 @cache
 def trace_pull_gaussians(real: type, flat: bool) -> Kernel:
     """Fills the gradients of Gaussians that rays meet, one block of one warp for each; the others' are zero before."""
-    ray, shape, color_pull = ray_reader(real), shape_reader(real), _color_pull(real)
+    ray, color_pull = ray_reader(real), _color_pull(real)
     meet, meet_gradient = ray_hit_maths(real, flat)
     zero, two, nowhere = real(0.0), real(2.0), real("inf")
 
@@ -367,7 +365,7 @@ def trace_pull_gaussians(real: type, flat: bool) -> Kernel:
                 hit = order[first + lane]
                 r, weight = hit_rays[hit], weights[hit]
                 o, d, _, length, _ = ray(origins, directions, r)
-                offset, frame = shape(means, frames, g, o)
+                offset, frame = shape_of(means, frames, g, o)
                 fill(rows[lane], offset, d, frame, length, weight, v_depths[r], pulls[hit], opacities[g])
                 if degree >= 0:
                     for k in range(HARMONICS):

@@ -49,18 +49,14 @@ def ray_reader(real: type) -> Scalar:
     return ray
 
 
-def shape_reader(real: type) -> Scalar:
+@inlined
+def shape_of(means, frames, g, o):  # type: ignore[no-untyped-def]
     """Offset from the origin, and frame, of one Gaussian."""
-
-    @inlined
-    def shape(means, frames, g, o):  # type: ignore[no-untyped-def]
-        offset = means[g, 0] - o[0], means[g, 1] - o[1], means[g, 2] - o[2]
-        first = frames[g, 0, 0], frames[g, 0, 1], frames[g, 0, 2]
-        second = frames[g, 1, 0], frames[g, 1, 1], frames[g, 1, 2]
-        third = frames[g, 2, 0], frames[g, 2, 1], frames[g, 2, 2]
-        return offset, (first, second, third)
-
-    return shape
+    offset = means[g, 0] - o[0], means[g, 1] - o[1], means[g, 2] - o[2]
+    first = frames[g, 0, 0], frames[g, 0, 1], frames[g, 0, 2]
+    second = frames[g, 1, 0], frames[g, 1, 1], frames[g, 1, 2]
+    third = frames[g, 2, 0], frames[g, 2, 1], frames[g, 2, 2]
+    return offset, (first, second, third)
 
 
 def coverage_maths(real: type, exp2: Scalar) -> Scalar:
@@ -83,17 +79,12 @@ def coverage_maths(real: type, exp2: Scalar) -> Scalar:
     return coverage
 
 
-def nearest_maths() -> Scalar:
-    """Builds `insert`, which keeps the nearest hits ordered by (t, Gaussian)."""
-
-    @inlined
-    def insert(ts, ids, alphas, count, t, g, alpha):  # type: ignore[no-untyped-def]
-        """Puts a hit in its place among the nearest; returns how many there are."""
-        place = count if count < CHUNK else CHUNK - 1
-        while place > 0 and (ts[place - 1] > t or (ts[place - 1] == t and ids[place - 1] > g)):
-            ts[place], ids[place], alphas[place] = ts[place - 1], ids[place - 1], alphas[place - 1]
-            place -= 1
-        ts[place], ids[place], alphas[place] = t, g, alpha
-        return count + 1 if count < CHUNK else count
-
-    return insert
+@inlined
+def insert(ts, ids, alphas, count, t, g, alpha):  # type: ignore[no-untyped-def]
+    """Puts a hit in its place among the nearest, ordered by (t, Gaussian); returns how many there are."""
+    place = count if count < CHUNK else CHUNK - 1
+    while place > 0 and (ts[place - 1] > t or (ts[place - 1] == t and ids[place - 1] > g)):
+        ts[place], ids[place], alphas[place] = ts[place - 1], ids[place - 1], alphas[place - 1]
+        place -= 1
+    ts[place], ids[place], alphas[place] = t, g, alpha
+    return count + 1 if count < CHUNK else count

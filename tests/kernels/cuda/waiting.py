@@ -15,9 +15,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from glassplat.kernels.backend import devices
 from glassplat.kernels.loss_terms import _EnergyInTorch, gradient_conflict_in_torch
-from glassplat.kernels.screen_statistics import add_views_in_torch
 from glassplat.scene import camera
 from glassplat.training import densify, losses
+from tests.kernels.test_screen_statistics import add_views_in_torch
 
 ATEN = torch.ops.aten
 LOOKED_AT = {ATEN._local_scalar_dense.default, ATEN.nonzero.default, ATEN.masked_select.default, ATEN.equal.default}
