@@ -224,8 +224,7 @@ def composite_backward(real: type, num_channels: int = 4, probed: bool = True) -
                             dot += pull * value[d]
                             v_value[d] += weight * pull
                         if channel >= 0:
-                            center, pull = pulls[pulled + at(middle)], pulls[pulled + at(spread)]
-                            difference = apart - center
+                            difference, pull = apart - pulls[pulled + at(middle)], pulls[pulled + at(spread)]
                             dot += pull * abs(difference)
                             if abs(difference) > on_mean * abs(pulls[pulled + at(middle)]):
                                 v_apart += weight * pull if difference > zero else -weight * pull
