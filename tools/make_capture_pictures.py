@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from glassplat.prepare.report_page import PAGE
+from glassplat.prepare.preparation import PAGE
 from glassplat.scene.camera import NumpyCamera
 from tools.browser import Browser
 from tools.marking_page import MarkingPage, marking_page

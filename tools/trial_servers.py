@@ -29,7 +29,7 @@ from glassplat.access import cookie_name
 from glassplat.annotate.server import AnnotationServer
 from glassplat.annotate.session import opened_session
 from glassplat.files.images import write_image
-from glassplat.prepare.report_page import PAGE
+from glassplat.prepare.preparation import PAGE
 from glassplat.render.planar import Planar
 from glassplat.viewer.drawing import Shown
 from glassplat.viewer.gate import LARGEST_MESSAGE, MESSAGES
