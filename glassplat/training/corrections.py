@@ -16,7 +16,7 @@ from glassplat.scene import logit
 from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import ByPhotograph, Exposures, PoseCorrections, upward
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.panes import Planes
+from glassplat.scene.panes import Planes, rectangle_offsets
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify
 from glassplat.training.options import DefaultDensify, PhotoExposure, Photographer, PoseRefinement, Rate
@@ -128,11 +128,7 @@ def first_photographer(
 def distance_to_panes(planes: Planes, cameras: Sequence[Camera]) -> float:
     """The median, over the cameras, of the distance to the nearest rectangle; world units."""
     centers = torch.stack([camera.center for camera in cameras]).to(planes.centers)
-    offsets = centers[:, None] - planes.centers
-    along = torch.stack([(offsets * axis).sum(-1) for axis in planes.axes()], dim=-1)
-    outside = (along.abs() - planes.half_sizes).clamp(min=0)
-    across: Tensor = (offsets * planes.normals).sum(-1, keepdim=True)
-    return float(torch.cat([outside, across], dim=-1).norm(dim=-1).amin(dim=1).median())
+    return float(rectangle_offsets(centers, planes).norm(dim=-1).amin(dim=1).median())
 
 
 PART = "photographer"
