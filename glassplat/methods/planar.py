@@ -162,9 +162,10 @@ def fitted_planes(dataset: Dataset, centers: Tensor | None, fit: PlaneFit) -> Pl
 def _check_marked(labels: Sequence[int], masks: Sequence[Tensor], dataset: Dataset) -> None:
     """Raises PlaneFitError where only photographs that are held out for tests show a pane."""
     for label in labels:
-        if not any(bool((mask == label).any()) for mask in masks):
-            shown = ((view.name, view.pane_labels) for view in dataset.test)
-            held_out = [name for name, seen in shown if seen is not None and bool((seen == label).any())]
+        if any(bool((mask == label).any()) for mask in masks):
+            continue
+        shown = ((view.name, view.pane_labels) for view in dataset.test)
+        if held_out := [name for name, seen in shown if seen is not None and bool((seen == label).any())]:
             raise PlaneFitError(
                 f"pane {label} is marked in {', '.join(held_out)} only, and test photographs teach nothing; expected "
                 "it in two others at least, better three, taken from places well apart"
