@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -181,31 +182,38 @@ class Surface:
 
     Attributes:
         image: [H, W, D] blended channels, as `shade_environment` reads them.
-        base: [H, W, 3] colour without reflection, over the background.
+        color: [H, W, 3] blended colour without reflection, without what lies behind it.
         normal: [H, W, 3] blended normal, world axes, turned to the camera, not normalised.
         strength: [H, W] share of the reflection.
         depth: [H, W] mean camera z, 0 where nothing is; empty if it was not asked for.
         alpha: [H, W] coverage.
+        background: colour behind everything, sRGB.
         direct: [N] bool, which Gaussians reach a pixel.
         screen: the record of the pass, if it was probed.
         extra: further layers, of discs those that say how thin the surface is.
     """
 
     image: Tensor
-    base: Tensor
+    color: Tensor
     normal: Tensor
     strength: Tensor
     depth: Tensor
     alpha: Tensor
+    background: tuple[float, float, float]
     direct: Tensor
     screen: tuple[ScreenPass, ...] = ()
     extra: Mapping[str, Tensor] = field(default_factory=dict)
 
-    def layers(self) -> dict[str, Tensor]:
-        """The layers of a frame."""
+    @cached_property
+    def base(self) -> Tensor:
+        """[H, W, 3] colour without reflection, over the background; `shade_environment` gives it as well."""
+        return over_background(self.color, self.alpha, self.background)
+
+    def layers(self, base: Tensor) -> dict[str, Tensor]:
+        """The layers of a frame, with the colour without reflection [H, W, 3] from where it is at hand."""
         return {
             **self.extra,
-            "base": self.base,
+            "base": base,
             "normal": self.normal,
             "strength": self.strength,
             **({"depth": self.depth} if self.depth.numel() else {}),
@@ -244,7 +252,8 @@ def _seen_ellipsoids(
     color, normal, strength, *depth = image.split((3, 3, 1, 1) if deep else (3, 3, 1), dim=2)
     return Surface(
         image=image,
-        base=over_background(color, alpha, background),
+        color=color,
+        background=background,
         normal=normal,
         strength=strength.squeeze(2),
         depth=mean_depth(depth[0].squeeze(2), alpha) if deep else alpha.new_zeros(0),
@@ -267,7 +276,8 @@ def _seen_discs(scene: Scene, camera: Camera, background: tuple[float, float, fl
     color, normal, strength = image.split((3, 3, 1), dim=2)
     return Surface(
         image=image,
-        base=over_background(color, alpha, background),
+        color=color,
+        background=background,
         normal=normal,
         strength=strength.squeeze(2),
         depth=depth,
@@ -364,7 +374,7 @@ class Deferred:
         camera = camera.to(scene.primary.means.device)
         surface = seen_surface(scene, camera, background=self.background, depth=self.depth, probed=probed)
         shaded = shaded_pixels(scene, camera, surface.image, surface.alpha, self.background, self.least_strength)
-        layers = surface.layers() | {"reflection": shaded.reflection}
+        layers = surface.layers(shaded.base) | {"reflection": shaded.reflection}
         if self.environment:
             layers["environment"] = torch.sigmoid(cube_lookup(scene.environment.raw, view_directions(camera)))
         return Frame(shaded.rgb, layers, direct=surface.direct, screen=surface.screen)

@@ -86,7 +86,7 @@ class Traced:
         part = scene.surroundings
         probe = part.means.new_zeros(len(part), 2).requires_grad_() if probed and len(part) else None
         rgb, reflection = self._shaded(scene, camera, surface, probe)
-        layers = surface.layers() | {"reflection": reflection}
+        layers = surface.layers(surface.base) | {"reflection": reflection}
         if self.surroundings:
             layers["surroundings"] = self.behind(scene, camera)
         return Frame(
