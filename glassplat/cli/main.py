@@ -90,9 +90,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def guarded(arguments: list[str], *, is_program: bool) -> int:
-    """Runs a command; whatever happens ends in one readable message and an exit code."""
+    """Runs a command; whatever happens ends in one readable message and an exit code, of a rank at once."""
+    from glassplat.training.ranks import leave
+
+    try:
+        code = ended(arguments, is_program=is_program)
+    except SystemExit as end:
+        if is_program and end.code:
+            leave(USAGE_CODE)
+        raise
+    if is_program:
+        leave(code)
+    return code
+
+
+def ended(arguments: list[str], *, is_program: bool) -> int:
+    """Runs a command and says how it has ended; returns the exit code."""
     from glassplat.cli import console
-    from glassplat.training.ranks import await_leader, leads, leave, tell
+    from glassplat.training.ranks import await_leader, leads, tell
 
     console.plain_streams()
     is_training = arguments[:1] == ["train"]
@@ -123,8 +138,6 @@ def guarded(arguments: list[str], *, is_program: bool) -> int:
             if is_training and not is_lost:
                 tell(*found)
             await_leader()
-            if is_program:
-                leave(found.code)
             return found.code
     return 0
 

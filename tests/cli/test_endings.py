@@ -205,3 +205,30 @@ def test_the_errors_known_by_name_are_those_of_the_package(monkeypatch: pytest.M
     kinds = (PlaneFitError, CudaUnavailableError, TrainingDivergedError)
     assert [*BAD, *FAILED] == [f"{kind.__module__}.{kind.__qualname__}" for kind in kinds]
     assert hasattr(torch, GPU_IS_FULL[0].rpartition(".")[2])
+
+
+@pytest.mark.parametrize(
+    ("raised", "expected"), [(None, 0), (SystemExit(2), 2), (InputError("x"), 2), (KeyboardInterrupt(), 130)]
+)
+def test_a_rank_ends_at_once_however_it_ends(
+    raised: BaseException | None, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(command: object) -> None:
+        if raised is not None:
+            raise raised
+
+    def leave(code: int) -> None:
+        raise LeftError(code)
+
+    monkeypatch.setattr("glassplat.cli.main.readied", lambda arguments: None)
+    monkeypatch.setattr("glassplat.cli.main.run", run)
+    monkeypatch.setattr("glassplat.training.ranks.leave", leave)
+    monkeypatch.setattr("glassplat.cli.main.interrupted", lambda stop, command: 130)
+    monkeypatch.setattr("sys.argv", ["glassplat", "info"])
+    with pytest.raises(LeftError) as left:
+        main()
+    assert left.value.args == (expected,)
+
+
+class LeftError(BaseException):
+    """The process would have ended here, without Python's own end."""
