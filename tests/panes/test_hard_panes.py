@@ -230,3 +230,17 @@ def test_views_from_one_place_are_refused_with_what_to_annotate() -> None:
         PlaneFitError, match=r"pane 1: its 3 annotated views .* annotate views of it from farther apart"
     ):
         fit_planes(POINTS, scene_of([FRONT], eyes), extent=EXTENT, options=QUICK)
+
+
+def test_masks_from_nearly_one_place_are_warned_of_with_what_to_annotate(caplog: pytest.LogCaptureFixture) -> None:
+    middle = np.mean(EYES, axis=0)
+    eyes = [tuple(middle + 0.25 * (np.array(eye) - middle)) for eye in EYES]
+    coarse = [
+        (camera, ragged((labels == 1).to(torch.uint8), amplitude=1.0, seed=number))
+        for number, (camera, labels) in enumerate(scene_of([FRONT], eyes))
+    ]
+    aside = camera_from(EYES[0], FRONT.center)
+    fit_planes(BARE[:0], coarse, extent=EXTENT, options=QUICK, unmarked=[("aside.jpg", aside)])
+    (warning,) = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
+    assert "pane 1: the plane could turn by" in warning
+    assert "aside.jpg should show it well" in warning
