@@ -228,6 +228,16 @@ class _Found:
     fault: ValueError | None = None
     is_shared: bool = False
 
+    @property
+    def has_few(self) -> bool:
+        """Return whether two views alone show it."""
+        return len(self.evidence.views) == 2
+
+    @property
+    def is_open(self) -> bool:
+        """Return whether its own masks say too little of its plane."""
+        return isinstance(self.fault, _UndecidedError) or (self.has_few and self.fault is None and not self.is_shared)
+
 
 def _found_pane(
     label: int, clouds: Mapping[str, Array], views: Sequence[PaneView], *, extent: float, options: PlaneFit
@@ -269,8 +279,8 @@ def _in_one_plane(found: Sequence[_Found], seed: int) -> list[_Found]:
     for labels in _neighbours(found):
         joint = _joint([panes[label] for label in labels], seed)
         panes |= {pane.label: pane for pane in joint}
-    trusted = [pane for pane in panes.values() if pane.fault is None]
-    return [_decided(pane, trusted) if isinstance(pane.fault, _UndecidedError) else pane for pane in panes.values()]
+    trusted = [pane for pane in panes.values() if pane.fault is None and not pane.has_few]
+    return [_decided(pane, trusted) if pane.is_open else pane for pane in panes.values()]
 
 
 def _decided(pane: _Found, trusted: Sequence[_Found]) -> _Found:
@@ -279,7 +289,8 @@ def _decided(pane: _Found, trusted: Sequence[_Found]) -> _Found:
     if not losses or min(losses) > MOST_LOSS:
         return pane
     other = trusted[int(np.argmin(losses))]
-    log.warning("pane %d takes the plane of pane %d, on which its masks meet: %s", pane.label, other.label, pane.fault)
+    reason = pane.fault or "two views alone leave it open"
+    log.warning("pane %d takes the plane of pane %d, on which its masks meet: %s", pane.label, other.label, reason)
     return replace(pane, plane=other.plane, fault=None, is_shared=True)
 
 
@@ -325,12 +336,9 @@ def _finished(pane: _Found, options: PlaneFit, unmarked: Sequence[tuple[str, Cam
     try:
         if pane.fault is not None:
             raise pane.fault
-        doubt = _doubt(pane.plane, pane.evidence)
-        if doubt > SOME_DOUBT and not pane.is_shared:
-            log.warning(
-                "pane %d: %s, and may be off by far more; annotate it in photographs from farther apart%s",
-                pane.label, _left_open(doubt, pane.evidence), _worth_marking(views, unmarked),
-            )  # fmt: skip
+        if not pane.is_shared and (reason := _reason_for_doubt(pane)):
+            worth_marking = _worth_marking(views, unmarked)
+            log.warning("pane %d: %s; annotate it from places farther apart%s", pane.label, reason, worth_marking)
         report_masks(pane.label, pane.plane, views)
         return _pane(pane.plane.planes, views, options.margin)
     except ValueError as error:
@@ -339,6 +347,14 @@ def _finished(pane: _Found, options: PlaneFit, unmarked: Sequence[tuple[str, Cam
             "same flat pane in every mask, and annotate more views, from places well apart, that show its outline "
             f"inside of the image with nothing standing before it{_worth_marking(views, unmarked)}"
         ) from error
+
+
+def _reason_for_doubt(pane: _Found) -> str:
+    """What may be wrong with a pane's own plane, for a message; nothing if all is well."""
+    if pane.has_few:
+        return "two annotated views alone often leave its plane off by tens of degrees"
+    doubt = _doubt(pane.plane, pane.evidence)
+    return f"{_left_open(doubt, pane.evidence)}, and may be off by far more" if doubt > SOME_DOUBT else ""
 
 
 MOST_NAMED = 3
@@ -386,8 +402,6 @@ def _check_views(label: int, views: Sequence[PaneView], extent: float) -> None:
             f"pane {label} is annotated in {len(views)} view(s), but its plane shows only between views: "
             "annotate at least two more views of it, taken from places well apart"
         )
-    if len(views) == 2:
-        log.warning("pane %d is annotated in two views only; its plane may be off by degrees, a third helps", label)
     _check_places(label, views, extent)
     _check_outline(label, views)
 

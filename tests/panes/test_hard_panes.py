@@ -244,3 +244,15 @@ def test_masks_from_nearly_one_place_are_warned_of_with_what_to_annotate(caplog:
     (warning,) = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
     assert "pane 1: the plane could turn by" in warning
     assert "aside.jpg should show it well" in warning
+
+
+def test_a_pane_that_two_views_show_is_placed_by_its_neighbour_in_the_same_front() -> None:
+    panes = [front_pane(-0.5, 0.45), front_pane(0.35, 0.15)]
+    coarse = []
+    for number, (camera, labels) in enumerate(scene_of(panes, (*EYES, (0.3, 0.6, -1.1), (0.5, 0.5, -1.0)))):
+        second = ragged((labels == 2).to(torch.uint8), amplitude=1.0, seed=10 + number) * (number < 2)
+        coarse.append((camera, torch.where(second == 1, 2, labels * (labels == 1))))
+    alone = fit_planes(BARE, coarse, extent=EXTENT, labels=[2], options=QUICK)
+    assert 45 < normal_error(alone, 0, panes[1]) < 135
+    together = fit_planes(BARE, coarse, extent=EXTENT, options=QUICK)
+    assert normal_error(together, 1, panes[1]) < 1

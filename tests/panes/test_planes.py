@@ -136,7 +136,7 @@ def test_among_several_panes_one_may_be_done_without() -> None:
 def test_two_views_are_enough_but_not_without_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     planes = fit_planes(frame_and_clutter([FRONT]), scene_of([FRONT])[:2], extent=EXTENT, options=QUICK)
     assert normal_error(planes, 0, FRONT) < 2
-    assert "annotated in two views only" in caplog.text
+    assert "two annotated views alone" in caplog.text
 
 
 def test_no_points_on_the_frame_are_needed() -> None:
