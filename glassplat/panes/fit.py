@@ -350,7 +350,7 @@ def _finished(pane: _Found, options: PlaneFit, unmarked: Sequence[tuple[str, Cam
 
 
 def _reason_for_doubt(pane: _Found) -> str:
-    """What may be wrong with a pane's own plane, for a message; nothing if all is well."""
+    """The reason to doubt a pane's own plane, for a message; empty if there is none."""
     if pane.has_few:
         return "two annotated views alone often leave its plane off by tens of degrees"
     doubt = _doubt(pane.plane, pane.evidence)
