@@ -108,8 +108,8 @@ LEAST_APART = 0.01
 """Distance between annotated cameras below which nothing is tried, in scene extents."""
 SOME_DOUBT, MOST_DOUBT = 2.5, 5.0
 """Degrees by which a plane may be turned without its masks telling before more masks are asked for, and before it is
-refused. Of 27 panes 24 come to at most 1.5. Beyond, the little that masks
-say misleads: a mirror that came to 3.6, small and marked in four photographs from nearly one place, was off by 29."""
+refused. Of 27 panes 24 come to at most 1.5. Beyond, the little that masks say misleads: a mirror that came to 3.6,
+small and marked in four photographs from nearly one place, was off by 29."""
 MOST_CONTRADICTION = 0.7
 """What may tell against a plane, as `contradiction` counts it, before it is refused."""
 MOST_LOSS = 0.04
@@ -358,7 +358,7 @@ def _reason_for_doubt(pane: _Found) -> str:
 
 
 MOST_NAMED = 3
-"""Photographs that a refusal names."""
+"""Photographs that a refusal or a warning names."""
 WELL_INSIDE = 0.2
 """Share of the image's sides between them and the middle of a pane that a photograph shows well."""
 

@@ -38,6 +38,16 @@ def assert_found(pane: Pane, annotations: Annotations, points: torch.Tensor, *, 
     assert covers(planes, 0, pane.larger(0.95))
 
 
+def roughened(annotations: Annotations, label: int, *, amplitude: float, seed: int = 0) -> Annotations:
+    """The annotations, one pane's masks of them ragged."""
+
+    def rough(number: int, labels: torch.Tensor) -> torch.Tensor:
+        mask = ragged((labels == label).to(torch.uint8), amplitude=amplitude, seed=seed + number)
+        return torch.where(mask == 1, label, labels * (labels != label))
+
+    return [(camera, rough(number, labels)) for number, (camera, labels) in enumerate(annotations)]
+
+
 def test_a_high_frame_seen_from_beyond_it_does_not_move_the_plane() -> None:
     beyond = ((2.6, 0.0, 0.3), (-1.9, 0.4, 0.6), (0.2, 0.2, -1.2))
     assert_found(FRONT, framed_scene_of(FRONT, 0.12, beyond), BARE, degrees=1, percent=1)
@@ -152,15 +162,7 @@ def front_pane(x: float, half_width: float, degrees: float = 0.0) -> Pane:
 def test_a_pane_that_its_masks_leave_open_is_placed_by_its_neighbour_in_the_same_front() -> None:
     panes = [front_pane(-0.5, 0.45), front_pane(0.2, 0.1)]
     annotations = scene_of(panes, (*EYES, (0.3, 0.6, -1.1)))
-    coarse = [
-        (
-            camera,
-            torch.where(
-                ragged((labels == 2).to(torch.uint8), amplitude=1.0, seed=number) == 1, 2, labels * (labels == 1)
-            ),
-        )
-        for number, (camera, labels) in enumerate(annotations)
-    ]
+    coarse = roughened(annotations, 2, amplitude=1.0)
     with pytest.raises(PlaneFitError, match=r"pane 2, .* could turn by"):
         fit_planes(BARE, coarse, extent=EXTENT, labels=[2], options=QUICK)
     together = fit_planes(BARE, coarse, extent=EXTENT, options=QUICK)
@@ -171,13 +173,7 @@ def test_a_pane_that_its_masks_leave_open_is_placed_by_its_neighbour_in_the_same
 def test_an_ill_measured_pane_of_a_front_is_placed_by_all_masks_together() -> None:
     panes = [front_pane(-0.5, 0.45), front_pane(0.35, 0.15)]
     annotations = scene_of(panes, (*EYES, (0.3, 0.6, -1.1)))
-    rough = [
-        (
-            camera,
-            torch.where(ragged(torch.where(labels == 2, 1, 0), amplitude=1.2, seed=10 + number) == 1, 2, labels % 2),
-        )
-        for number, (camera, labels) in enumerate(annotations)
-    ]
+    rough = roughened(annotations, 2, amplitude=1.2, seed=10)
     alone = fit_planes(BARE, rough, extent=EXTENT, labels=[2], options=QUICK)
     together = fit_planes(BARE, rough, extent=EXTENT, options=QUICK)
     assert normal_error(alone, 0, panes[1]) > 1
@@ -235,10 +231,7 @@ def test_views_from_one_place_are_refused_with_what_to_annotate() -> None:
 def test_masks_from_nearly_one_place_are_warned_of_with_what_to_annotate(caplog: pytest.LogCaptureFixture) -> None:
     middle = np.mean(EYES, axis=0)
     eyes = [tuple(middle + 0.25 * (np.array(eye) - middle)) for eye in EYES]
-    coarse = [
-        (camera, ragged((labels == 1).to(torch.uint8), amplitude=1.0, seed=number))
-        for number, (camera, labels) in enumerate(scene_of([FRONT], eyes))
-    ]
+    coarse = roughened(scene_of([FRONT], eyes), 1, amplitude=1.0)
     aside = camera_from(EYES[0], FRONT.center)
     fit_planes(BARE[:0], coarse, extent=EXTENT, options=QUICK, unmarked=[("aside.jpg", aside)])
     (warning,) = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
@@ -248,10 +241,9 @@ def test_masks_from_nearly_one_place_are_warned_of_with_what_to_annotate(caplog:
 
 def test_a_pane_that_two_views_show_is_placed_by_its_neighbour_in_the_same_front() -> None:
     panes = [front_pane(-0.5, 0.45), front_pane(0.35, 0.15)]
-    coarse = []
-    for number, (camera, labels) in enumerate(scene_of(panes, (*EYES, (0.3, 0.6, -1.1), (0.5, 0.5, -1.0)))):
-        second = ragged((labels == 2).to(torch.uint8), amplitude=1.0, seed=10 + number) * (number < 2)
-        coarse.append((camera, torch.where(second == 1, 2, labels * (labels == 1))))
+    annotations = scene_of(panes, (*EYES, (0.3, 0.6, -1.1), (0.5, 0.5, -1.0)))
+    both, first = annotations[:2], [(camera, labels * (labels == 1)) for camera, labels in annotations[2:]]
+    coarse = [*roughened(both, 2, amplitude=1.0, seed=10), *first]
     alone = fit_planes(BARE, coarse, extent=EXTENT, labels=[2], options=QUICK)
     assert 45 < normal_error(alone, 0, panes[1]) < 135
     together = fit_planes(BARE, coarse, extent=EXTENT, options=QUICK)
