@@ -23,6 +23,7 @@ from glassplat.panes.masks import (
     pane_views,
     plane_candidates,
 )
+from glassplat.panes.material import virtual_points
 from glassplat.panes.objective import MIDDLE, JointObjective, Objective, edge_matches, pane_rectangle
 from glassplat.panes.search import (
     Fit,
@@ -32,6 +33,7 @@ from glassplat.panes.search import (
     best_supported,
     contradiction,
     in_one_surface,
+    plane_of_images,
     tilt_uncertainty,
 )
 from glassplat.scene import logit
@@ -148,7 +150,8 @@ def fit_planes(
 
     Gaussians may mislead, so that each pane is fitted to the measured points as well, and of both planes the one is
     kept that masks and measured points support better (`plane_evidence`). Panes of one front get one plane, which the
-    masks of all place together (`JointObjective`), unless that fits one of them worse than its own.
+    masks of all place together (`JointObjective`), unless that fits one of them worse than its own. A pane that mirrors
+    many points, such as a mirror with ragged masks, is placed by these (`plane_of_images`).
 
     Args:
         centers: [N, 3] centres of the primary Gaussians, or SfM points.
@@ -182,10 +185,12 @@ def fit_planes(
         views = pane_views(annotations, label, most=options.most_views, names=names)
         with _told(label, len(labels)):
             found.append(_found_pane(label, clouds, views, extent=extent, options=options))
+    cameras = [camera for camera, _ in annotations] + [camera for _, camera in unmarked]
+    cloud = next(iter(clouds.values()))
     panes = []
     for pane in _in_one_plane(found, options.seed):
         with _told(pane.label, len(labels)):
-            panes.append(_finished(pane, options, unmarked))
+            panes.append(_finished(_placed_by_images(pane, cloud, cameras, options), options, unmarked))
     return _planes(panes, labels, options).to(centers.device)
 
 
@@ -219,14 +224,14 @@ class _Found:
         evidence: its masks and the points that were measured.
         plane: the best one, of H = 1.
         fault: why this plane cannot be trusted; None if it can.
-        is_shared: whether other panes lie on this plane as well, and their masks have placed it.
+        is_settled: whether more than its own masks has placed it: other panes on it, or points that it mirrors.
     """
 
     label: int
     evidence: Objective
     plane: FramedPlanes
     fault: ValueError | None = None
-    is_shared: bool = False
+    is_settled: bool = False
 
     @property
     def has_few(self) -> bool:
@@ -236,7 +241,7 @@ class _Found:
     @property
     def is_open(self) -> bool:
         """Return whether its own masks say too little of its plane."""
-        return isinstance(self.fault, _UndecidedError) or (self.has_few and self.fault is None and not self.is_shared)
+        return isinstance(self.fault, _UndecidedError) or (self.has_few and self.fault is None and not self.is_settled)
 
 
 def _found_pane(
@@ -291,7 +296,35 @@ def _decided(pane: _Found, trusted: Sequence[_Found]) -> _Found:
     other = trusted[int(np.argmin(losses))]
     reason = pane.fault or "two views alone leave it open"
     log.warning("pane %d takes the plane of pane %d, on which its masks meet: %s", pane.label, other.label, reason)
-    return replace(pane, plane=other.plane, fault=None, is_shared=True)
+    return replace(pane, plane=other.plane, fault=None, is_settled=True)
+
+
+def _placed_by_images(pane: _Found, cloud: Array, cameras: Sequence[Camera], options: PlaneFit) -> _Found:
+    """The pane on the plane about which points seen through it are mirror images of others; as it is if none is clear.
+
+    Its masks must not tell against that plane more than they may against one shared with other panes.
+    """
+    if pane.is_settled or not (pane.fault is None or pane.is_open):
+        return pane
+    try:
+        outlined = _pane(pane.plane.planes, pane.evidence.views, options.margin)
+    except ValueError:
+        return pane
+    cameras = [replace(camera, cam_from_world=camera.cam_from_world.float()) for camera in cameras]
+    panes = _planes([outlined], [pane.label], options)
+    seen = virtual_points(torch.from_numpy(cloud).float(), panes, cameras).numpy()
+    images = plane_of_images(pane.plane.planes, outlined.center, cloud[seen], cloud[~seen], pane.evidence.extent)
+    if images is None or not images.is_clear:
+        return pane
+    plane = FramedPlanes(images.plane, pane.plane.frames)
+    if _loss(pane, plane) > MOST_LOSS:
+        return pane
+    log.info(
+        "pane %d: %.0f points seen through it are mirror images of others on a plane %.2f degrees from that of its "
+        "masks, which has %.0f; it takes that plane",
+        pane.label, images.pairs, np.degrees(angle(pane.plane, plane)), images.before,
+    )  # fmt: skip
+    return replace(pane, plane=plane, fault=None, is_settled=True)
 
 
 def _loss(pane: _Found, plane: FramedPlanes) -> float:
@@ -321,7 +354,7 @@ def _joint(panes: Sequence[_Found], seed: int) -> list[_Found]:
         if max(losses) <= MOST_LOSS:
             turned = ", ".join(f"{p.label} by {np.degrees(angle(p.plane, plane)):.2f}" for p in panes)
             log.info("panes on one plane, which turns them by degrees: %s", turned)
-            return [replace(pane, plane=plane, is_shared=True) for pane in panes]
+            return [replace(pane, plane=plane, is_settled=True) for pane in panes]
         del panes[int(np.argmax(losses))]
     return panes
 
@@ -336,7 +369,7 @@ def _finished(pane: _Found, options: PlaneFit, unmarked: Sequence[tuple[str, Cam
     try:
         if pane.fault is not None:
             raise pane.fault
-        if not pane.is_shared and (reason := _reason_for_doubt(pane)):
+        if not pane.is_settled and (reason := _reason_for_doubt(pane)):
             worth_marking = _worth_marking(views, unmarked)
             log.warning("pane %d: %s; annotate it from places farther apart%s", pane.label, reason, worth_marking)
         report_masks(pane.label, pane.plane, views)
