@@ -32,7 +32,7 @@ from glassplat.scene.panes import Planes, coplanar_groups
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify, GrowSh, PerturbOpacity, Population, ResetOpacity, population_of
 from glassplat.training.corrections import corrections_begun, corrections_learnt, photographer_learnt
-from glassplat.training.densify import append, apply_edit, gaussians_from_points, keep
+from glassplat.training.densify import append, apply_edit, gaussians_from_points, keep, with_scattered
 from glassplat.training.losses import (
     LossTerm,
     depth_deviation_loss,
@@ -307,7 +307,7 @@ def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
 
 
 def first_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
-    """The first scene: one Gaussian per point, no planes yet.
+    """The first scene: one Gaussian per point and some scattered between them, no planes yet.
 
     Raises:
         PlaneFitError: the masks do not do. The planes are fitted to the measured points once and forgotten,
@@ -321,7 +321,8 @@ def first_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
         )
     if dataset.measured_points:
         fitted_planes(dataset, None, recipe.plane_fit)
-    scene = Scene(planar_population(recipe).initial(dataset.points, recipe.sh_degree), dataset.extent)
+    points = with_scattered(dataset, recipe.scattered)
+    scene = Scene(planar_population(recipe).initial(points, recipe.sh_degree), dataset.extent)
     return corrections_begun(recipe, scene, dataset)
 
 
