@@ -107,17 +107,16 @@ def with_scattered(dataset: Dataset, share: float) -> PointCloud:
 def _on_rays(view: View, measured: NDArray[np.float64], draws: NDArray[np.float64]) -> tuple[Tensor, Tensor]:
     """Positions and colours [P, 3] of draws [D, 3]: place in the photograph, and rank of the depth; all in [0, 1)."""
     camera = NumpyCamera.of(view.camera)
-    pixels = draws[:, :2] * camera.size
-    column, row = torch.from_numpy(pixels.astype(np.int64)).T
     depths = np.sort(camera.in_camera(measured[camera.holds(measured)])[:, 2])
-    counts = torch.full((len(draws),), len(depths) > 0)
+    pixels, ranks = draws[:, :2] * camera.size, draws[:, 2]
+    column, row = torch.from_numpy(pixels.astype(np.int64)).T
+    kept = np.full(len(draws), len(depths) > 0)
     if view.ignored is not None:
-        counts &= ~view.ignored[row, column].cpu()
-    pixels, ranks = pixels[counts.numpy()], draws[counts.numpy(), 2]
-    rays = camera.rays(pixels)
-    along = depths[(ranks * len(depths)).astype(np.int64)] / (rays @ camera.rotation[2])
+        kept &= ~view.ignored[row, column].cpu().numpy()
+    rays = camera.rays(pixels[kept])
+    along = depths[(ranks[kept] * len(depths)).astype(np.int64)] / (rays @ camera.rotation[2])
     positions = torch.from_numpy(camera.center + along[:, None] * rays)
-    return positions.to(torch.float32), view.photo[row[counts], column[counts]].cpu()
+    return positions.to(torch.float32), view.photo[row, column].cpu()[torch.from_numpy(kept)]
 
 
 def as_discs(spheres: Gaussians, *, seed: int = 0) -> Gaussians:
