@@ -85,7 +85,7 @@ class PlanarRecipe:
             Gaussians from where no photograph does, so that harmonics extrapolate; the paper has no such term.
         background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         scattered: Gaussians of the first scene on rays of pixels drawn by chance, as a share of those that start from
-            points, of which plain surfaces and what only panes show have none.
+            points, of which plain surfaces and lamps have none.
         stage_shares: lengths of the three stages in relation to each other (paper: 3000, 3000 and 24,000 iterations).
         fresnel: how the strength rises with the angle: as that of a pane with two surfaces, by Schlick's curve of one
             surface as in the paper, or not at all (ablation).

@@ -54,7 +54,7 @@ class SplatRecipe:
         view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
         background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
         scattered: Gaussians of the first scene on rays of pixels drawn by chance, as a share of those that start from
-            points, of which plain surfaces and what only panes show have none.
+            points, of which plain surfaces and lamps have none.
         rates: learning rates.
         rhythm: when opacities are reset and the SH degree grows.
         strategy: what decides how many Gaussians there are and where; `densify` or `mcmc` holds its options.

@@ -84,24 +84,22 @@ MOST_VIEWS, MOST_DEPTHS = 100, 20_000
 """Photographs whose pixels are drawn, and points whose depths are, where there are more."""
 
 
-def with_scattered(dataset: Dataset, share: float) -> PointCloud:
-    """The points and so many more, as a share of them, on the rays of pixels drawn by chance.
+def scattered_points(dataset: Dataset, share: float) -> PointCloud:
+    """Up to so many points, as a share of the capture's own, on the rays of pixels drawn by chance.
 
-    Structure from motion measures no points on plain surfaces, nor on what only panes show. These have the colour of
-    their pixel, and lie as far away as one of the points that its photograph shows. Random points, which fill that
-    space already, get no more.
+    Structure from motion measures no points on plain surfaces, nor on lamps. These have the colour of their pixel, and
+    lie as far away as one of the points that its photograph shows. Random points fill that space already: there are
+    none beside them.
     """
     points = dataset.points
     count = round(share * len(points)) if dataset.measured_points else 0
     if not count:
-        return points
+        return PointCloud(points.positions[:0], points.colors[:0])
     draws = SobolEngine(dimension=3, scramble=True, seed=0).draw(count).double().numpy()
     measured = points.positions[:: -(-len(points) // MOST_DEPTHS)].double().numpy()
     views = dataset.train[:: -(-len(dataset.train) // min(count, MOST_VIEWS))]
-    scattered = [_on_rays(view, measured, draws[start :: len(views)]) for start, view in enumerate(views)]
-    clouds = [(points.positions, points.colors), *scattered]
-    positions, colors = (torch.cat(parts) for parts in zip(*clouds, strict=True))
-    return replace(points, positions=positions, colors=colors)
+    clouds = [_on_rays(view, measured, draws[start :: len(views)]) for start, view in enumerate(views)]
+    return PointCloud(*(torch.cat(parts) for parts in zip(*clouds, strict=True)))
 
 
 def _on_rays(view: View, measured: NDArray[np.float64], draws: NDArray[np.float64]) -> tuple[Tensor, Tensor]:

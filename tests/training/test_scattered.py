@@ -12,20 +12,19 @@ from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import View
 from glassplat.methods.planar_recipe import PlanarRecipe
 from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.panes.material import virtual_points
 from glassplat.scene.camera import NumpyCamera, rotation_from_quat
-from glassplat.training.densify import with_scattered
+from glassplat.training.densify import scattered_points
 from tests.training.test_invariance import moved_capture
-from tests.training.tiny_capture import tiny_capture
+from tests.training.tiny_capture import tiny_capture, true_scene
 
 SHARE = 0.5
 
 
 def scattered(dataset: Dataset, share: float = SHARE) -> tuple[torch.Tensor, torch.Tensor]:
-    """Positions and colours of the points that were added."""
-    points, count = with_scattered(dataset, share), len(dataset.points)
-    assert torch.equal(points.positions[:count], dataset.points.positions)
-    assert torch.equal(points.colors[:count], dataset.points.colors)
-    return points.positions[count:], points.colors[count:]
+    """Positions and colours of the points that are scattered."""
+    points = scattered_points(dataset, share)
+    return points.positions, points.colors
 
 
 def test_there_are_so_many_more_of_the_colours_that_photographs_show_there() -> None:
@@ -75,8 +74,8 @@ def test_neither_units_nor_the_frame_matter(scale: float) -> None:
 
 def test_random_points_and_views_without_points_get_none() -> None:
     dataset = tiny_capture()
-    assert with_scattered(replace(dataset, measured_points=False), SHARE) is dataset.points
-    assert with_scattered(dataset, 0.0) is dataset.points
+    assert len(scattered_points(replace(dataset, measured_points=False), SHARE)) == 0
+    assert len(scattered_points(dataset, 0.0)) == 0
     camera = dataset.train[0].camera
     pose = camera.cam_from_world.clone()
     pose[2, 3] -= 1000
@@ -86,12 +85,23 @@ def test_random_points_and_views_without_points_get_none() -> None:
     assert positions.shape == colors.shape == (0, 3)
 
 
-@pytest.mark.parametrize("recipe", [SplatRecipe(), PlanarRecipe()], ids=["splat", "planar"])
-def test_methods_scatter_some_and_published_ones_none(
-    recipe: SplatRecipe | PlanarRecipe, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("glassplat.methods.planar.fitted_planes", lambda *_: None)
-    dataset = tiny_capture()
-    count = len(dataset.points)
-    assert len(recipe.initialise(dataset).primary) == count + round(recipe.scattered * count) > count
-    assert len(type(recipe).paper().initialise(dataset).primary) == count
+def first_points(recipe: SplatRecipe | PlanarRecipe) -> int:
+    return len(recipe.initialise(tiny_capture()).primary) - len(tiny_capture().points)
+
+
+def test_splat_starts_with_some_and_the_published_one_with_none() -> None:
+    assert first_points(SplatRecipe()) == round(SplatRecipe().scattered * len(tiny_capture().points)) > 0
+    assert first_points(SplatRecipe.paper()) == 0
+
+
+def test_planar_starts_with_those_that_are_not_seen_through_panes(monkeypatch: pytest.MonkeyPatch) -> None:
+    planes = true_scene().planes
+    monkeypatch.setattr("glassplat.methods.planar.fitted_planes", lambda *_: planes)
+    recipe, dataset = PlanarRecipe(scattered=1.0), tiny_capture()
+    more = scattered_points(dataset, 1.0)
+    behind = virtual_points(more.positions, planes, [view.camera for view in dataset.train])
+    assert 0 < behind.sum() < len(more)
+    assert first_points(recipe) == (~behind).sum()
+    means = recipe.initialise(dataset).primary.means
+    assert not (means[:, None] == more.positions[behind]).all(dim=2).any()
+    assert first_points(PlanarRecipe.paper()) == 0
