@@ -20,7 +20,6 @@ COMMON = "splat"
 """Differences that every method shares stand on the page of this one."""
 
 ALL = {
-    "scattered": "Structure from motion measures nothing on plain surfaces and lamps.",
     "rates.short_run_power": "Runs of n < 30,000 iterations learn (30,000 / n)^0.5 times as fast.",
     "rhythm.averaged_passes": "The mean over the last pass is better than the last step.",
     "densify.split_by": "Gradients of single pixels (AbsGS) find what a large Gaussian smears.",

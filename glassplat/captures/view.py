@@ -600,14 +600,6 @@ class PointCloud:
     def __len__(self) -> int:
         return self.positions.shape[0]
 
-    def select(self, index: Tensor) -> PointCloud:
-        """Those at an index, or where a mask [P] holds."""
-        return PointCloud(self.positions[index], self.colors[index])
-
-    def joined(self, other: PointCloud) -> PointCloud:
-        """These points, then those of another cloud."""
-        return PointCloud(torch.cat([self.positions, other.positions]), torch.cat([self.colors, other.colors]))
-
     @staticmethod
     def of(points: RawPoints) -> PointCloud:
         """The points that were read; they share their memory."""

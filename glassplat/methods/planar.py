@@ -32,7 +32,7 @@ from glassplat.scene.panes import Planes, coplanar_groups
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify, GrowSh, PerturbOpacity, Population, ResetOpacity, population_of
 from glassplat.training.corrections import corrections_begun, corrections_learnt, photographer_learnt
-from glassplat.training.densify import append, apply_edit, gaussians_from_points, keep, scattered_points
+from glassplat.training.densify import append, apply_edit, gaussians_from_points, keep
 from glassplat.training.losses import (
     LossTerm,
     depth_deviation_loss,
@@ -295,7 +295,7 @@ def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
     virtual = virtual_points(points.positions.to(device), panes, cameras).cpu()
     if not bool(virtual.any()):
         return False
-    behind = points.select(virtual)
+    behind = replace(points, positions=points.positions[virtual], colors=points.colors[virtual])
     primary = state.scene.primary
     seeds = gaussians_from_points(behind, sh_degree=primary.max_sh_degree).to(device)
     seeds = replace(seeds, active_sh_degree=primary.active_sh_degree)
@@ -307,13 +307,11 @@ def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
 
 
 def first_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
-    """The first scene: one Gaussian per point, some scattered between them before the panes, and no planes yet.
-
-    Scattered behind a pane they would paint what it mirrors.
+    """The first scene: one Gaussian per point, no planes yet.
 
     Raises:
-        PlaneFitError: the masks do not do. The planes are fitted to the measured points here already, because a bad
-            mask should end a run before the first iteration and not at the second stage.
+        PlaneFitError: the masks do not do. The planes are fitted to the measured points once and forgotten,
+            because a bad mask should end a run before the first iteration and not at the second stage.
     """
     if not dataset.pane_labels and dataset.planes is None:
         raise PlaneFitError(
@@ -321,13 +319,9 @@ def first_scene(recipe: PlanarRecipe, dataset: Dataset) -> Scene:
             f"10 photographs in {dataset.root / 'panes'}, named <photograph's name>.png, each pixel the label 1, "
             "2, ... of a pane, or 0 (`glassplat annotate` writes them). `glassplat train splat` needs none"
         )
-    points = dataset.points
     if dataset.measured_points:
-        panes = fitted_planes(dataset, None, recipe.plane_fit)
-        more = scattered_points(dataset, recipe.scattered)
-        through = virtual_points(more.positions, panes, [view.camera for view in dataset.train])
-        points = points.joined(more.select(~through))
-    scene = Scene(planar_population(recipe).initial(points, recipe.sh_degree), dataset.extent)
+        fitted_planes(dataset, None, recipe.plane_fit)
+    scene = Scene(planar_population(recipe).initial(dataset.points, recipe.sh_degree), dataset.extent)
     return corrections_begun(recipe, scene, dataset)
 
 

@@ -84,8 +84,6 @@ class PlanarRecipe:
         view_dependence_weight: of the squares of the spherical harmonics beyond the constant one. Mirrored views see
             Gaussians from where no photograph does, so that harmonics extrapolate; the paper has no such term.
         background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
-        scattered: Gaussians of the first scene on rays of pixels drawn by chance, as a share of those that start from
-            points, of which plain surfaces and lamps have none.
         stage_shares: lengths of the three stages in relation to each other (paper: 3000, 3000 and 24,000 iterations).
         fresnel: how the strength rises with the angle: as that of a pane with two surfaces, by Schlick's curve of one
             surface as in the paper, or not at all (ablation).
@@ -138,7 +136,6 @@ class PlanarRecipe:
     ssim_weight: Share = 0.2
     view_dependence_weight: NotNegative = 0.1
     background: Annotated[Color | None, ESSENTIAL] = None
-    scattered: Internal[Share] = 0.2
     stage_shares: Internal[tuple[Positive, Positive, Positive]] = (0.1, 0.1, 0.8)
     fresnel: Internal[Fresnel] = "pane"
     intensity: Internal[bool] = True
@@ -172,7 +169,6 @@ class PlanarRecipe:
         """As published, as far as the paper says; docs/planar.md lists what it leaves open."""
         return cls(
             view_dependence_weight=0.0,
-            scattered=0.0,
             fresnel="schlick",
             blend="srgb",
             panes="nearest",

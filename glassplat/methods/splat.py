@@ -11,7 +11,7 @@ from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import GrowSh, Population, population_of
 from glassplat.training.corrections import corrections_begun, corrections_learnt
-from glassplat.training.densify import as_discs, scattered_points
+from glassplat.training.densify import as_discs
 from glassplat.training.losses import LossTerm, PhotometricLoss, disc_normals, distortion, view_dependence, weighted
 from glassplat.training.options import PUBLISHED_ITERATIONS
 from glassplat.training.stage import Every, Stage
@@ -21,9 +21,8 @@ if TYPE_CHECKING:
 
 
 def first_scene(recipe: SplatRecipe, dataset: Dataset) -> Scene:
-    """The first scene: one Gaussian per point and some scattered between them."""
-    points = dataset.points.joined(scattered_points(dataset, recipe.scattered))
-    first = _population(recipe).initial(points, recipe.sh_degree)
+    """The first scene: one Gaussian per point."""
+    first = _population(recipe).initial(dataset.points, recipe.sh_degree)
     scene = Scene(as_discs(first) if recipe.primitive == "disc" else first, dataset.extent)
     return corrections_begun(recipe, scene, dataset)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from glassplat.options import ESSENTIAL, Color, Internal, NotNegative, Share, ShDegree
+from glassplat.options import ESSENTIAL, Color, NotNegative, Share, ShDegree
 from glassplat.training.options import (
     PUBLISHED_ITERATIONS,
     DefaultDensify,
@@ -53,8 +53,6 @@ class SplatRecipe:
         ssim_weight: lambda, share of D-SSIM in the photometric loss.
         view_dependence_weight: of the squares of the spherical harmonics beyond the constant one.
         background: colour behind everything, sRGB; None is white where photographs are transparent, else black.
-        scattered: Gaussians of the first scene on rays of pixels drawn by chance, as a share of those that start from
-            points, of which plain surfaces and lamps have none.
         rates: learning rates.
         rhythm: when opacities are reset and the SH degree grows.
         strategy: what decides how many Gaussians there are and where; `densify` or `mcmc` holds its options.
@@ -72,7 +70,6 @@ class SplatRecipe:
     ssim_weight: Share = 0.2
     view_dependence_weight: NotNegative = 0.0
     background: Annotated[Color | None, ESSENTIAL] = None
-    scattered: Internal[Share] = 0.2
     rates: GaussianRates = field(default_factory=GaussianRates)
     rhythm: Rhythm = field(default_factory=Rhythm)
     strategy: Annotated[Strategy, ESSENTIAL] = "default"
@@ -86,7 +83,6 @@ class SplatRecipe:
     def paper(cls) -> SplatRecipe:
         """As published: 3DGS, or 3DGS-MCMC with that strategy, or 2DGS with discs (docs/splat.md)."""
         return cls(
-            scattered=0.0,
             rates=GaussianRates(short_run_power=0.0),
             rhythm=Rhythm(averaged_passes=0.0),
             densify=DefaultDensify.published(),
@@ -94,7 +90,7 @@ class SplatRecipe:
         )
 
     def initialise(self, dataset: Dataset) -> Scene:
-        """The first scene: one Gaussian per point and some scattered between them."""
+        """The first scene: one Gaussian per point."""
         from glassplat.methods.splat import first_scene
 
         return first_scene(self, dataset)

@@ -13,24 +13,18 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
-from torch.quasirandom import SobolEngine
 
-from glassplat.captures.view import PointCloud, View
+from glassplat.captures.view import PointCloud
 from glassplat.kernels.screen_statistics import Sums, Views, add_views
 from glassplat.kernels.trace.bvh import morton_codes
 from glassplat.scene import SH_ZERO, logit
-from glassplat.scene.camera import NumpyCamera, rotation_from_quat
+from glassplat.scene.camera import rotation_from_quat
 from glassplat.scene.gaussians import DISC_SCALES, Gaussians
 from glassplat.training.options import DefaultDensify, McmcDensify
-
-if TYPE_CHECKING:
-    from glassplat.captures.dataset import Dataset
 
 NEIGHBOURS = 3
 SMALLEST_SCALE = 1e-6
@@ -78,43 +72,6 @@ def gaussians_from_points(
         sh=sh,
         channels={"log_intensity": torch.zeros(count, device=device)},
     )
-
-
-MOST_VIEWS, MOST_DEPTHS = 100, 20_000
-"""Photographs whose pixels are drawn, and points whose depths are, where there are more."""
-
-
-def scattered_points(dataset: Dataset, share: float) -> PointCloud:
-    """Up to so many points, as a share of the capture's own, on the rays of pixels drawn by chance.
-
-    Structure from motion measures no points on plain surfaces, nor on lamps. These have the colour of their pixel, and
-    lie as far away as one of the points that its photograph shows. Random points fill that space already: there are
-    none beside them.
-    """
-    points = dataset.points
-    count = round(share * len(points)) if dataset.measured_points else 0
-    if not count:
-        return PointCloud(points.positions[:0], points.colors[:0])
-    draws = SobolEngine(dimension=3, scramble=True, seed=0).draw(count).double().numpy()
-    measured = points.positions[:: -(-len(points) // MOST_DEPTHS)].double().numpy()
-    views = dataset.train[:: -(-len(dataset.train) // min(count, MOST_VIEWS))]
-    clouds = [_on_rays(view, measured, draws[start :: len(views)]) for start, view in enumerate(views)]
-    return PointCloud(*(torch.cat(parts) for parts in zip(*clouds, strict=True)))
-
-
-def _on_rays(view: View, measured: NDArray[np.float64], draws: NDArray[np.float64]) -> tuple[Tensor, Tensor]:
-    """Positions and colours [P, 3] of draws [D, 3]: place in the photograph, and rank of the depth; all in [0, 1)."""
-    camera = NumpyCamera.of(view.camera)
-    depths = np.sort(camera.in_camera(measured[camera.holds(measured)])[:, 2])
-    pixels, ranks = draws[:, :2] * camera.size, draws[:, 2]
-    column, row = torch.from_numpy(pixels.astype(np.int64)).T
-    kept = np.full(len(draws), len(depths) > 0)
-    if view.ignored is not None:
-        kept &= ~view.ignored[row, column].cpu().numpy()
-    rays = camera.rays(pixels[kept])
-    along = depths[(ranks[kept] * len(depths)).astype(np.int64)] / (rays @ camera.rotation[2])
-    positions = torch.from_numpy(camera.center + along[:, None] * rays)
-    return positions.to(torch.float32), view.photo[row, column].cpu()[torch.from_numpy(kept)]
 
 
 def as_discs(spheres: Gaussians, *, seed: int = 0) -> Gaussians:

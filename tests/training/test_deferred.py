@@ -298,7 +298,7 @@ def test_a_run_too_short_for_normals_is_one_of_splat_and_says_so(
     # Of the opacity resets, the first falls into the longer run.
     choices: dict[str, Any] = {"sh_degree": 1, "strategy": strategy, "rhythm": Rhythm(reset_stop=1.0)}
     matte = DeferredRecipe(**choices, least_iterations=iterations + 1, region=(0.0, 0.0, 3.5, 1.0))
-    plain = scene_after(SplatRecipe(**choices, scattered=0.0), iterations, tmp_path / "splat")
+    plain = scene_after(SplatRecipe(**choices), iterations, tmp_path / "splat")
     assert not caplog.records
     found = scene_after(matte, iterations, tmp_path / "deferred")
     (warning,) = [record.getMessage() for record in caplog.records]
