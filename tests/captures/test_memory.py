@@ -28,6 +28,12 @@ SIZE = 100
 WHOLE = 3 * SIZE
 
 
+@pytest.fixture(autouse=True)
+def room_on_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tests' own few bytes fit on a disk that is nearly full, too."""
+    monkeypatch.setattr(view_module, "DISK_RESERVE", 0)
+
+
 class Files:
     """Readers of numbered photographs, which count how often each is read."""
 
