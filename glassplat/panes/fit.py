@@ -164,7 +164,8 @@ def fit_planes(
         names: of the annotated photographs, for messages.
         labels: the panes to fit; all that the masks name if None.
         options: how to fit; the defaults if None.
-        unmarked: names and cameras of photographs without masks, of which a refusal names the best to mark.
+        unmarked: names and cameras of photographs without masks: they tell which points are seen through a pane, and a
+            refusal names the best to mark.
 
     Returns:
         Planes whose normals point to the side that most annotated cameras are on.

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from glassplat.panes.masks import FramedPlanes, PlaneEquations, in_plane_axes, joined, random_planes
+from glassplat.panes.masks import FramedPlanes, PlaneEquations, joined, random_planes
 from glassplat.panes.objective import (
     COARSE,
     EDGES,
@@ -391,40 +391,33 @@ def plane_of_images(plane: PlaneEquations, middle: Array, behind: Array, others:
     behind = behind[np.random.default_rng(0).permutation(len(behind))[:MOST_IMAGES]]
     tolerance = IMAGE_TOLERANCE * extent
     far = _distance_field(others, tolerance / 2)
-    turns = np.radians(np.arange(-IMAGE_TURN, IMAGE_TURN + 1e-9, IMAGE_TURN_STEP))
+    turns = np.tan(np.radians(np.arange(-IMAGE_TURN, IMAGE_TURN + 1e-9, IMAGE_TURN_STEP)))
     shifts = extent * np.arange(-IMAGE_SHIFT, IMAGE_SHIFT + 1e-9, IMAGE_SHIFT_STEP)
-    u, v = (axes[0] for axes in in_plane_axes(plane))
 
-    def counted(first: float, second: float, shifts: Array, distance: Callable[[Array], Array]) -> Array:
-        normal = _turned(plane.normals[0], u, v, first, second)
-        apart = (behind - middle) @ normal
-        images = behind - 2 * (apart - shifts[:, None])[..., None] * normal
+    def tried(steps: Array) -> PlaneEquations:
+        index = np.zeros(len(steps), np.int64)
+        return moved(plane.select(index), middle[None][index], steps)
+
+    def pairs(steps: Array, distance: Callable[[Array], Array]) -> Array:
+        planes = tried(steps)
+        images = behind - 2 * planes.distances(behind)[..., None] * planes.normals[:, None]
         return np.asarray(np.exp(-0.5 * (distance(images) / tolerance) ** 2).sum(axis=1))
 
-    counts = np.stack([[counted(first, second, shifts, far) for second in turns] for first in turns])
-    at = np.unravel_index(counts.argmax(), counts.shape)
-    apart = np.hypot(turns[:, None] - turns[at[0]], turns - turns[at[1]])
-    peak = float(counts[at] / max(counts[apart > np.radians(PEAK_WIDTH)].max(), np.finfo(np.float64).tiny))
+    steps = np.stack(np.meshgrid(turns, turns, shifts, indexing="ij"), axis=-1)
+    counts = np.stack([pairs(row.reshape(-1, 3), far) for row in steps]).reshape(steps.shape[:3])
+    best = steps[np.unravel_index(counts.argmax(), counts.shape)]
+    tilts = np.arctan(steps[..., :2]) - np.arctan(best[:2])
+    elsewhere = counts[np.linalg.norm(tilts, axis=-1) > np.radians(PEAK_WIDTH)].max()
     # The cells of the field are coarse; the distances themselves place the plane within a step.
     tree = cKDTree(others)
-
-    def exactly(first: float, second: float, shift: float) -> float:
-        return float(counted(first, second, np.array([shift]), lambda images: tree.query(images)[0])[0])
-
-    best = np.array([turns[at[0]], turns[at[1]], shifts[at[2]]])
-    step = np.array([turns[1] - turns[0], turns[1] - turns[0], shifts[1] - shifts[0]])
+    size = np.array([np.radians(IMAGE_TURN_STEP), np.radians(IMAGE_TURN_STEP), extent * IMAGE_SHIFT_STEP])
     for _ in range(HALVINGS):
-        step = step / 2
-        around = best + step * (np.indices((3, 3, 3)).reshape(3, -1).T - 1)
-        best = max(around, key=lambda tried: exactly(*tried))
-    normal = _turned(plane.normals[0], u, v, best[0], best[1])
-    placed = PlaneEquations(normal[None], np.array([normal @ middle + best[2]]))
-    return Images(placed, exactly(*best), exactly(0, 0, 0), peak)
-
-
-def _turned(normal: Array, u: Array, v: Array, first: float, second: float) -> Array:
-    turned: Array = normal + np.tan(first) * u + np.tan(second) * v
-    return turned / np.linalg.norm(turned)
+        size = size / 2
+        around = best + size * (np.indices((3, 3, 3)).reshape(3, -1).T - 1)
+        best = around[pairs(around, lambda images: tree.query(images)[0]).argmax()]
+    found, before = pairs(np.stack([best, np.zeros(3)]), lambda images: tree.query(images)[0])
+    peak = counts.max() / max(elsewhere, np.finfo(np.float64).tiny)
+    return Images(tried(best[None]), float(found), float(before), float(peak))
 
 
 def _distance_field(points: Array, cell: float) -> Callable[[Array], Array]:
