@@ -48,6 +48,8 @@ from glassplat.kernels.trace.steps import (
 )
 
 THREADS = 128
+MOST_KEPT, KEPT_BYTES = 64, 2**28
+"""Hits of a ray that the forward pass keeps at most, and bytes for those of all rays."""
 
 
 def build_bvh(shapes: Shapes, *, flat: bool) -> Bvh:
@@ -402,17 +404,20 @@ def trace(
     shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tensor],
     *, flat: bool, degree: int, near: float, learning: bool,
 ) -> tuple[Tensor, ...]:  # fmt: skip
-    """As `glassplat.kernels.trace.cpu.trace`, but that it keeps no hits."""
+    """As `glassplat.kernels.trace.cpu.trace`, but that hits are kept as [K, R], with what each of them covers."""
     origins = rays[0]
     count = origins.shape[0]
+    bytes_of_hits = (4 + origins.element_size()) * max(count, 1)
+    num_kept = min(MOST_KEPT, KEPT_BYTES // bytes_of_hits) if learning else 0
     outputs = (
         origins.new_empty(count, 3),
         origins.new_empty(count),
         origins.new_empty(count),
         torch.empty(count, dtype=torch.int32, device=origins.device),
     )
-    _search(shapes, rays, bvh, flat)(degree, near, None, None, None, *outputs)
-    return (*outputs, torch.empty(count, 0, dtype=torch.int32, device=origins.device))
+    kept = torch.empty(num_kept, count, dtype=torch.int32, device=origins.device), origins.new_empty(num_kept, count)
+    _search(shapes, rays, bvh, flat)(degree, near, None, None, None, *kept, *outputs)
+    return (*outputs, *kept)
 
 
 def trace_gradients(
@@ -428,7 +433,8 @@ def trace_gradients(
     whose = [torch.empty(total, dtype=torch.int32, device=means.device) for _ in range(2)]
     hits = Hits(offsets, *whose, *(means.new_empty(total) for _ in range(3)))
     # No colours: only what is met, and how much it covers.
-    _search(shapes, rays, bvh, flat)(-1, near, hits.offsets, hits.met, hits.alphas, None, None, None, None)
+    collect = _search(shapes, rays, bvh, flat)
+    collect(-1, near, hits.offsets, hits.met, hits.alphas, *outputs[4:], None, None, None, None)
     v_rays = [torch.zeros_like(ray) for ray in rays]
     means_and_frames, pulled = shapes[:2], (*outputs[:3], *cotangents)
     trace_pull_rays(real, flat)(
@@ -461,7 +467,8 @@ def _search(shapes: Sequence[Tensor], rays: Sequence[Tensor], bvh: Sequence[Tens
 
 @cache
 def trace_forward(real: type, flat: bool) -> Kernel:
-    """Fills colors, alphas, depths and hits; or where `starts` has elements, each ray's Gaussians and their coverage.
+    """Fills colors, alphas, depths, hits, and the nearest of these; or where `starts` has elements, each ray's
+    Gaussians and their coverage, from what was kept or by another search.
 
     Both are one kernel, so that both find the same hits: another one's products and sums may be fused in another way,
     and a Gaussian that covers just 1/255 would be met by one of them alone.
@@ -472,16 +479,21 @@ def trace_forward(real: type, flat: bool) -> Kernel:
     @kernel(
         "trace_forward_discs" if flat else "trace_forward_ellipsoids",
         real,
-        "real2 real3 real1 real3 real2 real2 int1 real1 long1 int real long1 int1 real1 real2 real1 real1 int1",
+        "real2 real3 real1 real3 real2 real2 int1 real1 long1 int real long1 int1 real1 int2 real2 "
+        "real2 real1 real1 int1",
     )
     def forward(
         means, frames, opacities, sh, origins, directions, order, boxes, offsets, degree, near, starts, met, met_alphas,
-        colors, alphas, depths, hits,
+        kept, kept_alphas, colors, alphas, depths, hits,
     ):  # fmt: skip
         ts, found, ids = cuda.local.array(CHUNK, real), cuda.local.array(CHUNK, real), cuda.local.array(CHUNK, np.int32)
         stack, waiting = cuda.local.array(STACK, np.int32), cuda.local.array(STACK, real)
         r = cuda.grid(1)
         if r >= origins.shape[0]:
+            return
+        if starts.size > 0 and starts[r + 1] - starts[r] <= kept.shape[0]:
+            for k in range(starts[r + 1] - starts[r]):
+                met[starts[r] + k], met_alphas[starts[r] + k] = kept[k, r], kept_alphas[k, r]
             return
         o, d, inverse, length, usable = ray(origins, directions, r)
         x, y, z = d[0] / length, d[1] / length, d[2] / length
@@ -501,6 +513,8 @@ def trace_forward(real: type, flat: bool) -> Kernel:
                 g, weight = ids[k], found[k] * left
                 if starts.size > 0:
                     met[starts[r] + blended], met_alphas[starts[r] + blended] = g, found[k]
+                elif blended < kept.shape[0]:
+                    kept[blended, r], kept_alphas[blended, r] = g, found[k]
                 if degree >= 0:
                     c = color(sh, g, degree, x, y, z)
                     red += weight * max(c[0] + half, zero)

@@ -15,6 +15,7 @@ from glassplat.kernels.backend.devices import SIMULATED
 from glassplat.kernels.records import RawGaussians, Rays
 from glassplat.kernels.trace import build_bvh, shapes_of, trace
 from glassplat.kernels.trace import cpu as build_cpu
+from glassplat.kernels.trace import cuda as tracer
 from glassplat.kernels.trace.reference import trace as twin
 from tests.kernels.cuda.agreement import DEVICE, DTYPES, close, many, on_a_device_or_skipped, on_device
 from tests.kernels.test_trace import (
@@ -60,6 +61,17 @@ def test_more_hits_than_a_search_returns(scales: int) -> None:
     faint = gaussians._replace(logit_opacities=torch.full_like(gaussians.logit_opacities, -4.5))
     expected = check(faint, rays_around(many(3, 60)), 1)
     assert int(expected[3].max()) > 32
+
+
+@pytest.mark.parametrize("scales", [DISCS, ELLIPSOIDS])
+def test_hits_that_are_not_kept_are_found_again(scales: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    gaussians = on_device(cloud(many(70, 600), scales, size=-0.5))
+    rays = on_device(rays_around(many(9, 700)))
+    kept = with_gradients(trace, gaussians, rays, 1)
+    few = int(kept[3].median())
+    assert int(kept[3].max()) > few > int(kept[3].min())
+    monkeypatch.setattr(tracer, "MOST_KEPT", few)
+    assert all(torch.equal(a, b) for a, b in zip(kept, with_gradients(trace, gaussians, rays, 1), strict=True))
 
 
 def test_a_gaussian_that_more_rays_meet_than_a_warp_has_lanes() -> None:
