@@ -15,7 +15,7 @@ from glassplat.options import BLACK
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.fit import fit_planes, with_mirrors
 from glassplat.panes.material import (
-    SLOPE_AMONG_GLASS,
+    SURE_SLOPE,
     JudgedPane,
     glass_gaussians,
     judged_pane,
@@ -198,7 +198,7 @@ def mirrors_among(planes: Planes, judged: Mapping[int, JudgedPane]) -> list[int]
     for group in coplanar_groups(planes, rows):
         labels = {planes.labels[row] for row in group}
         if any(judged[label].is_known for label in labels - alike):
-            alike -= {label for label in labels if judged[label].like.slope < SLOPE_AMONG_GLASS}
+            alike -= {label for label in labels if judged[label].like.slope < SURE_SLOPE}
     return [label for label in judged if label in alike]
 
 

@@ -22,6 +22,7 @@ from glassplat.panes.masks import (
     mask_agreement,
     pane_views,
     plane_candidates,
+    without_gaps,
 )
 from glassplat.panes.material import virtual_points
 from glassplat.panes.objective import MIDDLE, JointObjective, Objective, edge_matches, pane_rectangle
@@ -251,8 +252,32 @@ class _Found:
 def _found_pane(
     label: int, clouds: Mapping[str, Array], views: Sequence[PaneView], *, extent: float, options: PlaneFit
 ) -> _Found:
-    """The plane, of those fitted to each cloud, that masks and the first cloud support best."""
+    """The pane on the plane of its masks, or of what they are without gaps where that tells against it.
+
+    Gaps between parts of a pane lie on its plane. But the edges of a post before it meet on a plane of their own, and
+    may turn the pane's to that.
+    """
     _check_views(label, views, extent)
+    found = _fitted_pane(label, clouds, views, extent=extent, options=options)
+    filled = [without_gaps(view) for view in views]
+    if all(other is view for other, view in zip(filled, views, strict=True)):
+        return found
+    whole = _fitted_pane(label, clouds, filled, extent=extent, options=options)
+    if whole.fault is not None or _doubt(whole.plane, whole.evidence) > SOME_DOUBT:
+        return found
+    if found.fault is None and _loss(whole, found.plane) <= MOST_LOSS:
+        return found
+    log.info(
+        "pane %d: without the gaps of its masks, where things may stand before it, its plane is another one, %.2f "
+        "degrees away; it takes that plane", label, np.degrees(angle(found.plane, whole.plane)),
+    )  # fmt: skip
+    return whole
+
+
+def _fitted_pane(
+    label: int, clouds: Mapping[str, Array], views: Sequence[PaneView], *, extent: float, options: PlaneFit
+) -> _Found:
+    """The plane, of those fitted to each cloud, that masks and the first cloud support best."""
     objectives = {}
     for source, points in clouds.items():
         chosen = points[plane_candidates(points, views, band=options.band)]

@@ -9,7 +9,7 @@ known where a mask shows another pane, which may stand in front.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -279,6 +279,25 @@ def pane_view(camera: Camera, labels: Tensor, label: int, *, name: str = "") -> 
         outward=_outward(mask, edge),
         name=name,
     )
+
+
+WIDEST_GAP, LEAST_FILLED = 0.04, 0.01
+"""Width of gaps in a mask that are filled, in image diagonals, and the share of it that they must have."""
+
+
+def without_gaps(view: PaneView) -> PaneView:
+    """The view with narrow gaps of its mask filled, such as a thing before the pane leaves; itself if it has none."""
+    from scipy import ndimage
+
+    reach = round(WIDEST_GAP / 2 * view.diagonal) + 1
+    padded = np.pad(view.mask, 2 * reach, mode="edge")
+    widened = ndimage.distance_transform_edt(~padded) < reach
+    closed = ndimage.distance_transform_edt(widened) >= reach
+    mask = view.mask | (closed[2 * reach : -2 * reach, 2 * reach : -2 * reach] & ~view.hidden)
+    if mask.sum() < (1 + LEAST_FILLED) * view.mask.sum():
+        return view
+    edge = _edge_points(mask)
+    return replace(view, mask=mask, distance=_signed_distance(mask), edge=edge, outward=_outward(mask, edge))
 
 
 def _array(tensor: Tensor) -> Array:

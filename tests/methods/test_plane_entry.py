@@ -158,6 +158,32 @@ def test_what_shows_through_a_wall_behind_glass_is_a_reflection_unless_its_place
     assert not finished(action.apply(state, dataset, Clock(25, 100, 1)))
 
 
+def test_nothing_is_turned_round_where_many_are_hidden_from_some_places_alone() -> None:
+    tilted = in_single_precision(showcase(pane(2.0, half=0.8)))
+    planes = replace(tilted.planes, centers=torch.tensor([[0.0, 0, 2]]), raw_normals=torch.tensor([[0.0, 0, -1]]))
+    # Half a wall: what stands behind its end is hidden from one side.
+    half = wall(3.0)
+    half = half.select(half.means[:, 0] < 0)
+    reflected, beside = (
+        torch.tensor([[-0.6, 0.0, 6.0]]),
+        torch.tensor([[x, y, 6.0] for x in (0.15, 0.25) for y in (0, 0.2)]),
+    )
+    places = (camera_at(x, 0, -0.3) for x in (-0.3, 0.1, 0.3))
+    cameras = [replace(camera, cam_from_world=camera.cam_from_world.float()) for camera in places]
+
+    def found(*parts: Gaussians) -> list[int]:
+        primary = concatenated(*parts)
+        return (
+            reflections_behind(replace(tilted, primary=primary, planes=planes), planes, cameras)
+            .nonzero()
+            .flatten()
+            .tolist()
+        )
+
+    assert found(half, solid(reflected)) == [len(half)]
+    assert found(half, solid(reflected), solid(beside)) == []
+
+
 @pytest.mark.parametrize(("slope", "expected"), [(0.42, []), (0.75, [2])])
 def test_a_pane_of_a_glass_front_is_a_mirror_only_beyond_doubt(slope: float, expected: list[int]) -> None:
     one, other = pane(2.0, half=0.4), pane(2.0, half=0.4, label=2)

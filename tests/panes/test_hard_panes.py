@@ -62,6 +62,34 @@ def test_ragged_masks_with_holes_and_specks_give_the_pane(seed: int) -> None:
     assert_found(FRONT, annotations, POINTS, degrees=1.5, percent=1)
 
 
+WALK = tuple((x, -0.1 + 0.1 * (i % 2), 0.6 - 0.1 * (i % 3)) for i, x in enumerate((-0.8, -0.4, 0.0, 0.3, 0.6, 0.9)))
+"""Along a pane that no photograph holds whole."""
+
+
+def walked_past(panes: list[Pane], labels: tuple[int, ...]) -> Annotations:
+    """Masks of a walk past panes and things, each with a label; 0 is no pane."""
+    told = torch.tensor((0, *labels), dtype=torch.uint8)
+    cameras = [camera_from(eye, np.array([0.8 * eye[0] + 0.2, -0.1, 2.0])) for eye in WALK]
+    return [(camera, told[label_image(camera, panes).long()]) for camera in cameras]
+
+
+@pytest.mark.parametrize(("depth", "half_width"), [(1.6, 0.03), (1.7, 0.03), (1.85, 0.02)])
+def test_the_edges_of_a_post_before_a_pane_do_not_turn_its_plane(depth: float, half_width: float) -> None:
+    pane = Pane(np.array([-0.6, -0.1, 2.0]), FRONT.normal, FRONT.tangent, (1.6, 0.6))
+    post = Pane(np.array([0.3, -0.1, depth]), FRONT.normal, FRONT.tangent, (half_width, 3.0))
+    planes = fit_planes(BARE, walked_past([pane, post], (1, 0)), extent=EXTENT, options=QUICK)
+    assert normal_error(planes, 0, pane) < 0.5
+
+
+def test_the_bars_of_a_window_place_it_where_no_photograph_shows_where_it_ends() -> None:
+    window = Pane(np.array([0.0, -0.1, 2.0]), FRONT.normal, FRONT.tangent, (9.0, 9.0))
+    bars = [Pane(np.array([x, -0.1, 2.0]), FRONT.normal, FRONT.tangent, (0.03, 9.0)) for x in (-0.9, -0.1, 0.7)]
+    bars += [Pane(np.array([0.0, y, 2.0]), FRONT.normal, FRONT.bitangent, (0.03, 9.0)) for y in (-0.5, 0.4)]
+    annotations = walked_past([*bars, window], (*(0 for _ in bars), 1))
+    planes = fit_planes(BARE, annotations, extent=EXTENT, options=QUICK)
+    assert normal_error(planes, 0, window) < 0.5
+
+
 def test_masks_that_include_the_frame_give_the_pane() -> None:
     assert_found(FRONT, scene_of([FRONT.larger(1.06)]), POINTS, degrees=0.5, percent=0.5)
 

@@ -18,6 +18,7 @@ from glassplat.panes.material import (
     MIRROR_CORRELATION,
     REDUCED_WIDTH,
     WINDOW,
+    Likeness,
     about_local_mean,
     degrees_between,
     glass_gaussians,
@@ -146,6 +147,14 @@ def test_likeness_is_slope_and_correlation() -> None:
     assert found.slope == pytest.approx(0.1, abs=1e-4)
     assert found.correlation == pytest.approx(1.0, abs=1e-4)
     assert not found.is_mirror
+
+
+@pytest.mark.parametrize(
+    ("slope", "correlation", "expected"),
+    [(0.46, 0.42, True), (0.89, 0.25, True), (0.50, 0.27, False), (0.30, 0.40, False), (0.89, 0.10, False)],
+)
+def test_a_slope_near_one_needs_less_correlation(slope: float, correlation: float, expected: bool) -> None:
+    assert Likeness(slope, correlation).is_mirror == expected
 
 
 def test_local_means_ignore_what_lies_outside_the_region() -> None:
