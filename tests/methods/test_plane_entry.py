@@ -11,8 +11,8 @@ import torch
 
 from glassplat.captures.view import PointCloud
 from glassplat.methods.planar import TurnReflections, mirrors_among, seed_reflection, surfaces, turn_virtual_scene_round
-from glassplat.panes.fit import with_mirrors
 from glassplat.panes import material
+from glassplat.panes.fit import with_mirrors
 from glassplat.panes.material import JudgedPane, Likeness, mostly_reflections, reflections_behind, virtual_points
 from glassplat.scene.camera import mirror_matrices
 from glassplat.scene.gaussians import Gaussians
