@@ -483,7 +483,7 @@ def reflections_behind(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -
 
 
 def mostly_reflections(often: Tensor, always: Tensor, looked_at: Tensor, confirmed: Tensor) -> Tensor:
-    """Whether what is hidden behind a front of glass is mostly what it mirrors; all are numbers of Gaussians, and [].
+    """[] bool: what is hidden behind a front of glass is mostly what it mirrors. All arguments are numbers of Gaussians.
 
     Args:
         often: hidden in most views.
