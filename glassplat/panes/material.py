@@ -483,7 +483,7 @@ def reflections_behind(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -
 
 
 def mostly_reflections(often: Tensor, always: Tensor, looked_at: Tensor, confirmed: Tensor) -> Tensor:
-    """[] bool: what is hidden behind a front of glass is mostly what it mirrors. All arguments are numbers of Gaussians.
+    """[] bool: what is hidden behind a front of glass is mostly what it mirrors. All arguments count Gaussians.
 
     Args:
         often: hidden in most views.
