@@ -186,6 +186,7 @@ def test_nothing_is_turned_round_where_views_find_no_surface_in_its_place(monkey
         (1066, 635, 114, 63, True),
         (300, 280, 0, 0, True),
         (1719, 1185, 264, 6, False),
+        (1802, 1501, 1413, 275, False),
         (3379, 1769, 1427, 67, False),
         (1469, 932, 1006, 220, False),
     ],
