@@ -114,18 +114,23 @@ def drop_output() -> None:
 
 
 class LogLines(logging.Handler):
-    """Shows what is logged among the other lines of a command, above its progress bar."""
+    """Shows what is logged among the other lines of a command, above its progress bar; the same line once."""
 
     def __init__(self, console: Console) -> None:
         super().__init__()
         self._console = console
+        self._shown: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Prints one record."""
+        """Prints one record, unless its line is there already: planes are fitted twice in a training."""
+        text = record.getMessage()
+        if text in self._shown:
+            return
+        self._shown.add(text)
         if record.levelno >= logging.WARNING:
-            warn(self._console, record.getMessage())
+            warn(self._console, text)
         else:
-            say(self._console, record.getMessage())
+            say(self._console, text)
 
 
 @contextmanager
@@ -135,11 +140,16 @@ def heard_by(console: Console) -> Iterator[None]:
     def show(message: Warning | str, *place: Any, **more: Any) -> None:
         warn(console, message)
 
-    logging.basicConfig(level=logging.WARNING, handlers=[LogLines(console)])
+    lines, root = LogLines(console), logging.getLogger()
+    if not root.handlers:
+        root.addHandler(lines)
     logging.getLogger("glassplat").setLevel(logging.INFO)
-    with warnings.catch_warnings():
-        warnings.showwarning = show
-        yield
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = show
+            yield
+    finally:
+        root.removeHandler(lines)
 
 
 WORDS = {

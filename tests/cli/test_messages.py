@@ -95,3 +95,15 @@ def test_what_is_logged_and_warned_of_is_a_line_each(
         "warning: beware",
         "warning: an image of [127] megapixels",
     ]
+
+
+def test_a_command_says_the_same_line_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+    panes = logging.getLogger("glassplat.panes")
+    for _ in range(2):
+        with heard_by(message_console()):
+            panes.warning("pane %d: may be off", 1)
+            panes.warning("pane %d: may be off", 2)
+            panes.warning("pane %d: may be off", 1)
+    assert capsys.readouterr().out.splitlines() == 2 * ["warning: pane 1: may be off", "warning: pane 2: may be off"]
+    assert not logging.getLogger().handlers
