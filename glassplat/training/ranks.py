@@ -13,6 +13,8 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
+import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -29,6 +31,9 @@ if TYPE_CHECKING:
 LONGEST_WAIT = timedelta(minutes=10)
 """For a rank that lives and does not answer: it may save a large scene, compile kernels, or be paused in the viewer.
 One that dies is missed at once."""
+LAST_WAIT = 15.0
+"""Seconds for which a process that was asked to end waits for the others: `torchrun` kills it after 30, and it has to
+save before that."""
 LOST = (
     "another process of the run has ended without a word, or its machine does not answer ({}); repeat the command with "
     "--resume to go on from the last checkpoint"
@@ -102,8 +107,34 @@ class Ranks:
 
         everything: list[Any] = [None] * self.count
         with _others_needed():
-            dist.all_gather_object(everything, said)
+            self._waited_for(lambda: dist.all_gather_object(everything, said))
         return everything
+
+    def _waited_for(self, call: Callable[[], object]) -> None:
+        """Runs a call in a thread: inside of one that waits for others, Python answers no signal.
+
+        Raises:
+            RuntimeError: this process was asked to end, and the others have not answered for `LAST_WAIT`.
+        """
+        failures: list[BaseException] = []
+
+        def run() -> None:
+            try:
+                call()
+            except BaseException as error:
+                failures.append(error)
+
+        waiting = threading.Thread(target=run, daemon=True)
+        waiting.start()
+        asked_at = None
+        while waiting.is_alive():
+            waiting.join(LAST_WAIT / 10)
+            if asked_at is None and self.asked():
+                asked_at = time.monotonic()
+            if asked_at is not None and time.monotonic() - asked_at > LAST_WAIT:
+                raise RuntimeError("no answer since this one was asked to end")
+        if failures:
+            raise failures[0]
 
     def summed(self, tensors: Sequence[Tensor]) -> list[Tensor]:
         """The sums over all ranks, of tensors of one type and device; call after an exchange."""
@@ -122,7 +153,10 @@ class Ranks:
         # One message instead of dozens, each of which would cost its own delay.
         flat = torch.cat([tensor.detach().reshape(-1) for tensor in tensors])
         with _others_needed():
-            dist.all_reduce(flat, getattr(dist.ReduceOp, operation))
+            if flat.is_cuda:
+                dist.all_reduce(flat, getattr(dist.ReduceOp, operation))
+            else:
+                self._waited_for(lambda: dist.all_reduce(flat, getattr(dist.ReduceOp, operation)))
         parts = flat.split([tensor.numel() for tensor in tensors])
         return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
 
