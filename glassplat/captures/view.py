@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from threading import Lock
-from typing import IO
+from typing import IO, TypeVar
 
 import numpy as np
 import torch
@@ -69,6 +69,15 @@ DISK_RESERVE = 5 * GIGABYTE
 """Bytes of the disk that photographs leave free: the training writes there, too."""
 LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 """Files that say how much a container may take."""
+
+
+Item = TypeVar("Item")
+
+
+def evenly(items: Sequence[Item], most: int) -> list[Item]:
+    """No more than so many of the items, evenly among all of them."""
+    count = min(most, len(items))
+    return [items[len(items) * number // count] for number in range(count)]
 
 
 class Source:

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
 from glassplat.captures.dataset import Dataset
-from glassplat.captures.view import View, estimated_normals
+from glassplat.captures.view import View, estimated_normals, evenly
 from glassplat.render.deferred import cell_side, depth_normals, resized, seen_surface, view_directions
 from glassplat.render.frame import Frame, Renderer
 from glassplat.render.layers import contributions, gathered
@@ -68,12 +68,6 @@ class Search:
         shown, spreads = residual_spreads(scene, evenly(views, self.views), renderer)
         reflects = scene.primary.channels["logit_strength"] > logit(self.strength)
         return mean_in_region(scene, shown, ~reflects & (spreads > self.spread))
-
-
-def evenly(views: Sequence[View], most: int) -> list[View]:
-    """No more than so many of the views, evenly among all of them."""
-    count = min(most, len(views))
-    return [views[len(views) * number // count] for number in range(count)]
 
 
 def mean_in_region(scene: Scene, shown: Tensor, values: Tensor) -> float:

@@ -7,9 +7,11 @@ from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from glassplat.captures.dataset import Dataset
+from glassplat.captures.view import PointCloud
 from glassplat.methods.splat import image_terms
 from glassplat.options import BLACK
 from glassplat.panes import PlaneFit, PlaneFitError
@@ -20,17 +22,27 @@ from glassplat.panes.material import (
     glass_gaussians,
     judged_pane,
     mirrored_coverage,
+    mirrored_lamps,
     photographs_of,
     reflections_behind,
+    unseen_places,
     virtual_points,
 )
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
-from glassplat.scene.gaussians import mirrored_gaussians
+from glassplat.scene.gaussians import Gaussians, mirrored_gaussians
 from glassplat.scene.panes import Planes, coplanar_groups
 from glassplat.scene.scene import Scene
-from glassplat.training.actions import Densify, GrowSh, PerturbOpacity, Population, ResetOpacity, population_of
+from glassplat.training.actions import (
+    Densify,
+    GrowSh,
+    PerturbOpacity,
+    Population,
+    ResetOpacity,
+    SeedUnexplained,
+    population_of,
+)
 from glassplat.training.corrections import corrections_begun, corrections_learnt, photographer_learnt
 from glassplat.training.densify import append, apply_edit, gaussians_from_points, keep
 from glassplat.training.losses import (
@@ -267,6 +279,89 @@ class TurnReflections:
         return moved > 0
 
 
+LIT_AT, FILLED_AT = (0.4, 0.6), 0.5
+"""Shares of a run at which lamps are looked for, and at which what no view shows is filled."""
+
+
+@dataclass(frozen=True)
+class LightLamps:
+    """Takes the images of lamps from behind panes of glass, and makes the lamps as bright as their reflections are.
+
+    Attributes:
+        moments: shares of the run at which to do it.
+    """
+
+    moments: tuple[float, ...] = LIT_AT
+    name: str = "light lamps"
+
+    def due(self, clock: Clock) -> bool:
+        """Return whether to act after this step."""
+        return clock.is_at(self.moments)
+
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
+        """Edits `state`, if there is anything to edit, and tells how far it is."""
+        yield Working("looking for lamps that panes mirror", 0, 1)
+        scene = state.scene
+        rows = [row for row, label in enumerate(scene.planes.labels) if label not in scene.planes.mirrors]
+        lamps = mirrored_lamps(scene, scene.planes.select(rows), photographs_of(scene, dataset.train)) if rows else None
+        if lamps is None:
+            return False
+        log_gains = scene.primary.channels["log_intensity"] + lamps.gains.log()
+        primary = scene.primary.with_tensors({"log_intensity": log_gains})
+        primary, state.optimizer.moments = apply_edit(primary, state.optimizer.moments, keep(~lamps.images))
+        state.scene = replace(scene, primary=primary)
+        state.statistics.pop("primary", None)
+        count, lit = int(lamps.images.sum()), lamps.gains > 1
+        log.info("%d Gaussians behind glass were images of lamps; %d of these shine brighter", count, int(lit.sum()))
+        return True
+
+
+@dataclass(frozen=True)
+class FillUnseen:
+    """Adds Gaussians where panes of glass mirror something that no photograph shows, and nothing stands.
+
+    Attributes:
+        moment: share of the run at which to do it.
+    """
+
+    moment: float = FILLED_AT
+    name: str = "fill unseen"
+
+    def due(self, clock: Clock) -> bool:
+        """Return whether to act after this step."""
+        return clock.is_at((self.moment,))
+
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
+        """Edits `state`, if there is anything to edit, and tells how far it is."""
+        cameras, added = [view.camera for view in dataset.train], 0
+        of_glass = surfaces(state.scene.planes, mirrors=False)
+        for done, panes in enumerate(of_glass):
+            yield Working(f"looking for what {named(panes, 'pane')} can mirror", done, len(of_glass))
+            places, color = unseen_places(state.scene, panes, cameras)
+            if len(places):
+                colors = (255 * color).round().to(torch.uint8).expand(len(places), 3)
+                seeds = seeds_of(state, PointCloud(places.cpu(), colors.cpu()), opacity=0.7, spread=0.7)
+                add_primary(state, seeds)
+                added += len(seeds)
+        if added:
+            log.info("%d Gaussians added where panes mirror what nothing shows", added)
+        return added > 0
+
+
+def seeds_of(state: TrainState, points: PointCloud, *, opacity: float = 0.1, spread: float = 1.0) -> Gaussians:
+    """Gaussians like the primary ones, from points."""
+    primary = state.scene.primary
+    seeds = gaussians_from_points(points, sh_degree=primary.max_sh_degree, opacity=opacity, spread=spread)
+    return replace(seeds.to(primary.means.device), active_sh_degree=primary.active_sh_degree)
+
+
+def add_primary(state: TrainState, seeds: Gaussians) -> None:
+    """Adds Gaussians to the primary ones, whose statistics begin anew."""
+    primary, state.optimizer.moments = append(state.scene.primary, state.optimizer.moments, seeds)
+    state.scene = replace(state.scene, primary=primary)
+    state.statistics.pop("primary", None)
+
+
 def turn_round(state: TrainState, virtual: Tensor, panes: Planes) -> int:
     """Mirrors some primary Gaussians at panes in one plane; returns how many."""
     count = int(virtual.sum())
@@ -296,12 +391,8 @@ def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
     if not bool(virtual.any()):
         return False
     behind = replace(points, positions=points.positions[virtual], colors=points.colors[virtual])
-    primary = state.scene.primary
-    seeds = gaussians_from_points(behind, sh_degree=primary.max_sh_degree).to(device)
-    seeds = replace(seeds, active_sh_degree=primary.active_sh_degree)
-    seeds = mirrored_gaussians(seeds, panes.centers[0], panes.normals[0])
-    primary, state.optimizer.moments = append(primary, state.optimizer.moments, seeds)
-    state.scene = replace(state.scene, primary=primary)
+    seeds = mirrored_gaussians(seeds_of(state, behind), panes.centers[0], panes.normals[0])
+    add_primary(state, seeds)
     log.info("no photograph shows what is mirrored by %s: %d points behind mirrored", named(panes, "pane"), len(seeds))
     return True
 
@@ -404,6 +495,7 @@ def _adjustment(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
             *population.edits,
             GrowSh(Every(recipe.rhythm.sh)),
             Densify(recipe.densify, part="glass"),
+            *_missing(recipe, recipe.stage_shares[0] / sum(recipe.stage_shares) + ADJUSTED_AFTER),
             *_early_resets(recipe, population),
             *_clearing(recipe),
         ),
@@ -428,11 +520,13 @@ def _joint(recipe: PlanarRecipe, share: float) -> Stage:
         | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {}),
         actions=(
             *_turns(recipe),
+            *_missing(recipe, _joint_start(recipe) + JOINED_AFTER),
             *population.edits,
             GrowSh(Every(recipe.rhythm.sh)),
             Densify(recipe.densify, part="glass"),
             *population.resets,
             *_clearing(recipe),
+            *((FillUnseen(),) if recipe.seed_reflections else ()),
             PerturbOpacity(beat, recipe.perturbation.amplitude, recipe.perturbation.bounds),
         ),
         post_steps=(*_glass_post_steps(recipe), *population.post_steps),
@@ -466,9 +560,20 @@ def _early_resets(recipe: PlanarRecipe, population: Population) -> tuple[ResetOp
     return population.resets if recipe.early_resets else ()
 
 
-def _turns(recipe: PlanarRecipe) -> tuple[TurnReflections, ...]:
-    """The turning round of reflections behind glass, if there is to be any."""
-    return (TurnReflections(_joint_start(recipe) + TURN_AFTER),) if recipe.turn_reflections else ()
+def _turns(recipe: PlanarRecipe) -> tuple[TurnReflections | LightLamps, ...]:
+    """The turning round of reflections behind glass, and the lighting of lamps, if there are to be any."""
+    return (TurnReflections(_joint_start(recipe) + TURN_AFTER), LightLamps()) if recipe.turn_reflections else ()
+
+
+ADJUSTED_AFTER, JOINED_AFTER = 0.005, 0.003
+"""Shares of a run after the beginning of plane adjustment, and of joint optimisation, at which missing things are
+looked for: as soon as it is known where panes are, behind which nothing is to be found."""
+
+
+def _missing(recipe: PlanarRecipe, moment: float) -> tuple[SeedUnexplained, ...]:
+    """The search for what is missing, if there is to be any; not under `mcmc`, which moves its own."""
+    wanted = recipe.seed_unexplained and recipe.strategy == "default"
+    return (SeedUnexplained(moment, finished_renderer(recipe)),) if wanted else ()
 
 
 def _clearing(recipe: PlanarRecipe) -> tuple[ResetOpacity, ...]:

@@ -93,8 +93,12 @@ class PlanarRecipe:
         detect_mirrors: treat panes that look like mirrors as mirrors, unless `--plane-fit.mirror-labels` names them.
         fixed_mirrors: mirrors keep their reflectance, and what the first stage built behind them moves to their front;
             if not, they only start at that reflectance, as in the paper.
-        seed_reflections: start what no photograph shows directly from the virtual points behind the panes.
-        turn_reflections: move what was built behind glass, for what that mirrors, to its front in the joint stage.
+        seed_reflections: start what no photograph shows directly from the virtual points behind the panes, and fill
+            what no Gaussian stands for halfway through the run.
+        turn_reflections: move what was built behind glass, for what that mirrors, to its front in the joint stage, and
+            make lamps as bright as their reflections are.
+        seed_unexplained: add Gaussians where photographs agree on something that the scene lacks, twice early in a run;
+            not under `mcmc`, which moves its own.
         tint: panes may be tinted: each learns what share of red, green and blue light gets through (not in the paper).
         tint_weight: of the mean square of the logarithm of that share in the objective.
         glass_count: glass Gaussians placed on each pane.
@@ -145,6 +149,7 @@ class PlanarRecipe:
     fixed_mirrors: Internal[bool] = True
     seed_reflections: Internal[bool] = True
     turn_reflections: Internal[bool] = True
+    seed_unexplained: Internal[bool] = True
     tint: bool = False
     tint_weight: NotNegative = 0.01
     glass_count: Annotated[int, Range(1, 1_000_000)] = 1000
@@ -176,6 +181,7 @@ class PlanarRecipe:
             fixed_mirrors=False,
             seed_reflections=False,
             turn_reflections=False,
+            seed_unexplained=False,
             weights=ReflectionWeights(intensity=0.0),
             moving_mean=True,
             perturbation=Perturbation(stop=29 / 30, bounds=(1e-6, 1 - 1e-6)),

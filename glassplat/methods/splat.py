@@ -9,7 +9,7 @@ from glassplat.captures.dataset import Dataset
 from glassplat.options import BLACK
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
-from glassplat.training.actions import GrowSh, Population, population_of
+from glassplat.training.actions import GrowSh, Population, SeedUnexplained, population_of
 from glassplat.training.corrections import corrections_begun, corrections_learnt
 from glassplat.training.densify import as_discs
 from glassplat.training.losses import LossTerm, PhotometricLoss, disc_normals, distortion, view_dependence, weighted
@@ -41,7 +41,7 @@ def stages_of(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITERAT
         renderer=_bare(recipe),
         losses=(*image_terms(recipe.ssim_weight, recipe.view_dependence_weight), *population.terms),
         rates=recipe.rates.of("primary"),
-        actions=(*population.edits, GrowSh(Every(recipe.rhythm.sh)), *population.resets),
+        actions=(*_missing(recipe), *population.edits, GrowSh(Every(recipe.rhythm.sh)), *population.resets),
         post_steps=population.post_steps,
         densify_until=population.densify_until,
     )
@@ -61,6 +61,16 @@ def stages_of(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITERAT
 def _bare(recipe: SplatRecipe, *, normal: bool = False) -> Splat:
     """The renderer with what the losses need and no more."""
     return Splat(recipe.background or BLACK, depth=False, normal=normal)
+
+
+SEED_AT = (0.105, 0.203)
+"""Shares of a run after which missing things are looked for, as in `planar`."""
+
+
+def _missing(recipe: SplatRecipe) -> tuple[SeedUnexplained, ...]:
+    """The search for what is missing, if there is to be any."""
+    wanted = recipe.seed_unexplained and recipe.primitive == "ellipsoid" and recipe.strategy == "default"
+    return tuple(SeedUnexplained(moment, _bare(recipe)) for moment in SEED_AT if wanted)
 
 
 def _population(recipe: SplatRecipe) -> Population:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from glassplat.options import ESSENTIAL, Color, NotNegative, Share, ShDegree
+from glassplat.options import ESSENTIAL, Color, Internal, NotNegative, Share, ShDegree
 from glassplat.training.options import (
     PUBLISHED_ITERATIONS,
     DefaultDensify,
@@ -58,6 +58,8 @@ class SplatRecipe:
         strategy: what decides how many Gaussians there are and where; `densify` or `mcmc` holds its options.
         densify: when and how Gaussians are added and pruned under `default`.
         mcmc: when and how Gaussians are relocated and added under `mcmc`.
+        seed_unexplained: add ellipsoids where photographs agree on something that the scene lacks, twice early in a
+            run; not under `mcmc`, which moves its own.
         discs: what keeps discs on one surface.
         exposure: whether the exposure of each photograph is learned.
         poses: whether the camera of each photograph is corrected.
@@ -75,6 +77,7 @@ class SplatRecipe:
     strategy: Annotated[Strategy, ESSENTIAL] = "default"
     densify: DefaultDensify = field(default_factory=DefaultDensify)
     mcmc: McmcDensify = field(default_factory=McmcDensify)
+    seed_unexplained: Internal[bool] = True
     discs: DiscTerms = field(default_factory=DiscTerms)
     exposure: PhotoExposure = field(default_factory=PhotoExposure)
     poses: PoseRefinement = field(default_factory=PoseRefinement)
@@ -85,6 +88,7 @@ class SplatRecipe:
         return cls(
             rates=GaussianRates(short_run_power=0.0),
             rhythm=Rhythm(averaged_passes=0.0),
+            seed_unexplained=False,
             densify=DefaultDensify.published(),
             mcmc=McmcDensify.published(),
         )

@@ -1,4 +1,4 @@
-"""The first glass Gaussians, mirrors told from glass, and the virtual scene behind mirrors and glass."""
+"""The first glass Gaussians, mirrors told from glass, what seems to be behind panes, and what they mirror unseen."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from glassplat.captures.view import View
+from glassplat.captures.view import View, evenly
 from glassplat.kernels.maths.images import linear_from_srgb
+from glassplat.render.layers import gathered, gathered_mirrored
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
-from glassplat.scene import logit
+from glassplat.scene import SH_ZERO, logit
 from glassplat.scene.camera import Camera, mirror_matrices, quat_from_rotation
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes, crosses_pane, in_image
@@ -192,8 +193,7 @@ class Photograph(NamedTuple):
 
 def photographs_of(scene: Scene, views: Sequence[View]) -> list[Photograph]:
     """At most `MOST_PHOTOGRAPHS` of the views, evenly spread, none wider than `REDUCED_WIDTH`."""
-    number = min(len(views), MOST_PHOTOGRAPHS)
-    return [reduced_photograph(scene, views[index * len(views) // number]) for index in range(number)]
+    return [reduced_photograph(scene, view) for view in evenly(views, MOST_PHOTOGRAPHS)]
 
 
 def reduced_photograph(scene: Scene, view: View) -> Photograph:
@@ -505,3 +505,181 @@ def relative_depths(points: Tensor, camera: Camera, depth: Tensor) -> tuple[Tens
     row = pixels[:, 1].nan_to_num().clamp(0, camera.height - 1).long()
     there = depth[row, column]
     return torch.where(there > 0, depths / there, 1), in_image(points, camera)
+
+
+CLIPPED = 0.98
+"""Value of the darkest channel from which a pixel may be brighter than it can show."""
+LAMP_SHARE = 0.6
+"""Of what photographs show directly of a lamp, how much is clipped; of what they show of its image, how much lies where
+a pane mirrors it."""
+LEAST_GAIN, MOST_GAIN = 1.5, 30.0
+"""Radiance of a lamp, where white is 1."""
+LEAST_BRIGHT = 0.8
+"""Of the pixels in which a pane mirrors a lamp, how many are bright enough for one."""
+IMAGE_BRIGHTNESS = 0.5
+"""Of the darkest channel of a lamp's image, sRGB: what is darker a pane mirrors of white things."""
+LAMP_RIM = 0.012
+"""How far beside where it should be an image is looked for, as a share of the image width."""
+FEWEST_SEEN = 0.3
+"""Pixels, of all photographs together, below which nothing is told."""
+
+
+class Lamps(NamedTuple):
+    """Lamps that panes mirror.
+
+    images [N] bool: primary Gaussians behind the panes that show them; gains [N]: factors on how bright primary
+    Gaussians are where they are mirrored, 1 for all but lamps.
+    """
+
+    images: Tensor
+    gains: Tensor
+
+
+@torch.no_grad()
+def mirrored_lamps(scene: Scene, panes: Planes, photographs: Sequence[Photograph]) -> Lamps | None:
+    """Lamps that panes of glass mirror, with the radiance that their reflections have; None without any.
+
+    A photograph cannot say how much brighter than white a lamp is, but its reflection at a few hundredths can. Before
+    that is known, the first scene has built the reflection behind the glass, as bright as it looks, and there it stays,
+    because it explains the photographs. So lamps are found by what is clipped wherever it is seen directly, and so
+    bright wherever a pane mirrors it that no reflection of white would do. What stands behind the pane where it
+    mirrors a lamp, and nowhere else, is its image.
+
+    Args:
+        scene: with the panes.
+        panes: of glass.
+        photographs: those that tell.
+    """
+    alone = replace(scene, planes=panes)
+    lamps = _lamps_among(alone, photographs)
+    if not bool(lamps.any()):
+        return None
+    images = _images_of(alone, lamps, photographs)
+    if not bool(images.any()):
+        return None
+    dark = torch.full_like(scene.primary.logit_opacities, logit(1e-3))
+    opacities = torch.where(images, torch.minimum(dark, scene.primary.logit_opacities), scene.primary.logit_opacities)
+    without = replace(alone, primary=scene.primary.with_tensors({"logit_opacities": opacities}))
+    return Lamps(images, _gains_of(without, lamps, photographs))
+
+
+def _lamps_among(scene: Scene, photographs: Sequence[Photograph]) -> Tensor:
+    """[N] bool: what is clipped where it is seen directly, and brighter than white where it is mirrored."""
+    clipped, direct, bright, mirrored = scene.primary.means.new_zeros(4, len(scene.primary))
+    for photograph in photographs:
+        strength = Planar(nearest_only=True)(scene, photograph.camera).layers["strength"]
+        past, through = photograph.told & (strength <= 0), photograph.told & (strength > 0)
+        darkest = photograph.pixels.amin(dim=-1)
+        shown = gathered(scene, photograph.camera, torch.stack([past & (darkest > CLIPPED), past], dim=-1).float())
+        enough = linear_from_srgb(darkest.clamp(0, 1)) > LEAST_GAIN * strength
+        there = gathered_mirrored(scene, photograph.camera, torch.stack([through & enough, through], dim=-1).float())
+        clipped, direct = clipped + shown[:, 0], direct + shown[:, 1]
+        bright, mirrored = bright + there[:, 0], mirrored + there[:, 1]
+    enough_seen = (direct > FEWEST_SEEN) & (mirrored > FEWEST_SEEN)
+    return enough_seen & (clipped > LAMP_SHARE * direct) & (bright > LEAST_BRIGHT * mirrored)
+
+
+def _images_of(scene: Scene, lamps: Tensor, photographs: Sequence[Photograph]) -> Tensor:
+    """[N] bool: what is bright, behind the panes, and mostly where they mirror the lamps [N]."""
+    means = scene.primary.means
+    near, through = means.new_zeros(2, len(means))
+    for photograph in photographs:
+        glass, lit = _lit_pixels(scene, lamps, photograph.camera)
+        rim = max(round(LAMP_RIM * glass.shape[1]), 1)
+        lit = glass & (torch.nn.functional.max_pool2d(lit[None].float(), 2 * rim + 1, 1, rim)[0] > 0)
+        shown = gathered(scene, photograph.camera, torch.stack([lit, glass], dim=-1).float())
+        shown = shown * crosses_pane(means, scene.planes, photograph.camera.to(means.device).center)[:, None]
+        near, through = near + shown[:, 0], through + shown[:, 1]
+    bright = (scene.primary.sh[:, 0] * SH_ZERO + 0.5).amin(dim=-1) > IMAGE_BRIGHTNESS
+    return bright & (through > FEWEST_SEEN) & (near > LAMP_SHARE * through)
+
+
+def _lit_pixels(scene: Scene, lamps: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """[H, W] bool each: where a view shows a pane, and where this mirrors mostly lamps [N]."""
+    sh = torch.zeros_like(scene.primary.sh)
+    sh[:, 0] = (lamps.float()[:, None] - 0.5) / SH_ZERO
+    painted = replace(scene.primary.with_tensors({"sh": sh}), active_sh_degree=0)
+    frame = Planar(intensity=False, nearest_only=True)(replace(scene, primary=painted), camera)
+    glass = frame.layers["strength"] > 0
+    return glass, glass & (frame.layers["reflection"].amin(dim=-1) > 0.5)
+
+
+def _gains_of(scene: Scene, lamps: Tensor, photographs: Sequence[Photograph]) -> Tensor:
+    """[N] radiance that the photographs leave to the reflections of lamps [N] over what they have; 1 for all others."""
+    left, had = scene.primary.means.new_zeros(2, len(scene.primary))
+    for photograph in photographs:
+        layers = Planar(nearest_only=True)(scene, photograph.camera).layers
+        _, lit = _lit_pixels(scene, lamps, photograph.camera)
+        strength = layers["strength"].clamp(min=1e-2)[..., None]
+        behind = linear_from_srgb(layers["transmission"].clamp(0, 1))
+        radiance = (linear_from_srgb(photograph.pixels.clamp(0, 1)) - (1 - strength) * behind) / strength
+        values = torch.stack([radiance.clamp(min=0), linear_from_srgb(layers["reflection"].clamp(min=0))]).mean(dim=-1)
+        sums = gathered_mirrored(scene, photograph.camera, (values * (lit & photograph.told)).movedim(0, -1))
+        left, had = left + sums[:, 0], had + sums[:, 1]
+    gains = (left / had.clamp(min=1e-6)).clamp(1, MOST_GAIN)
+    return torch.where(lamps & (had > 0), gains, 1)
+
+
+UNCOVERED = 0.5
+"""Coverage of the mirrored image below which it counts as a hole."""
+HOLE_CAMERAS, RAYS_ACROSS, CELLS_ACROSS = 24, 40, 60
+"""Cameras that look for holes, rays across an image, and cells along the room's diagonal with a place each."""
+ROOM_QUANTILE = 0.01
+"""Of the Gaussians' positions along each axis, how many lie beyond either end of the room."""
+
+
+class Unseen(NamedTuple):
+    """Places [P, 3] that panes mirror and no photograph shows, and their likely colour [3], sRGB."""
+
+    places: Tensor
+    color: Tensor
+
+
+@torch.no_grad()
+def unseen_places(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Unseen:
+    """Places at the end of the room that panes mirror, and where no Gaussian stands.
+
+    A pane cannot mirror nothing. What is dark in its image for want of Gaussians, the transmission has too much of.
+
+    Args:
+        scene: with the panes.
+        panes: of glass.
+        cameras: of the photographs; some of them are enough.
+    """
+    device = scene.primary.means.device
+    cameras = [camera.to(device) for camera in evenly(cameras, HOLE_CAMERAS)]
+    low, high = _room_of(scene, cameras)
+    places, colors = [], [torch.zeros(0, 3, device=device)]
+    for camera in cameras:
+        for row in range(len(panes)):
+            pane = panes.select([row])
+            image = mirrored_image(replace(scene, planes=pane), camera)
+            colors.append(image.color[image.seen & (image.coverage > LEAST_COVERAGE)].clamp(0, 1))
+            places.append(_ends_of_rays(pane, camera, image.seen & (image.coverage < UNCOVERED), low, high))
+    found, known = torch.cat(places), torch.cat(colors)
+    cells = ((found - low) / ((high - low).norm() / CELLS_ACROSS)).floor().long()
+    _, cell = torch.unique(cells, dim=0, return_inverse=True)
+    first = torch.full_like(cell, len(found)).scatter_reduce_(0, cell, torch.arange(len(found), device=device), "amin")
+    return Unseen(found[first[first < len(found)]], known.mean(dim=0) if len(known) else known.new_full((3,), 0.5))
+
+
+def _room_of(scene: Scene, cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
+    """Lowest and highest corner [3] of a box around the cameras and nearly all Gaussians."""
+    means = scene.primary.means.sort(dim=0).values
+    beyond = int(ROOM_QUANTILE * len(means))
+    centers = torch.stack([camera.center for camera in cameras])
+    return torch.minimum(means[beyond], centers.amin(dim=0)), torch.maximum(means[-1 - beyond], centers.amax(dim=0))
+
+
+def _ends_of_rays(pane: Planes, camera: Camera, hole: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """[P, 3] where rays through some pixels of a hole [H, W] leave the room, once the pane has mirrored them."""
+    step = max(camera.width // RAYS_ACROSS, 1)
+    row, column = (hole[::step, ::step].nonzero() * step + 0.5).to(low).unbind(dim=1)
+    x, y = (column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
+    ray = torch.stack([x, y, torch.ones_like(x)], dim=1) @ camera.cam_from_world[:3, :3]
+    normal, toward = pane.normals[0], ray @ pane.normals[0]
+    start = camera.center + (((pane.centers[0] - camera.center) @ normal) / toward)[:, None] * ray
+    ray = ray - 2 * toward[:, None] * normal
+    length = torch.maximum((low - start) / ray, (high - start) / ray).amin(dim=1)
+    inside = torch.isfinite(length) & (length > 0)
+    return (start + length[:, None] * ray)[inside]

@@ -151,6 +151,18 @@ def gathered(scene: Scene, camera: Camera, values: Tensor) -> Tensor:
     return _sums(project_gaussians(primary, camera, near=near), camera, values)[0]
 
 
+def gathered_mirrored(scene: Scene, camera: Camera, values: Tensor) -> Tensor:
+    """[N, D] the same, by the weights in what the nearest pane of each pixel mirrors."""
+    camera = camera.to(scene.primary.means.device)
+    primary, near = replace(detached(scene.primary), active_sh_degree=0), NEAR_PER_EXTENT * scene.extent
+    seen = seen_panes(scene.planes, camera, nearest_hits(panes_in_camera(scene.planes, camera), camera), most=1)
+    if seen is None:
+        return values.new_zeros(len(primary), values.shape[-1])
+    of_pane = seen.order[0] == torch.arange(len(seen.planes), device=values.device)[:, None, None]
+    projected = project_mirrored(primary, camera, seen, near=near)
+    return _sums(projected, camera, of_pane[..., None] * values, seen.tiles).sum(dim=0)
+
+
 def _weight_sums(projected: Projected, camera: Camera, tiles: Tensor | None = None) -> Tensor:
     """[N] blending weights summed over the pixels of the images."""
     ones = projected.depths.new_ones(camera.height, camera.width, 1)
@@ -158,7 +170,10 @@ def _weight_sums(projected: Projected, camera: Camera, tiles: Tensor | None = No
 
 
 def _sums(projected: Projected, camera: Camera, values: Tensor, tiles: Tensor | None = None) -> Tensor:
-    """[C, N, D] what a constant channel has for a gradient where `values` [H, W, D] are those of the images."""
+    """[C, N, D] what a constant channel has for a gradient where `values` are those of the images.
+
+    They are [C, H, W, D], or [H, W, D] for all images.
+    """
     splats = joined_splats(projected)
     with torch.enable_grad():
         ones = projected.depths.new_ones(*projected.depths.shape, values.shape[-1]).requires_grad_()

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from glassplat.captures.dataset import Dataset
-from glassplat.captures.view import PointCloud
+from glassplat.captures.view import PointCloud, View, evenly
+from glassplat.render.frame import Frame, Renderer
 from glassplat.render.layers import contributions
-from glassplat.scene.camera import Camera
+from glassplat.scene.camera import Camera, moved
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.panes import behind_panes
+from glassplat.scene.panes import behind_panes, crosses_pane, in_image
 from glassplat.scene.scene import Scene
 from glassplat.training.densify import (
     Moments,
+    append,
     apply_edit,
     densified,
     forget,
@@ -33,6 +36,8 @@ from glassplat.training.losses import LossTerm, mean_opacity, mean_scale, of_all
 from glassplat.training.messages import Working
 from glassplat.training.options import DefaultDensify, McmcDensify, Rate, Rhythm, Strategy
 from glassplat.training.stage import Action, AverageLast, Clock, Every, PostStep, TrainState, Work
+
+log = logging.getLogger("glassplat.training")
 
 MEGAPIXEL = 1e6
 GAUSSIANS_PER_PIXEL = 0.5
@@ -389,3 +394,121 @@ def mcmc_population(densifier: McmcDensify, means_rate: Rate) -> Population:
         post_steps=(AddNoise(densifier, means_rate),) if densifier.noise_rate != 0 else (),
         terms=terms,
     )
+
+
+UNEXPLAINED = 0.1
+"""Mean difference of a photograph from its render, sRGB, over a window of `WINDOW` of its width, that is no detail."""
+WINDOW = 0.03
+CELLS = 96
+"""Places along the longest side of the box that is searched."""
+MOST_LOOKED_AT = 100
+"""Photographs that search it."""
+FEWEST_AGREEING, LEAST_AGREEING, MOST_SPREAD, MOST_ALIKE = 5, 0.7, 0.08, 0.98
+"""Photographs that must see something unexplained at a place; their share of all that look there directly; the standard
+deviation of its colour; and the length of the mean direction from which they look, 1 if all look from one side."""
+
+
+@dataclass(frozen=True)
+class SeedUnexplained:
+    """Adds Gaussians where several photographs agree that something is, and the scene does not.
+
+    Densification moves and copies what is there. A plain thing in an open space, such as a lamp, has no points, and
+    is found late or by chance (lab/gaussians.md). It stands where the photographs of it meet: in the visual hull of
+    what they show differently.
+
+    Attributes:
+        moment: share of the run at which to do it.
+        renderer: shows the scene as the photographs do.
+    """
+
+    moment: float
+    renderer: Renderer
+    name: str = "seed unexplained"
+
+    def due(self, clock: Clock) -> bool:
+        """Return whether to act after this step."""
+        return clock.is_at((self.moment,))
+
+    def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
+        """Edits `state`, if there is anything to edit, and tells how far it is."""
+        cloud, size = yield from unexplained_places(state.scene, dataset.train, self.renderer)
+        if not len(cloud):
+            return False
+        primary = state.scene.primary
+        seeds = gaussians_from_points(cloud, sh_degree=primary.max_sh_degree, opacity=0.5).to(primary.means.device)
+        seeds = seeds.with_tensors({"log_scales": torch.full_like(seeds.log_scales, math.log(size))})
+        channels = {name: seeds.channels[name] for name in primary.channels}
+        seeds = replace(seeds, active_sh_degree=primary.active_sh_degree, channels=channels)
+        primary, state.optimizer.moments = append(primary, state.optimizer.moments, seeds)
+        state.scene = replace(state.scene, primary=primary)
+        state.statistics.pop("primary", None)
+        log.info("%d Gaussians added where photographs agree on something that was not there", len(seeds))
+        return True
+
+
+@torch.no_grad()
+def unexplained_places(
+    scene: Scene, views: Sequence[View], renderer: Renderer
+) -> Generator[Working, None, tuple[PointCloud, float]]:
+    """Places where photographs agree on something that the scene lacks, and the size of a Gaussian there.
+
+    They are searched in a grid around the cameras. A pane hides what is behind it, because what it mirrors would be
+    found there.
+    """
+    views = evenly(views, MOST_LOOKED_AT)
+    device = scene.primary.means.device
+    places, cell = grid_around([view.camera for view in views], scene.extent)
+    places = places.to(device)
+    looking, agreeing = places.new_zeros(2, len(places))
+    colors, squares, sides = places.new_zeros(3, len(places), 3)
+    for done, view in enumerate(views):
+        yield Working("looking for what is missing", done, len(views))
+        camera = view.camera.to(device)
+        row, column, looks = _looked_at(scene, camera, places)
+        frame = renderer(scene, camera)
+        looks &= _past_panes(frame)[row, column]
+        missing = _unexplained(frame, view, scene)[row, column] & looks
+        color = moved(view.photo, device)[row, column].float() / 255 * missing[:, None]
+        looking, agreeing = looking + looks, agreeing + missing
+        colors, squares = colors + color, squares + color.square()
+        sides += torch.nn.functional.normalize(camera.center - places, dim=1) * missing[:, None]
+    mean = colors / agreeing.clamp(min=1)[:, None]
+    spread = (squares / agreeing.clamp(min=1)[:, None] - mean.square()).clamp(min=0).mean(dim=1).sqrt()
+    found = (agreeing >= FEWEST_AGREEING) & (agreeing >= LEAST_AGREEING * looking) & (spread < MOST_SPREAD)
+    found &= sides.norm(dim=1) < MOST_ALIKE * agreeing
+    cloud = PointCloud(places[found].cpu(), (255 * mean[found]).round().to(torch.uint8).cpu())
+    return cloud, 0.6 * cell
+
+
+def grid_around(cameras: Sequence[Camera], extent: float) -> tuple[Tensor, float]:
+    """[P, 3] centres of the cells of a grid over a box around the cameras, one extent larger, and a cell's side."""
+    centers = torch.stack([camera.center.cpu() for camera in cameras])
+    low, high = centers.amin(dim=0) - extent, centers.amax(dim=0) + extent
+    cell = float((high - low).amax()) / CELLS
+    axes = [torch.arange(float(a) + cell / 2, float(b), cell) for a, b in zip(low, high, strict=True)]
+    return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3), cell
+
+
+def _looked_at(scene: Scene, camera: Camera, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Row and column [P] of places in an image, and [P] bool which are in it and before all panes."""
+    pixels, _ = camera.project(places)
+    column = pixels[:, 0].nan_to_num().clamp(0, camera.width - 1).long()
+    row = pixels[:, 1].nan_to_num().clamp(0, camera.height - 1).long()
+    return row, column, in_image(places, camera) & ~crosses_pane(places, scene.planes, camera.center)
+
+
+def _unexplained(frame: Frame, view: View, scene: Scene) -> Tensor:
+    """[H, W] bool: pixels in which more than detail is missing."""
+    error = moved(view.photo, frame.rgb.device).float() / 255 - scene.exposures.applied(frame.rgb, view.name)
+    if view.ignored is not None:
+        error = error.masked_fill(moved(view.ignored, error.device)[..., None], 0)
+    reach = max(round(WINDOW / 2 * error.shape[1]), 1)
+    planes = error.movedim(-1, 0)[None]
+    mean = torch.nn.functional.avg_pool2d(planes, 2 * reach + 1, 1, reach, count_include_pad=False)[0]
+    return mean.abs().mean(dim=0) > UNEXPLAINED
+
+
+def _past_panes(frame: Frame) -> Tensor:
+    """[H, W] bool: pixels that show no pane."""
+    strength = frame.layers.get("strength")
+    return torch.ones_like(frame.rgb[..., 0], dtype=torch.bool) if strength is None else strength <= 0

@@ -13,10 +13,10 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -74,6 +74,7 @@ class Ranks:
         self.batch = count if batch is None else batch
         self.asked: Callable[[], bool] = lambda: False
         self._is_ending = False
+        self._thread = ThreadPoolExecutor(1)
 
     @property
     def leads(self) -> bool:
@@ -116,25 +117,14 @@ class Ranks:
         Raises:
             RuntimeError: this process was asked to end, and the others have not answered for `LAST_WAIT`.
         """
-        failures: list[BaseException] = []
-
-        def run() -> None:
-            try:
-                call()
-            except BaseException as error:
-                failures.append(error)
-
-        waiting = threading.Thread(target=run, daemon=True)
-        waiting.start()
         asked_at = None
-        while waiting.is_alive():
-            waiting.join(LAST_WAIT / 10)
+        waiting = self._thread.submit(call)
+        while not wait([waiting], LAST_WAIT / 10).done:
             if asked_at is None and self.asked():
                 asked_at = time.monotonic()
             if asked_at is not None and time.monotonic() - asked_at > LAST_WAIT:
                 raise RuntimeError("no answer since this one was asked to end")
-        if failures:
-            raise failures[0]
+        waiting.result()
 
     def summed(self, tensors: Sequence[Tensor]) -> list[Tensor]:
         """The sums over all ranks, of tensors of one type and device; call after an exchange."""

@@ -111,6 +111,10 @@ def blend_case(dtype: torch.dtype, count: int = 3) -> dict[str, Tensor]:
     }
 
 
+STRENGTH = ("normals", "base_reflectances")
+"""What the strength depends on, but for the mask."""
+
+
 def with_gradients(case: dict[str, Tensor], function: Callable[..., BlendedPanes], **switches: object) -> list[Tensor]:
     inputs = {name: case[name].detach().requires_grad_() for name in INPUTS}
     result = function(**(case | inputs), **switches)
@@ -141,6 +145,8 @@ def test_blend_gradients_match_finite_differences(name: str, fresnel: Fresnel) -
     case = blend_case(torch.float64)
     if name == "mask":
         case["mask"] = case["mask"].clamp(min=0.05)
+    if name in STRENGTH:
+        case["reflections"] = case["reflections"].clamp(max=case["reflections"].new_tensor([0.9, 0.9, 0.9, 0.0]))
     values = case[name].requires_grad_()
     directions = [torch.randn(values.shape, generator=torch.Generator().manual_seed(s)).double() for s in (4, 5)]
 
@@ -155,6 +161,23 @@ def test_blend_gradients_match_finite_differences(name: str, fresnel: Fresnel) -
         for direction in directions:
             slope = (objective(values + 1e-7 * direction) - objective(values - 1e-7 * direction)) / 2e-7
             assert math.isclose(float(slope), float((gradient * direction).sum()), rel_tol=1e-4, abs_tol=1e-4)
+
+
+@pytest.mark.parametrize("linear", [True, False])
+def test_what_is_brighter_than_white_tells_nothing_of_the_strength(linear: bool) -> None:
+    case = blend_case(torch.float64)
+    case["reflections"][..., :3], case["reflections"][..., 3] = 0.5, 0.0
+    case["reflections"][:, :, ::2, 3] = 9.0
+    by_strength = {}
+    for name in ("all", "dim"):
+        leaves = {leaf: case[leaf].detach().requires_grad_() for leaf in (*STRENGTH, "reflections", "mask")}
+        rgb = blend_panes(**(case | leaves), linear=linear).rgb
+        (rgb if name == "all" else rgb[:, 1::2]).square().sum().backward()
+        by_strength[name] = {leaf: leaves[leaf].grad for leaf in leaves}
+    for leaf in STRENGTH:
+        torch.testing.assert_close(by_strength["all"][leaf], by_strength["dim"][leaf])
+        assert bool(by_strength["all"][leaf].any())
+    assert bool(by_strength["all"]["reflections"][:, :, ::2].any()) and bool(by_strength["all"]["mask"][:, ::2].any())
 
 
 @pytest.mark.parametrize("fresnel", ["pane", "none"])

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from glassplat.captures.view import View
-from glassplat.methods.mirrors import Search, evenly, in_region, residual_spreads
+from glassplat.captures.view import View, evenly
+from glassplat.methods.mirrors import Search, in_region, residual_spreads
 from glassplat.render.deferred import Deferred
 from glassplat.render.layers import contributions
 from glassplat.scene import SH_ZERO, logit

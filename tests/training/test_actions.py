@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
+from glassplat.captures.dataset import Dataset
+from glassplat.captures.view import PointCloud, View
 from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.panes.material import glass_gaussians
+from glassplat.render.planar import Planar
+from glassplat.render.splat import Splat
+from glassplat.scene import SH_ZERO
+from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
-from glassplat.training.actions import Densify, PruneIdle, limit_of
-from glassplat.training.densify import ScreenStatistics
+from glassplat.training.actions import Densify, PruneIdle, SeedUnexplained, limit_of
+from glassplat.training.densify import ScreenStatistics, gaussians_from_points
 from glassplat.training.options import DefaultDensify
 from glassplat.training.stage import Clock, TrainState
+from tests.render.tiny_scene import concatenated
 from tests.training.progress_of import finished
 from tests.training.tiny_capture import tiny_capture
 
@@ -68,3 +80,68 @@ def test_a_set_grows_to_its_limit_and_no_further() -> None:
     share = (count + 2) / sum(view.camera.width * view.camera.height for view in capture.train)
     Densify(DefaultDensify(per_pixel=share)).apply(state, capture, Clock(10, 100, 5))
     assert len(state.scene.primary) == count + 2
+
+
+def views_of(scene: Scene) -> Dataset:
+    """Ten views of a scene in a half circle, without test views."""
+    views = []
+    for index in range(10):
+        angle = math.pi * (index - 4.5) / 10
+        place = (2.5 * math.sin(angle), 0.2 * (-1) ** index, -2.5 * math.cos(angle))
+        camera = Camera.look_at(place, (0, 0, 0), up=(0, -1, 0), width=80, height=60)
+        photo = (255 * Splat()(scene, camera).rgb.clamp(0, 1)).to(torch.uint8)
+        views.append(View.in_memory(f"{index}.png", camera, photo=photo))
+    points = PointCloud(scene.primary.means, torch.full_like(scene.primary.means, 128).to(torch.uint8))
+    return Dataset(Path("made"), tuple(views), (), points, scene.extent)
+
+
+def balls(centers: list[tuple[float, float, float]], colors: list[int], log_scale: float) -> Gaussians:
+    points = PointCloud(torch.tensor(centers), torch.tensor(colors)[:, None].repeat(1, 3).to(torch.uint8))
+    made = gaussians_from_points(points, sh_degree=0, opacity=0.99)
+    return made.with_tensors({"log_scales": torch.full((len(centers), 3), log_scale)})
+
+
+def test_a_thing_without_points_is_found_where_the_photographs_of_it_meet() -> None:
+    ground = balls([(x, 1.0, z) for x in (-1.0, 0.0, 1.0) for z in (-1.0, 0.0, 1.0)], [90] * 9, -1.5)
+    lamp = balls([(0.3, -0.2, 0.1)], [250], -1.8)
+    whole = Scene(concatenated(ground, lamp), 2.0)
+    state, capture = TrainState(Scene(ground, 2.0), seed=0), views_of(whole)
+    means = torch.ones_like(ground.means)
+    state.optimizer.moments["primary.means"] = (means, means.clone())
+    action = SeedUnexplained(0.2, Splat())
+    assert action.due(Clock(20, 100, 10)) and not action.due(Clock(21, 100, 10))
+    assert finished(action.apply(state, capture, Clock(20, 100, 10)))
+    added = state.scene.primary.means[len(ground) :]
+    assert len(added) > 5 and float((added - torch.tensor([0.3, -0.2, 0.1])).norm(dim=1).max()) < 0.5
+    assert float((state.scene.primary.sh[len(ground) :, 0] * SH_ZERO + 0.5).mean()) > 0.3
+    assert not bool(state.optimizer.moments["primary.means"][0][len(ground) :].any())
+    before = float(
+        (Splat()(Scene(ground, 2.0), capture.train[4].camera).rgb - capture.train[4].photo / 255).abs().mean()
+    )
+    after = float((Splat()(state.scene, capture.train[4].camera).rgb - capture.train[4].photo / 255).abs().mean())
+    assert after < 0.5 * before
+
+
+def test_nothing_is_added_where_the_scene_explains_the_photographs() -> None:
+    whole = Scene(balls([(0.0, 0.0, 0.0), (0.5, 0.2, 0.3)], [200, 90], -1.8), 2.0)
+    state = TrainState(whole, seed=0)
+    assert not finished(SeedUnexplained(0.2, Splat()).apply(state, views_of(whole), Clock(20, 100, 10)))
+    assert state.scene is whole
+
+
+def test_what_a_pane_mirrors_is_not_found_behind_it() -> None:
+    planes = Planes.rectangle((0.0, 0.0, 0.5), (0.0, 0.0, -1.0), (3.0, 3.0))
+    room = balls([(0.0, 0.0, -1.2)], [250], -1.5)
+    mirror = planes.with_tensors({"logit_reflectances": torch.logit(torch.tensor([0.9]))})
+    whole = Scene(room, 2.0, glass=glass_gaussians(mirror, opacity=0.9), planes=mirror)
+    plain = replace(whole, planes=mirror.with_tensors({"logit_reflectances": torch.logit(torch.tensor([0.01]))}))
+    shown = [
+        View.in_memory(
+            view.name, view.camera, photo=(255 * Planar()(whole, view.camera).rgb.clamp(0, 1)).to(torch.uint8)
+        )
+        for view in views_of(whole).train
+    ]
+    state = TrainState(plain, seed=0)
+    capture = replace(views_of(whole), train=tuple(shown))
+    finished(SeedUnexplained(0.2, Planar()).apply(state, capture, Clock(20, 100, 10)))
+    assert not bool((state.scene.primary.means[len(room) :, 2] > 0.5).any())

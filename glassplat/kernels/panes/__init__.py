@@ -87,7 +87,8 @@ def blend_panes(
     Where no pane is shown or the mask is 0, the image is the transmission, bit for bit, and strength and reflection
     are 0; also the image where the strength is 0.
 
-    Differentiable in `transmission`, `mask`, `reflections`, `normals` and `base_reflectances`.
+    Differentiable in `transmission`, `mask`, `reflections`, `normals` and `base_reflectances`. The last two get no
+    gradient from pixels that mirror what is brighter than white: photographs do not say how bright a lamp is.
 
     Args:
         transmission: [H, W, 3] C_t, sRGB.

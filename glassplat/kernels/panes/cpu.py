@@ -122,8 +122,8 @@ ALL = (1 << LANES) - 1
 MASK, GAIN, RAW, SHARE, ALONG, LENGTH = (plane * RUN for plane in range(6))
 BEHIND, MIRRORED, RGB, BRIGHT = (plane * RUN for plane in (6, 9, 12, 15))
 FORWARD_PLANES = 18
-V_RGB, V_BRIGHT, V_SHARE, V_GAIN = (plane * RUN for plane in (18, 21, 24, 25))
-BACKWARD_PLANES = 26
+V_RGB, V_BRIGHT, V_SHARE, V_GAIN, TOLD = (plane * RUN for plane in (18, 21, 24, 25, 26))
+BACKWARD_PLANES = 27
 
 
 def blend_panes(inputs: Sequence[Tensor], switches: tuple[int, bool, bool]) -> tuple[Tensor, ...]:
@@ -322,7 +322,10 @@ def _unmix(real: type) -> Scalar:
 
     @inlined
     def unmix(run, d, linear):
-        """Gradients of channel d; those of BEHIND and MIRRORED replace V_RGB and V_BRIGHT, the others add up."""
+        """Gradients of channel d; those of BEHIND and MIRRORED replace V_RGB and V_BRIGHT, the others add up.
+
+        Where the reflection is brighter than white, TOLD becomes zero.
+        """
         at = d * RUN
         for i in range(RUN):
             behind, mirrored = run[BEHIND + at + i], run[MIRRORED + at + i]
@@ -335,12 +338,14 @@ def _unmix(real: type) -> Scalar:
                 mixed = lit + share * (bright - lit)
                 v_mixed *= encoded_slope(mixed, encoded(mixed))
                 v_bright = v_mixed * share + v_bright * encoded_slope(bright, encoded(bright))
+                run[TOLD + i] = run[TOLD + i] if bright <= one else zero
                 run[V_SHARE + i] += v_mixed * (bright - lit)
                 run[V_GAIN + i] += v_bright * shone
                 run[V_RGB + at + i] = v_mixed * (one - share) * linear_slope(behind, lit)
                 run[V_BRIGHT + at + i] = v_bright * gain * linear_slope(mirrored, shone)
             else:
                 v_bright += v_mixed * share
+                run[TOLD + i] = run[TOLD + i] if mirrored * gain <= one else zero
                 run[V_SHARE + i] += v_mixed * (mirrored * gain - behind)
                 run[V_GAIN + i] += v_bright * mirrored
                 run[V_RGB + at + i] = v_mixed * (one - share)
@@ -361,7 +366,7 @@ def _dim(real: type) -> Scalar:
         sum_x, sum_1, sum_base = zero, zero, zero
         for i in range(RUN):
             marked, along, length = run[MASK + i], run[ALONG + i], run[LENGTH + i]
-            v_raw = run[V_SHARE + i] * marked if marked > zero else zero
+            v_raw = run[V_SHARE + i] * marked * run[TOLD + i] if marked > zero else zero
             by_base, by_cosine = strength_slopes(law, base, abs(along) / length)
             slope = v_raw * by_cosine / length
             slope = slope if along > zero else -slope
@@ -378,7 +383,7 @@ def blend_panes_backward(real: type) -> Kernel:
     """Fills the gradients of transmission, mask, reflections, normals and base reflectances; all start at zero."""
     load, shine, unmix, dim = _load(real), _shine(real), _unmix(real), _dim(real)
     load_lanes, (load_triples, store_triples) = vector_kind(real, LANES).load, _copies(real)
-    zero = real(0.0)
+    zero, one = real(0.0), real(1.0)
 
     @kernel("blend_panes_backward", real)
     def backward(
@@ -404,6 +409,7 @@ def blend_panes_backward(real: type) -> Kernel:
                     y = shine(run, normals, bases, k, row, first, intrinsics, law)
                     for i in range(RUN):
                         run[V_SHARE + i], run[V_GAIN + i] = v_strength[row, first + min(i, count - 1)], zero
+                        run[TOLD + i] = one
                     for start in range(0, count, LANES):
                         if start + LANES <= count:
                             load_triples(run, V_RGB + start, v_mixed, row * width + first + start)

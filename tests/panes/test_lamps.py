@@ -1,0 +1,115 @@
+"""Lamps found by their reflections, and what panes mirror that no photograph shows."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from glassplat.captures.view import PointCloud
+from glassplat.panes.material import Photograph, glass_gaussians, mirrored_lamps, unseen_places
+from glassplat.render.planar import Planar
+from glassplat.scene.camera import Camera
+from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.panes import Planes
+from glassplat.scene.scene import Scene
+from glassplat.training.densify import gaussians_from_points
+from tests.render.tiny_scene import concatenated
+
+LAMP = (0.9, 0.0, 1.0)
+IMAGE = (0.9, 0.0, 3.0)
+RADIANCE = 6.0
+
+
+def camera(x: float) -> Camera:
+    pose = torch.eye(4)
+    pose[:3, 3] = torch.tensor([-x, 0.0, 0.3])
+    return Camera(pose, 100.0, 100.0, 80.0, 60.0, 160, 120)
+
+
+CAMERAS = [camera(x) for x in (-0.3, -0.1, 0.0, 0.1, 0.3)]
+
+
+def gaussians(means: Tensor, color: int, log_scale: float) -> Gaussians:
+    made = gaussians_from_points(
+        PointCloud(means, torch.full_like(means, color).to(torch.uint8)), sh_degree=0, opacity=0.99
+    )
+    return made.with_tensors({"means": means, "log_scales": torch.full((len(means), 3), log_scale)})
+
+
+def panel(center: tuple[float, float, float], color: int = 255) -> Gaussians:
+    side = torch.linspace(-0.2, 0.2, 9)
+    means = torch.tensor(center) + torch.cartesian_prod(side, side, torch.zeros(1))
+    return gaussians(means, color, math.log(0.03))
+
+
+def wall(depth: float, color: int = 40) -> Gaussians:
+    side = torch.linspace(-5, 5, 31)
+    return gaussians(torch.cartesian_prod(side, side, torch.tensor([depth])), color, math.log(0.25))
+
+
+def scene_of(*parts: Gaussians) -> Scene:
+    planes = Planes.rectangle((0.0, 0.0, 2.0), (0.0, 0.0, -1.0), (0.8, 0.8))
+    planes = planes.with_tensors({"logit_reflectances": torch.logit(torch.tensor([0.1]))})
+    return Scene(concatenated(*parts), 2.0, glass=glass_gaussians(planes, opacity=0.9), planes=planes)
+
+
+def shining(lamp: Gaussians) -> Gaussians:
+    return lamp.with_tensors({"log_intensity": torch.full((len(lamp),), math.log(RADIANCE))})
+
+
+def photographs_of(scene: Scene) -> list[Photograph]:
+    return [
+        Photograph(view, rgb, torch.ones_like(rgb[..., 0], dtype=torch.bool), None)
+        for view in CAMERAS
+        for rgb in [Planar()(scene, view).rgb.clamp(0, 1)]
+    ]
+
+
+def test_the_image_of_a_lamp_is_found_and_the_lamp_gets_its_radiance() -> None:
+    photographs = photographs_of(scene_of(wall(4.0), shining(panel(LAMP))))
+    first = scene_of(wall(4.0), panel(LAMP), panel(IMAGE))
+    lamps = mirrored_lamps(first, first.planes, photographs)
+    assert lamps is not None
+    before, lamp = len(wall(4.0)), len(panel(LAMP))
+    assert bool(lamps.images[before + lamp :].float().mean() > 0.7) and not bool(lamps.images[: before + lamp].any())
+    gains = lamps.gains[before : before + lamp]
+    assert bool((gains > 1).float().mean() > 0.5) and not bool((lamps.gains[:before] != 1).any())
+    assert 0.7 * RADIANCE < float(gains[gains > 1].median()) < 1.3 * RADIANCE
+
+
+@pytest.mark.parametrize(
+    ("photographed", "first"),
+    [
+        pytest.param([panel(LAMP, 200), panel(IMAGE)], [panel(LAMP, 200), panel(IMAGE)], id="grey where it is seen"),
+        pytest.param(
+            [panel(LAMP), panel((0.5, 0.4, 3.0))], [panel(LAMP), panel((0.5, 0.4, 3.0))], id="as bright as white"
+        ),
+        pytest.param([shining(panel(LAMP))], [shining(panel(LAMP)), panel((0.2, 0.3, 3.0))], id="an image elsewhere"),
+    ],
+)
+def test_nothing_is_taken_for_a_lamp_that_need_not_be_one(
+    photographed: list[Gaussians], first: list[Gaussians]
+) -> None:
+    scene = scene_of(wall(4.0), *first)
+    assert mirrored_lamps(scene, scene.planes, photographs_of(scene_of(wall(4.0), *photographed))) is None
+
+
+def test_ignored_pixels_make_no_lamp() -> None:
+    photographs = photographs_of(scene_of(wall(4.0), shining(panel(LAMP))))
+    hidden = [one._replace(told=torch.zeros_like(one.told)) for one in photographs]
+    first = scene_of(wall(4.0), panel(LAMP), panel(IMAGE))
+    assert mirrored_lamps(first, first.planes, hidden) is None
+
+
+def test_places_are_found_where_a_pane_mirrors_nothing_and_nowhere_else() -> None:
+    half = wall(-3.0, 120)
+    half = half.select(half.means[:, 0] < 0)
+    empty, closed = scene_of(wall(4.0), half), scene_of(wall(4.0), wall(-3.0, 120))
+    found = unseen_places(empty, empty.planes, CAMERAS)
+    assert len(found.places) > 10
+    assert bool((found.places[:, 2] < 2).all()) and float((found.places[:, 0] > -0.5).float().mean()) == 1
+    torch.testing.assert_close(found.color, torch.full((3,), 120 / 255), atol=0.02, rtol=0)
+    assert len(unseen_places(closed, closed.planes, CAMERAS).places) == 0
