@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-from glassplat.captures.view import PointCloud
-from glassplat.panes.material import Photograph, glass_gaussians, mirrored_lamps, unseen_places
+from glassplat.captures.dataset import Dataset
+from glassplat.captures.view import PointCloud, View
+from glassplat.methods.planar import FillUnseen, LightLamps
+from glassplat.panes.material import Photograph, glass_gaussians, mirrored_image, mirrored_lamps, unseen_places
 from glassplat.render.planar import Planar
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
 from glassplat.training.densify import gaussians_from_points
+from glassplat.training.stage import Clock, TrainState
 from tests.render.tiny_scene import concatenated
+from tests.training.progress_of import finished
 
 LAMP = (0.9, 0.0, 1.0)
 IMAGE = (0.9, 0.0, 3.0)
@@ -113,3 +119,44 @@ def test_places_are_found_where_a_pane_mirrors_nothing_and_nowhere_else() -> Non
     assert bool((found.places[:, 2] < 2).all()) and float((found.places[:, 0] > -0.5).float().mean()) == 1
     torch.testing.assert_close(found.color, torch.full((3,), 120 / 255), atol=0.02, rtol=0)
     assert len(unseen_places(closed, closed.planes, CAMERAS).places) == 0
+
+
+def state_of(scene: Scene) -> TrainState:
+    state, ones = TrainState(scene, seed=0), torch.ones_like(scene.primary.means)
+    state.optimizer.moments["primary.means"] = (ones, ones.clone())
+    return state
+
+
+def capture_of(scene: Scene) -> Dataset:
+    views = []
+    for number, view in enumerate(CAMERAS):
+        photo = (255 * Planar()(scene, view).rgb.clamp(0, 1)).to(torch.uint8)
+        views.append(View.in_memory(f"{number}.png", view, photo=photo))
+    points = PointCloud(scene.primary.means, torch.full_like(scene.primary.means, 128).to(torch.uint8))
+    return Dataset(Path("made"), tuple(views), (), points, scene.extent, pane_labels=(1,))
+
+
+def test_lamps_are_lit_at_their_moments_and_their_images_go() -> None:
+    capture = capture_of(scene_of(wall(4.0), shining(panel(LAMP))))
+    state, action = state_of(scene_of(wall(4.0), panel(LAMP), panel(IMAGE))), LightLamps((0.4, 0.6))
+    assert [step for step in range(101) if action.due(Clock(step, 100, 5))] == [40, 60]
+    before = len(state.scene.primary)
+    assert finished(action.apply(state, capture, Clock(40, 100, 5)))
+    gone = before - len(state.scene.primary)
+    assert 0 < gone <= len(panel(IMAGE)) == before - len(wall(4.0)) - len(panel(LAMP))
+    assert len(state.optimizer.moments["primary.means"][0]) == len(state.scene.primary)
+    assert float(state.scene.primary.channels["log_intensity"].max()) > math.log(0.5 * RADIANCE)
+    mirrors = scene_of(wall(4.0), panel(LAMP), panel(IMAGE))
+    mirrors = replace(mirrors, planes=replace(mirrors.planes, mirrors=(1,)))
+    assert not finished(action.apply(state_of(mirrors), capture, Clock(40, 100, 5)))
+
+
+def test_what_a_pane_mirrors_unseen_is_filled_once() -> None:
+    scene = scene_of(wall(4.0), wall(-3.0, 120).select(wall(-3.0).means[:, 0] < 0))
+    state, action = state_of(scene), FillUnseen(0.5)
+    assert finished(action.apply(state, capture_of(scene), Clock(50, 100, 5)))
+    added = len(state.scene.primary) - len(scene.primary)
+    assert added > 10 and not bool(state.optimizer.moments["primary.means"][0][-added:].any())
+    images = [mirrored_image(one, CAMERAS[2]) for one in (scene, state.scene)]
+    holes = [int((image.seen & (image.coverage < 0.5)).sum()) for image in images]
+    assert holes[1] < 0.5 * holes[0]

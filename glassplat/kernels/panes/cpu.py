@@ -33,7 +33,7 @@ from glassplat.kernels.backend.cpu_vector import (
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.images import color_space_maths
 from glassplat.kernels.maths.pane import pane_maths
-from glassplat.kernels.records import REAL_OF, TILE, PaneHits
+from glassplat.kernels.records import DAZZLING, REAL_OF, TILE, PaneHits
 
 
 def pane_hits(
@@ -318,13 +318,13 @@ def blend_panes_forward(real: type) -> Kernel:
 
 def _unmix(real: type) -> Scalar:
     linear_of, linear_slope, encoded, encoded_slope = color_space_maths(real)
-    zero, one = real(0.0), real(1.0)
+    zero, one, dazzling = real(0.0), real(1.0), real(DAZZLING)
 
     @inlined
     def unmix(run, d, linear):
         """Gradients of channel d; those of BEHIND and MIRRORED replace V_RGB and V_BRIGHT, the others add up.
 
-        Where the reflection is brighter than white, TOLD becomes zero.
+        Where the reflection is `DAZZLING`, TOLD becomes zero.
         """
         at = d * RUN
         for i in range(RUN):
@@ -338,14 +338,14 @@ def _unmix(real: type) -> Scalar:
                 mixed = lit + share * (bright - lit)
                 v_mixed *= encoded_slope(mixed, encoded(mixed))
                 v_bright = v_mixed * share + v_bright * encoded_slope(bright, encoded(bright))
-                run[TOLD + i] = run[TOLD + i] if bright <= one else zero
+                run[TOLD + i] = run[TOLD + i] if bright <= dazzling else zero
                 run[V_SHARE + i] += v_mixed * (bright - lit)
                 run[V_GAIN + i] += v_bright * shone
                 run[V_RGB + at + i] = v_mixed * (one - share) * linear_slope(behind, lit)
                 run[V_BRIGHT + at + i] = v_bright * gain * linear_slope(mirrored, shone)
             else:
                 v_bright += v_mixed * share
-                run[TOLD + i] = run[TOLD + i] if mirrored * gain <= one else zero
+                run[TOLD + i] = run[TOLD + i] if mirrored * gain <= dazzling else zero
                 run[V_SHARE + i] += v_mixed * (mirrored * gain - behind)
                 run[V_GAIN + i] += v_bright * mirrored
                 run[V_RGB + at + i] = v_mixed * (one - share)

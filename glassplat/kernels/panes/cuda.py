@@ -15,7 +15,7 @@ from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.images import color_space_maths
 from glassplat.kernels.maths.pane import pane_maths
-from glassplat.kernels.records import REAL_OF, TILE, PaneHits
+from glassplat.kernels.records import DAZZLING, REAL_OF, TILE, PaneHits
 
 PIXELS = TILE * TILE
 
@@ -197,7 +197,7 @@ def blend_panes_backward(real: type) -> Kernel:
     """
     shine, strength_slopes = _shine(real), pane_maths(real).strength_slopes
     linear_of, linear_slope, encoded, encoded_slope = color_space_maths(real)
-    zero, one = real(0.0), real(1.0)
+    zero, one, dazzling = real(0.0), real(1.0), real(DAZZLING)
 
     @kernel("blend_panes_backward", real, f"{INPUTS} real3 real3 real2 real3 real2 real4 real3")
     def backward(
@@ -226,14 +226,14 @@ def blend_panes_backward(real: type) -> Kernel:
                 mixed = lit + share * (bright - lit)
                 v_mixed *= encoded_slope(mixed, encoded(mixed))
                 v_bright = v_mixed * share + v_bright * encoded_slope(bright, encoded(bright))
-                told = told if bright <= one else zero
+                told = told if bright <= dazzling else zero
                 v_share += v_mixed * (bright - lit)
                 v_gain += v_bright * shone
                 mixed_behind = v_mixed * (one - share) * linear_slope(behind, lit)
                 v_reflections[k, row, column, d] = v_bright * gain * linear_slope(mirrored, shone)
             else:
                 v_bright += v_mixed * share
-                told = told if mirrored * gain <= one else zero
+                told = told if mirrored * gain <= dazzling else zero
                 v_share += v_mixed * (mirrored * gain - behind)
                 v_gain += v_bright * mirrored
                 mixed_behind = v_mixed * (one - share)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from glassplat.kernels import Fresnel
 from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
-from glassplat.kernels.records import TILE, BlendedPanes, PaneHits, Panes
+from glassplat.kernels.records import DAZZLING, TILE, BlendedPanes, PaneHits, Panes
 
 
 def pane_hits(
@@ -99,7 +99,7 @@ def blend_panes(
         reflection = torch.where(shown[..., None], bright, reflection)
         light = linear_from_srgb(color) * gain if linear else bright
         share = REFLECTANCE[fresnel](base, cosine)
-        share = torch.where((light <= 1).all(dim=-1), share, share.detach())
+        share = torch.where((light <= DAZZLING).all(dim=-1), share, share.detach())
         strength = torch.where(shown, share * mask, strength)
     share = strength[..., None]
     if linear:
