@@ -92,7 +92,7 @@ def test_a_plane_through_the_camera_is_not_hit() -> None:
 
 
 def blend_case(dtype: torch.dtype, count: int = 3) -> dict[str, Tensor]:
-    """Random arguments of `blend_panes`; a tenth of the mask is 0, some colours are dark, some beyond 1."""
+    """Random arguments of `blend_panes`: a tenth of the mask is 0, some colours are dark, some dazzling."""
     panes, intrinsics = random_panes(count, dtype)
     generator = torch.Generator().manual_seed(2)
 
@@ -103,7 +103,8 @@ def blend_case(dtype: torch.dtype, count: int = 3) -> dict[str, Tensor]:
     return {
         "transmission": 1.2 * draw(HEIGHT, WIDTH, 3) ** 3,
         "mask": torch.where(mask < 0.1, 0, mask),
-        "reflections": 1.2 * draw(count, HEIGHT, WIDTH, 4) ** 3 - intrinsics.new_tensor([0, 0, 0, 1]),
+        "reflections": intrinsics.new_tensor([1.2, 1.2, 1.2, 4.0]) * draw(count, HEIGHT, WIDTH, 4) ** 3
+        - intrinsics.new_tensor([0, 0, 0, 1]),
         "pane": pane_hits(panes, intrinsics, WIDTH, HEIGHT).pane,
         "normals": panes.normals,
         "base_reflectances": 0.9 * draw(count),

@@ -340,7 +340,7 @@ def test_blend_panes(switches: tuple[Fresnel, bool, bool], dtype: torch.dtype) -
     panes, intrinsics = two_panes(dtype)
     pane = panes_twin.pane_hits(panes, intrinsics, WIDTH, HEIGHT).pane
     mask = draw(HEIGHT, WIDTH, seed=1).to(dtype).clamp(min=0, max=1)
-    images = (torch.rand(HEIGHT, WIDTH, 3, dtype=dtype), mask, torch.rand(2, HEIGHT, WIDTH, 4, dtype=dtype))
+    images = (torch.rand(HEIGHT, WIDTH, 3, dtype=dtype), mask, 2 * torch.rand(2, HEIGHT, WIDTH, 4, dtype=dtype))
     leaves = [t.requires_grad_() for t in (*images, panes.normals, torch.tensor([0.04, 0.5], dtype=dtype))]
     own = [on_device(leaf) for leaf in leaves]
     names = dict(zip(("fresnel", "intensity", "linear"), switches, strict=True))
