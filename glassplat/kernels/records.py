@@ -98,8 +98,8 @@ MOST_CHANNELS = 32
 
 TILE = 16
 """Edge of a tile in pixels."""
-DAZZLING = 2.0
-"""Light that a pane mirrors, white being 1, from which only a lamp is so bright."""
+DAZZLING = 1.5
+"""Intensity of a reflection beyond which it is that of a lamp."""
 
 MOST_PAIRS = 2**31 - 1
 """(tile, splat) pairs that their index type can count."""

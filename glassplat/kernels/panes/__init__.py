@@ -88,7 +88,7 @@ def blend_panes(
     are 0; also the image where the strength is 0.
 
     Differentiable in `transmission`, `mask`, `reflections`, `normals` and `base_reflectances`. The last two get no
-    gradient from pixels that mirror what is `DAZZLING`: photographs do not say how bright a lamp is.
+    gradient where A is `DAZZLING`: a lamp's reflection says how bright the lamp is, and nothing of the pane.
 
     Args:
         transmission: [H, W, 3] C_t, sRGB.

@@ -122,8 +122,8 @@ ALL = (1 << LANES) - 1
 MASK, GAIN, RAW, SHARE, ALONG, LENGTH = (plane * RUN for plane in range(6))
 BEHIND, MIRRORED, RGB, BRIGHT = (plane * RUN for plane in (6, 9, 12, 15))
 FORWARD_PLANES = 18
-V_RGB, V_BRIGHT, V_SHARE, V_GAIN, TOLD = (plane * RUN for plane in (18, 21, 24, 25, 26))
-BACKWARD_PLANES = 27
+V_RGB, V_BRIGHT, V_SHARE, V_GAIN = (plane * RUN for plane in (18, 21, 24, 25))
+BACKWARD_PLANES = 26
 
 
 def blend_panes(inputs: Sequence[Tensor], switches: tuple[int, bool, bool]) -> tuple[Tensor, ...]:
@@ -318,14 +318,11 @@ def blend_panes_forward(real: type) -> Kernel:
 
 def _unmix(real: type) -> Scalar:
     linear_of, linear_slope, encoded, encoded_slope = color_space_maths(real)
-    zero, one, dazzling = real(0.0), real(1.0), real(DAZZLING)
+    zero, one = real(0.0), real(1.0)
 
     @inlined
     def unmix(run, d, linear):
-        """Gradients of channel d; those of BEHIND and MIRRORED replace V_RGB and V_BRIGHT, the others add up.
-
-        Where the reflection is `DAZZLING`, TOLD becomes zero.
-        """
+        """Gradients of channel d; those of BEHIND and MIRRORED replace V_RGB and V_BRIGHT, the others add up."""
         at = d * RUN
         for i in range(RUN):
             behind, mirrored = run[BEHIND + at + i], run[MIRRORED + at + i]
@@ -338,14 +335,12 @@ def _unmix(real: type) -> Scalar:
                 mixed = lit + share * (bright - lit)
                 v_mixed *= encoded_slope(mixed, encoded(mixed))
                 v_bright = v_mixed * share + v_bright * encoded_slope(bright, encoded(bright))
-                run[TOLD + i] = run[TOLD + i] if bright <= dazzling else zero
                 run[V_SHARE + i] += v_mixed * (bright - lit)
                 run[V_GAIN + i] += v_bright * shone
                 run[V_RGB + at + i] = v_mixed * (one - share) * linear_slope(behind, lit)
                 run[V_BRIGHT + at + i] = v_bright * gain * linear_slope(mirrored, shone)
             else:
                 v_bright += v_mixed * share
-                run[TOLD + i] = run[TOLD + i] if mirrored * gain <= dazzling else zero
                 run[V_SHARE + i] += v_mixed * (mirrored * gain - behind)
                 run[V_GAIN + i] += v_bright * mirrored
                 run[V_RGB + at + i] = v_mixed * (one - share)
@@ -356,7 +351,7 @@ def _unmix(real: type) -> Scalar:
 
 def _dim(real: type) -> Scalar:
     strength_slopes = pane_maths(real).strength_slopes
-    zero, one, half = real(0.0), real(1.0), real(0.5)
+    zero, one, half, dazzling = real(0.0), real(1.0), real(0.5), real(DAZZLING)
 
     @inlined
     def dim(run, base, first, intrinsics, law):
@@ -366,7 +361,7 @@ def _dim(real: type) -> Scalar:
         sum_x, sum_1, sum_base = zero, zero, zero
         for i in range(RUN):
             marked, along, length = run[MASK + i], run[ALONG + i], run[LENGTH + i]
-            v_raw = run[V_SHARE + i] * marked * run[TOLD + i] if marked > zero else zero
+            v_raw = run[V_SHARE + i] * marked if (marked > zero) & (run[GAIN + i] <= dazzling) else zero
             by_base, by_cosine = strength_slopes(law, base, abs(along) / length)
             slope = v_raw * by_cosine / length
             slope = slope if along > zero else -slope
@@ -383,7 +378,7 @@ def blend_panes_backward(real: type) -> Kernel:
     """Fills the gradients of transmission, mask, reflections, normals and base reflectances; all start at zero."""
     load, shine, unmix, dim = _load(real), _shine(real), _unmix(real), _dim(real)
     load_lanes, (load_triples, store_triples) = vector_kind(real, LANES).load, _copies(real)
-    zero, one = real(0.0), real(1.0)
+    zero = real(0.0)
 
     @kernel("blend_panes_backward", real)
     def backward(
@@ -409,7 +404,6 @@ def blend_panes_backward(real: type) -> Kernel:
                     y = shine(run, normals, bases, k, row, first, intrinsics, law)
                     for i in range(RUN):
                         run[V_SHARE + i], run[V_GAIN + i] = v_strength[row, first + min(i, count - 1)], zero
-                        run[TOLD + i] = one
                     for start in range(0, count, LANES):
                         if start + LANES <= count:
                             load_triples(run, V_RGB + start, v_mixed, row * width + first + start)

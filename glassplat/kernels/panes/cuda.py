@@ -214,7 +214,7 @@ def blend_panes_backward(real: type) -> Kernel:
                 v_transmission[row, column, d] = v_rgb[row, column, d]
             return
         raw, x, y, along, length = shine(row, column, k, normals, bases, intrinsics, law)
-        share, v_share, v_gain, told = raw * marked, v_strength[row, column], zero, one
+        share, v_share, v_gain = raw * marked, v_strength[row, column], zero
         gain = one + reflections[k, row, column, 3] if intensity else one
         for d in range(3):
             behind, mirrored = transmission[row, column, d], reflections[k, row, column, d]
@@ -226,14 +226,12 @@ def blend_panes_backward(real: type) -> Kernel:
                 mixed = lit + share * (bright - lit)
                 v_mixed *= encoded_slope(mixed, encoded(mixed))
                 v_bright = v_mixed * share + v_bright * encoded_slope(bright, encoded(bright))
-                told = told if bright <= dazzling else zero
                 v_share += v_mixed * (bright - lit)
                 v_gain += v_bright * shone
                 mixed_behind = v_mixed * (one - share) * linear_slope(behind, lit)
                 v_reflections[k, row, column, d] = v_bright * gain * linear_slope(mirrored, shone)
             else:
                 v_bright += v_mixed * share
-                told = told if mirrored * gain <= dazzling else zero
                 v_share += v_mixed * (mirrored * gain - behind)
                 v_gain += v_bright * mirrored
                 mixed_behind = v_mixed * (one - share)
@@ -241,7 +239,7 @@ def blend_panes_backward(real: type) -> Kernel:
             v_transmission[row, column, d] = mixed_behind if share > zero else v_behind
         v_reflections[k, row, column, 3] = v_gain if intensity else zero
         v_mask[row, column] = v_share * raw
-        v_raw = v_share * marked * told
+        v_raw = v_share * marked if gain <= dazzling else zero
         by_base, by_cosine = strength_slopes(law, bases[k], abs(along) / length)
         slope = v_raw * by_cosine / length
         slope = slope if along > zero else -slope

@@ -94,13 +94,12 @@ def blend_panes(
         cosine = (rays @ normals[k]).abs().clamp(max=1)
         base = base_reflectances[k]
         gain = 1 + reflections[k, ..., 3:] if intensity else torch.ones_like(mask)[..., None]
+        share = REFLECTANCE[fresnel](base, cosine)
+        share = torch.where(gain[..., 0] <= DAZZLING, share, share.detach())
+        strength = torch.where(shown, share * mask, strength)
         color = reflections[k, ..., :3]
         bright = srgb_from_linear(linear_from_srgb(color) * gain) if linear else color * gain
         reflection = torch.where(shown[..., None], bright, reflection)
-        light = linear_from_srgb(color) * gain if linear else bright
-        share = REFLECTANCE[fresnel](base, cosine)
-        share = torch.where((light <= DAZZLING).all(dim=-1), share, share.detach())
-        strength = torch.where(shown, share * mask, strength)
     share = strength[..., None]
     if linear:
         behind, mirrored = linear_from_srgb(transmission), linear_from_srgb(reflection)
