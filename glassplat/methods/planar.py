@@ -35,6 +35,7 @@ from glassplat.scene.gaussians import Gaussians, mirrored_gaussians
 from glassplat.scene.panes import Planes, coplanar_groups
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import (
+    MOST_ADDED,
     Densify,
     GrowSh,
     PerturbOpacity,
@@ -338,7 +339,7 @@ class FillUnseen:
         for done, panes in enumerate(of_glass):
             yield Working(f"looking for what {named(panes, 'pane')} can mirror", done, len(of_glass))
             places, color = unseen_places(state.scene, panes, cameras)
-            if len(places):
+            if 0 < len(places) < MOST_ADDED * len(state.scene.primary):
                 colors = (255 * color).round().to(torch.uint8).expand(len(places), 3)
                 seeds = seeds_of(state, PointCloud(places.cpu(), colors.cpu()), opacity=0.7, spread=0.7)
                 add_primary(state, seeds)

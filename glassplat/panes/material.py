@@ -623,9 +623,9 @@ def _gains_of(scene: Scene, lamps: Tensor, photographs: Sequence[Photograph]) ->
 UNCOVERED = 0.5
 """Coverage of the mirrored image below which it counts as a hole."""
 HOLE_CAMERAS, RAYS_ACROSS, CELLS_ACROSS = 24, 40, 60
-"""Cameras that look for holes, rays across an image, and cells along the room's diagonal with a place each."""
-ROOM_QUANTILE = 0.01
-"""Of the Gaussians' positions along each axis, how many lie beyond either end of the room."""
+"""Cameras that look for holes, rays across an image, and cells across the room with a place each."""
+BEYOND = 0.05
+"""Of the Gaussians, how many are farther from the middle of the cameras than the end of the room."""
 
 
 class Unseen(NamedTuple):
@@ -648,38 +648,34 @@ def unseen_places(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -> Uns
     """
     device = scene.primary.means.device
     cameras = [camera.to(device) for camera in evenly(cameras, HOLE_CAMERAS)]
-    low, high = _room_of(scene, cameras)
+    middle = torch.stack([camera.center for camera in cameras]).mean(dim=0)
+    away = (scene.primary.means - middle).norm(dim=1).sort().values
+    radius = away[int((1 - BEYOND) * (len(away) - 1))]
     places, colors = [], [torch.zeros(0, 3, device=device)]
     for camera in cameras:
         for row in range(len(panes)):
             pane = panes.select([row])
             image = mirrored_image(replace(scene, planes=pane), camera)
             colors.append(image.color[image.seen & (image.coverage > LEAST_COVERAGE)].clamp(0, 1))
-            places.append(_ends_of_rays(pane, camera, image.seen & (image.coverage < UNCOVERED), low, high))
+            places.append(_ends_of_rays(pane, camera, image.seen & (image.coverage < UNCOVERED), middle, radius))
     found, known = torch.cat(places), torch.cat(colors)
-    cells = ((found - low) / ((high - low).norm() / CELLS_ACROSS)).floor().long()
+    # In the axes of a camera, so that it does not matter which way the world is turned.
+    cells = ((found - middle) @ cameras[0].cam_from_world[:3, :3].T / (2 * radius / CELLS_ACROSS)).floor().long()
     _, cell = torch.unique(cells, dim=0, return_inverse=True)
     first = torch.full_like(cell, len(found)).scatter_reduce_(0, cell, torch.arange(len(found), device=device), "amin")
     return Unseen(found[first[first < len(found)]], known.mean(dim=0) if len(known) else known.new_full((3,), 0.5))
 
 
-def _room_of(scene: Scene, cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
-    """Lowest and highest corner [3] of a box around the cameras and nearly all Gaussians."""
-    means = scene.primary.means.sort(dim=0).values
-    beyond = int(ROOM_QUANTILE * len(means))
-    centers = torch.stack([camera.center for camera in cameras])
-    return torch.minimum(means[beyond], centers.amin(dim=0)), torch.maximum(means[-1 - beyond], centers.amax(dim=0))
-
-
-def _ends_of_rays(pane: Planes, camera: Camera, hole: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """[P, 3] where rays through some pixels of a hole [H, W] leave the room, once the pane has mirrored them."""
+def _ends_of_rays(pane: Planes, camera: Camera, hole: Tensor, middle: Tensor, radius: Tensor) -> Tensor:
+    """[P, 3] where rays through some pixels of a hole [H, W] leave a sphere, once the pane has mirrored them."""
     step = max(camera.width // RAYS_ACROSS, 1)
-    row, column = (hole[::step, ::step].nonzero() * step + 0.5).to(low).unbind(dim=1)
+    row, column = (hole[::step, ::step].nonzero() * step + 0.5).to(middle).unbind(dim=1)
     x, y = (column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
     ray = torch.stack([x, y, torch.ones_like(x)], dim=1) @ camera.cam_from_world[:3, :3]
     normal, toward = pane.normals[0], ray @ pane.normals[0]
-    start = camera.center + (((pane.centers[0] - camera.center) @ normal) / toward)[:, None] * ray
-    ray = ray - 2 * toward[:, None] * normal
-    length = torch.maximum((low - start) / ray, (high - start) / ray).amin(dim=1)
-    inside = torch.isfinite(length) & (length > 0)
-    return (start + length[:, None] * ray)[inside]
+    start = camera.center + (((pane.centers[0] - camera.center) @ normal) / toward)[:, None] * ray - middle
+    ray = torch.nn.functional.normalize(ray - 2 * toward[:, None] * normal, dim=1)
+    along = (start * ray).sum(dim=1)
+    squared = along.square() - start.square().sum(dim=1) + radius.square()
+    length = squared.clamp(min=0).sqrt() - along
+    return (middle + start + length[:, None] * ray)[(squared > 0) & (length > 0)]

@@ -407,6 +407,9 @@ FEWEST_AGREEING, LEAST_AGREEING, MOST_SPREAD, MOST_ALIKE = 5, 0.7, 0.08, 0.98
 """Photographs that must see something unexplained at a place; their share of all that look there directly; the standard
 deviation of its colour; and the length of the mean direction from which they look, 1 if all look from one side."""
 
+MOST_ADDED = 0.05
+"""Of the Gaussians there are, how many may be added; where more is missing, the scene has hardly been learned yet."""
+
 
 @dataclass(frozen=True)
 class SeedUnexplained:
@@ -432,12 +435,13 @@ class SeedUnexplained:
     def apply(self, state: TrainState, dataset: Dataset, clock: Clock) -> Work:
         """Edits `state`, if there is anything to edit, and tells how far it is."""
         cloud, size = yield from unexplained_places(state.scene, dataset.train, self.renderer)
-        if not len(cloud):
-            return False
         primary = state.scene.primary
+        if not 0 < len(cloud) < MOST_ADDED * len(primary):
+            return False
         seeds = gaussians_from_points(cloud, sh_degree=primary.max_sh_degree, opacity=0.5).to(primary.means.device)
         seeds = seeds.with_tensors({"log_scales": torch.full_like(seeds.log_scales, math.log(size))})
-        channels = {name: seeds.channels[name] for name in primary.channels}
+        usual = {name: values.median().expand(len(seeds)).clone() for name, values in primary.channels.items()}
+        channels = {name: seeds.channels.get(name, values) for name, values in usual.items()}
         seeds = replace(seeds, active_sh_degree=primary.active_sh_degree, channels=channels)
         primary, state.optimizer.moments = append(primary, state.optimizer.moments, seeds)
         state.scene = replace(state.scene, primary=primary)
@@ -481,12 +485,17 @@ def unexplained_places(
 
 
 def grid_around(cameras: Sequence[Camera], extent: float) -> tuple[Tensor, float]:
-    """[P, 3] centres of the cells of a grid over a box around the cameras, one extent larger, and a cell's side."""
-    centers = torch.stack([camera.center.cpu() for camera in cameras])
+    """[P, 3] centres of the cells of a grid over a box around the cameras, one extent larger, and a cell's side.
+
+    Its axes are those of the first camera, so that it does not matter which way the world is turned.
+    """
+    axes = cameras[0].cam_from_world[:3, :3].cpu()
+    centers = torch.stack([camera.center.cpu() for camera in cameras]) @ axes.T
     low, high = centers.amin(dim=0) - extent, centers.amax(dim=0) + extent
     cell = float((high - low).amax()) / CELLS
-    axes = [torch.arange(float(a) + cell / 2, float(b), cell) for a, b in zip(low, high, strict=True)]
-    return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3), cell
+    numbers = ((high - low) / cell).round().clamp(min=1).int().tolist()
+    along = [start + cell * (torch.arange(number) + 0.5) for start, number in zip(low, numbers, strict=True)]
+    return torch.stack(torch.meshgrid(*along, indexing="ij"), dim=-1).reshape(-1, 3) @ axes, cell
 
 
 def _looked_at(scene: Scene, camera: Camera, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -52,8 +52,8 @@ def panel(center: tuple[float, float, float], color: int = 255) -> Gaussians:
 
 
 def wall(depth: float, color: int = 40) -> Gaussians:
-    side = torch.linspace(-5, 5, 31)
-    return gaussians(torch.cartesian_prod(side, side, torch.tensor([depth])), color, math.log(0.25))
+    side = torch.linspace(-5, 5, 61)
+    return gaussians(torch.cartesian_prod(side, side, torch.tensor([depth])), color, math.log(0.13))
 
 
 def scene_of(*parts: Gaussians) -> Scene:
@@ -152,7 +152,7 @@ def test_lamps_are_lit_at_their_moments_and_their_images_go() -> None:
 
 
 def test_what_a_pane_mirrors_unseen_is_filled_once() -> None:
-    scene = scene_of(wall(4.0), wall(-3.0, 120).select(wall(-3.0).means[:, 0] < 0))
+    scene = scene_of(wall(4.0), wall(-3.0, 120).select(wall(-3.0).means[:, 0] < 1))
     state, action = state_of(scene), FillUnseen(0.5)
     assert finished(action.apply(state, capture_of(scene), Clock(50, 100, 5)))
     added = len(state.scene.primary) - len(scene.primary)

@@ -102,7 +102,8 @@ def balls(centers: list[tuple[float, float, float]], colors: list[int], log_scal
 
 
 def test_a_thing_without_points_is_found_where_the_photographs_of_it_meet() -> None:
-    ground = balls([(x, 1.0, z) for x in (-1.0, 0.0, 1.0) for z in (-1.0, 0.0, 1.0)], [90] * 9, -1.5)
+    side = torch.linspace(-1.5, 1.5, 50).tolist()
+    ground = balls([(x, 1.0, z) for x in side for z in side], [90] * 2500, -3.0)
     lamp = balls([(0.3, -0.2, 0.1)], [250], -1.8)
     whole = Scene(concatenated(ground, lamp), 2.0)
     state, capture = TrainState(Scene(ground, 2.0), seed=0), views_of(whole)
@@ -127,6 +128,12 @@ def test_nothing_is_added_where_the_scene_explains_the_photographs() -> None:
     state = TrainState(whole, seed=0)
     assert not finished(SeedUnexplained(0.2, Splat()).apply(state, views_of(whole), Clock(20, 100, 10)))
     assert state.scene is whole
+
+
+def test_where_most_is_missing_nothing_is_added() -> None:
+    whole = Scene(balls([(0.3, -0.2, 0.1), (0.0, 0.4, 0.0)], [250, 200], -1.8), 2.0)
+    state = TrainState(Scene(whole.primary.select(torch.tensor([False, True])), 2.0), seed=0)
+    assert not finished(SeedUnexplained(0.2, Splat()).apply(state, views_of(whole), Clock(20, 100, 10)))
 
 
 def test_what_a_pane_mirrors_is_not_found_behind_it() -> None:
