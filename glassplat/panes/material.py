@@ -622,7 +622,7 @@ def _gains_of(scene: Scene, lamps: Tensor, photographs: Sequence[Photograph]) ->
 
 UNCOVERED = 0.5
 """Coverage of the mirrored image below which it counts as a hole."""
-HOLE_CAMERAS, RAYS_ACROSS, CELLS_ACROSS = 24, 40, 60
+HOLE_CAMERAS, RAYS_ACROSS, CELLS_ACROSS = 24, 40, 40
 """Cameras that look for holes, rays across an image, and cells across the room with a place each."""
 BEYOND = 0.05
 """Of the Gaussians, how many are farther from the middle of the cameras than the end of the room."""
