@@ -70,7 +70,6 @@ REASONS: dict[str, dict[str, str]] = {
         "fixed_mirrors": "R0 falls otherwise, and the mirror becomes a window.",
         "seed_reflections": "Captures from the front show the room in the glass only.",
         "turn_reflections": "What the first stage built behind glass would stay there, and R0 would be too low.",
-        "seed_unexplained": ALL["seed_unexplained"],
         "weights.intensity": "R0 and the brightness factor a do nearly the same.",
         "moving_mean": "Gaussians move towards the mean depth; the mean itself is not pulled towards stray ones.",
         "perturbation.stop": "What was perturbed has time to settle.",

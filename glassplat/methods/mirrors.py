@@ -23,7 +23,7 @@ from torch.nn.functional import interpolate, normalize
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import View, estimated_normals, evenly
 from glassplat.render.deferred import cell_side, depth_normals, resized, seen_surface, view_directions
-from glassplat.render.frame import Frame, Renderer
+from glassplat.render.frame import Renderer
 from glassplat.render.layers import contributions, gathered
 from glassplat.scene import SH_ZERO, logit
 from glassplat.scene.camera import Camera, moved, quat_product, rotation_from_quat
@@ -31,6 +31,7 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import Densify, GrowSh, ResetOpacity
 from glassplat.training.densify import Moments, forget
+from glassplat.training.losses import residual
 from glassplat.training.options import MirrorSearch, NormalPropagation, PropagationSchedule, Rate
 from glassplat.training.stage import Clock, Every, TrainState
 
@@ -112,15 +113,6 @@ def residual_sums(scene: Scene, view: View, renderer: Renderer) -> Tensor:
             (residual(frame, view, scene) * frame.layers.get("base", frame.rgb)).sum(), sh
         )
     return gradient[:, 0] / SH_ZERO
-
-
-def residual(frame: Frame, view: View, scene: Scene) -> Tensor:
-    """[H, W, 3] photograph minus render, sRGB, 0 where the view is ignored."""
-    image = scene.exposures.applied(frame.rgb.detach(), view.name)
-    difference = view.photo.to(image) / 255 - image
-    if view.ignored is not None:
-        difference = difference.masked_fill(view.ignored.to(image.device)[..., None], 0)
-    return difference
 
 
 COLOR_NEIGHBOURS, NORMAL_NEIGHBOURS = 16, 4

@@ -31,7 +31,7 @@ from glassplat.panes.material import (
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
-from glassplat.scene.gaussians import Gaussians, mirrored_gaussians
+from glassplat.scene.gaussians import mirrored_gaussians
 from glassplat.scene.panes import Planes, coplanar_groups
 from glassplat.scene.scene import Scene
 from glassplat.training.actions import (
@@ -42,10 +42,12 @@ from glassplat.training.actions import (
     Population,
     ResetOpacity,
     SeedUnexplained,
+    add_primary,
     population_of,
+    seeds_of,
 )
 from glassplat.training.corrections import corrections_begun, corrections_learnt, photographer_learnt
-from glassplat.training.densify import append, apply_edit, gaussians_from_points, keep
+from glassplat.training.densify import append, apply_edit, keep
 from glassplat.training.losses import (
     LossTerm,
     depth_deviation_loss,
@@ -341,26 +343,12 @@ class FillUnseen:
             places, color = unseen_places(state.scene, panes, cameras)
             if 0 < len(places) < MOST_ADDED * len(state.scene.primary):
                 colors = (255 * color).round().to(torch.uint8).expand(len(places), 3)
-                seeds = seeds_of(state, PointCloud(places.cpu(), colors.cpu()), opacity=0.7, spread=0.7)
+                seeds = seeds_of(state.scene.primary, PointCloud(places.cpu(), colors.cpu()), opacity=0.7, spread=0.7)
                 add_primary(state, seeds)
                 added += len(seeds)
         if added:
             log.info("%d Gaussians added where panes mirror what nothing shows", added)
         return added > 0
-
-
-def seeds_of(state: TrainState, points: PointCloud, *, opacity: float = 0.1, spread: float = 1.0) -> Gaussians:
-    """Gaussians like the primary ones, from points."""
-    primary = state.scene.primary
-    seeds = gaussians_from_points(points, sh_degree=primary.max_sh_degree, opacity=opacity, spread=spread)
-    return replace(seeds.to(primary.means.device), active_sh_degree=primary.active_sh_degree)
-
-
-def add_primary(state: TrainState, seeds: Gaussians) -> None:
-    """Adds Gaussians to the primary ones, whose statistics begin anew."""
-    primary, state.optimizer.moments = append(state.scene.primary, state.optimizer.moments, seeds)
-    state.scene = replace(state.scene, primary=primary)
-    state.statistics.pop("primary", None)
 
 
 def turn_round(state: TrainState, virtual: Tensor, panes: Planes) -> int:
@@ -392,7 +380,7 @@ def seed_reflection(state: TrainState, dataset: Dataset, panes: Planes) -> Work:
     if not bool(virtual.any()):
         return False
     behind = replace(points, positions=points.positions[virtual], colors=points.colors[virtual])
-    seeds = mirrored_gaussians(seeds_of(state, behind), panes.centers[0], panes.normals[0])
+    seeds = mirrored_gaussians(seeds_of(state.scene.primary, behind), panes.centers[0], panes.normals[0])
     add_primary(state, seeds)
     log.info("no photograph shows what is mirrored by %s: %d points behind mirrored", named(panes, "pane"), len(seeds))
     return True

@@ -20,7 +20,7 @@ from glassplat.render.splat import Splat
 from glassplat.scene import SH_ZERO, logit
 from glassplat.scene.camera import Camera, mirror_matrices, quat_from_rotation
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.panes import Planes, crosses_pane, in_image
+from glassplat.scene.panes import Planes, crosses_pane, in_image, nearest_pixels
 from glassplat.scene.scene import Scene
 
 OVERLAP = 0.7
@@ -501,9 +501,7 @@ def relative_depths(points: Tensor, camera: Camera, depth: Tensor) -> tuple[Tens
     The ratio is 1 where the image holds nothing.
     """
     pixels, depths = camera.project(points)
-    column = pixels[:, 0].nan_to_num().clamp(0, camera.width - 1).long()
-    row = pixels[:, 1].nan_to_num().clamp(0, camera.height - 1).long()
-    there = depth[row, column]
+    there = depth[nearest_pixels(pixels, camera)]
     return torch.where(there > 0, depths / there, 1), in_image(points, camera)
 
 
@@ -554,13 +552,14 @@ def mirrored_lamps(scene: Scene, panes: Planes, photographs: Sequence[Photograph
     lamps = _lamps_among(alone, photographs)
     if not bool(lamps.any()):
         return None
-    images = _images_of(alone, lamps, photographs)
+    lit = [_lit_pixels(alone, lamps, photograph.camera) for photograph in photographs]
+    images = _images_of(alone, lit, photographs)
     if not bool(images.any()):
         return None
     dark = torch.full_like(scene.primary.logit_opacities, logit(1e-3))
     opacities = torch.where(images, torch.minimum(dark, scene.primary.logit_opacities), scene.primary.logit_opacities)
     without = replace(alone, primary=scene.primary.with_tensors({"logit_opacities": opacities}))
-    return Lamps(images, _gains_of(without, lamps, photographs))
+    return Lamps(images, torch.where(lamps, _gains_of(without, lit, photographs), 1))
 
 
 def _lamps_among(scene: Scene, photographs: Sequence[Photograph]) -> Tensor:
@@ -579,12 +578,28 @@ def _lamps_among(scene: Scene, photographs: Sequence[Photograph]) -> Tensor:
     return enough_seen & (clipped > LAMP_SHARE * direct) & (bright > LEAST_BRIGHT * mirrored)
 
 
-def _images_of(scene: Scene, lamps: Tensor, photographs: Sequence[Photograph]) -> Tensor:
-    """[N] bool: what is bright, behind the panes, and mostly where they mirror the lamps [N]."""
+class LitPixels(NamedTuple):
+    """[H, W] bool each: where a view shows a pane, and where this mirrors mostly lamps."""
+
+    glass: Tensor
+    lit: Tensor
+
+
+def _lit_pixels(scene: Scene, lamps: Tensor, camera: Camera) -> LitPixels:
+    """Those of a view, of lamps [N] bool."""
+    sh = torch.zeros_like(scene.primary.sh)
+    sh[:, 0] = (lamps.float()[:, None] - 0.5) / SH_ZERO
+    painted = replace(scene.primary.with_tensors({"sh": sh}), active_sh_degree=0)
+    frame = Planar(intensity=False, nearest_only=True)(replace(scene, primary=painted), camera)
+    glass = frame.layers["strength"] > 0
+    return LitPixels(glass, glass & (frame.layers["reflection"].amin(dim=-1) > 0.5))
+
+
+def _images_of(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Photograph]) -> Tensor:
+    """[N] bool: what is bright, behind the panes, and mostly where these mirror lamps."""
     means = scene.primary.means
     near, through = means.new_zeros(2, len(means))
-    for photograph in photographs:
-        glass, lit = _lit_pixels(scene, lamps, photograph.camera)
+    for photograph, (glass, lit) in zip(photographs, seen, strict=True):
         rim = max(round(LAMP_RIM * glass.shape[1]), 1)
         lit = glass & (torch.nn.functional.max_pool2d(lit[None].float(), 2 * rim + 1, 1, rim)[0] > 0)
         shown = gathered(scene, photograph.camera, torch.stack([lit, glass], dim=-1).float())
@@ -594,22 +609,11 @@ def _images_of(scene: Scene, lamps: Tensor, photographs: Sequence[Photograph]) -
     return bright & (through > FEWEST_SEEN) & (near > LAMP_SHARE * through)
 
 
-def _lit_pixels(scene: Scene, lamps: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """[H, W] bool each: where a view shows a pane, and where this mirrors mostly lamps [N]."""
-    sh = torch.zeros_like(scene.primary.sh)
-    sh[:, 0] = (lamps.float()[:, None] - 0.5) / SH_ZERO
-    painted = replace(scene.primary.with_tensors({"sh": sh}), active_sh_degree=0)
-    frame = Planar(intensity=False, nearest_only=True)(replace(scene, primary=painted), camera)
-    glass = frame.layers["strength"] > 0
-    return glass, glass & (frame.layers["reflection"].amin(dim=-1) > 0.5)
-
-
-def _gains_of(scene: Scene, lamps: Tensor, photographs: Sequence[Photograph]) -> Tensor:
-    """[N] radiance that the photographs leave to the reflections of lamps [N] over what they have; 1 for all others."""
+def _gains_of(scene: Scene, seen: Sequence[LitPixels], photographs: Sequence[Photograph]) -> Tensor:
+    """[N] radiance that the photographs leave to the reflections of lamps over what they have; 1 where none is seen."""
     left, had = scene.primary.means.new_zeros(2, len(scene.primary))
-    for photograph in photographs:
+    for photograph, (_, lit) in zip(photographs, seen, strict=True):
         layers = Planar(nearest_only=True)(scene, photograph.camera).layers
-        _, lit = _lit_pixels(scene, lamps, photograph.camera)
         strength = layers["strength"].clamp(min=1e-2)[..., None]
         behind = linear_from_srgb(layers["transmission"].clamp(0, 1))
         radiance = (linear_from_srgb(photograph.pixels.clamp(0, 1)) - (1 - strength) * behind) / strength
@@ -617,7 +621,7 @@ def _gains_of(scene: Scene, lamps: Tensor, photographs: Sequence[Photograph]) ->
         sums = gathered_mirrored(scene, photograph.camera, (values * (lit & photograph.told)).movedim(0, -1))
         left, had = left + sums[:, 0], had + sums[:, 1]
     gains = (left / had.clamp(min=1e-6)).clamp(1, MOST_GAIN)
-    return torch.where(lamps & (had > 0), gains, 1)
+    return torch.where(had > 0, gains, 1)
 
 
 UNCOVERED = 0.5

@@ -264,6 +264,12 @@ def crosses_pane(points: Tensor, planes: Planes, eye: Tensor) -> Tensor:
     return inside.any(dim=1)
 
 
+def nearest_pixels(positions: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Row and column [N] of the pixels that are nearest to positions [N, 2] in an image or beside it."""
+    column, row = positions.nan_to_num().unbind(dim=1)
+    return row.clamp(0, camera.height - 1).long(), column.clamp(0, camera.width - 1).long()
+
+
 def in_image(points: Tensor, camera: Camera) -> Tensor:
     """[N] bool: whether the points lie in the image of a camera, hidden or not."""
     pixels, depths = camera.project(points)

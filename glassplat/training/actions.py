@@ -16,7 +16,7 @@ from glassplat.render.frame import Frame, Renderer
 from glassplat.render.layers import contributions
 from glassplat.scene.camera import Camera, moved
 from glassplat.scene.gaussians import Gaussians
-from glassplat.scene.panes import behind_panes, crosses_pane, in_image
+from glassplat.scene.panes import behind_panes, crosses_pane, in_image, nearest_pixels
 from glassplat.scene.scene import Scene
 from glassplat.training.densify import (
     Moments,
@@ -32,7 +32,7 @@ from glassplat.training.densify import (
     reset_opacity,
     sgld_noise,
 )
-from glassplat.training.losses import LossTerm, mean_opacity, mean_scale, of_all, weighted
+from glassplat.training.losses import LossTerm, mean_opacity, mean_scale, of_all, residual, weighted
 from glassplat.training.messages import Working
 from glassplat.training.options import DefaultDensify, McmcDensify, Rate, Rhythm, Strategy
 from glassplat.training.stage import Action, AverageLast, Clock, Every, PostStep, TrainState, Work
@@ -438,16 +438,26 @@ class SeedUnexplained:
         primary = state.scene.primary
         if not 0 < len(cloud) < MOST_ADDED * len(primary):
             return False
-        seeds = gaussians_from_points(cloud, sh_degree=primary.max_sh_degree, opacity=0.5).to(primary.means.device)
-        seeds = seeds.with_tensors({"log_scales": torch.full_like(seeds.log_scales, math.log(size))})
-        usual = {name: values.median().expand(len(seeds)).clone() for name, values in primary.channels.items()}
-        channels = {name: seeds.channels.get(name, values) for name, values in usual.items()}
-        seeds = replace(seeds, active_sh_degree=primary.active_sh_degree, channels=channels)
-        primary, state.optimizer.moments = append(primary, state.optimizer.moments, seeds)
-        state.scene = replace(state.scene, primary=primary)
-        state.statistics.pop("primary", None)
+        seeds = seeds_of(primary, cloud, opacity=0.5)
+        add_primary(state, seeds.with_tensors({"log_scales": torch.full_like(seeds.log_scales, math.log(size))}))
         log.info("%d Gaussians added where photographs agree on something that was not there", len(seeds))
         return True
+
+
+def seeds_of(primary: Gaussians, points: PointCloud, *, opacity: float = 0.1, spread: float = 1.0) -> Gaussians:
+    """Gaussians like the primary ones, from points; what points do not tell of a channel is the median there."""
+    seeds = gaussians_from_points(points, sh_degree=primary.max_sh_degree, opacity=opacity, spread=spread)
+    seeds = seeds.to(primary.means.device)
+    usual = {name: values.median().expand(len(seeds)).clone() for name, values in primary.channels.items()}
+    channels = {name: seeds.channels.get(name, values) for name, values in usual.items()}
+    return replace(seeds, active_sh_degree=primary.active_sh_degree, channels=channels)
+
+
+def add_primary(state: TrainState, seeds: Gaussians) -> None:
+    """Adds Gaussians to the primary ones, whose statistics begin anew."""
+    primary, state.optimizer.moments = append(state.scene.primary, state.optimizer.moments, seeds)
+    state.scene = replace(state.scene, primary=primary)
+    state.statistics.pop("primary", None)
 
 
 @torch.no_grad()
@@ -468,11 +478,12 @@ def unexplained_places(
     for done, view in enumerate(views):
         yield Working("looking for what is missing", done, len(views))
         camera = view.camera.to(device)
-        row, column, looks = _looked_at(scene, camera, places)
+        pixels = nearest_pixels(camera.project(places)[0], camera)
         frame = renderer(scene, camera)
-        looks &= _past_panes(frame)[row, column]
-        missing = _unexplained(frame, view, scene)[row, column] & looks
-        color = moved(view.photo, device)[row, column].float() / 255 * missing[:, None]
+        looks = in_image(places, camera) & ~crosses_pane(places, scene.planes, camera.center)
+        looks &= _past_panes(frame)[pixels]
+        missing = _unexplained(residual(frame, view, scene))[pixels] & looks
+        color = moved(view.photo, device)[pixels].float() / 255 * missing[:, None]
         looking, agreeing = looking + looks, agreeing + missing
         colors, squares = colors + color, squares + color.square()
         sides += torch.nn.functional.normalize(camera.center - places, dim=1) * missing[:, None]
@@ -498,19 +509,8 @@ def grid_around(cameras: Sequence[Camera], extent: float) -> tuple[Tensor, float
     return torch.stack(torch.meshgrid(*along, indexing="ij"), dim=-1).reshape(-1, 3) @ axes, cell
 
 
-def _looked_at(scene: Scene, camera: Camera, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Row and column [P] of places in an image, and [P] bool which are in it and before all panes."""
-    pixels, _ = camera.project(places)
-    column = pixels[:, 0].nan_to_num().clamp(0, camera.width - 1).long()
-    row = pixels[:, 1].nan_to_num().clamp(0, camera.height - 1).long()
-    return row, column, in_image(places, camera) & ~crosses_pane(places, scene.planes, camera.center)
-
-
-def _unexplained(frame: Frame, view: View, scene: Scene) -> Tensor:
-    """[H, W] bool: pixels in which more than detail is missing."""
-    error = moved(view.photo, frame.rgb.device).float() / 255 - scene.exposures.applied(frame.rgb, view.name)
-    if view.ignored is not None:
-        error = error.masked_fill(moved(view.ignored, error.device)[..., None], 0)
+def _unexplained(error: Tensor) -> Tensor:
+    """[H, W] bool: pixels of a residual [H, W, 3] in which more than detail is missing."""
     reach = max(round(WINDOW / 2 * error.shape[1]), 1)
     planes = error.movedim(-1, 0)[None]
     mean = torch.nn.functional.avg_pool2d(planes, 2 * reach + 1, 1, reach, count_include_pad=False)[0]

@@ -187,6 +187,15 @@ def _where_counted(errors: Tensor, view: View) -> Tensor:
     return errors if view.ignored is None else errors.masked_fill(moved(view.ignored, errors.device), 0)
 
 
+def residual(frame: Frame, view: View, scene: Scene) -> Tensor:
+    """[H, W, 3] photograph minus render, sRGB, 0 where the view is ignored."""
+    image = scene.exposures.applied(frame.rgb.detach(), view.name)
+    difference = view.photo.to(image) / 255 - image
+    if view.ignored is not None:
+        difference = difference.masked_fill(view.ignored.to(image.device)[..., None], 0)
+    return difference
+
+
 def mask_loss(frame: Frame, view: View, scene: Scene) -> Tensor | None:
     """Reflection mask loss L_m (TR-Gaussians, Eq. 16), on annotated views only. Ignored pixels count as right."""
     if view.pane_labels is None:

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from datetime import timedelta
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from glassplat.errors import InputError, RankLostError
@@ -143,10 +144,8 @@ class Ranks:
         # One message instead of dozens, each of which would cost its own delay.
         flat = torch.cat([tensor.detach().reshape(-1) for tensor in tensors])
         with _others_needed():
-            if flat.is_cuda:
-                dist.all_reduce(flat, getattr(dist.ReduceOp, operation))
-            else:
-                self._waited_for(lambda: dist.all_reduce(flat, getattr(dist.ReduceOp, operation)))
+            reduce = partial(dist.all_reduce, flat, getattr(dist.ReduceOp, operation))
+            reduce() if flat.is_cuda else self._waited_for(reduce)
         parts = flat.split([tensor.numel() for tensor in tensors])
         return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
 

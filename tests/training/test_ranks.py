@@ -239,14 +239,16 @@ def test_the_death_of_a_rank_ends_the_others_with_one_message(rank: int, capture
     assert load_checkpoint(tmp_path / "run" / "checkpoint.safetensors").step > 0
 
 
-def test_a_rank_that_is_asked_to_end_does_not_wait_long_for_a_silent_one(capture: Path, tmp_path: Path) -> None:
-    arguments = train_arguments(capture, tmp_path / "run", "--checkpoint-every", "0.01", iterations=100_000)
-    first, silent = start_apart(arguments, [])
+def last_word_before_a_silent_rank(program: str, capture: Path, output: Path, *, asked: bool) -> str:
+    """What the leader says of a rank that is stopped, asked to end meanwhile or not; it saves, and exits with 1."""
+    arguments = train_arguments(capture, output, "--checkpoint-every", "0.01", iterations=100_000)
+    first, silent = start_apart([program, *arguments[1:]], [])
     try:
-        wait_for(tmp_path / "run" / "checkpoint.safetensors", first)
+        wait_for(output / "checkpoint.safetensors", first)
         silent.send_signal(signal.SIGSTOP)
-        time.sleep(1.0)
-        first.send_signal(signal.SIGTERM)
+        if asked:
+            time.sleep(1.0)
+            first.send_signal(signal.SIGTERM)
         _, text = first.communicate(timeout=LONGEST)
     finally:
         first.kill()
@@ -255,26 +257,17 @@ def test_a_rank_that_is_asked_to_end_does_not_wait_long_for_a_silent_one(capture
     assert first.returncode == 1
     ours = [line for line in text.splitlines() if line.startswith(("stopped:", "error:"))]
     assert len(ours) == 1, text
-    assert "asked to end" in ours[0]
-    assert load_checkpoint(tmp_path / "run" / "checkpoint.safetensors").step > 0
+    assert load_checkpoint(output / "checkpoint.safetensors").step > 0
+    return ours[0]
+
+
+def test_a_rank_that_is_asked_to_end_does_not_wait_long_for_a_silent_one(capture: Path, tmp_path: Path) -> None:
+    assert "asked to end" in last_word_before_a_silent_rank("glassplat", capture, tmp_path / "run", asked=True)
 
 
 def test_a_rank_that_falls_silent_is_given_up_and_what_was_trained_is_saved(capture: Path, tmp_path: Path) -> None:
-    arguments = train_arguments(capture, tmp_path / "run", "--checkpoint-every", "0.01", iterations=100_000)
-    first, silent = start_apart(["tests.training.impatient_rank", *arguments[1:]], [])
-    try:
-        wait_for(tmp_path / "run" / "checkpoint.safetensors", first)
-        silent.send_signal(signal.SIGSTOP)
-        _, text = first.communicate(timeout=LONGEST)
-    finally:
-        first.kill()
-        silent.kill()
-        silent.communicate()
-    assert first.returncode == 1
-    ours = [line for line in text.splitlines() if line.startswith(("stopped:", "error:"))]
-    assert len(ours) == 1, text
-    assert "does not answer" in ours[0]
-    assert load_checkpoint(tmp_path / "run" / "checkpoint.safetensors").step > 0
+    impatient = "tests.training.impatient_rank"
+    assert "does not answer" in last_word_before_a_silent_rank(impatient, capture, tmp_path / "run", asked=False)
 
 
 @pytest.mark.parametrize(
