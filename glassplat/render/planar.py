@@ -11,7 +11,7 @@ from torch import Tensor
 
 from glassplat.kernels import Fresnel
 from glassplat.kernels.composite import color_and_depth, composite, join_channels
-from glassplat.kernels.panes import layer_slopes, pane_layers, slopes_at
+from glassplat.kernels.panes import layer_slopes, slopes_at
 from glassplat.kernels.project import GradientSum
 from glassplat.kernels.records import Deviation, PaneHits, Panes, Splats
 from glassplat.kernels.tiles import bin_tiles
@@ -99,10 +99,10 @@ class Planar:
     pane is the C of the pane behind it (the paper shows the nearest only). The layers R, C_r and C_t are those of the
     nearest one that is more than `FAINT`ly visible; see `glassplat.render.panes.glazed`.
 
-    Layers: `transmission`, `reflection` [H, W, 3]; `strength`, `mask`, `depth`, `alpha` [H, W]; `hit` [H, W], 1 in
-    the panes' rectangles, and `inner` [H, W], without the rim of what reflects; `without_panes` [H, W, 3], the image
-    were there no panes, and `share` [H, W], how much of what is seen the panes add, all of them together;
-    `deviation` [H, W] (Eq. 14) if asked for.
+    Layers: `transmission`, `reflection` [H, W, 3]; `strength`, `mask`, `depth`, `alpha` [H, W]; `pane` [H, W]
+    int32, the pane whose rectangle is nearest, -1 for none; `without_panes` [H, W, 3], the image were there no panes,
+    and `share` [H, W], how much of what is seen the panes add, all of them together; `deviation` [H, W] (Eq. 14) if
+    asked for.
 
     A photograph also shows who took it, in the panes: `Scene.photographer`, Gaussians in a frame that goes along with
     the camera. They are drawn among those that a pane mirrors, through the camera mirrored about it, and nowhere else.
@@ -147,14 +147,14 @@ class Planar:
         first = self._first_pass(scene, camera, rectangles, probed)
         layers = {"without_panes": first.image, "depth": first.depth, "alpha": first.alpha, "mask": first.mask}
         hits = nearest_hits(rectangles, camera, first.mask)
+        layers["pane"] = hits.pane
         if first.deviation is not None:
             layers["deviation"] = first.deviation
         seen = seen_panes(scene.planes, camera, hits, first.mask, most=1 if self.nearest_only else None)
         if seen is None:
             nothing = torch.zeros_like(first.mask)
-            layers["hit"] = (hits.pane >= 0).to(nothing.dtype)
             layers |= {"transmission": first.image, "reflection": torch.zeros_like(first.image)}
-            layers |= {"strength": nothing, "share": nothing, "inner": nothing}
+            layers |= {"strength": nothing, "share": nothing}
             return Frame(first.image, layers, first.direct, None, first.screen)
         second = self._second_pass(scene, camera, seen, probed, first.total)
         masks = self._visibilities(scene, camera, seen, first)
@@ -163,7 +163,6 @@ class Planar:
             with_body = replace(self, photographer="present")._second_pass(scene, camera, seen, False, first.total)
             layers["photographed"] = self._glazed(first, seen, masks, with_body, camera).rgb
         layers |= {name: getattr(result, name) for name in ("transmission", "reflection", "strength", "share")}
-        layers["hit"], layers["inner"] = pane_layers(hits.pane, result.strength)
         screen = self._screen(first, second, hits, result) if probed else ()
         return Frame(result.rgb, layers, first.direct, second.mirrored, screen)
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from glassplat.captures.view import FOLDER, View, in_world, normals_in_camera, with_ignored_right
 from glassplat.kernels.loss_terms import gradient_conflict as shared_edges
 from glassplat.kernels.loss_terms import harmonic_energy
+from glassplat.kernels.panes import inside_panes
 from glassplat.kernels.photometric import photometric
 from glassplat.render.deferred import cell_means, cell_side, depth_normals
 from glassplat.render.frame import Frame
@@ -177,9 +178,9 @@ def gradient_conflict(frame: Frame, view: View, scene: Scene) -> Tensor:
     one of `PAPER_PIXELS`, so that one weight serves photographs of any size.
     """
     layers = frame.layers
-    hit = layers["inner"]
-    size = (hit.numel() / PAPER_PIXELS) ** SIZE_POWER
-    return size * shared_edges(layers["without_panes"], layers["reflection"], hit)
+    inside = inside_panes(layers["pane"], layers["strength"])
+    size = (inside.numel() / PAPER_PIXELS) ** SIZE_POWER
+    return size * shared_edges(layers["without_panes"], layers["reflection"], inside)
 
 
 def _where_counted(errors: Tensor, view: View) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from glassplat.kernels.composite import color_and_depth, join_channels
 from glassplat.kernels.loss_terms import _EnergyInTorch, harmonic_energy
-from glassplat.kernels.panes import pane_layers
+from glassplat.kernels.panes import inside_panes
 
 DTYPES = [(torch.float32, 1e-5), (torch.float64, 1e-12)]
 
@@ -93,13 +93,12 @@ def test_channels(cameras: int, count: int, more: int) -> None:
 
 
 @pytest.mark.parametrize("size", [(40, 53), (2, 2), (1, 7), (7, 1)])
-def test_layers_of_panes(size: tuple[int, int]) -> None:
+def test_inside_of_panes(size: tuple[int, int]) -> None:
     """Patches of three panes and of none, of which a part reflects nothing."""
     pane = (4 * draw(-(-size[0] // 7), -(-size[1] // 7), seed=5)).int() - 1
     pane = pane.repeat_interleave(7, 0).repeat_interleave(7, 1)[: size[0], : size[1]].contiguous()
     strength = torch.where(draw(*size, seed=2) > 0.03, 0.1, 0.0)
-    hit, inner = pane_layers(pane, strength)
-    assert torch.equal(hit, (pane >= 0).to(strength.dtype))
+    inner = inside_panes(pane, strength)
     shown = torch.where(strength > 0, pane, -1)
     expected = torch.zeros_like(strength)
     for y in range(size[0]):
@@ -132,6 +131,6 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(ValueError, match="colors"):
         join_channels(image, alpha)
     with pytest.raises(TypeError, match="int32"):
-        pane_layers(alpha, alpha)
+        inside_panes(alpha, alpha)
     with pytest.raises(ValueError, match="sh"):
         harmonic_energy(image)

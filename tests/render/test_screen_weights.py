@@ -41,7 +41,7 @@ def test_a_mirror_counts_for_what_it_shows() -> None:
     scene = replace(showcase(), planes=pane(2.0, base_reflectance=1 - 1e-9))
     layers = Planar(blend="srgb")(scene, CAMERA).layers
     direct, mirrored = primary_and_mirrored(scene, CAMERA)
-    assert float(mirrored.weight) == pytest.approx(float(layers["mask"][layers["hit"] > 0].mean()), rel=1e-6)
+    assert float(mirrored.weight) == pytest.approx(float(layers["mask"][layers["pane"] >= 0].mean()), rel=1e-6)
     columns, rows = direct.means2d[0].floor().long().unbind(-1)
     inside = (columns >= 0) & (columns < CAMERA.width) & (rows >= 0) & (rows < CAMERA.height)
     hidden = inside & (direct.radii[0] > 0).all(dim=-1)

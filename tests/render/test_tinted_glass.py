@@ -39,7 +39,7 @@ def test_clear_glass_changes_nothing(blend: Blend) -> None:
 
 def test_what_is_behind_is_darker_by_the_transmittance_and_nothing_else_changes() -> None:
     plain, frame = Planar()(showcase(), CAMERA), Planar()(tinted_showcase(), CAMERA)
-    shown = (plain.layers["mask"] > 0.2) & (plain.layers["hit"] > 0)
+    shown = (plain.layers["mask"] > 0.2) & (plain.layers["pane"] >= 0)
     assert int(shown.sum()) > 50
     behind, through = (linear_from_srgb(f.layers["transmission"][shown]) for f in (plain, frame))
     left = 1 - plain.layers["mask"][shown][:, None] * (1 - GREENISH)

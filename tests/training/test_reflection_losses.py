@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from glassplat.captures.view import View
-from glassplat.kernels.panes import pane_layers
 from glassplat.render.frame import Frame
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
@@ -31,7 +30,7 @@ def frame_with(**layers: torch.Tensor) -> Any:
 
 
 def conflict(transmission: torch.Tensor, reflection: torch.Tensor, pane: torch.Tensor, strength: torch.Tensor) -> float:
-    layers = {"without_panes": transmission, "reflection": reflection, "inner": pane_layers(pane, strength)[1]}
+    layers = {"without_panes": transmission, "reflection": reflection, "pane": pane, "strength": strength}
     return float(gradient_conflict(frame_with(**layers), SimpleNamespace(), SimpleNamespace()))
 
 
@@ -95,7 +94,7 @@ def _shrunk(image: Tensor, factor: int) -> Tensor:
 def test_gradient_conflict_leaves_the_reflection_alone() -> None:
     transmission = torch.rand(8, 9, 3, requires_grad=True)
     reflection = torch.rand(8, 9, 3, requires_grad=True)
-    frame = frame_with(without_panes=transmission, reflection=reflection, inner=torch.ones(8, 9))
+    frame = frame_with(without_panes=transmission, reflection=reflection, pane=ALL, strength=EVEN)
     loss = gradient_conflict(frame, SimpleNamespace(), SimpleNamespace())
     to_transmission, to_reflection = torch.autograd.grad(loss, [transmission, reflection], allow_unused=True)
     assert float(to_transmission.abs().sum()) > 0 and to_reflection is None

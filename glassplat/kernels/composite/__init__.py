@@ -287,12 +287,33 @@ def color_and_depth(image: Tensor, alpha: Tensor, background: tuple[float, ...])
     """
     height, width = alpha.shape
     check_tensors({"image": (image, (height, width, 4)), "alpha": (alpha, (height, width))})
-    colors, total = image[..., :3], image[..., 3]
+    colors, depth = _ColorAndDepth.apply(image, alpha)
     if any(background):
         # Filled in on the device: a tensor of numbers that came from here would make a GPU wait.
         behind = torch.stack([torch.full_like(alpha, value) for value in background], dim=-1)
         colors = colors + (1 - alpha)[..., None] * behind
-    return colors, mean_depth(total, alpha)
+    return colors, depth
+
+
+class _ColorAndDepth(torch.autograd.Function):
+    """One node, whose colours lie together: everything that reads a part of an image copies it first."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
+        ctx.set_materialize_grads(False)
+        depth = mean_depth(image[..., 3], alpha)
+        ctx.save_for_backward(alpha, depth)
+        return image[..., :3].contiguous(), depth
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_colors: Tensor | None, v_depth: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        alpha, depth = ctx.saved_tensors
+        v_sum = None if v_depth is None else mean_depth(v_depth, alpha)
+        v_image = alpha.new_empty(*alpha.shape, 4)
+        v_image[..., :3] = 0 if v_colors is None else v_colors
+        v_image[..., 3] = 0 if v_sum is None else v_sum
+        return v_image, None if v_sum is None else -v_sum * depth
 
 
 def mean_depth(depth_sum: Tensor, alpha: Tensor) -> Tensor:
@@ -317,5 +338,23 @@ def join_channels(colors: Tensor, values: Tensor, more: int = 0) -> Tensor:
     """
     leading = tuple(values.shape)
     check_tensors({"colors": (colors, (*leading, 3)), "values": (values, leading)})
-    joined = torch.cat([colors, values[..., None]], dim=-1)
-    return torch.nn.functional.pad(joined, (0, 0, 0, more)) if more else joined
+    joined: Tensor = _JoinChannels.apply(colors, values, more)
+    return joined
+
+
+class _JoinChannels(torch.autograd.Function):
+    """One node and one copy; concatenation and padding would copy twice, and leave gradients to be copied."""
+
+    @staticmethod
+    def forward(ctx: Any, colors: Tensor, values: Tensor, more: int) -> Tensor:
+        cameras, count = values.shape
+        joined = colors.new_empty(cameras, count + more, 4)
+        joined[:, :count, :3], joined[:, :count, 3], joined[:, count:] = colors, values, 0
+        ctx.count = count
+        return joined
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_joined: Tensor) -> tuple[Tensor, Tensor, None]:
+        own = v_joined[:, : ctx.count]
+        return own[..., :3].contiguous(), own[..., 3].contiguous(), None

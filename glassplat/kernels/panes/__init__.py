@@ -149,18 +149,18 @@ class _BlendPanes(torch.autograd.Function):
 
 
 @torch.no_grad()
-def pane_layers(pane: Tensor, strength: Tensor) -> tuple[Tensor, Tensor]:
-    """Two images: 1 in the panes' rectangles, and 1 where a pixel and its eight neighbours show the same pane.
+def inside_panes(pane: Tensor, strength: Tensor) -> Tensor:
+    """1 where a pixel and its eight neighbours show the same pane, 0 elsewhere. Not differentiable.
 
-    The second is 0 where nothing reflects: on the rim of a pane, and where it is hit and no glass is there. Pixels
-    beyond the border of the image count as those next to them. Not differentiable.
+    It is 0 where nothing reflects: on the rim of a pane, and where it is hit and no glass is there. Pixels beyond the
+    border of the image count as those next to them.
 
     Args:
         pane: [H, W] int32, which pane is nearest, -1 for none.
         strength: [H, W] of the reflection.
 
     Returns:
-        Both [H, W], of the type of the strength.
+        [H, W], of the type of the strength.
 
     Raises:
         ValueError: shapes disagree.
@@ -171,14 +171,15 @@ def pane_layers(pane: Tensor, strength: Tensor) -> tuple[Tensor, Tensor]:
     if pane.dtype != torch.int32:
         raise TypeError(f"pane is {pane.dtype}; expected int32")
     shown = torch.where(strength > 0, pane, -1)
-    above, along = shown[1:] == shown[:-1], shown[:, 1:] == shown[:, :-1]
-    # Three rows that are each the same throughout, and the same as their neighbours.
-    row = torch.nn.functional.pad(along, (0, 1), value=True) & torch.nn.functional.pad(along, (1, 0), value=True)
-    pair = row[1:] & row[:-1] & above
-    inner = torch.nn.functional.pad(pair, (0, 0, 0, 1), value=True) & torch.nn.functional.pad(
-        pair, (0, 0, 1, 0), value=True
-    )
-    return (pane >= 0).to(strength.dtype), (inner & row & (shown >= 0)).to(strength.dtype)
+    inside = shown >= 0
+    along, above = shown[:, 1:] == shown[:, :-1], shown[1:] == shown[:-1]
+    inside[:, 1:] &= along
+    inside[:, :-1] &= along
+    # Two rows of which each pixel shows what those beside it and the one above it show.
+    pairs = (inside[1:] & inside[:-1]).logical_and_(above)
+    inside[1:] &= pairs
+    inside[:-1] &= pairs
+    return inside.to(strength.dtype)
 
 
 @torch.no_grad()
@@ -239,7 +240,12 @@ def slopes_at(slopes: Tensor, near: Tensor, means2d: Tensor, depths: Tensor) -> 
     expected = {"slopes": (slopes, size), "near": (near, size), "means2d": (means2d, (*leading, 2))}
     check_tensors({**expected, "depths": (depths, leading)})
     height, width = slopes.shape
-    # Held within the image before the conversion, which infinities would leave to chance.
-    columns, rows = means2d.nan_to_num().unbind(-1)
-    pixels = rows.clamp(0, height - 1).long(), columns.clamp(0, width - 1).long()
-    return torch.where(depths > near[pixels], slopes[pixels], 1.0)
+    # Held within the image before the conversion, which infinities and NaN would leave to chance; fmax takes 0 for NaN.
+    zero = means2d.new_zeros(())
+    columns, rows = (
+        torch.fmax(axis, zero).clamp_(max=size - 1).int()
+        for axis, size in zip(means2d.unbind(-1), (width, height), strict=True)
+    )
+    pixels = (rows * width + columns).flatten()
+    surface, slope = (image.flatten().index_select(0, pixels).view_as(depths) for image in (near, slopes))
+    return torch.where(depths > surface, slope, 1.0)
