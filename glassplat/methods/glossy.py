@@ -19,7 +19,7 @@ from glassplat.methods.mirrors import (
     RefineEnvironment,
     ResetRaised,
 )
-from glassplat.methods.splat import image_terms
+from glassplat.methods.splat import image_term
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.methods.surroundings import AddEnvironment, AddSurroundings, BeginReflections, StayMatte
 from glassplat.options import BLACK
@@ -69,13 +69,13 @@ def stages_of(recipe: DeferredRecipe, seed: int, iterations: int = PUBLISHED_ITE
 def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
     """Those of a run that is long enough for normals to spread."""
     population = _population(recipe)
-    image = image_terms(recipe.ssim_weight, recipe.view_dependence_weight)
+    image, held = image_term(recipe.ssim_weight), recipe.view_dependence_weight
     bootstrap = Stage(
         name="1 bootstrap",
         share=recipe.bootstrap,
         renderer=Splat(recipe.background or BLACK, depth=False),
-        losses=(*image, *population.terms),
-        rates=(_rates_of_splat(recipe) if recipe.search.begin_found else recipe.rates).of("primary"),
+        losses=(image, *population.terms),
+        rates=(_rates_of_splat(recipe) if recipe.search.begin_found else recipe.rates).of("primary", held),
         actions=(*population.edits, *_regular(recipe, population)),
         post_steps=population.post_steps,
         densify_until=population.densify_until,
@@ -92,8 +92,8 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
         name="2 reflection",
         share=recipe.schedule.stop - recipe.bootstrap,
         renderer=renderer,
-        losses=(*image, *guidance, *population.terms),
-        rates=recipe.rates.of("primary") | recipe.reflection_rates.of(),
+        losses=(image, *guidance, *population.terms),
+        rates=recipe.rates.of("primary", held) | recipe.reflection_rates.of(),
         actions=(
             *_edits(recipe, population),
             # Before the resets: it looks at what is seen, also at the beats that it leaves to them.

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import PointCloud
-from glassplat.methods.splat import image_terms
+from glassplat.methods.splat import image_term
 from glassplat.options import BLACK
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.fit import fit_planes, with_mirrors
@@ -442,8 +442,8 @@ def stages_of(recipe: PlanarRecipe, seed: int, iterations: int = PUBLISHED_ITERA
         name="1 initialisation",
         share=first,
         renderer=Splat(recipe.background or BLACK, depth=False),
-        losses=(*image_terms(recipe.ssim_weight, recipe.view_dependence_weight), *population.terms),
-        rates=recipe.rates.of("primary"),
+        losses=(image_term(recipe.ssim_weight), *population.terms),
+        rates=recipe.rates.of("primary", recipe.view_dependence_weight),
         actions=(*population.edits, GrowSh(Every(recipe.rhythm.sh)), *_early_resets(recipe, population)),
         post_steps=population.post_steps,
         densify_until=population.densify_until,
@@ -479,7 +479,7 @@ def _adjustment(recipe: PlanarRecipe, share: float, setup: PaneSetup) -> Stage:
         share=share,
         renderer=_training_renderer(recipe, "planes"),
         losses=_joint_terms(recipe, population),
-        rates=recipe.rates.of("primary") | recipe.rates.of("glass") | plane_rates(),
+        rates=_gaussian_rates(recipe) | plane_rates(),
         actions=(
             *population.edits,
             GrowSh(Every(recipe.rhythm.sh)),
@@ -503,8 +503,7 @@ def _joint(recipe: PlanarRecipe, share: float) -> Stage:
         share=share,
         renderer=_training_renderer(recipe, "all"),
         losses=_joint_terms(recipe, population),
-        rates=recipe.rates.of("primary")
-        | recipe.rates.of("glass")
+        rates=_gaussian_rates(recipe)
         | plane_rates(JOINT_FACTOR)
         | ({"primary.log_intensity": Rate(recipe.rates.intensity)} if recipe.intensity else {}),
         actions=(
@@ -523,15 +522,19 @@ def _joint(recipe: PlanarRecipe, share: float) -> Stage:
     )
 
 
+def _gaussian_rates(recipe: PlanarRecipe) -> dict[str, Rate]:
+    """Learning rates of primary and glass Gaussians."""
+    return recipe.rates.of("primary", recipe.view_dependence_weight) | recipe.rates.of("glass")
+
+
 def _glass_post_steps(recipe: PlanarRecipe) -> tuple[PostStep, ...]:
     """Steps that keep transmittances possible; before the means of the last passes are taken."""
     return (glass_only_darkens,) if recipe.tint else ()
 
 
 def _joint_terms(recipe: PlanarRecipe, population: Population) -> tuple[LossTerm, ...]:
-    image = image_terms(recipe.ssim_weight, recipe.view_dependence_weight)
     glass = weighted(LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, tint_departure))
-    return (*image, *reflection_terms(recipe.weights), *glass, *population.terms)
+    return (image_term(recipe.ssim_weight), *reflection_terms(recipe.weights), *glass, *population.terms)
 
 
 def planar_population(recipe: PlanarRecipe) -> Population:

@@ -12,7 +12,7 @@ from glassplat.scene.scene import Scene
 from glassplat.training.actions import GrowSh, Population, SeedUnexplained, population_of
 from glassplat.training.corrections import corrections_begun, corrections_learnt
 from glassplat.training.densify import as_discs
-from glassplat.training.losses import LossTerm, PhotometricLoss, disc_normals, distortion, view_dependence, weighted
+from glassplat.training.losses import LossTerm, PhotometricLoss, disc_normals, distortion
 from glassplat.training.options import PUBLISHED_ITERATIONS
 from glassplat.training.stage import Every, Stage
 
@@ -39,8 +39,8 @@ def stages_of(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITERAT
         name="splat",
         share=1.0,
         renderer=_bare(recipe),
-        losses=(*image_terms(recipe.ssim_weight, recipe.view_dependence_weight), *population.terms),
-        rates=recipe.rates.of("primary"),
+        losses=(image_term(recipe.ssim_weight), *population.terms),
+        rates=recipe.rates.of("primary", recipe.view_dependence_weight),
         actions=(*_missing(recipe), *population.edits, GrowSh(Every(recipe.rhythm.sh)), *population.resets),
         post_steps=population.post_steps,
         densify_until=population.densify_until,
@@ -90,9 +90,6 @@ def terms_by_start(options: DiscTerms) -> tuple[tuple[float, LossTerm], ...]:
     return tuple(sorted(wanted, key=lambda pair: pair[0]))
 
 
-def image_terms(ssim_weight: float, view_dependence_weight: float) -> tuple[LossTerm, ...]:
-    """(1 - lambda) L1 + lambda D-SSIM (TR-Gaussians, Eq. 18), and what keeps colours from turning with the view."""
-    return weighted(
-        LossTerm("photometric", 1.0, PhotometricLoss(ssim_weight)),
-        LossTerm("view dependence", view_dependence_weight, view_dependence),
-    )
+def image_term(ssim_weight: float) -> LossTerm:
+    """(1 - lambda) L1 + lambda D-SSIM (TR-Gaussians, Eq. 18)."""
+    return LossTerm("photometric", 1.0, PhotometricLoss(ssim_weight))

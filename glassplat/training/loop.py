@@ -20,7 +20,7 @@ from glassplat.scene.scene import Scene
 from glassplat.training.densify import ScreenStatistics
 from glassplat.training.messages import ActionDone, Message, StageEntered, StepDone
 from glassplat.training.ranks import Ranks
-from glassplat.training.stage import Clock, Stage, TrainState, carried_out, rate_tensor, stage_starts
+from glassplat.training.stage import Clock, Stage, TrainState, carried_out, decay_tensor, rate_tensor, stage_starts
 
 
 class TrainingDivergedError(FloatingPointError):
@@ -336,7 +336,8 @@ def update(
     progress = state.step / iterations
     extent = state.scene.extent
     rates = {n: rate_tensor(stage.rates[n], parameters[n], progress, extent, iterations) for n in gradients}
-    state.optimizer.step(parameters, gradients, rates, views=views)
+    decays = {n: decay for n in gradients if (decay := decay_tensor(stage.rates[n], parameters[n])) is not None}
+    state.optimizer.step(parameters, gradients, rates, decays=decays, views=views)
 
 
 def collect(statistics: dict[str, ScreenStatistics], result: Differentiated, view: View) -> None:

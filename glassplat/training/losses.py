@@ -12,7 +12,6 @@ from torch import Tensor
 
 from glassplat.captures.view import FOLDER, View, in_world, normals_in_camera, with_ignored_right
 from glassplat.kernels.loss_terms import gradient_conflict as shared_edges
-from glassplat.kernels.loss_terms import harmonic_energy
 from glassplat.kernels.panes import inside_panes
 from glassplat.kernels.photometric import photometric
 from glassplat.render.deferred import cell_means, cell_side, depth_normals
@@ -77,16 +76,6 @@ def mean_scale(frame: Frame, view: View, scene: Scene) -> Tensor:
 def of_all(term: LossFunction) -> LossFunction:
     """A term of what the view shows directly, as one of all Gaussians."""
     return lambda frame, view, scene: term(replace(frame, direct=None), view, scene)
-
-
-def view_dependence(frame: Frame, view: View, scene: Scene) -> Tensor:
-    """Squares of the spherical harmonics beyond the constant one, per Gaussian (not in the papers).
-
-    What is seen from few directions has coefficients that no photograph decides, and its colour from other directions,
-    from which a pane shows it, is whatever they happen to be.
-    """
-    sh = scene.primary.sh
-    return harmonic_energy(sh) / max(sh.shape[0], 1)
 
 
 def _direct_mean(values: Tensor, activation: Callable[[Tensor], Tensor], frame: Frame) -> Tensor:

@@ -40,6 +40,7 @@ class Rate:
         decay: share of the run at which `end` is reached.
         per_extent: multiply by the scene extent (for positions).
         rest: factor for every SH coefficient but the constant one; only for `sh`.
+        penalty: weight in the loss of the mean over the Gaussians of the squares of what `rest` scales.
         short_run_power: a run of fewer iterations than the published 30,000 multiplies the rate by their ratio to this
             power (`FASTEST_ITERATIONS` at the least), because Adam moves a parameter by about its rate at every step,
             however small the gradient.
@@ -50,6 +51,7 @@ class Rate:
     decay: float = 1.0
     per_extent: bool = False
     rest: float | None = None
+    penalty: float = 0.0
     short_run_power: float = 0.0
 
     def at(self, progress: float, extent: float, iterations: int = PUBLISHED_ITERATIONS) -> float:
@@ -94,12 +96,19 @@ class GaussianRates:
     intensity: Internal[LearningRate] = 5e-3
     short_run_power: Internal[Annotated[float, Range(0, 2)]] = 0.5
 
-    def of(self, part: str) -> dict[str, Rate]:
-        """The rates by dotted parameter name."""
+    def of(self, part: str, view_dependence: float = 0.0) -> dict[str, Rate]:
+        """The rates by dotted parameter name.
+
+        Args:
+            part: of the scene.
+            view_dependence: weight in the loss of the squares of the spherical harmonics beyond the constant one, per
+                Gaussian. What is seen from few directions has coefficients that no photograph decides, and its colour
+                from other directions, from which a pane shows it, is whatever they happen to be (not in the papers).
+        """
         power = self.short_run_power
         return {
             f"{part}.means": Rate(self.means, MEANS_END, decay=self.decay, per_extent=True, short_run_power=power),
-            f"{part}.sh": Rate(self.sh, rest=1 / 20, short_run_power=power),
+            f"{part}.sh": Rate(self.sh, rest=1 / 20, penalty=view_dependence, short_run_power=power),
             f"{part}.logit_opacities": Rate(self.opacity),
             f"{part}.log_scales": Rate(self.scale, short_run_power=power),
             f"{part}.quats": Rate(self.rotation, short_run_power=power),

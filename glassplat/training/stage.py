@@ -51,9 +51,12 @@ class Optimizer:
         gradients: Mapping[str, Tensor],
         rates: Mapping[str, float | Tensor],
         *,
+        decays: Mapping[str, Tensor] | None = None,
         views: int = 1,
     ) -> None:
         """Updates `parameters` in place for every name in `gradients`, which are means over so many views.
+
+        `decays` are those of `glassplat.kernels.adam.Update`, of the parameters that have one.
 
         Rates are those of a step of one view. They grow by the root of the number of views, and moments remember as
         many views as ever: so a step leads as far as so many steps would whose gradients agree on nothing (Malladi et
@@ -61,6 +64,7 @@ class Optimizer:
         """
         learning = [name for name in gradients if parameters[name].numel() > 0 and not self._waits(name, views)]
         updates = [self._update(name, parameters[name], gradients[name], rates[name], views) for name in learning]
+        updates = [u._replace(decay=(decays or {}).get(name)) for name, u in zip(learning, updates, strict=True)]
         adam(updates, betas=(BETAS[0] ** views, BETAS[1] ** views))
 
     def _update(self, name: str, parameter: Tensor, gradient: Tensor, rate: float | Tensor, views: int) -> Update:
@@ -95,6 +99,16 @@ def rate_tensor(rate: Rate, parameter: Tensor, progress: float, extent: float, i
         return value
     columns = torch.full(parameter.shape[1:], value * rate.rest, dtype=parameter.dtype, device=parameter.device)
     columns[:1].fill_(value)
+    return columns.flatten()
+
+
+def decay_tensor(rate: Rate, parameter: Tensor) -> Tensor | None:
+    """The decay that gives the gradient of `Rate.penalty`; None where there is no penalty."""
+    if not rate.penalty or not parameter.numel():
+        return None
+    decay = 2 * rate.penalty / len(parameter)
+    columns = torch.full(parameter.shape[1:], decay, dtype=parameter.dtype, device=parameter.device)
+    columns[:1].zero_()
     return columns.flatten()
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numba
 import pytest
 import torch
@@ -28,6 +30,18 @@ def test_several_steps_agree_with_torch(dtype: torch.dtype, tolerance: float) ->
         optimizer.step()
         adam([Update(parameter, gradient, first, second, 0.05, step)], betas=BETAS)
     torch.testing.assert_close(parameter, theirs.detach(), rtol=tolerance, atol=tolerance)
+
+
+def test_decay_is_the_weight_decay_of_torch() -> None:
+    parameter = draws(3001, 4)
+    first, second = torch.zeros_like(parameter), torch.zeros_like(parameter)
+    theirs = parameter.clone().requires_grad_()
+    optimizer = torch.optim.Adam([theirs], lr=0.05, eps=1e-15, weight_decay=0.3)
+    for step in range(1, 4):
+        theirs.grad = draws(3001, 4, seed=step)
+        optimizer.step()
+        adam([Update(parameter, draws(3001, 4, seed=step), first, second, 0.05, step, torch.full((4,), 0.3))])
+    torch.testing.assert_close(parameter, theirs.detach(), rtol=1e-5, atol=1e-5)
 
 
 def test_each_column_has_its_own_rate() -> None:
@@ -62,13 +76,15 @@ def test_a_vector_is_rows_of_one_column() -> None:
 
 
 def several(dtype: torch.dtype) -> list[Update]:
-    """Tensors of less than a task, of several, and of none, whose steps and rates differ."""
+    """Tensors of less than a task, of several, and of none, whose steps, rates and decays differ."""
     shapes = ((5,), (3000, 4), (0, 3), (700, 16, 3), (1, 3))
     updates = []
     for i, shape in enumerate(shapes):
         tensors = (draws(*shape, dtype=dtype, seed=4 * i + k) for k in range(3))
         rates = torch.linspace(0.0, 0.1, 48) if len(shape) == 3 else 0.02 * (i + 1)
-        updates.append(Update(*tensors, draws(*shape, dtype=dtype, seed=4 * i + 3).square(), rates, step=i + 1))
+        decay = torch.linspace(0.5, 0.0, math.prod(shape[1:])) if i % 3 else None
+        squares = draws(*shape, dtype=dtype, seed=4 * i + 3).square()
+        updates.append(Update(*tensors, squares, rates, step=i + 1, decay=decay))
     return updates
 
 
@@ -128,6 +144,7 @@ def test_a_parameter_that_requires_grad_is_updated_in_place() -> None:
         ({"gradient": torch.zeros(3, 2)}, ValueError, r"gradient has shape \(3, 2\); expected \(4, 2\)"),
         ({"second_moment": torch.zeros(2, 4).T}, ValueError, "second_moment is changed in place"),
         ({"lr": torch.zeros(3)}, ValueError, r"lr has shape \(3,\); expected one number or one per column, \(2,\)"),
+        ({"decay": torch.zeros(4)}, ValueError, r"decay has shape \(4,\); expected one number or one per column"),
         ({"step": 0}, ValueError, "steps count from 1"),
         ({"gradient": torch.zeros(4, 2, dtype=torch.float64)}, TypeError, "gradient is torch.float64"),
     ],

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
-import numba
 import pytest
 import torch
 from torch import Tensor
 
 from glassplat.kernels.composite import color_and_depth, join_channels
-from glassplat.kernels.loss_terms import _EnergyInTorch, harmonic_energy
 from glassplat.kernels.panes import inside_panes
-
-DTYPES = [(torch.float32, 1e-5), (torch.float64, 1e-12)]
 
 
 def draw(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -29,15 +24,6 @@ def with_gradients(function: Callable[..., Any], leaves: tuple[Tensor, ...], *re
     weights = [draw(*output.shape, seed=9 + i, dtype=output.dtype) - 0.5 for i, output in enumerate(outputs)]
     gradients = torch.autograd.grad(outputs, own, weights, allow_unused=True, materialize_grads=True)
     return [*(output.detach() for output in outputs), *gradients]
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    numba.set_num_threads(1)
-    try:
-        yield
-    finally:
-        numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
 
 
 def blended(dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -109,21 +95,6 @@ def test_inside_of_panes(size: tuple[int, int]) -> None:
     assert size != (40, 53) or 0.1 < float(expected.mean()) < 0.7
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), DTYPES)
-@pytest.mark.parametrize("shape", [(2500, 16), (3, 1), (3, 0), (0, 4)])
-def test_energy_of_harmonics(shape: tuple[int, int], dtype: torch.dtype, tolerance: float) -> None:
-    sh = draw(*shape, 3, dtype=dtype) - 0.3
-    found, on_gpu, expected = (
-        with_gradients(f, (sh,)) for f in (harmonic_energy, _EnergyInTorch.apply, lambda sh: sh[:, 1:].square().sum())
-    )
-    for own, of_gpu, wanted in zip(found, on_gpu, expected, strict=True):
-        torch.testing.assert_close(own, wanted, rtol=tolerance, atol=tolerance)
-        torch.testing.assert_close(of_gpu, wanted, rtol=tolerance, atol=tolerance)
-    with one_thread():
-        again = with_gradients(harmonic_energy, (sh,))
-    assert all(torch.equal(a, b) for a, b in zip(found, again, strict=True))
-
-
 def test_bad_input_is_named() -> None:
     image, alpha = blended(torch.float32)
     with pytest.raises(ValueError, match="image"):
@@ -132,5 +103,3 @@ def test_bad_input_is_named() -> None:
         join_channels(image, alpha)
     with pytest.raises(TypeError, match="int32"):
         inside_panes(alpha, alpha)
-    with pytest.raises(ValueError, match="sh"):
-        harmonic_energy(image)

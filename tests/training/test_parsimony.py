@@ -8,10 +8,15 @@ from typing import Any
 import pytest
 import torch
 
+from glassplat.methods.planar_recipe import PlanarRecipe
+from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.render.frame import Frame
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Scene
-from glassplat.training.losses import mean_opacity, mean_scale, view_dependence
+from glassplat.training.loop import update
+from glassplat.training.losses import mean_opacity, mean_scale
+from glassplat.training.options import GaussianRates, Rate
+from glassplat.training.stage import TrainState, decay_tensor
 
 UNUSED: Any = None
 UNTOLD = Frame(torch.zeros(1, 1, 3))
@@ -68,26 +73,30 @@ def test_no_gaussians_cost_nothing() -> None:
     assert mean_scale(UNTOLD, UNUSED, scene).item() == 0
 
 
-def test_only_colours_that_turn_with_the_view_are_held() -> None:
-    scene = scene_of([0.5, 0.5], scale=0.3)
-    sh = torch.zeros(2, 4, 3)
-    sh[:, 0] = 7.0
-    constant = replace(scene, primary=scene.primary.with_tensors({"sh": sh}))
-    assert view_dependence(UNUSED, UNUSED, constant).item() == 0
-    sh = sh.clone()
-    sh[1, 2] = torch.tensor([1.0, -2.0, 0.0])
-    turning = replace(scene, primary=scene.primary.with_tensors({"sh": sh}))
-    assert view_dependence(UNUSED, UNUSED, turning).item() == pytest.approx(5 / 2)
-    assert view_dependence(UNUSED, UNUSED, scene).item() == 0
+def test_decay_is_the_gradient_of_the_squares_of_harmonics_beyond_the_constant() -> None:
+    sh = torch.randn(5, 9, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    (expected,) = torch.autograd.grad(0.7 * sh[:, 1:].square().sum() / 5, sh)
+    decay = decay_tensor(GaussianRates().of("primary", 0.7)["primary.sh"], sh)
+    assert decay is not None
+    torch.testing.assert_close(decay.reshape(9, 3) * sh.detach(), expected)
+    assert not expected[:, 0].any()
 
 
-def test_the_gradient_holds_harmonics_and_leaves_the_constant_alone() -> None:
-    scene = scene_of([0.5, 0.5, 0.5], scale=0.3)
-    sh = torch.randn(3, 9, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+@pytest.mark.parametrize("rate", [Rate(1.0, rest=0.05), Rate(1.0, rest=0.05, penalty=0.7)])
+def test_nothing_decays_that_has_no_penalty_or_no_harmonics(rate: Rate) -> None:
+    assert decay_tensor(rate, torch.zeros(5 if not rate.penalty else 0, 9, 3)) is None
 
-    def penalty(values: torch.Tensor) -> torch.Tensor:
-        return view_dependence(UNUSED, UNUSED, replace(scene, primary=scene.primary.with_tensors({"sh": values})))
 
-    assert torch.autograd.gradcheck(penalty, sh)
-    (gradient,) = torch.autograd.grad(penalty(sh), sh)
-    assert not gradient[:, 0].any()
+def test_every_stage_of_planar_holds_harmonics_of_the_primary_gaussians_alone() -> None:
+    for stage in PlanarRecipe(view_dependence_weight=0.3).stages(seed=0):
+        assert {name: rate.penalty for name, rate in stage.rates.items() if rate.penalty} == {"primary.sh": 0.3}
+
+
+def test_a_step_takes_off_what_no_photograph_asks_for() -> None:
+    (stage,) = SplatRecipe(view_dependence_weight=0.1).stages(seed=0)
+    state = TrainState(scene_of([0.5, 0.5], scale=0.3), seed=0)
+    state.scene = replace(state.scene, primary=state.scene.primary.with_tensors({"sh": torch.full((2, 9, 3), 0.2)}))
+    before = state.scene.primary.sh.clone()
+    update(stage, state, {"primary.sh": torch.zeros_like(before)}, iterations=100)
+    assert bool((state.scene.primary.sh[:, 1:] < before[:, 1:]).all())
+    assert torch.equal(state.scene.primary.sh[:, :1], before[:, :1])

@@ -73,7 +73,7 @@ def test_planar_goes_through_its_stages() -> None:
     assert [(m.step, m.stage[0]) for m in messages if isinstance(m, StageEntered)] == [(0, "1"), (4, "2"), (10, "3")]
     assert any(isinstance(m, ActionDone) for m in messages)
     terms = [set(m.losses) for m in messages if isinstance(m, StepDone)]
-    assert terms[0] == {"photometric", "view dependence"}
+    assert terms[0] == {"photometric"}
     assert {"photometric", "depth", "conflict"} <= terms[-1]
     assert any("mask" in names for names in terms)
 

@@ -1,4 +1,4 @@
-"""Adam, in place and in one pass over all parameters, with a learning rate per column where wanted."""
+"""Adam, in place and in one pass over all parameters; learning rate and weight decay may differ by column."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ class Update(NamedTuple):
             all dimensions after the first.
         step: number of this step, from 1; the bias correction depends on it. A fraction where steps before it had other
             betas.
+        decay: [columns] by what the parameter is multiplied and added to its gradient, which is that of an L2 penalty
+            of half as much; None adds nothing.
     """
 
     parameter: Tensor
@@ -33,6 +35,7 @@ class Update(NamedTuple):
     second_moment: Tensor
     lr: float | Tensor
     step: float
+    decay: Tensor | None = None
 
     def corrections(self, betas: tuple[float, float]) -> tuple[float, float]:
         """The factors on the step size and on the root of the second moment that undo the bias towards zero."""
@@ -47,14 +50,16 @@ CHANGED = ("parameter", "first_moment", "second_moment")
 def adam(updates: Sequence[Update], *, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15) -> None:
     """Takes one Adam step with bias correction, as `torch.optim.Adam` does; changes all but the gradients in place.
 
+    So is `decay` that optimiser's `weight_decay`: part of the gradient, and not taken off the parameter as by AdamW.
+
     Args:
         updates: the parameters, all of one floating-point type and on one device, no two of them in the same memory.
         betas: decay of the two running means.
         eps: added to the root of the second moment.
 
     Raises:
-        ValueError: shapes differ, a rate has not one entry per column, a step is below 1, or a tensor that changes in
-            place is not contiguous.
+        ValueError: shapes differ, a rate or decay has not one entry per column, a step is below 1, or a tensor that
+            changes in place is not contiguous.
         TypeError: floating-point types differ or are not supported, or tensors are on different devices.
     """
     for update in updates:
@@ -72,8 +77,9 @@ def _check(update: Update, like: Tensor) -> None:
         if not getattr(update, name).is_contiguous():
             raise ValueError(f"{name} is changed in place and must be contiguous; pass {name}.contiguous()")
     columns = (math.prod(shape[1:]),)
-    if isinstance(update.lr, Tensor) and tuple(update.lr.shape) != columns:
-        raise ValueError(f"lr has shape {tuple(update.lr.shape)}; expected one number or one per column, {columns}")
+    for name, value in (("lr", update.lr), ("decay", update.decay)):
+        if isinstance(value, Tensor) and tuple(value.shape) != columns:
+            raise ValueError(f"{name} has shape {tuple(value.shape)}; expected one number or one per column, {columns}")
     if update.step < 1:
         raise ValueError(f"step is {update.step}; steps count from 1")
 

@@ -25,49 +25,56 @@ def adam(flat: Sequence[Update], betas: tuple[float, float], eps: float) -> None
     """Takes the updates, whose tensors are flat."""
     real = REAL_OF[flat[0].parameter.dtype]
     table, step_sizes, roots = [], [], []
+    pulls: list[float] = []
     for update in flat:
         step_correction, root = update.corrections(betas)
-        rates = update.lr.tolist() if isinstance(update.lr, Tensor) else [update.lr]
+        columns = 1 if update.decay is None else len(update.decay)
+        rates = update.lr.tolist() if isinstance(update.lr, Tensor) else [update.lr] * columns
         table.append([*(tensor.data_ptr() for tensor in update[:4]), update.parameter.numel(), len(rates)])
         step_sizes += [rate * step_correction for rate in rates]
+        pulls += [0.0] * len(rates) if update.decay is None else update.decay.tolist()
         roots.append(root)
     # 1 - 0.999 loses half of its digits in single precision, so the gains are rounded from the double.
     decays, gains = tuple(real(b) for b in betas), tuple(real(1 - b) for b in betas)
-    adam_step(real)(np.array(table), np.array(step_sizes, real), np.array(roots, real), decays, gains, real(eps))
+    columns_of = np.array([step_sizes, pulls]).astype(real)
+    adam_step(real)(np.array(table), columns_of, np.array(roots, real), decays, gains, real(eps))
 
 
 @cache
 def adam_step(real: type) -> Kernel:
-    """Updates flat arrays in place; `step_sizes` of the columns of each follow one another."""
+    """Updates flat arrays in place; `columns` are step sizes and decays of those of each, which follow one another."""
     at = array_at(real)
 
     @kernel("adam", real)
-    def step(table, step_sizes, roots, betas, gains, eps):
-        # What a task needs of its tensor: which tasks are before it, and a step size for each of its elements.
+    def step(table, columns, roots, betas, gains, eps):
+        # What a task needs of its tensor: which tasks are before it, and step size and decay of each of its elements.
         count, known = table.shape[0], 0
         tasks, begins = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)
         for k in range(count):
             block = table[k, COLUMNS] * max(1, BLOCK // table[k, COLUMNS])
             tasks[k + 1] = tasks[k] + (table[k, SIZE] + block - 1) // block
             begins[k + 1] = begins[k] + block
-        repeated = np.empty(begins[count], real)
+        repeated = np.empty((2, begins[count]), real)
         for k in range(count):
             for begin in range(begins[k], begins[k + 1], table[k, COLUMNS]):
                 for column in range(table[k, COLUMNS]):
-                    repeated[begin + column] = step_sizes[known + column]
+                    repeated[0, begin + column] = columns[0, known + column]
+                    repeated[1, begin + column] = columns[1, known + column]
             known += table[k, COLUMNS]
         for task in prange(tasks[count]):
             k = 0
             while tasks[k + 1] <= task:
                 k += 1
-            rates, root = repeated[begins[k] : begins[k + 1]], roots[k]
+            rates, decays = repeated[0, begins[k] : begins[k + 1]], repeated[1, begins[k] : begins[k + 1]]
+            root = roots[k]
             first = (task - tasks[k]) * rates.size
             size = min(rates.size, table[k, SIZE] - first)
             p, g = at(table[k, PARAMETER], first, size), at(table[k, GRADIENT], first, size)
             m, v = at(table[k, FIRST], first, size), at(table[k, SECOND], first, size)
             for i in range(size):
-                mean = betas[0] * m[i] + gains[0] * g[i]
-                square = betas[1] * v[i] + gains[1] * g[i] * g[i]
+                pull = g[i] + decays[i] * p[i]
+                mean = betas[0] * m[i] + gains[0] * pull
+                square = betas[1] * v[i] + gains[1] * pull * pull
                 m[i], v[i] = mean, square
                 p[i] -= rates[i] * mean / (math.sqrt(square) * root + eps)
 

@@ -26,8 +26,11 @@ def adam(flat: Sequence[Update], betas: tuple[float, float], eps: float) -> None
             rates = lr.detach().to(parameter.device, parameter.dtype).contiguous()
         else:
             rate *= lr
+        decays = update.decay
+        if decays is not None:
+            decays = decays.detach().to(parameter.device, parameter.dtype).contiguous()
         adam_step(REAL_OF[parameter.dtype])(
-            blocks_for(parameter.numel(), THREADS), THREADS, *update[:4], rates, rate,
+            blocks_for(parameter.numel(), THREADS), THREADS, *update[:4], rates, decays, rate,
             betas[0], betas[1], 1 - betas[0], 1 - betas[1], root, eps,
         )  # fmt: skip
 
@@ -36,14 +39,14 @@ def adam(flat: Sequence[Update], betas: tuple[float, float], eps: float) -> None
 def adam_step(real: type) -> Kernel:
     """Updates flat arrays in place; `rate` is the step size, times that of the column in `rates`."""
 
-    @kernel("adam", real, "real1 real1 real1 real1 real1 real real real real real real real")
+    @kernel("adam", real, "real1 real1 real1 real1 real1 real1 real real real real real real real")
     def step(
-        parameter, gradient, first, second, rates, rate, beta_1, beta_2, gain_1, gain_2, second_scale, eps
+        parameter, gradient, first, second, rates, decays, rate, beta_1, beta_2, gain_1, gain_2, second_scale, eps
     ):  # fmt: skip
         i = cuda.grid(1)
         if i >= parameter.size:
             return
-        g = gradient[i]
+        g = gradient[i] + decays[i % decays.size] * parameter[i] if decays.size > 0 else gradient[i]
         mean = beta_1 * first[i] + gain_1 * g
         square = beta_2 * second[i] + gain_2 * g * g
         first[i], second[i] = mean, square

@@ -13,7 +13,9 @@ from glassplat.kernels.adam import Update
 @torch.no_grad()
 def adam(updates: Sequence[Update], *, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15) -> None:
     """Takes one Adam step in place; see `glassplat.kernels.adam.adam`."""
-    for parameter, gradient, first_moment, second_moment, lr, step in updates:
+    for parameter, gradient, first_moment, second_moment, lr, step, decay in updates:
+        if decay is not None:
+            gradient = gradient + decay.reshape(parameter.shape[1:]) * parameter
         first_moment.mul_(betas[0]).add_(gradient, alpha=1 - betas[0])
         second_moment.mul_(betas[1]).add_(gradient * gradient, alpha=1 - betas[1])
         mean = first_moment / (1 - betas[0] ** step)

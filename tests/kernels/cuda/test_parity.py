@@ -439,9 +439,10 @@ def test_adam(columns: bool, dtype: torch.dtype) -> None:
     expected += [torch.zeros_like(expected[0]), torch.zeros_like(expected[0])]
     found = [tensor.clone().to(DEVICE) for tensor in expected]
     lr = torch.linspace(0.1, 0.6, 6, dtype=dtype) if columns else 0.3
+    decay = torch.linspace(0.0, 0.5, 6, dtype=dtype) if columns else None
     for step in (1, 2, 3):
-        adam_operation.adam([adam_operation.Update(*found, lr, step)])
-        adam_twin.adam([adam_operation.Update(*expected, lr, step)])
+        adam_operation.adam([adam_operation.Update(*found, lr, step, decay)])
+        adam_twin.adam([adam_operation.Update(*expected, lr, step, decay)])
     for value, want in zip(found, expected, strict=True):
         close(value, want)
 

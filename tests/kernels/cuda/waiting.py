@@ -14,7 +14,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from glassplat.kernels.backend import devices
-from glassplat.kernels.loss_terms import _EnergyInTorch, gradient_conflict_in_torch
+from glassplat.kernels.loss_terms import gradient_conflict_in_torch
 from glassplat.scene import camera
 from glassplat.training import densify, losses
 from tests.kernels.test_screen_statistics import add_views_in_torch
@@ -113,6 +113,5 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch, waits: Waits) -> None:
     monkeypatch.setattr(devices, "_module", counted)
     # The operations that are PyTorch's own on a GPU, and one whose kernel is not asked for on a CPU.
     monkeypatch.setattr(losses, "shared_edges", gradient_conflict_in_torch)
-    monkeypatch.setattr(losses, "harmonic_energy", _EnergyInTorch.apply)
     monkeypatch.setattr(densify, "add_views", add_views_in_torch)
     monkeypatch.setattr(camera, "waits", lambda device: True)
