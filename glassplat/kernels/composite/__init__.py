@@ -310,9 +310,11 @@ class _ColorAndDepth(torch.autograd.Function):
     def backward(ctx: Any, v_colors: Tensor | None, v_depth: Tensor | None) -> tuple[Tensor, Tensor | None]:
         alpha, depth = ctx.saved_tensors
         v_sum = None if v_depth is None else mean_depth(v_depth, alpha)
-        v_image = alpha.new_empty(*alpha.shape, 4)
-        v_image[..., :3] = 0 if v_colors is None else v_colors
-        v_image[..., 3] = 0 if v_sum is None else v_sum
+        v_image = alpha.new_zeros(*alpha.shape, 4)
+        if v_colors is not None:
+            v_image[..., :3] = v_colors
+        if v_sum is not None:
+            v_image[..., 3] = v_sum
         return v_image, None if v_sum is None else -v_sum * depth
 
 
@@ -349,7 +351,8 @@ class _JoinChannels(torch.autograd.Function):
     def forward(ctx: Any, colors: Tensor, values: Tensor, more: int) -> Tensor:
         cameras, count = values.shape
         joined = colors.new_empty(cameras, count + more, 4)
-        joined[:, :count, :3], joined[:, :count, 3], joined[:, count:] = colors, values, 0
+        joined[:, :count, :3], joined[:, :count, 3] = colors, values
+        joined[:, count:].zero_()
         ctx.count = count
         return joined
 
