@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from glassplat.captures.view import FOLDER, View, in_world, normals_in_camera, with_ignored_right
-from glassplat.kernels.loss_terms import gradient_conflict as shared_edges
+from glassplat.kernels.gradient_conflict import gradient_conflict as shared_edges
 from glassplat.kernels.panes import inside_panes
 from glassplat.kernels.photometric import photometric
 from glassplat.render.deferred import cell_means, cell_side, depth_normals

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from glassplat.kernels.loss_terms import gradient_conflict, sobel
-from glassplat.kernels.loss_terms import gradient_conflict_in_torch as twin
+from glassplat.kernels.gradient_conflict import gradient_conflict, sobel
+from glassplat.kernels.gradient_conflict import gradient_conflict_in_torch as twin
 
 
 def pictures(height: int, width: int, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:

@@ -14,7 +14,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from glassplat.kernels.backend import devices
-from glassplat.kernels.loss_terms import gradient_conflict_in_torch
+from glassplat.kernels.gradient_conflict import gradient_conflict_in_torch
 from glassplat.scene import camera
 from glassplat.training import densify, losses
 from tests.kernels.test_screen_statistics import add_views_in_torch

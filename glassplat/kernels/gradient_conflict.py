@@ -1,4 +1,4 @@
-"""A term of the loss that is added up in one pass: the edges that two images share.
+"""The edges that two images share, added up in one pass (TR-Gaussians, Eq. 15).
 
 PyTorch writes all products down before it adds them up; on a GPU that is no bottleneck, and there it stays PyTorch's.
 """
