@@ -23,6 +23,7 @@ from glassplat.training.densify import (
     append,
     apply_edit,
     densified,
+    fog_around,
     forget,
     gaussians_from_points,
     in_morton_order,
@@ -138,9 +139,10 @@ class Densify:
 
 @dataclass(frozen=True)
 class PruneIdle:
-    """Removes the Gaussians of one set that add next to nothing to any training view.
+    """Removes the Gaussians of one set that add next to nothing to any training view, or stand where a camera stood.
 
-    What stood behind a pane for a reflection, and has lost that to the mirrored image, ends as such.
+    What stood behind a pane for a reflection, and has lost that to the mirrored image, ends as such. And no photograph
+    was taken in a fog; see `fog_around`.
 
     Attributes:
         densifier: holds what is next to nothing, and when.
@@ -172,6 +174,8 @@ class PruneIdle:
             yield Working("looking for Gaussians that no view needs", done, len(dataset.train))
             most = torch.maximum(most, self.measure(state.scene, view.camera))
         busy = most >= self.densifier.least_contribution
+        if self.part == "primary":
+            busy &= ~fog_around(gaussians, torch.stack([view.camera.center for view in dataset.train]))
         # A scene without Gaussians is reported; surroundings that nothing mirrors yet may still be needed.
         if bool(busy.all()) or (self.part != "primary" and not bool(busy.any())):
             return False

@@ -157,6 +157,30 @@ def clone(count: int, index: Tensor) -> Edit:
     return Edit(source, torch.arange(source.shape[0], device=index.device) >= count)
 
 
+THICK_FOG = 0.1
+"""Opacity of a Gaussian at a place, from which on it is no place for a camera."""
+
+
+@torch.no_grad()
+def fog_around(gaussians: Gaussians, places: Tensor) -> Tensor:
+    """[N] bool: which Gaussians would hide what is seen from one of the places [P, 3].
+
+    A Gaussian is drawn if its centre lies before the camera. One around the camera itself is therefore seen in some
+    directions and not in others: it may hang between two cameras, where only a pane mirrors it, and cover all that a
+    third one sees. Discs hide nothing, as they have no volume.
+    """
+    hiding = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+    if gaussians.are_discs:
+        return hiding
+    reach = math.sqrt(-2 * math.log(THICK_FOG)) * gaussians.log_scales.amax(dim=1).exp()
+    for place in places.to(gaussians.means):
+        near = ((place - gaussians.means).norm(dim=1) < reach).nonzero().squeeze(1)
+        offset = (place - gaussians.means[near])[:, None] @ rotation_from_quat(gaussians.quats[near])
+        squared = (offset.squeeze(1) / gaussians.log_scales[near].exp()).square().sum(dim=1)
+        hiding[near] |= torch.sigmoid(gaussians.logit_opacities[near]) * torch.exp(-squared / 2) > THICK_FOG
+    return hiding
+
+
 CHILDREN = 2
 """Gaussians that take the place of one that is split."""
 SHRINK = 1.6

@@ -15,6 +15,7 @@ from glassplat.captures.view import PointCloud, View
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.panes.material import glass_gaussians
 from glassplat.render.frame import Renderer
+from glassplat.render.layers import contributions
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene import SH_ZERO
@@ -23,7 +24,7 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene, without_glass
 from glassplat.training.actions import Densify, PruneIdle, SeedUnexplained, limit_of, unexplained_places
-from glassplat.training.densify import ScreenStatistics, gaussians_from_points
+from glassplat.training.densify import ScreenStatistics, fog_around, gaussians_from_points
 from glassplat.training.options import DefaultDensify
 from glassplat.training.stage import Clock, TrainState
 from tests.render.tiny_scene import concatenated
@@ -49,6 +50,51 @@ def test_what_no_view_needs_is_removed_with_its_moments() -> None:
     assert 0 < len(kept) < len(before) and 3 not in kept.tolist()
     assert torch.equal(state.scene.primary.means, before[kept])
     assert not finished(action.apply(state, tiny_capture(), Clock(80, 100, 5)))
+
+
+def one_gaussian(
+    scales: tuple[float, float, float], opacity: float, quat: tuple[float, ...] = (1, 0, 0, 0)
+) -> Gaussians:
+    """At (1, 0, 0)."""
+    return Gaussians(
+        means=torch.tensor([[1.0, 0.0, 0.0]]),
+        quats=torch.tensor([quat], dtype=torch.float32),
+        log_scales=torch.tensor([scales]).log(),
+        logit_opacities=torch.logit(torch.tensor([opacity])),
+        sh=torch.zeros(1, 1, 3),
+    )
+
+
+@pytest.mark.parametrize(
+    ("gaussian", "expected"),
+    [
+        (one_gaussian((1.0, 0.1, 0.1), 0.9), True),
+        (one_gaussian((0.1, 1.0, 1.0), 0.9), False),
+        (one_gaussian((0.1, 1.0, 0.1), 0.9, quat=(1, 0, 0, 1)), True),
+        (one_gaussian((1.0, 0.1, 0.1), 0.1), False),
+        (one_gaussian((0.5, 0.5, 0.5), 0.99), True),
+        (one_gaussian((0.4, 0.4, 0.4), 0.99), False),
+    ],
+)
+def test_fog_is_what_is_opaque_where_a_camera_stands(gaussian: Gaussians, expected: bool) -> None:
+    far, here = torch.tensor([[9.0, 9.0, 9.0]]), torch.zeros(1, 3)
+    assert fog_around(gaussian, torch.cat([far, here])).tolist() == [expected]
+    assert not fog_around(gaussian, far).any()
+
+
+def test_no_gaussian_stays_around_a_camera_though_others_see_it() -> None:
+    state, capture = state_with_one_out_of_sight(), tiny_capture()
+    row = int(contributions(state.scene, capture.train[0].camera).argmax())
+    means = state.scene.primary.means.clone()
+    # Between the last camera and what it looks at, so that the others see it at the side of their pictures.
+    means[row] = capture.train[5].camera.center - torch.tensor([0.0, 0.0, 0.3])
+    log_scales = state.scene.primary.log_scales.clone()
+    log_scales[row] = math.log(0.4)
+    primary = state.scene.primary.with_tensors({"means": means, "log_scales": log_scales})
+    state.scene = replace(state.scene, primary=primary)
+    state.optimizer.moments["primary.means"] = (torch.arange(len(means)).float()[:, None].repeat(1, 3),) * 2
+    assert finished(PruneIdle(DefaultDensify(least_contribution=1e-3)).apply(state, capture, Clock(50, 100, 5)))
+    assert row not in state.optimizer.moments["primary.means"][0][:, 0].long().tolist()
 
 
 def test_idle_gaussians_are_looked_for_at_the_moments_that_were_asked_for() -> None:
