@@ -138,7 +138,7 @@ class PlanarRecipe:
 
     sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
     ssim_weight: Share = 0.2
-    view_dependence_weight: NotNegative = 0.1
+    view_dependence_weight: NotNegative = 0.02
     background: Annotated[Color | None, ESSENTIAL] = None
     stage_shares: Internal[tuple[Positive, Positive, Positive]] = (0.1, 0.1, 0.8)
     fresnel: Internal[Fresnel] = "pane"
