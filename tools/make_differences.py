@@ -25,7 +25,6 @@ ALL = {
     "densify.split_by": "Gradients of single pixels (AbsGS) find what a large Gaussian smears.",
     "densify.whole_passes": "Every Gaussian is seen before it is judged.",
     "densify.adapt_to_size": "Small photographs grow more Gaussians than they have pixels otherwise.",
-    "densify.most_reach": "What is as long as it is far away is drawn as a haze.",
     "densify.prune_large_start": "Walls and sky are large and stay.",
     "densify.per_pixel": "Photographs that contradict each other never stop asking for more.",
     "densify.least_contribution": "A sixth of the Gaussians does nothing.",
@@ -57,7 +56,6 @@ GLOSSY = {
     "rhythm.sh": "As 3DGS.",
     "densify.start": "As 3DGS.",
     "densify.stop": "As 3DGS.",
-    "densify.most_reach": ALL["densify.most_reach"],
     "densify.prune_large_start": ALL["densify.prune_large_start"],
     "densify.prune_opacity": "As 3DGS.",
 }
@@ -105,7 +103,6 @@ REASONS: dict[str, dict[str, str]] = {
         "surroundings.densify.stop": "Runs are shorter.",
         "surroundings.densify.gradient_threshold": "As the scene.",
         "surroundings.densify.prune_opacity": "As the scene.",
-        "surroundings.densify.most_reach": "As the scene.",
         "surroundings.densify.prune_large_start": "As the scene.",
         "surroundings.densify.cap": "As the scene.",
         "surroundings.densify.per_pixel": "As the scene.",

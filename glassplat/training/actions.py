@@ -91,15 +91,6 @@ def limit_of(densifier: DefaultDensify, dataset: Dataset) -> int | None:
     return round(densifier.per_pixel * sum(view.camera.width * view.camera.height for view in dataset.train))
 
 
-MOST_STANDPOINTS = 64
-"""Cameras to which distances are taken at every densification; among thousands one is near to each of the others."""
-
-
-def centers_of(views: Sequence[View]) -> Tensor:
-    """[C, 3] where photographs were taken."""
-    return torch.stack([view.camera.center for view in views])
-
-
 @dataclass(frozen=True)
 class Densify:
     """Clones, splits and prunes one set of Gaussians by its screen gradients."""
@@ -140,7 +131,6 @@ class Densify:
             extent=state.scene.extent,
             generator=state.generator(self.name),
             part=self.part,
-            cameras=centers_of(evenly(dataset.train, MOST_STANDPOINTS)) if self.part == "primary" else None,
             prune_large=self.part in LARGE_ARE_PRUNED and clock.progress > self.densifier.prune_large_start,
         )
         put_in_order(state, edited, moments, self.part)
@@ -185,7 +175,7 @@ class PruneIdle:
             most = torch.maximum(most, self.measure(state.scene, view.camera))
         busy = most >= self.densifier.least_contribution
         if self.part == "primary":
-            busy &= ~fog_around(gaussians, centers_of(dataset.train))
+            busy &= ~fog_around(gaussians, torch.stack([view.camera.center for view in dataset.train]))
         # A scene without Gaussians is reported; surroundings that nothing mirrors yet may still be needed.
         if bool(busy.all()) or (self.part != "primary" and not bool(busy.any())):
             return False

@@ -157,17 +157,6 @@ def clone(count: int, index: Tensor) -> Edit:
     return Edit(source, torch.arange(source.shape[0], device=index.device) >= count)
 
 
-@torch.no_grad()
-def reaching(gaussians: Gaussians, cameras: Tensor | None, share: float) -> Tensor:
-    """[N] bool: whose longest axis is more than a share of the way to the nearest of the cameras [C, 3]; 0 for none."""
-    if cameras is None or not share:
-        return torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
-    nearest = torch.full_like(gaussians.logit_opacities, math.inf)
-    for camera in cameras.to(gaussians.means):
-        nearest = torch.minimum(nearest, (gaussians.means - camera).norm(dim=1))
-    return gaussians.log_scales.amax(dim=1).exp() > share * nearest
-
-
 THICK_FOG = 0.1
 """Opacity of a Gaussian at a place, from which on it is no place for a camera."""
 
@@ -381,7 +370,6 @@ def densified(
     generator: torch.Generator,
     part: str = "primary",
     prune_large: bool = False,
-    cameras: Tensor | None = None,
 ) -> tuple[Gaussians, dict[str, tuple[Tensor, Tensor]]]:
     """A set of Gaussians and their moments after cloning, splitting and pruning.
 
@@ -397,16 +385,13 @@ def densified(
         part: the scene part that `gaussians` is.
         prune_large: also remove what is too large; 3DGS does so once the opacities have been
             reset for the first time.
-        cameras: [C, 3] from where the Gaussians are seen, for `DefaultDensify.most_reach`; None for those of a set that
-            is not seen directly.
     """
     if statistics.max_radius.shape[0] != len(gaussians):
         raise ValueError(
             f"statistics hold {statistics.max_radius.shape[0]} rows for {len(gaussians)} Gaussians; "
             "start new statistics whenever the set has changed"
         )
-    far_reaching = reaching(gaussians, cameras, options.most_reach)
-    grown = _growth(options, gaussians, statistics, far_reaching=far_reaching, extent=extent, generator=generator)
+    grown = _growth(options, gaussians, statistics, extent=extent, generator=generator)
     radius = torch.where(grown.fresh, 0, statistics.max_radius[grown.source])
     superfluous = _superfluous(options, gaussians, grown, radius, extent=extent, prune_large=prune_large)
     return apply_edit(gaussians, moments, grown.then(keep(~superfluous)), part=part)
@@ -417,7 +402,6 @@ def _growth(
     gaussians: Gaussians,
     statistics: ScreenStatistics,
     *,
-    far_reaching: Tensor,
     extent: float,
     generator: torch.Generator,
 ) -> Edit:
@@ -425,7 +409,6 @@ def _growth(
     needs = statistics.mean_gradient / options.gradient_threshold
     if options.split_by == "pull":
         needs = torch.where(large, statistics.mean_pull / options.pull_threshold, needs)
-    needs, large = torch.where(far_reaching, torch.inf, needs), large | far_reaching
     chosen = _within_cap(options, needs)
     halved = split(gaussians, (chosen & large).nonzero().squeeze(1), generator=generator)
     # What was not split moved forward by as many rows as were split before it.

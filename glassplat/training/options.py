@@ -182,9 +182,6 @@ class DefaultDensify:
         pull_threshold: mean pull of single pixels, in the same unit, above which a large Gaussian is split by `pull`.
         dense_fraction: Gaussians whose longest axis is above this share of the scene extent are
             split, smaller ones cloned.
-        most_reach: Gaussians whose longest axis is more than this share of the way to the nearest camera are split as
-            well, whatever pulls at them; 0 splits none. A Gaussian is projected as if it were small against its
-            distance, so that a floor of one piece is drawn as a haze over all that a low camera sees.
         prune_opacity: Gaussians less opaque than this are removed.
         prune_large_start: share of the run after which what is too large is removed as well; 1 never does.
         prune_scale_fraction: with `prune_large`, Gaussians with an axis above this share of the
@@ -210,7 +207,6 @@ class DefaultDensify:
     gradient_threshold: Positive = 2e-4
     pull_threshold: Positive = 1.2e-3
     dense_fraction: Internal[Positive] = 0.01
-    most_reach: Internal[NotNegative] = 1.0
     prune_opacity: Share = 0.005
     prune_large_start: Internal[Share] = 1.0
     prune_scale_fraction: Internal[Positive] = 0.1
@@ -227,7 +223,6 @@ class DefaultDensify:
             split_by="gradient",
             whole_passes=False,
             adapt_to_size=False,
-            most_reach=0.0,
             prune_large_start=3000 / 30_000,
             per_pixel=0.0,
             least_contribution=0.0,
