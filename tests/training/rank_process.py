@@ -10,7 +10,7 @@ from pathlib import Path
 from glassplat.methods.recipe import RECIPES
 from glassplat.training.checkpoint import save_checkpoint
 from glassplat.training.loop import train
-from glassplat.training.messages import ActionDone, StepDone
+from glassplat.training.messages import Message, StepDone
 from glassplat.training.ranks import Ranks, join
 from glassplat.training.stage import Stage, TrainState
 from tests.training.test_trainer import planar_stages
@@ -26,14 +26,14 @@ def stages_of(name: str) -> tuple[Stage, ...]:
     return RECIPES["splat"](sh_degree=1, strategy="mcmc").stages(seed=0)
 
 
-def trained(name: str, ranks: Ranks, iterations: int) -> tuple[TrainState, list[StepDone | ActionDone]]:
+def trained(name: str, ranks: Ranks, iterations: int) -> tuple[TrainState, list[Message]]:
     """The state after so many iterations, and what happened."""
     state = TrainState(RECIPES["splat"](sh_degree=1).initialise(tiny_capture()), seed=0)
     messages = train(stages_of(name), tiny_capture(), state, iterations, ranks=ranks)
-    return state, [message for message in messages if isinstance(message, StepDone | ActionDone)]
+    return state, list(messages)
 
 
-def losses_of(messages: list[StepDone | ActionDone]) -> list[float]:
+def losses_of(messages: list[Message]) -> list[float]:
     """The loss of every step."""
     return [message.loss for message in messages if isinstance(message, StepDone)]
 
