@@ -226,8 +226,9 @@ def step_while_written(checkpoint: Path) -> int:
     except FileNotFoundError:
         return 0
     except RuntimeError as error:
-        assert "required mapping size" in str(error)
-        return 0
+        if "required mapping size" in str(error):
+            return 0
+        raise
 
 
 def test_a_run_that_is_asked_to_end_goes_on_with_another_number_of_ranks(capture: Path, tmp_path: Path) -> None:
