@@ -63,17 +63,22 @@ class Optimizer:
         al. 2022, "On the SDEs and Scaling Rules for Adaptive Gradient Algorithms").
         """
         learning = [name for name in gradients if parameters[name].numel() > 0 and not self._waits(name, views)]
-        updates = [self._update(name, parameters[name], gradients[name], rates[name], views) for name in learning]
-        updates = [u._replace(decay=(decays or {}).get(name)) for name, u in zip(learning, updates, strict=True)]
+        known = decays or {}
+        updates = [
+            self._update(name, parameters[name], gradients[name], rates[name], known.get(name), views)
+            for name in learning
+        ]
         adam(updates, betas=(BETAS[0] ** views, BETAS[1] ** views))
 
-    def _update(self, name: str, parameter: Tensor, gradient: Tensor, rate: float | Tensor, views: int) -> Update:
+    def _update(
+        self, name: str, parameter: Tensor, gradient: Tensor, rate: float | Tensor, decay: Tensor | None, views: int
+    ) -> Update:
         """The next step of a parameter, which so many views have asked for; counts them."""
         moments = self.moments_of(name, parameter)
         self.updates[name] = self.updates.get(name, 0) + views
         factor = math.sqrt(views) * self.hurried.get(name, 1.0)
         lr = rate if factor == 1 else rate * factor
-        return Update(parameter, gradient, *moments, lr=lr, step=self.updates[name] / views)
+        return Update(parameter, gradient, *moments, lr=lr, step=self.updates[name] / views, decay=decay)
 
     def _waits(self, name: str, views: int) -> bool:
         """Return whether a parameter is paused; counts the views of the step."""
@@ -97,18 +102,20 @@ def rate_tensor(rate: Rate, parameter: Tensor, progress: float, extent: float, i
     value = rate.at(progress, extent, iterations)
     if rate.rest is None:
         return value
-    columns = torch.full(parameter.shape[1:], value * rate.rest, dtype=parameter.dtype, device=parameter.device)
-    columns[:1].fill_(value)
-    return columns.flatten()
+    return _columns(parameter, value, value * rate.rest)
 
 
 def decay_tensor(rate: Rate, parameter: Tensor) -> Tensor | None:
     """The decay that gives the gradient of `Rate.penalty`; None where there is no penalty."""
     if not rate.penalty or not parameter.numel():
         return None
-    decay = 2 * rate.penalty / len(parameter)
-    columns = torch.full(parameter.shape[1:], decay, dtype=parameter.dtype, device=parameter.device)
-    columns[:1].zero_()
+    return _columns(parameter, 0.0, 2 * rate.penalty / len(parameter))
+
+
+def _columns(parameter: Tensor, constant: float, rest: float) -> Tensor:
+    """One number per column of spherical harmonics [N, K, 3]: of the constant one, and of all others."""
+    columns = torch.full(parameter.shape[1:], rest, dtype=parameter.dtype, device=parameter.device)
+    columns[:1].fill_(constant)
     return columns.flatten()
 
 
