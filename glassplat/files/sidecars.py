@@ -85,7 +85,7 @@ def opened_tensors(path: Path, file_format: str, what: str) -> Iterator[TensorsF
         ValueError: the file cannot be read, is truncated or foreign; also if that shows while it is open.
     """
     try:
-        with records.reading(path), _unicode_name(path) as name, safe_open(name, framework="pt") as file:
+        with records.reading(path), _unicode_name(path) as name, _opened(name) as file:
             header = records.parse_json((file.metadata() or {}).get(HEADER_KEY, "{}"), f"the header of {path}")
             if not isinstance(header, dict) or header.get("format") != file_format:
                 found = header.get("format") if isinstance(header, dict) else header
@@ -94,6 +94,28 @@ def opened_tensors(path: Path, file_format: str, what: str) -> Iterator[TensorsF
     except SafetensorError as error:
         reason = str(error)[:LONGEST_REASON]  # It may repeat all of the header.
         raise ValueError(f"{path} is truncated or not {what} ({reason}); expected a whole file") from error
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The library's view of one file; it opens a path twice, and another file may be written there in between."""
+    while True:
+        before = _file_identity(path)
+        try:
+            file = safe_open(path, framework="pt")
+        except (OSError, RuntimeError, SafetensorError):
+            if _file_identity(path) == before:
+                raise
+            continue
+        with file:
+            if _file_identity(path) == before:
+                yield file
+                return
+
+
+def _file_identity(path: Path) -> tuple[int, int]:
+    told = path.stat()
+    return told.st_ino, told.st_mtime_ns
 
 
 @contextmanager

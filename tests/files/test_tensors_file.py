@@ -11,9 +11,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import save_file
 
 from glassplat.cli.console import described_os_error
+from glassplat.files import sidecars
 from glassplat.files.sidecars import opened_tensors, system_error, write_equirect, write_tensors
 
 TENSORS = {"a": torch.arange(1000.0), "b": torch.zeros(0, 3)}
@@ -96,6 +98,28 @@ def test_a_foreign_header_is_named(tmp_path: Path, header: str | None, message: 
     save_file(TENSORS, path, metadata=None if header is None else {"glassplat": header})
     with pytest.raises(ValueError, match=message), opened_tensors(path, "x-1", "an x"):
         pass
+
+
+@pytest.mark.parametrize("size", [10, 100_000])
+def test_a_file_that_is_replaced_while_it_is_opened_is_opened_again(
+    size: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.safetensors"
+    write_tensors(path, TENSORS, {"format": "x-1", "step": 1})
+    files: list[object] = []
+
+    def replacing(name: Path, framework: str) -> object:
+        files.append(safe_open(name, framework=framework))
+        if len(files) == 1:
+            write_tensors(path, {"a": torch.ones(size)}, {"format": "x-1", "step": 2})
+            if size < 1000:
+                raise RuntimeError("there are fewer bytes than the header of the first file says")
+        return files[-1]
+
+    monkeypatch.setattr(sidecars, "safe_open", replacing)
+    with opened_tensors(path, "x-1", "an x") as file:
+        assert file.header["step"] == 2 and torch.equal(file.tensors()["a"], torch.ones(size))
+    assert len(files) == 2
 
 
 @pytest.mark.parametrize("kept", [0, 7, 100, 1000])
