@@ -93,7 +93,7 @@ def ptx_of(kernel: Any, capabilities: Sequence[tuple[int, int]] = CAPABILITIES) 
         # What `numba.cuda.compile` does, but typing and lowering, most of the time, happen once for all capabilities.
         library, _ = compiler._compile_pyfunc_with_fixup(
             kernel.function, types.void(*kernel.signature), device=False, cc=capabilities[0], abi="numba",
-            launch_bounds=kernel.bounds, lto=False, **options,
+            launch_bounds=None, lto=False, **options,
         )  # fmt: skip
         return ["".join(library.get_asm_strs(cc=capability)) for capability in capabilities]
 

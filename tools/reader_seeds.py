@@ -23,7 +23,7 @@ from glassplat.captures import colmap_library as library
 from glassplat.captures.colmap import pose_matrix, read_model
 from glassplat.captures.masks import read_mask_values
 from glassplat.captures.transforms import load_transforms
-from glassplat.captures.view import View, estimated_normals
+from glassplat.captures.view import View, estimated_normals, normals_reader
 from glassplat.files.glb import write_glb
 from glassplat.files.images import read_image
 from glassplat.files.ply import write_gaussians
@@ -289,7 +289,8 @@ def _normals(path: Path) -> None:
     def no_photograph() -> torch.Tensor:
         raise FileNotFoundError
 
-    estimated_normals(View("a.png", camera_of(), path.parent / "a.png", no_photograph))
+    read = normals_reader(path.parent / "a.png", camera_of())
+    estimated_normals(View("a.png", camera_of(), path.parent / "a.png", no_photograph, read_normals=read))
 
 
 READERS: dict[str, Reader] = {

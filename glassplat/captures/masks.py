@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from os.path import lexists
+from os.path import lexists, normpath
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -264,10 +264,13 @@ def find_masks(
     if not paths and (root / PANE_FOLDER).is_dir():
         raise InputError(f"{root / PANE_FOLDER} holds no mask images; add masks, or remove the folder")
     masks, warnings = _found_masks(root, photographs)
+    named = {normpath(path) for path in (kept or {}).values()}
+    masks = {name: path for name, path in masks.items() if normpath(path) not in named}
     earlier = _why_panes(root, masks, marked=bool(paths))
     if earlier is not None:
         found = _understood(root, masks, polarity, read_mask_values)
-        warnings = (f"{earlier} {next(iter(masks.values())).parent} is read as panes; rename it to {PANE_FOLDER}/.",)
+        renaming = f"{earlier} {next(iter(masks.values())).parent} is read as panes; rename it to {PANE_FOLDER}/."
+        warnings = (renaming, *warnings)
         return CaptureMasks(replace(found, warnings=(*warnings, *found.warnings)), _joined(kept or {}, ignored))
     found = _understood(root, paths, polarity, read_mask_values) if paths else MaskSet({})
     return CaptureMasks(

@@ -280,25 +280,30 @@ def _load_whole(root: Path) -> Capture:
         points=read_points(root, settings),
         format_name=WHOLE,
         warnings=(*warnings, *_unused_priors(settings)),
-        kept=_mask_paths(root, settings, shots),
+        kept=_mask_paths(root, WHOLE, settings, shots),
     )
 
 
 def _load_split(root: Path) -> Capture:
     """Separate files for training and testing, as synthetic scenes have them."""
-    settings = read_settings(root / TRAIN)
-    test = shots_of(root, read_settings(root / TEST), TEST) if (root / TEST).is_file() else None
+    files = {name: read_settings(root / name) for name in (TRAIN, TEST) if (root / name).is_file()}
+    shots = {name: shots_of(root, settings, name) for name, settings in files.items()}
+    kept: dict[str, Path] = {}
+    for name, settings in files.items():
+        kept |= _mask_paths(root, name, settings, shots[name])
     return Capture(
-        shots=tuple(shots_of(root, settings, TRAIN).values()),
-        test_shots=None if test is None else tuple(test.values()),
-        points=read_points(root, settings),
+        shots=tuple(shots[TRAIN].values()),
+        test_shots=tuple(shots[TEST].values()) if TEST in shots else None,
+        points=read_points(root, files[TRAIN]),
         format_name=TRAIN,
-        random_points=points_in_box if _is_blender(settings) else None,
+        random_points=points_in_box if _is_blender(files[TRAIN]) else None,
+        warnings=tuple(_unused_priors(files[TRAIN])),
+        kept=kept,
     )
 
 
-def _mask_paths(root: Path, settings: Settings, shots: Mapping[str, Shot]) -> dict[str, Path]:
-    """The masks that frames name, by name of the photograph."""
+def _mask_paths(root: Path, file: str, settings: Settings, shots: Mapping[str, Shot]) -> dict[str, Path]:
+    """The masks that the frames of a file name, by name of the photograph."""
     paths = {
         shots[frame["file_path"]].name: Path(normpath(root / frame["mask_path"].replace("\\", "/")))
         for frame in settings["frames"]
@@ -307,7 +312,7 @@ def _mask_paths(root: Path, settings: Settings, shots: Mapping[str, Shot]) -> di
     missing = [str(path) for path in paths.values() if not isfile(path)]
     if missing:
         raise InputError(
-            f"mask_path of {WHOLE} names {len(missing)} masks that are missing: {first_names(missing)}; copy them "
+            f"mask_path of {file} names {len(missing)} masks that are missing: {first_names(missing)}; copy them "
             "there, or delete the entries"
         )
     return paths

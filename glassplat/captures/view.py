@@ -22,7 +22,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from threading import Lock
 from typing import IO, TypeVar
@@ -162,7 +162,7 @@ class Memory:
 
     Attributes:
         budget: bytes, of all pixels together. What a single step needs is read even where it is more.
-        ahead: views that are worth reading ahead.
+        ahead: views that are worth reading ahead, besides that of the current step.
     """
 
     def __init__(self, budget: float | None = None, *, largest: int = 0) -> None:
@@ -303,6 +303,7 @@ class View:
         read_photo: returns `photo`.
         read_pane_labels: returns `pane_labels`; None where the view is not annotated.
         read_ignored: returns `ignored`; None where all pixels count.
+        read_normals: returns `normals`; None where nobody estimated any.
         memory: holds what was read, for all views of a capture.
     """
 
@@ -312,6 +313,7 @@ class View:
     read_photo: Callable[[], Tensor]
     read_pane_labels: Callable[[], Tensor] | None = None
     read_ignored: Callable[[], Tensor] | None = None
+    read_normals: Callable[[], Tensor] | None = None
     memory: Memory = field(default_factory=lambda: Memory(math.inf), repr=False, compare=False)
 
     def __repr__(self) -> str:
@@ -335,6 +337,15 @@ class View:
     def ignored(self) -> Tensor | None:
         """[H, W] bool, the pixels that show what is not to be learned or measured; None where there are none."""
         return None if self.read_ignored is None else self.memory.get(Source(self.read_ignored, is_mask=True))
+
+    @property
+    def normals(self) -> Tensor | None:
+        """[H, W, 3] estimated unit normals in camera axes, zero where none is known; None where there is no file.
+
+        Raises:
+            InputError: the file cannot be read, or has not the proportions of the photograph.
+        """
+        return None if self.read_normals is None else self.memory.get(Source(self.read_normals))
 
     def read_ahead(self) -> None:
         """Has threads read what training on the view will ask for."""
@@ -439,16 +450,17 @@ def prepare_view(
     small = _reduced_size(pinhole, options.downscale, shot.name)
     pixel_map = PixelMap(lens if distorted else None, *small)
     pose = torch.from_numpy(rigid_pose(shot.cam_from_world, shot.name)).float()
-    camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.width, pinhole.height)
+    camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.width, pinhole.height).resized(*small)
     view = View(
         name=shot.name,
-        camera=camera.resized(*small),
+        camera=camera,
         image_path=shot.image_path,
         read_photo=PhotoFile(shot.image_path, pixel_map, options.background),
         read_pane_labels=None if mask is None else _mask_file(mask, (width, height), pixel_map),
         read_ignored=MaskFiles(tuple(_mask_file(one, (width, height), pixel_map) for one in ignored))
         if ignored
         else None,
+        read_normals=normals_reader(shot.image_path, camera),
     )
     return PreparedView(view, lens is not shot.lens)
 
@@ -516,9 +528,9 @@ def estimated_normals(view: View) -> Tensor | None:
     """[H, W, 3] unit normals of a view in world axes, zero where none is known; None where there is no file.
 
     Raises:
-        InputError: as `normals_in_camera`.
+        InputError: as `View.normals`.
     """
-    normals = normals_in_camera(view)
+    normals = view.normals
     return None if normals is None else in_world(normals, view.camera)
 
 
@@ -527,25 +539,27 @@ def in_world(normals: Tensor, camera: Camera) -> Tensor:
     return normals @ camera.cam_from_world[:3, :3].to(normals)
 
 
-def normals_in_camera(view: View) -> Tensor | None:
-    """[H, W, 3] unit normals of a view in camera axes, zero where none is known; None where there is no file.
+def normals_reader(image_path: Path, camera: Camera) -> Callable[[], Tensor] | None:
+    """What reads the estimated normals of a photograph at a camera's size; None where there is no file of them."""
+    path = normals_path(image_path)
+    return None if path is None else partial(normals_in_file, path, camera)
 
-    The photograph's lens must be a pinhole: normals are reduced with it, but not undistorted.
+
+def normals_in_file(path: Path, camera: Camera) -> Tensor:
+    """[H, W, 3] unit normals in camera axes at a camera's size, zero where none is known.
+
+    They are of the photograph without its lens's distortion, as `View.photo` is.
 
     Raises:
-        InputError: a file cannot be read, or has not the proportions of the photograph.
+        InputError: a file cannot be read, or has not the camera's proportions.
     """
-    path = normals_path(view.image_path)
-    if path is None:
-        return None
     with input_checked():
         vectors = _vectors(path)
-    camera = view.camera
     height, width = vectors.shape[:2]
     if abs(width * camera.height - height * camera.width) > max(width, height, camera.width, camera.height):
         raise InputError(
-            f"{path} is {width}x{height} pixels large, its photograph {camera.width}x{camera.height} here; expected "
-            "the same proportions"
+            f"{path} is {width}x{height} pixels large, its photograph {camera.width}x{camera.height} here, without "
+            "the distortion of its lens; expected the same proportions"
         )
     in_picture = torch.from_numpy(vectors).permute(2, 0, 1)[None]
     small = torch.nn.functional.interpolate(in_picture, (camera.height, camera.width), mode="area")[0].permute(1, 2, 0)

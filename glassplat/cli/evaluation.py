@@ -116,9 +116,11 @@ def cameras_of_test_views(stored: StoredRun, aligned: bool) -> str:
 
 
 def train_seconds(stored: StoredRun) -> float | None:
-    """Training time as the checkpoint recorded it."""
-    file = stored.directory.checkpoint
-    return recorded_seconds(file) if file.is_file() else None
+    """Training time as the checkpoint recorded it; None where none is whole: the scene does not need it."""
+    try:
+        return recorded_seconds(stored.directory.checkpoint)
+    except (FileNotFoundError, InputError):
+        return None
 
 
 def print_results(console: Console, *results: dict) -> None:

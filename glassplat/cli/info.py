@@ -14,7 +14,7 @@ from rich.console import Console
 
 from glassplat.captures.files import CaptureFiles, read_capture
 from glassplat.cli.console import import_held, say, shell_word, warn
-from glassplat.errors import InputError, UnknownFormatError, first_names
+from glassplat.errors import InputError, UnknownFormatError, first_names, input_checked
 from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
 from glassplat.files.records import read_json
 from glassplat.files.writing import SCENE, SPLAT_SUFFIXES, scene_source
@@ -160,10 +160,14 @@ def video_finding(path: Path) -> Iterator[Finding]:
 
 def preparation_finding(path: Path) -> Iterator[Finding]:
     """The folder of a preparation that was interrupted."""
-    settings = read_json(path / "settings.json")
-    finding = Finding("an interrupted preparation", {"of": settings.get("input")})
+    with input_checked():
+        settings = read_json(path / "settings.json")
+    source = settings.get("input") if isinstance(settings, dict) else None
+    if not isinstance(source, str):
+        raise InputError(f"{path / 'settings.json'} names no input; expected what `prepare` writes: prepare again")
+    output = str(path).removesuffix(".partial")
+    finding = Finding("an interrupted preparation", {"of": source})
     finding.problems.append("it is not finished")
-    source, output = settings.get("input"), str(path).removesuffix(".partial")
     finding.next.append(f"glassplat prepare {shell_word(source)} --output {shell_word(output)} --resume")
     yield finding
 

@@ -230,9 +230,9 @@ def run(command: Any) -> None:
     """Runs a command; its console shows the package's log too, and what libraries warn of."""
     from glassplat.cli.console import heard_by, message_console
 
-    console = message_console()
-    with heard_by(console):
-        command.run(console)
+    is_for_programs = getattr(command, "json", False)  # Its output is one document, without lines of the log in it.
+    with heard_by(message_console(stderr=is_for_programs)):
+        command.run(message_console())
 
 
 def interrupted(stop: KeyboardInterrupt, command: Any) -> int:

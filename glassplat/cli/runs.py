@@ -74,7 +74,8 @@ def open_run(path: Path, device: DeviceName = "auto", data: Path | None = None) 
     scene = scene.to(chosen_device(device))
     dataset = capture_of(directory, recorded, data)
     directory.check_photographs(dataset)
-    dataset = with_corrected_cameras(dataset, scene)
+    if data is not None or not directory.imported.is_file():  # Without a capture, cameras are written corrected.
+        dataset = with_corrected_cameras(dataset, scene)
     recipe = settled(recorded, dataset)
     return StoredRun(directory, recipe, scene, recipe.renderer(), dataset, iterations)
 

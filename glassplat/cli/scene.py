@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -307,6 +308,8 @@ class Export:
         """Refuses what contradicts itself, what is no scene, and an output that holds something else."""
         if not self.formats:
             raise InputError(f"nothing to write without --formats; expected some of {', '.join(WRITTEN)}")
+        if {"sog", "ksplat"} & {*self.formats} and find_spec("gaussforge") is None:
+            raise InputError("--formats sog and ksplat need gaussforge; pip install 'glassplat[formats]'")
         if self.url is not None and not self.url.startswith(("https://", "http://")):
             raise InputError(f"--url is {self.url}; expected an address that begins with https://")
         check_scene(self.scene)

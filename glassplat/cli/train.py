@@ -111,13 +111,14 @@ class Train(Generic[RecipeKind]):
         return replace(self, resume=begun)
 
 
+PATH_OPTIONS = ("--data", "--output", "--config")
 HELP, FULL_HELP = ("-h", "--help"), "--help-advanced"
 POINTER = f"These are the options that most runs need; {FULL_HELP} in place of --help shows all of them."
 
 
 def help_of_method(arguments: Sequence[str]) -> str:
     """A pointer to all options of the method that arguments name; tyro points to a list that has none of them."""
-    method = next((argument for argument in arguments if argument in RECIPES), PlanarRecipe.method)
+    method = asked_method(arguments) or PlanarRecipe.method
     return f"all options of a method: glassplat train {method} {FULL_HELP}"
 
 
@@ -151,10 +152,16 @@ def configured(path: Path, arguments: Sequence[str]) -> Any:
     """
     with input_checked():
         recipe = recipe_from_json(read_text(path), str(path))
-    asked = next((argument for argument in arguments if argument in RECIPES), recipe.method)
+    asked = asked_method(arguments) or recipe.method
     if asked != recipe.method:
         raise InputError(f"{path} is a recipe of {recipe.method}; expected one of {asked}, or `train {recipe.method}`")
     return recipe
+
+
+def asked_method(arguments: Sequence[str]) -> str | None:
+    """The first word that is a method's name, and not a folder's; None if there is none."""
+    words = itertools.pairwise(["", *arguments])
+    return next((word for before, word in words if word in RECIPES and before not in PATH_OPTIONS), None)
 
 
 def asked_preset(arguments: Sequence[str]) -> Preset:

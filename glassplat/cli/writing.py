@@ -100,7 +100,7 @@ def planar_renderer(stored: StoredRun) -> Planar:
     renderer = stored.renderer
     if isinstance(renderer, Planar) and len(stored.scene.planes):
         return replace(renderer, photographer="present")
-    data = shell_word(stored.directory.settings().data)
+    data = "CAPTURE" if stored.directory.imported.is_file() else shell_word(stored.directory.settings().data)
     raise InputError(
         f"{stored.directory.path} is a {stored.recipe.method} run without panes, so it knows no reflection; train one "
         f"that does, with pane masks: glassplat train planar --data {data} --output RUN"

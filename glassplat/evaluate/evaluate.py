@@ -346,14 +346,20 @@ def _measure(
         "corrected_psnr": _counted_psnr(metrics.color_corrected(image, photo, region=counted), photo, counted),
         "right_half_psnr": _right_half_psnr(image, photo, counted),
         "ssim": metrics.ssim(image, photo),
-        "lpips": metrics.NO_LPIPS
-        if isinstance(lpips, str)
-        else lpips(metrics.quantized(image), metrics.quantized(photo)),
+        "lpips": _lpips(lpips, image, photo),
         "pane_psnr": pane if isinstance(pane, str) else _region_psnr(image, photo, pane, TOO_FEW),
         "transmission_psnr": _transmission_psnr(frame, *truth),
         **metrics.surface_metrics(frame, photo, surface),
     }
     return _Measurement(measured, seconds, _reflection_pixels(frame, *truth))
+
+
+def _lpips(lpips: metrics.Lpips | str, image: Tensor, photo: Tensor) -> metrics.Outcome:
+    if isinstance(lpips, str):
+        return metrics.NO_LPIPS
+    if min(photo.shape[:2]) < metrics.SMALLEST_SIDE:
+        return f"views of fewer than {metrics.SMALLEST_SIDE} pixels a side"
+    return lpips(metrics.quantized(image), metrics.quantized(photo))
 
 
 def _counted_psnr(image: Tensor, photo: Tensor, counted: Tensor | None) -> metrics.Outcome:

@@ -151,6 +151,8 @@ def opened(path: Path) -> Iterator[Image.Image]:
             yield image
     except FileNotFoundError as error:
         raise FileNotFoundError(f"no image {path}; expected it there") from error
+    except MemoryError:
+        raise
     except Exception as error:  # Its parsers raise whatever damaged bytes lead to, from KeyError to struct.error.
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error) or type(error).__name__
         raise ValueError(f"cannot read {path} as an image ({reason}); replace the file or remove it") from error

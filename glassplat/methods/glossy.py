@@ -20,7 +20,7 @@ from glassplat.methods.mirrors import (
     ResetRaised,
 )
 from glassplat.methods.splat import image_term
-from glassplat.methods.splat_recipe import SplatRecipe
+from glassplat.methods.splat_recipe import Primitive, SplatRecipe
 from glassplat.methods.surroundings import AddEnvironment, AddSurroundings, BeginReflections, StayMatte
 from glassplat.options import BLACK
 from glassplat.render.deferred import INVISIBLE, Deferred
@@ -62,7 +62,7 @@ def finished_renderer(recipe: DeferredRecipe) -> Deferred:
 def stages_of(recipe: DeferredRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
     """Bootstrap, then everything; what changes in between is up to `Propagate`. A short run has one stage."""
     short = iterations < recipe.least_iterations
-    stages = _matte_stages(recipe, seed, iterations) if short else _reflecting_stages(recipe)
+    stages = _matte_stages(recipe, "ellipsoid", seed, iterations) if short else _reflecting_stages(recipe)
     return corrections_learnt(recipe, stages)
 
 
@@ -117,10 +117,11 @@ def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
     return bootstrap, reflection, refinement
 
 
-def _matte_stages(recipe: DeferredRecipe, seed: int, iterations: int) -> tuple[Stage, ...]:
-    """The one stage of a run that is too short for normals to spread: that of `splat`."""
+def _matte_stages(recipe: DeferredRecipe, primitive: Primitive, seed: int, iterations: int) -> tuple[Stage, ...]:
+    """Those of a run that is too short for normals to spread: as in `splat`."""
     usual = Rhythm()
     plain = SplatRecipe(
+        primitive=primitive,
         sh_degree=recipe.sh_degree,
         ssim_weight=recipe.ssim_weight,
         view_dependence_weight=recipe.view_dependence_weight,
@@ -131,9 +132,8 @@ def _matte_stages(recipe: DeferredRecipe, seed: int, iterations: int) -> tuple[S
         densify=recipe.densify,
         mcmc=recipe.mcmc,
     )
-    (stage,) = plain.stages(seed)
-    setup = StayMatte(iterations, recipe.least_iterations, _environment(recipe))
-    return (replace(stage, name="as splat", setup=setup),)
+    first, *later = (replace(stage, name=f"as {stage.name}") for stage in plain.stages(seed))
+    return replace(first, setup=StayMatte(iterations, recipe.least_iterations, _environment(recipe))), *later
 
 
 def _rates_of_splat(recipe: DeferredRecipe) -> GaussianRates:
@@ -235,10 +235,10 @@ def traced_finished_renderer(recipe: TracedRecipe) -> Traced | Deferred:
 
 
 def traced_stages_of(recipe: TracedRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
-    """Bootstrap, reflections, everything without propagation; a short run has one stage."""
+    """Bootstrap, reflections, everything without propagation; a short run learns as `splat` does."""
+    if iterations < recipe.least_iterations:
+        return corrections_learnt(recipe, _matte_stages(recipe.distant(), recipe.primitive, seed, iterations))
     known = recipe.distant().stages(seed, iterations)
-    if len(known) == 1:
-        return known
     if recipe.harmonics_from_start:
         known = tuple(_with_harmonics(stage, Every(recipe.rhythm.sh)) for stage in known)
     bootstrap, distant, refinement = known

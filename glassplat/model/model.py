@@ -8,11 +8,13 @@ import io
 import json
 import logging
 import os
+import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
@@ -38,7 +40,8 @@ from glassplat.render.deferred import equirect_from_environment
 from glassplat.render.frame import Frame, Renderer, check_layers
 from glassplat.render.layers import layer_image
 from glassplat.scene import scene
-from glassplat.scene.camera import Camera
+from glassplat.scene.camera import LEAST_SINE, Camera
+from glassplat.scene.corrections import upward
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
@@ -99,7 +102,7 @@ class Model:
         Raises:
             InputError: viser is not installed.
         """
-        viewer = Viewer(shown_of(self, {}), LOCAL, vacant_port(LOCAL))
+        viewer = Viewer(shown_of(replace(self, cameras=self.viewpoints), {}), LOCAL, vacant_port(LOCAL))
         viewer.start()
         return viewer
 
@@ -118,6 +121,11 @@ class Model:
     def panes(self) -> tuple[int, ...]:
         """Labels of the panes, as in the masks."""
         return self.scene.planes.labels
+
+    @property
+    def viewpoints(self) -> Mapping[str, Camera]:
+        """Its cameras; where it has none, some that look at the scene from around it, -y up."""
+        return self.cameras or dict(cameras_around(self.scene.primary, torch.tensor(AXES["-y"], dtype=torch.float64)))
 
     def render(self, camera: Camera | str, *, layers: Sequence[str] = ("rgb",)) -> Frame:
         """Renders the image and its layers; differentiable in every tensor of the scene and in the camera's pose.
@@ -160,7 +168,7 @@ class Model:
 
     def orbit(self, frames: int) -> list[Camera]:
         """Cameras once around what the photographs show, or in a loop before what was photographed from one side."""
-        return orbit(list(self.cameras.values()), self.scene.extent, frames)
+        return orbit(list(self.viewpoints.values()), self.scene.extent, frames)
 
     def evaluate(self, dataset: Dataset) -> dict[str, Any]:
         """Metrics over the test views of a data set, by name: `psnr`, `ssim`, `pane_psnr` ...
@@ -193,7 +201,7 @@ class Model:
         Raises:
             InputError: nothing would be left.
         """
-        centers = torch.stack([camera.center for camera in self.cameras.values()])
+        centers = torch.stack([camera.center for camera in self.viewpoints.values()])
         bare, found = cleaned(self.scene, Floaters(self.scene.primary, centers), cleaning or Cleaning())
         return self.with_scene(bare), found
 
@@ -270,7 +278,7 @@ class Model:
             center: [3] the rectangle's middle, world units.
             normal: [3] of any length.
             half_sizes: half its sides along tangent and bitangent, world units.
-            tangent: [3] direction of its first side; the most horizontal one if None.
+            tangent: [3] direction of its first side; if None a horizontal one, as the cameras are held upright.
             base_reflectance: R0; that of window glass if not given, 1 makes a mirror.
             label: what to call it; the first number that is free if None.
 
@@ -279,12 +287,20 @@ class Model:
                 another method than `planar` and `splat`, or of discs.
         """
         free = next(number for number in range(1, len(self.panes) + 2) if number not in self.panes)
+        tangent = self._level_direction(normal) if tangent is None else tangent
         pane = Planes.rectangle(center, normal, half_sizes, tangent=tangent, label=free if label is None else label)
         added = with_pane(self.scene, pane)
         recipe = planar_of(self.recipe)
         recipe.renderer().check(added)
         model = replace(self, scene=added, recipe=recipe).with_reflectance(pane.labels[0], base_reflectance)
         return model.with_mirrors(*pane.labels) if base_reflectance == 1 else model
+
+    def _level_direction(self, normal: Sequence[float]) -> list[float] | None:
+        """[3] a direction at right angles to a normal that is level; None where all of them or none are."""
+        up = upward([*self.cameras.values()]) if self.cameras else (0.0, -1.0, 0.0)
+        across = np.asarray([*normal], np.float64)
+        level = np.cross(up, across) if across.shape == (3,) else np.zeros(3)
+        return level.tolist() if np.linalg.norm(level) > LEAST_SINE * np.linalg.norm(across) else None
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
         """Writes the model; `glassplat.load` reads what it wrote, but for .html, which is for browsers.
@@ -358,7 +374,7 @@ def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
     """
     kind = path.suffix.lower().removeprefix(".")
     if not kind:
-        return save_folder(model, path)
+        return save_folder(model, path, overwrite=overwrite)
     if kind not in writing.WRITTEN:
         endings = ", ".join(f".{known}" for known in writing.WRITTEN)
         raise InputError(f"{path}: expected a name that ends in {endings}, or a folder's")
@@ -385,7 +401,7 @@ def save_model(model: Model, path: Path, *, overwrite: bool) -> Path:
 def save_page(model: Model, path: Path, title: str, *, sharing: Sharing = PRIVATE) -> None:
     """Writes the page that shows a model with live panes in any browser."""
     with input_checked():
-        write_page(path, model.scene, model.renderer, tuple(model.cameras.items()), title, sharing=sharing)
+        write_page(path, model.scene, model.renderer, tuple(model.viewpoints.items()), title, sharing=sharing)
 
 
 def write_beside(folder: Path, scene: Scene) -> list[Path]:
@@ -438,11 +454,11 @@ def write_as_run(folder: Path, model: Model, source: Path | None) -> None:
     write_text(folder / "recipe.json", recipe_to_json(model.recipe))
 
 
-def save_folder(model: Model, folder: Path) -> Path:
+def save_folder(model: Model, folder: Path, *, overwrite: bool = False) -> Path:
     """Writes a model as a run of its own, whose tensors are loaded bit for bit; returns the folder.
 
     Raises:
-        FileExistsError: something is there; nothing was written.
+        FileExistsError: something is there, and it is no saved model that may be replaced; nothing was written.
         InputError: the model has no cameras, without which nothing reads the folder again.
     """
     if not model.cameras:
@@ -450,9 +466,19 @@ def save_folder(model: Model, folder: Path) -> Path:
             f"a model without cameras cannot be saved as the folder {folder}; give it some, such as those of "
             "`glassplat.Camera.look_at`, or save it as .ply"
         )
-    if os.path.lexists(folder) and (not folder.is_dir() or any(folder.iterdir())):
-        raise FileExistsError(f"{folder} is already there and not empty; nothing was written. Choose a new folder")
-    write_as_run(folder, model, model.path)
+    if not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir())):
+        write_as_run(folder, model, model.path)
+        return folder
+    is_saved = (folder / "recipe.json").is_file() and not RunDirectory(folder).checkpoint.is_file()
+    if not (overwrite and is_saved):
+        more = ", or overwrite=True" if is_saved else ""
+        raise FileExistsError(
+            f"{folder} is already there and not empty; nothing was written. Choose a new folder{more}"
+        )
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as beside:
+        write_as_run(Path(beside) / "new", model, model.path)
+        folder.rename(Path(beside) / "old")
+        (Path(beside) / "new").rename(folder)
     return folder
 
 

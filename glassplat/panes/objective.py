@@ -281,7 +281,7 @@ class Objective:
 
     def agreement(self, planes: PlaneEquations) -> Array:
         """[H] how well the masks agree on each plane."""
-        return mask_agreement(planes, self.views, pixels_per_view=PIXELS // len(self.views))
+        return mask_agreement(planes, self.views, pixels_per_view=max(PIXELS // len(self.views), 1))
 
     def anchors(self, planes: PlaneEquations) -> Array:
         """[H, 3] a point near the middle of the pane on each plane."""

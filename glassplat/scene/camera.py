@@ -30,6 +30,7 @@ def moved(tensor: Tensor, device: torch.device | str) -> Tensor:
 
 
 @lru_cache(maxsize=1024)
+@torch.inference_mode(False)  # A later call may need it for gradients.
 def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """A tensor of these numbers, or rows of them: the same one at every call, so leave it as it is."""
     return moved(torch.tensor(values, dtype=dtype, device="cpu"), device)

@@ -175,7 +175,7 @@ def moved_camera(camera: Camera, twist: Tensor, extent: float) -> Camera:
         extent: world units.
     """
     pose = camera.cam_from_world
-    return replace(camera, cam_from_world=motion(twist, extent).to(pose) @ pose.to(twist.device))
+    return replace(camera, cam_from_world=motion(twist, extent).to(pose.dtype) @ pose.to(twist.device))
 
 
 def motion(twist: Tensor, extent: float) -> Tensor:

@@ -112,7 +112,7 @@ def train(
                 ranks.settle(state)
             yield StageEntered(state.step, stage.name, counts_of(state.scene))
         while state.step < end:
-            coming = scheduled_views(dataset, state, dataset.memory.ahead * ranks.batch)
+            coming = scheduled_views(dataset, state, (1 + dataset.memory.ahead) * ranks.batch)
             for view in coming[ranks.rank :: ranks.count]:
                 view.read_ahead()
             views = scheduled_views(dataset, state, min(ranks.batch, end - state.step))

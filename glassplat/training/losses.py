@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from glassplat.captures.view import FOLDER, View, in_world, normals_in_camera, with_ignored_right
+from glassplat.captures.view import FOLDER, View, in_world, with_ignored_right
 from glassplat.kernels.gradient_conflict import gradient_conflict as shared_edges
 from glassplat.kernels.panes import inside_panes
 from glassplat.kernels.photometric import photometric
@@ -240,21 +240,20 @@ class MonocularNormals:
     """The mean of 1 - n . N_m over the pixels of an image, n the blended normal made unit, N_m the estimated one.
 
     Pixels without an estimate, that show nothing or that the view ignores count as 0; a view without a file of normals
-    has no such term. Files are read once.
+    has no such term.
     """
 
-    _known: dict[str, Tensor | None] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _lacking: set[str] = field(default_factory=set, init=False, repr=False, compare=False)
 
     def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor | None:
         """The loss of a view; None where no normals lie beside its photograph."""
-        if view.name not in self._known:
-            self._known[view.name] = normals_in_camera(view)
-            if self._known[view.name] is None and (view.image_path.parent.parent / FOLDER).is_dir():
+        normals = view.normals
+        if normals is None:
+            if view.name not in self._lacking and (view.image_path.parent.parent / FOLDER).is_dir():
                 log.warning("no normals for %s in the folder %r beside it: it is learned without", view.name, FOLDER)
-        estimated = self._known[view.name]
-        if estimated is None:
+            self._lacking.add(view.name)
             return None
-        estimated = in_world(moved(estimated, frame.rgb.device).to(frame.rgb), view.camera)
+        estimated = in_world(moved(normals, frame.rgb.device).to(frame.rgb), view.camera)
         known = (estimated.square().sum(-1) > 0) & (frame.layers["alpha"].detach() > 0.5)
         blended = torch.nn.functional.normalize(frame.layers["normal"], dim=-1)
         return _where_counted(known * (1 - (blended * estimated).sum(-1)), view).mean()

@@ -7,7 +7,7 @@ const STATE = { layer: 'rgb', compare: false, divider: 0.5, glass: 'real', pane:
 function makePanel(scene, navigation, changed) {
   const state = { ...STATE, reflectances: scene.panes.map((pane) => pane.reflectance) };
   const silver = scene.panes.map(() => 0);  // How far each pane is on its way from glass to a mirror.
-  const body = document.body;
+  const body = document.body, reflects = scene.panes.length > 0 || Boolean(scene.mirrored);
   const chosen = () => scene.panes.map((_, k) => k).filter((k) => state.pane === 'all' || Number(state.pane) === k);
   const percent = (share) => `${(100 * share).toFixed(share < 0.1 ? 1 : 0)} %`;
   // The slider's middle is a third of all light, so that glass has room on it.
@@ -102,6 +102,7 @@ function makePanel(scene, navigation, changed) {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (event.target.matches('input, textarea') && event.key !== 'Escape') return;
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+    if (!reflects && ('cgm'.includes(key) || LAYER_KEYS[Number(key) - 1])) return;
     if ('wasdqe'.includes(key)) { walking.add(key); navigation.still(); changed(); }
     else if (LAYER_KEYS[Number(key) - 1]) set('layer', LAYER_KEYS[Number(key) - 1]);
     else if (KEYS[key]) KEYS[key](); else return;

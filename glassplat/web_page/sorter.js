@@ -62,23 +62,28 @@ function sortingWorker() {
   self.onmessage = ({ data }) => {
     if (data.positions) { order = sorterOf(data); return; }
     const orders = data.cameras.map(order);
-    self.postMessage({ ticket: data.ticket, orders }, orders.map((sorted) => sorted.buffer));
+    self.postMessage({ orders }, orders.map((sorted) => sorted.buffer));
   };
 }
 
 // Asks the worker, or sorts here where a browser allows none; only the newest request waits while one is under way.
 function makeSorter({ positions, reaches, areas, owners }) {
   const splats = { positions, reaches, areas, owners };
-  let worker = null, here = null, ticket = 0, busy = false, waiting = null;
-  const answers = new Map();
+  let worker = null, here = null, asked = null, waiting = null;
   try {
     const source = `${sorterOf}\n(${sortingWorker})()`;
     worker = new Worker(URL.createObjectURL(new Blob([source], { type: 'text/javascript' })));
-    worker.onerror = () => { worker = null; here = sorterOf(splats); busy = false; pump(); };
+    worker.onerror = () => {  // What it was asked is sorted here, unless something newer was asked since.
+      worker = null;
+      here = sorterOf(splats);
+      if (waiting) asked?.resolve(null);
+      waiting ||= asked;
+      asked = null;
+      pump();
+    };
     worker.onmessage = ({ data }) => {
-      busy = false;
-      answers.get(data.ticket)?.(data.orders);
-      answers.delete(data.ticket);
+      asked.resolve(data.orders);
+      asked = null;
       pump();
     };
     worker.postMessage(splats);
@@ -87,13 +92,12 @@ function makeSorter({ positions, reaches, areas, owners }) {
   }
 
   function pump() {
-    if (!waiting || busy) return;
-    const { cameras, resolve } = waiting;
+    if (!waiting || asked) return;
+    const next = waiting;
     waiting = null;
-    if (here) { resolve(cameras.map(here)); return; }
-    busy = true;
-    answers.set(++ticket, resolve);
-    worker.postMessage({ ticket, cameras });
+    if (here) { next.resolve(next.cameras.map(here)); return; }
+    asked = next;
+    worker.postMessage({ cameras: next.cameras });
   }
 
   return (cameras) => new Promise((resolve) => {

@@ -199,6 +199,24 @@ def test_what_changes_while_it_is_saved_is_not_said_to_be_saved(page: Page) -> N
     assert [len(places) for places in page.document()["corners"]] == [1, 1, 0, 0]
 
 
+def test_what_the_server_refuses_is_not_said_to_be_saved(page: Page) -> None:
+    page.mark_true(0)
+    page.window.run(
+        'window.asked = window.fetch; window.fetch = async () => new Response(\'{"error": "the disk is full"}\','
+        " { status: 400, headers: { 'Content-Type': 'application/json' } })"
+    )
+    page.window.press("#undo")
+    page.window.wait("document.body.dataset.state === 'failed'", "a refusal")
+    for button in ("#close", "#write"):
+        page.window.press(button)
+        page.window.wait("document.getElementById('status').className === 'bad'", "a refusal once more")
+        assert page.window.run("return document.body.dataset.state") == "failed" and not page.server.is_finished
+    page.window.run("window.fetch = window.asked")
+    page.window.press("#close")
+    page.window.wait("document.body.dataset.state === 'closed'", "the end")
+    assert [len(places) for places in page.document()["corners"]] == [1, 1, 1, 0]
+
+
 def test_what_is_not_to_be_seen_is_skipped(page: Page) -> None:
     for view, hidden in ((0, 1), (1, 3), (2, 0)):
         corners: list = list(true_corners(view))

@@ -118,6 +118,33 @@ def test_frames_name_their_masks(tmp_path: Path) -> None:
         load_dataset(root)
 
 
+def name_mask(root: Path, file: str) -> None:
+    """Has a transforms file name a mask of one photograph."""
+    settings = json.loads((root / file).read_text())
+    next(frame for frame in settings["frames"] if frame["file_path"] == "images/1.png")["mask_path"] = "masks/1.png"
+    (root / file).write_text(json.dumps(settings))
+
+
+def test_masks_that_frames_name_are_no_panes_whatever_their_values(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path / "capture")
+    shutil.rmtree(root / "panes")
+    write_shades(root / "masks/1.png", KEPT > 0)
+    name_mask(root, "transforms.json")
+    assert load_dataset(root).pane_labels == () and torch.equal(ignored_of(root)["1.png"], DROPPED)
+
+
+def test_frames_of_a_file_for_training_name_their_masks_too(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path / "capture")
+    (root / "transforms.json").rename(root / "transforms_train.json")
+    write_shades(root / "masks/1.png", KEPT)
+    (root / "masks").rename(root / "kept")
+    name_mask(root, "transforms_train.json")
+    with pytest.raises(InputError, match=r"mask_path of transforms_train.json .* missing"):
+        load_dataset(root)
+    (root / "kept").rename(root / "masks")
+    assert torch.equal(ignored_of(root)["1.png"], DROPPED)
+
+
 def test_masks_of_photographs_without_a_pose_are_mentioned(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path / "capture")
     write_shades(root / "masks/1.png", KEPT)
@@ -137,6 +164,8 @@ def test_a_capture_of_earlier_versions_keeps_its_panes_and_says_so_once(tmp_path
     for old, new in zip(before.train, now.train, strict=True):
         assert old.ignored is None and torch.equal(old.pane_labels, new.pane_labels)
     assert [text for text in before.warnings if "rename it to panes/" in text] == list(before.warnings)
+    shutil.copy(next((root / "masks").iterdir()), root / "masks" / "elsewhere.png")
+    assert any("belong to no photograph (elsewhere.png)" in text for text in load_dataset(root).warnings)
 
 
 def test_black_and_white_panes_of_earlier_versions_are_known_by_their_planes(tmp_path: Path) -> None:

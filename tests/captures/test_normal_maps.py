@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from glassplat.captures.view import View, estimated_normals
+from glassplat.captures.view import View, estimated_normals, normals_reader
 from glassplat.errors import InputError
 from glassplat.scene.camera import Camera
 
@@ -21,7 +21,8 @@ def view_in(folder: Path, pose: torch.Tensor | None = None) -> View:
     (folder / "images").mkdir(exist_ok=True)
     path = folder / "images" / "a.jpg"
     Image.fromarray(np.zeros((SIZE, SIZE, 3), dtype=np.uint8)).save(path)
-    return View("a.jpg", camera, path, lambda: torch.zeros(SIZE, SIZE, 3, dtype=torch.uint8))
+    photo = torch.zeros(SIZE, SIZE, 3, dtype=torch.uint8)
+    return View("a.jpg", camera, path, lambda: photo, read_normals=normals_reader(path, camera))
 
 
 def write(folder: Path, name: str, vectors: np.ndarray) -> None:
@@ -69,21 +70,20 @@ def test_without_a_file_there_are_none(tmp_path: Path) -> None:
 
 
 def test_what_is_no_map_of_normals_is_refused(tmp_path: Path) -> None:
-    view = view_in(tmp_path)
     for vectors, message in [
         (
             np.zeros((SIZE, 2 * SIZE, 3), dtype=np.float32),
-            "24x12 pixels large, its photograph 12x12 here; expected the",
+            "24x12 pixels large, its photograph 12x12 here, without",
         ),
         (np.zeros((SIZE, SIZE), dtype=np.float32), r"holds float32 of shape \[12, 12\]; expected floats \[H, W, 3\]"),
         (np.zeros((SIZE, SIZE, 3), dtype=np.int64), "holds int64 of shape"),
     ]:
         write(tmp_path, "a.npy", vectors)
         with pytest.raises(InputError, match=message):
-            estimated_normals(view)
+            estimated_normals(view_in(tmp_path))
     # The second was found by damaging files at random: NumPy evaluates the head as a part of a program.
     head = b"\x93NUMPY\x01\x00v\x00\xd8'descr': '<f4', 'fortran_order': False, 'shape': (2, 3, 3), }" + b" " * 60
     for damaged in (b"no", head):
         (tmp_path / "normals" / "a.npy").write_bytes(damaged)
         with pytest.raises(InputError, match="is no array that NumPy can read"):
-            estimated_normals(view)
+            estimated_normals(view_in(tmp_path))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -120,6 +121,16 @@ def test_what_was_interrupted_goes_on(tmp_path: Path, capsys: pytest.CaptureFixt
     (tmp_path / "my capture.partial" / "settings.json").write_text('{"input": "photographs"}')
     found = told(tmp_path / "my capture.partial", capsys)
     assert not found["healthy"] and found["next"][0].endswith("--resume")
+    for damaged in ("{bad", "[]", "{}"):
+        (tmp_path / "my capture.partial" / "settings.json").write_text(damaged)
+        assert main(["info", str(tmp_path / "my capture.partial")]) == 2
+        assert "report it" not in capsys.readouterr().err
+
+
+def test_what_is_for_programs_has_no_line_of_the_log_in_it() -> None:
+    command = [sys.executable, "-m", "glassplat", "info", str(SCENE), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert json.loads(done.stdout)["path"] == str(SCENE) and "pane 1: the plane" in done.stderr
 
 
 def test_a_run_is_described_and_misses_its_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

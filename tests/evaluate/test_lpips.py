@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from glassplat.evaluate.evaluate import _lpips
 from glassplat.evaluate.metrics import Lpips, load_lpips
 
 MODULE = "torchmetrics.image.lpip"
@@ -43,6 +44,12 @@ def test_images_that_are_too_small_are_refused(size: tuple[int, int]) -> None:
     image = torch.zeros(*size, 3)
     with pytest.raises(ValueError, match="at least 32 pixels a side"):
         Lpips(mean_difference)(image, image)
+
+
+def test_views_that_are_too_small_have_a_reason_and_no_distance() -> None:
+    small, large = torch.zeros(31, 40, 3), torch.zeros(40, 40, 3)
+    assert _lpips(Lpips(mean_difference), small, small) == "views of fewer than 32 pixels a side"
+    assert _lpips(Lpips(mean_difference), large, large) == 0
 
 
 def test_images_of_different_sizes_are_refused() -> None:

@@ -150,6 +150,34 @@ def test_what_is_saved_is_loaded_again(name: str, tolerance: float, tmp_path: Pa
     torch.testing.assert_close(again.image("2.png"), whole.image("2.png"), atol=tolerance, rtol=0)
     with pytest.raises(FileExistsError, match="nothing was written"):
         whole.save(path)
+    darker = whole.with_reflectance(LABEL, 0.01)
+    darker.save(path, overwrite=True)
+    assert float(glassplat.load(path, device="cpu").scene.planes.base_reflectances) == pytest.approx(0.01, rel=1e-3)
+    assert not [left for left in path.parent.iterdir() if left.name.startswith(".")]
+
+
+def test_a_folder_that_is_no_saved_model_is_never_replaced(tmp_path: Path) -> None:
+    (tmp_path / "photographs").mkdir()
+    (tmp_path / "photographs" / "a.jpg").touch()
+    with pytest.raises(FileExistsError, match=r"not empty; nothing was written. Choose a new folder$"):
+        model().save(tmp_path / "photographs", overwrite=True)
+    assert (tmp_path / "photographs" / "a.jpg").exists()
+
+
+@pytest.mark.parametrize("normal", [(1.0, 0.0, 0.0), (0.0, 0.0, -2.0), (1.0, -0.2, 0.5)])
+def test_the_first_side_of_a_pane_is_level_unless_said_otherwise(normal: tuple[float, float, float]) -> None:
+    pane = bare().with_pane((0.0, 0.0, 1.5), normal, (2.0, 1.0)).scene.planes
+    assert abs(float(pane.tangents[0, 1])) < 0.05, "the cameras of this scene are held upright, y down"
+    flat = bare().with_pane((0.0, 1.0, 0.0), (0.0, 1.0, 0.0), (2.0, 1.0)).scene.planes
+    assert abs(float(flat.normals[0] @ flat.tangents[0])) < 1e-5
+
+
+def test_a_model_without_cameras_is_looked_at_from_around_it() -> None:
+    blind = dataclasses.replace(model(), cameras={})
+    assert len(blind.orbit(3)) == 3 and len(blind.viewpoints) > 1
+    assert blind.cleaned()[1].keys() == model().cleaned()[1].keys()
+    viewer = blind.show()
+    viewer.stop()
 
 
 def test_a_model_without_cameras_is_saved_as_a_file_and_as_no_folder(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from glassplat.captures.dataset import Dataset, load_dataset, with_corrected_cameras
 from glassplat.captures.view import View
+from glassplat.cli.runs import open_run
 from glassplat.evaluate.evaluate import aligned_camera, with_aligned_test_views
 from glassplat.files.scene_folder import read_scene, write_scene
 from glassplat.files.sidecars import read_cameras, write_colmap
@@ -227,6 +228,14 @@ def test_the_model_of_a_training_has_the_cameras_that_its_run_records(tmp_path: 
     for view in (*dataset.train, *dataset.test):
         assert misplacement(recorded[view.name], model.cameras[view.name]) < 1e-5
         assert misplacement(view.camera, model.cameras[view.name]) > 1e-4
+    model.save(tmp_path / "saved")
+    for view in open_run(tmp_path / "saved", "cpu").dataset.train:
+        assert misplacement(recorded[view.name], view.camera) < 1e-5, "saved cameras are corrected already"
+
+
+def test_a_camera_in_memory_is_moved_by_what_is_on_another_device() -> None:
+    elsewhere = moved_camera(CAMERA, torch.zeros(6, device="meta"), 1.0)  # A device that every machine has.
+    assert elsewhere.cam_from_world.device.type == "meta"
 
 
 def test_a_refined_model_is_read_as_colmap(tmp_path: Path) -> None:

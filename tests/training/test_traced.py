@@ -13,11 +13,12 @@ import torch
 from glassplat.methods.glossy_recipes import TracedRecipe
 from glassplat.methods.mirrors import GrowShAfterPropagation, Propagate, RefineEnvironment
 from glassplat.methods.recipe import recipe_from_json, recipe_to_json
+from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.methods.surroundings import AddSurroundings
 from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.scene import Environment, Scene
-from glassplat.training.actions import Densify, GrowSh, PruneIdle, ResetOpacity
+from glassplat.training.actions import Densify, GrowSh, PruneIdle, ResetOpacity, SeedUnexplained
 from glassplat.training.checkpoint import load_checkpoint, save_checkpoint
 from glassplat.training.densify import ScreenStatistics
 from glassplat.training.loop import differentiate, train
@@ -254,6 +255,16 @@ def test_the_preset_is_that_of_the_public_configuration() -> None:
     assert recipe.surroundings.densify.prune_opacity == 0.05
     for stage in stages:
         assert {"consistency", "monocular normals"} <= {term.name for term in stage.losses}
+
+
+def test_a_short_run_of_discs_learns_as_splat_does_with_discs() -> None:
+    stages, plain = TracedRecipe(primitive="disc").stages(0, 1000), SplatRecipe(primitive="disc").stages(0)
+    assert [stage.name for stage in stages] == [f"as {stage.name}" for stage in plain]
+    assert [[term.name for term in stage.losses] for stage in stages] == [
+        [term.name for term in stage.losses] for stage in plain
+    ]
+    assert not any(isinstance(action, SeedUnexplained) for stage in stages for action in stage.actions)
+    assert stages[0].setup is not None and all(stage.setup is None for stage in stages[1:])
 
 
 def test_normals_of_discs_can_learn_from_the_first_step_on() -> None:

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+import errno
+import socket
 import threading
 import time
 from collections.abc import Callable
 
 import numpy as np
+import pytest
 
-from glassplat.viewer.render_loop import LEAST_WIDTH, MOST_SHARE, DrawingShare, Picture, RenderLoop, RenderThread
+from glassplat.errors import InputError
+from glassplat.viewer.render_loop import (
+    LEAST_WIDTH,
+    MOST_SHARE,
+    DrawingShare,
+    Picture,
+    RenderLoop,
+    RenderThread,
+    check_port,
+)
+from tests.viewer.free_port import free_port
 
 SIZE = (1280, 720)
 
@@ -50,6 +63,20 @@ def wait_until(condition: Callable[[], bool]) -> None:
 def slow(recorder: Recorder) -> None:
     """As if a sharp picture took ten times what a coarse one may."""
     recorder.loop._seconds_per_pixel = 1e-6
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "::"])
+def test_a_port_of_any_address_of_this_machine_is_checked(host: str) -> None:
+    if ":" in host:
+        with socket.socket(socket.AF_INET6) as probe:
+            if probe.connect_ex(("::1", free_port())) == errno.EADDRNOTAVAIL:
+                pytest.skip("this machine has no IPv6")
+    check_port(host, free_port())
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as taken:
+        taken.bind((host, 0))
+        taken.listen()
+        with pytest.raises(InputError, match="in use"):
+            check_port(host, taken.getsockname()[1])
 
 
 def test_a_coarse_picture_comes_first_and_a_sharp_one_follows() -> None:

@@ -217,7 +217,7 @@ function pressed(event) {
   if (tool === "corner") pressCorner(place);
   else if (tool === "edge") { pending = { kind: "edge", points: [place, place] }; drag = { kind: "edge" }; }
   else if (tool === "polygon" || tool === "grab") pressPolygon(place);
-  else { pending = { kind: "brush", effect: tool === "brush" ? "cut" : "keep", radius: radius / drawing.scale, points: [place] }; drag = { kind: "brush" }; }
+  else { pending = { kind: "brush", effect: tool === "brush" ? "cut" : "keep", radius: Math.min(10000, Math.max(0.1, radius / drawing.scale)), points: [place] }; drag = { kind: "brush" }; }
   draw();
 }
 
@@ -291,7 +291,7 @@ async function grab(points) {
   }
 }
 
-function choose(name) { tool = name; pending = null; refresh(); }
+function choose(name) { tool = name; pending = drag = null; refresh(); }
 
 function nextPane() {
   const labels = marking.document.panes.map((pane) => pane.label);
@@ -352,14 +352,21 @@ async function write() {
   }
 }
 
-// Resolves when the server knows everything.
+// Resolves when the server knows everything; an error if it refuses that once more.
 async function settled() {
+  if (document.body.dataset.state === "failed") await send();
   while (document.body.dataset.state === "changed" || sending) await new Promise((next) => setTimeout(next, 50));
+  if (document.body.dataset.state === "failed") throw new Error(element("status").textContent);
 }
 
 async function close() {
-  await settled();
-  await ask("/close", {});
+  try {
+    await settled();
+    await ask("/close", {});
+  } catch (error) {
+    tell(error.message, true);
+    return;
+  }
   document.body.replaceChildren(make("main", { textContent: "Saved. The command has ended; this page can be closed." }));
   document.body.dataset.state = "closed";
 }
@@ -374,7 +381,7 @@ function listen() {
   canvas.addEventListener("wheel", (event) => { event.preventDefault(); drawing.zoom(spot(event), Math.exp(-event.deltaY / 400)); draw(); }, { passive: false });
   window.addEventListener("keydown", keyed);
   window.addEventListener("keyup", (event) => { if (event.key === " ") spaceHeld = false; });
-  window.addEventListener("beforeunload", (event) => { if (document.body.dataset.state === "changed") event.preventDefault(); });
+  window.addEventListener("beforeunload", (event) => { if (["changed", "failed"].includes(document.body.dataset.state)) event.preventDefault(); });
   new ResizeObserver(() => { drawing.fit(); draw(); }).observe(canvas);
   document.querySelectorAll("[data-tool]").forEach((button) => button.addEventListener("click", () => choose(button.dataset.tool)));
   for (const [id, act] of [["undo", () => marking.undo()], ["redo", () => marking.redo()], ["add", KEYS.a], ["write", write], ["close", close]]) {

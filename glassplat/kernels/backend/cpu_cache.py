@@ -15,7 +15,7 @@ import pickle
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
@@ -215,6 +215,34 @@ def _globals_read(code: CodeType) -> set[str]:
     return read.union(*map(_globals_read, nested))
 
 
+def kept_data(files: Iterable[caching.IndexDataCacheFile], key: Any) -> Any:
+    """What the first folder that has something keeps under a key; None where none has. Damaged files count as none."""
+    for file in files:
+        try:
+            data = file.load(key)
+        except OSError:
+            continue  # A folder that is none, or that this user may not look into.
+        except DAMAGE as error:
+            log.warning("%s cannot be read (%s); compiling again", file._index_path, error)
+            continue
+        if data is not None:
+            return data
+    return None
+
+
+def keep_data(file: caching.IndexDataCacheFile, key: Any, data: Any) -> None:
+    """Keeps something under a key; a damaged index, which cannot be added to, is begun anew.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    try:
+        file.save(key, data)
+    except DAMAGE:
+        file.flush()
+        file.save(key, data)
+
+
 @cache
 def loading_context() -> CPUContext:
     """Context for loading kernels that this process compiled, apart from the compiler's own."""
@@ -245,18 +273,8 @@ class KernelCache(caching.FunctionCache):
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
         """The kernel for a signature from the first folder that has it; a damaged file counts as none."""
-        key = self._index_key(sig, target_context.codegen())
-        for file in self._files:
-            try:
-                data = file.load(key)
-            except OSError:
-                continue  # A folder that is none, or that this user may not look into.
-            except DAMAGE as error:
-                log.warning("%s cannot be read (%s); compiling again", file._index_path, error)
-                continue
-            if data is not None:
-                return self._impl.rebuild(target_context, data)
-        return None
+        data = kept_data(self._files, self._index_key(sig, target_context.codegen()))
+        return None if data is None else self._impl.rebuild(target_context, data)
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, Any, str]:
         return sig, codegen.magic_tuple(), self._fingerprint

@@ -10,16 +10,13 @@ import ctypes
 import hashlib
 import logging
 import math
-import os
 import re
 import struct
-import tempfile
 import threading
 import time
 from collections.abc import Callable
 from functools import cache, lru_cache
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,10 +25,9 @@ from cuda import pathfinder
 from cuda.bindings import driver
 from cuda.core import Linker, LinkerOptions, ObjectCode
 from numba import config, cuda, types
-from numba.core.caching import FunctionCache
 from torch import Tensor
 
-from glassplat.kernels.backend.cpu_cache import fingerprint
+from glassplat.kernels.backend.cpu_cache import KernelFiles, fingerprint, keep_data, kept_data
 from glassplat.kernels.backend.devices import SIMULATED
 
 ENTRY = re.compile(r"\.entry\s+([\w$]+)\s*\(")
@@ -55,23 +51,15 @@ class MachineCode(NamedTuple):
     cubin: bytes
 
 
-def compiled(
-    function: Callable[..., None],
-    signature: tuple[Any, ...],
-    capability: tuple[int, int],
-    bounds: tuple[int, int] | None,
-) -> MachineCode:
+def compiled(function: Callable[..., None], signature: tuple[Any, ...], capability: tuple[int, int]) -> MachineCode:
     """Compiles a kernel.
 
     Args:
         function: the kernel in Python.
         signature: the Numba types of its arguments.
         capability: compute capability (major, minor) of the GPU.
-        bounds: threads of a block, and how many blocks a multiprocessor should hold at once.
     """
-    text, _ = cuda.compile(
-        function, signature, device=False, abi="numba", cc=capability, launch_bounds=bounds, debug=False, opt=True
-    )
+    text, _ = cuda.compile(function, signature, device=False, abi="numba", cc=capability, debug=False, opt=True)
     (entry,) = ENTRY.findall(text)
     options = LinkerOptions(arch=f"sm_{capability[0]}{capability[1]}")
     linked = Linker(ObjectCode.from_ptx(text.encode()), options=options).link("cubin")
@@ -103,86 +91,45 @@ def _linker_version() -> Any:
 
 log = logging.getLogger("glassplat.kernels")
 
-MAGIC = b"glassplat cubin 1\n"
-DIGEST = hashlib.sha256().digest_size
-
 
 class ImageCache:
     """The machine code of one kernel: from the disk, or from the compiler, which is announced.
 
+    It lies where compiled CPU kernels do (`cpu_cache`).
+
     Attributes:
-        name: of the kernel and its files.
+        name: of the kernel.
     """
 
-    def __init__(
-        self, function: Callable[..., None], name: str, signature: tuple[Any, ...], bounds: tuple[int, int] | None
-    ) -> None:
+    def __init__(self, function: Callable[..., None], name: str, signature: tuple[Any, ...]) -> None:
         self.name = name
         self._function = function
         self._signature = signature
-        self._bounds = bounds
 
     def machine_code(self, capability: tuple[int, int]) -> MachineCode:
         """The kernel for a compute capability (major, minor), compiled unless the disk has it."""
-        path, key = self.path(capability), self.key(capability)
-        found = None if path is None else _read(path, key)
-        if found is not None:
-            return found
+        folders, key = KernelFiles(self._function), self.key(capability)
+        files = folders.files(self._function)
+        found = kept_data(files, key)
+        # Another process may have written its own kernel under the same name at the same time.
+        if found is not None and found[:2] == (key, hashlib.sha256(found[3]).digest()):
+            return MachineCode(*found[2:])
         log.info("compiling %s for this GPU (first use only, then cached on disk) ...", self.name)
         started = time.perf_counter()
-        made = compiled(self._function, self._signature, capability, self._bounds)
+        made = compiled(self._function, self._signature, capability)
         log.info("compiled %s in %.1f s", self.name, time.perf_counter() - started)
-        if path is not None:
-            self._keep(path, key, made)
+        try:
+            folders.locator.ensure_cache_path()
+            keep_data(files[0], key, (key, hashlib.sha256(made.cubin).digest(), *made))
+        except OSError as error:
+            folders.not_kept(error)
+        else:
+            folders.remark()
         return made
 
-    def path(self, capability: tuple[int, int]) -> Path | None:
-        """The kernel's file, in the folder that Numba chooses for CPU kernels too; None where none can be written."""
-        try:
-            folder = FunctionCache(self._function).cache_path
-        except RuntimeError as error:
-            log.warning("cannot keep %s for the next time: %s", self.name, error)
-            return None
-        return Path(folder) / f"{self.name}.sm_{capability[0]}{capability[1]}.cubin"
-
-    def key(self, capability: tuple[int, int]) -> bytes:
+    def key(self, capability: tuple[int, int]) -> str:
         """Digest of the kernel's code and that of all functions it uses, its types, and whatever compiles it."""
-        flags = f"{self._signature} {self._bounds} {capability} {compiler_versions()}"
-        return bytes.fromhex(fingerprint(self._function, flags))
-
-    def _keep(self, path: Path, key: bytes, made: MachineCode) -> None:
-        try:
-            _write(path, key, made)
-        except OSError as error:
-            log.warning("cannot keep %s for the next time: %s", self.name, error)
-
-
-def _write(path: Path, key: bytes, made: MachineCode) -> None:
-    """Puts a whole file in place at once: who reads at the same time finds the old one or the new one."""
-    content = made.entry.encode() + b"\0" + made.cubin
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=path.name, delete=False) as file:
-        try:
-            file.write(MAGIC + key + hashlib.sha256(content).digest() + content)
-            file.close()
-            os.replace(file.name, path)
-        except BaseException:
-            os.unlink(file.name)
-            raise
-
-
-def _read(path: Path, key: bytes) -> MachineCode | None:
-    """The machine code of a file made under this key; None where it is missing, foreign or damaged."""
-    try:
-        data = path.read_bytes()
-    except OSError:
-        return None
-    at = len(MAGIC) + DIGEST
-    head, digest, content = data[:at], data[at : at + DIGEST], data[at + DIGEST :]
-    if head != MAGIC + key or hashlib.sha256(content).digest() != digest:
-        return None
-    entry, _, cubin = content.partition(b"\0")
-    return MachineCode(entry.decode(), cubin)
+        return fingerprint(self._function, f"{self._signature} {capability} {compiler_versions()}")
 
 
 SLOT = 8
@@ -283,20 +230,16 @@ class Kernel:
         name: the operation and direction, such as `composite_forward_float32`.
         function: the kernel before compilation.
         signature: the Numba types of its arguments.
-        bounds: threads of a block, and how many blocks a multiprocessor should hold at once; caps the registers.
     """
 
-    def __init__(
-        self, function: Callable[..., None], name: str, signature: tuple[Any, ...], bounds: tuple[int, int] | None
-    ) -> None:
+    def __init__(self, function: Callable[..., None], name: str, signature: tuple[Any, ...]) -> None:
         self.name = name
         self.function = function
         self.signature = signature
-        self.bounds = bounds
         self._expected = [Expected(type_) for type_ in signature]
         self._loaded: dict[int, LoadedKernel] = {}
         self._layout = struct.Struct("<" + "".join(expected.layout for expected in self._expected))
-        self._images = ImageCache(function, name, signature, bounds)
+        self._images = ImageCache(function, name, signature)
         self._simulated = cuda.jit(function) if SIMULATED else None
 
     def __call__(self, blocks: int, threads: int, *arguments: Any) -> None:
@@ -386,9 +329,7 @@ class Expected:
         return array
 
 
-def kernel(
-    name: str, real: type, arguments: str, *, bounds: tuple[int, int] | None = None
-) -> Callable[[Callable[..., None]], Kernel]:
+def kernel(name: str, real: type, arguments: str) -> Callable[[Callable[..., None]], Kernel]:
     """Declares a kernel function made by a factory for one floating-point type.
 
     Args:
@@ -396,14 +337,13 @@ def kernel(
         real: `np.float32` or `np.float64`.
         arguments: the type of each argument: `bool`, `byte`, `short`, `int`, `long`, `float`, `double` or `real`, with
             a digit for a C-contiguous array of so many dimensions: `"real2 int1 real"`.
-        bounds: threads of a block, and how many blocks a multiprocessor should hold at once.
     """
     full_name = f"{name}_{np.dtype(real).name}"
 
     def decorate(function: Callable[..., None]) -> Kernel:
         function.__name__ = full_name
         function.__qualname__ = full_name
-        return Kernel(function, full_name, tuple(_numba_type(token, real) for token in arguments.split()), bounds)
+        return Kernel(function, full_name, tuple(_numba_type(token, real) for token in arguments.split()))
 
     return decorate
 

@@ -208,7 +208,11 @@ def composite_discs(
     _check(discs, channels, bins, probe)
     if not near >= 0 or not low_pass >= 0:
         raise ValueError(f"near is {near} and low_pass {low_pass}; expected numbers of at least 0")
-    return BlendedDiscs(*_CompositeDiscs.apply(*discs[:4], channels, probe, discs.outlines, bins, near, low_pass))
+    needing = [tensor for tensor in (*discs[:4], channels, probe) if tensor is not None]
+    needs_gradients = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in needing)
+    return BlendedDiscs(
+        *_CompositeDiscs.apply(*discs[:4], channels, probe, discs.outlines, bins, near, low_pass, needs_gradients)
+    )
 
 
 def _check(discs: Discs, channels: Tensor, bins: TileBins, probe: Tensor | None) -> None:
@@ -243,12 +247,14 @@ class _CompositeDiscs(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means2d: Tensor, maps: Tensor, opacities: Tensor, depths: Tensor, channels: Tensor,
-        probe: Tensor | None, outlines: Splats, bins: TileBins, near: float, low_pass: float,
+        probe: Tensor | None, outlines: Splats, bins: TileBins, near: float, low_pass: float, needs_gradients: bool,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         tensors = tuple(tensor.detach().contiguous() for tensor in (means2d, maps, opacities, depths, channels))
         plain = _discs(tensors, Splats(*(tensor.detach().contiguous() for tensor in outlines)))
         kernels = kernels_for("composite", channels.device)
-        *outputs, saved = kernels.composite_discs(plain, tensors[4], bins, near=near, low_pass=low_pass)
+        *outputs, saved = kernels.composite_discs(
+            plain, tensors[4], bins, near=near, low_pass=low_pass, needs_gradients=needs_gradients
+        )
         ctx.save_for_backward(*tensors)
         ctx.rest = (plain.outlines, bins, saved, near, low_pass)
         return tuple(outputs)
@@ -262,7 +268,7 @@ class _CompositeDiscs(torch.autograd.Function):
             _discs(ctx.saved_tensors, outlines), channels, bins, saved, [v.contiguous() for v in v_outputs],
             near=near, low_pass=low_pass, probed=ctx.needs_input_grad[5],
         )  # fmt: skip
-        return (*found, None, None, None, None)
+        return (*found, None, None, None, None, None)
 
 
 def color_and_depth(image: Tensor, alpha: Tensor, background: tuple[float, ...]) -> tuple[Tensor, Tensor]:

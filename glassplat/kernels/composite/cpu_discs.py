@@ -559,9 +559,9 @@ class Saved(NamedTuple):
 
 
 def composite_discs(
-    discs: Discs, channels: Tensor, bins: TileBins, *, near: float, low_pass: float
+    discs: Discs, channels: Tensor, bins: TileBins, *, near: float, low_pass: float, needs_gradients: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Saved]:
-    """The fields of `BlendedDiscs`, and what `composite_discs_gradients` starts from."""
+    """The fields of `BlendedDiscs`, and what `composite_discs_gradients` starts from, which costs nothing here."""
     cameras, count, num_channels = channels.shape
     shape, real = (bins.num_cameras, bins.height, bins.width), REAL_OF[channels.dtype]
     images = [channels.new_zeros(s) for s in ((*shape, num_channels), shape, shape, shape, shape)]

@@ -334,13 +334,13 @@ class Saved(NamedTuple):
 
 
 def composite_discs(
-    discs: Discs, channels: Tensor, bins: TileBins, *, near: float, low_pass: float
+    discs: Discs, channels: Tensor, bins: TileBins, *, near: float, low_pass: float, needs_gradients: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Saved]:
     """As `glassplat.kernels.composite.cpu_discs.composite_discs`."""
     num_channels, tiles, device = channels.shape[2], len(bins.active), channels.device
     shape = (bins.num_cameras, bins.height, bins.width)
     image, *flat = (channels.new_zeros(s) for s in ((*shape, num_channels), shape, shape, shape, shape))
-    buckets = len(bins.pair_splats) // BUCKET + tiles
+    buckets = len(bins.pair_splats) // BUCKET + tiles if needs_gradients else 0
     alpha, depth, median, distortion = flat
     saved = Saved(
         channels.new_empty(tiles, FINALS, PIXELS),
@@ -448,12 +448,12 @@ def composite_discs_forward(real: type, num_channels: int = 6) -> Kernel:
         if pixel == 0:
             most[0] = 0
         start, stop = tile_offsets[active[n]], tile_offsets[active[n] + 1]
-        first_bucket = start // BUCKET + n
+        first_bucket, keeps = start // BUCKET + n, bucket_tiles.size > 0
         for first in range(0, stop - start, PIXELS):
             if not cuda.syncthreads_or(running):
                 break
             if start + first + pixel < stop:
-                if pixel % BUCKET == 0:
+                if keeps and pixel % BUCKET == 0:
                     bucket_tiles[first_bucket + (first + pixel) // BUCKET] = n
                 s = pair_splats[start + first + pixel]
                 reached[pixel] = load(
@@ -463,11 +463,12 @@ def composite_discs_forward(real: type, num_channels: int = 6) -> Kernel:
             cuda.syncthreads()
             here, group = np.int32(min(PIXELS, stop - start - first)), np.int32(0)
             while running != 0 and group < here:
-                bucket = first_bucket + (first + group) // BUCKET
-                kept[bucket, KEPT_T, pixel], kept[bucket, KEPT_DEPTH, pixel] = t, far
-                kept[bucket, KEPT_TOTAL, pixel], kept[bucket, KEPT_SQUARES, pixel] = total, squares
-                for d in range(num_channels):
-                    kept[bucket, KEPT_VALUES + d, pixel] = sums[d]
+                if keeps:
+                    bucket = first_bucket + (first + group) // BUCKET
+                    kept[bucket, KEPT_T, pixel], kept[bucket, KEPT_DEPTH, pixel] = t, far
+                    kept[bucket, KEPT_TOTAL, pixel], kept[bucket, KEPT_SQUARES, pixel] = total, squares
+                    for d in range(num_channels):
+                        kept[bucket, KEPT_VALUES + d, pixel] = sums[d]
                 i = group
                 group = np.int32(min(group + BUCKET, here))
                 while i < group:

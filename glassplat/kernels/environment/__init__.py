@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -201,8 +202,19 @@ def shade_environment(
             "world_from_cam": (world_from_cam, (3, 3)),
         }
     )
-    inputs = (blended, alpha, texels, intrinsics, world_from_cam, blended.new_tensor(background))
+    behind = _color(tuple(background), blended.dtype, blended.device)
+    inputs = (blended, alpha, texels, intrinsics, world_from_cam, behind)
     return Shaded(*_ShadeEnvironment.apply(least_strength, *inputs))
+
+
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)
+def _color(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The numbers as a tensor, the same one at every call; filled on the device, as copying them makes it wait."""
+    color = torch.empty(len(values), dtype=dtype, device=device)
+    for part, value in zip(color, values, strict=True):
+        part.fill_(value)
+    return color
 
 
 class _ShadeEnvironment(torch.autograd.Function):

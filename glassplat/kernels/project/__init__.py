@@ -47,6 +47,7 @@ def projection_inputs(
 
 
 @lru_cache(maxsize=64)
+@torch.inference_mode(False)
 def _whole_images(count: int, width: int, height: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Windows of all pixels, the same tensor at every call; filled on the device, as copying numbers makes it wait."""
     windows = torch.zeros(count, 4, dtype=dtype, device=device)

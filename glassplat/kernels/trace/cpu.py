@@ -105,7 +105,8 @@ def trace_gradients(
     means, sh, hits, kept = shapes[0], shapes[3], outputs[3], outputs[4]
     real, count = REAL_OF[means.dtype], means.shape[0]
     hit_offsets = torch.cat([hits.new_zeros(1, dtype=torch.int64), hits.cumsum(0)])
-    met = torch.empty(int(hit_offsets[-1]), dtype=torch.int32)
+    # Not `empty`: two kernels search, and where one rounds otherwise and finds less, what is left must be a Gaussian.
+    met = torch.zeros(int(hit_offsets[-1]), dtype=torch.int32)
     num_blocks = -(-hits.shape[0] // GRADIENT_BLOCK)
     distinct = torch.zeros(num_blocks, dtype=torch.int64)
     places = np.full((numba.get_num_threads(), 2, count), -1, np.int32)
