@@ -2,8 +2,8 @@
 
     python -m tools.make_differences
 
-A row is an option whose value in `--preset paper` is another one. Here are only the reasons; a test holds that the
-pages are up to date, and that no difference is without a reason.
+A row is a field of the recipe whose value in `--preset paper` is another one. Here are only the reasons; a test holds
+that the pages are up to date, and that no difference is without a reason.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ALL = {
     "densify.whole_passes": "Every Gaussian is seen before it is judged.",
     "densify.adapt_to_size": "Small photographs grow more Gaussians than they have pixels otherwise.",
     "densify.prune_large_start": "Walls and sky are large and stay.",
-    "densify.per_pixel": "Photographs that contradict each other never stop asking for more.",
+    "densify.per_pixel": "Inconsistent photographs would otherwise trigger densification without end.",
     "densify.least_contribution": "A sixth of the Gaussians does nothing.",
     "seed_unexplained": "A lamp in an open space has no points, and is found late or never.",
     "mcmc.noise_units": "The units of the capture do not matter.",
@@ -111,7 +111,7 @@ REASONS: dict[str, dict[str, str]] = {
         "normals_throughout": "Depths are too noisy later: -0.25 to -1 dB.",
     },
 }
-"""Why an option differs, by method and dotted name."""
+"""Why a field differs, by method and dotted name."""
 
 
 def leaves(options: Any, name: str = "") -> dict[str, Any]:
@@ -126,7 +126,7 @@ def leaves(options: Any, name: str = "") -> dict[str, Any]:
 
 
 def differences(method: str) -> dict[str, tuple[Any, Any]]:
-    """The default and the published value of every option in which the two differ."""
+    """The default and the published value of every field in which the two differ."""
     ours, published = leaves(recipe_of(method)), leaves(recipe_of(method, "paper"))
     return {name: (value, published[name]) for name, value in ours.items() if value != published[name]}
 
@@ -152,7 +152,7 @@ def table_of(method: str) -> str:
         f"| `{name}` | {written(ours)} | {written(published)} | {REASONS[method][name]} |"
         for name, (ours, published) in own_differences(method).items()
     ]
-    return "\n".join(["| option | here | paper | why |", "|---|---|---|---|", *rows])
+    return "\n".join(["| field | here | paper | why |", "|---|---|---|---|", *rows])
 
 
 def with_table(page: str, method: str) -> str:
