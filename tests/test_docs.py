@@ -61,7 +61,9 @@ def test_the_readme_can_be_read_elsewhere() -> None:
 
 def test_the_readme_shows_how_to_start() -> None:
     shown = [shlex.split(line)[1] for line in shell_lines(README) if line.startswith("glassplat")]
-    assert {"demo", "train", "eval", "view"} <= set(shown)
+    assert {"train", "eval", "view"} <= set(shown)
+    made = [shlex.split(line, comments=True)[1] for line in shell_lines(README) if line.startswith("make")]
+    assert made == ["demo", "test"]
 
 
 @pytest.mark.parametrize("arguments", commands("glassplat"), ids=" ".join)

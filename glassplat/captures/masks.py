@@ -292,7 +292,7 @@ def _found_masks(root: Path, photographs: Mapping[str, Path]) -> tuple[dict[str,
 
 
 def _why_panes(root: Path, masks: Mapping[str, Path], *, marked: bool) -> str | None:
-    """Sentence on why masks are taken for panes, as in captures of earlier versions; None where they are not.
+    """Sentence on why masks in `masks/` are taken for panes; None where they are not.
 
     Raises:
         InputError: they look like labels of panes, and these are in `panes/`.
@@ -309,12 +309,8 @@ def _why_panes(root: Path, masks: Mapping[str, Path], *, marked: bool) -> str | 
         return None
     if labels:
         keep = " (if 1 is what to keep, write 255 for it)" if highest == 1 else ""
-        return f"The masks hold labels of panes, as in captures of earlier versions{keep}."
-    return (
-        f"There is a {PLANES} but no {PANE_FOLDER}/, as in captures of earlier versions."
-        if (masks and (root / PLANES).is_file())
-        else None
-    )
+        return f"The masks hold labels of panes{keep}."
+    return f"There is a {PLANES} but no {PANE_FOLDER}/." if (masks and (root / PLANES).is_file()) else None
 
 
 def _highest_value(path: Path) -> int:

@@ -540,7 +540,7 @@ def in_world(normals: Tensor, camera: Camera) -> Tensor:
 
 
 def normals_reader(image_path: Path, camera: Camera) -> Callable[[], Tensor] | None:
-    """What reads the estimated normals of a photograph at a camera's size; None where there is no file of them."""
+    """Reader of the estimated normals of a photograph, at a camera's size; None where there is no file of them."""
     path = normals_path(image_path)
     return None if path is None else partial(normals_in_file, path, camera)
 

@@ -216,7 +216,7 @@ def _globals_read(code: CodeType) -> set[str]:
 
 
 def kept_data(files: Iterable[caching.IndexDataCacheFile], key: Any) -> Any:
-    """What the first folder that has something keeps under a key; None where none has. Damaged files count as none."""
+    """Data kept under a key, from the first folder that has it; None where none has. Damaged files count as none."""
     for file in files:
         try:
             data = file.load(key)
