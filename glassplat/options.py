@@ -1,14 +1,12 @@
 """Options as dataclasses: ranges in annotations, checked from the command line and from JSON.
 
 An annotation is the only place that says what a value may be: its type, `Literal` choices, and requirements such as
-`Range`. A dataclass whose fields have to fit together has a method `contradiction`. One that files of earlier versions
-hold with fields which are constants now has them in `FORMER`, with their values.
+`Range`. A dataclass whose fields have to fit together has a method `contradiction`.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import logging
 import math
 import types
 import typing
@@ -20,8 +18,6 @@ from typing import Annotated, Any, Literal, NamedTuple, Protocol, TypeVar, runti
 import tyro
 
 from glassplat.errors import InputError
-
-log = logging.getLogger("glassplat.options")
 
 MOST = 1_000_000_000
 """Of anything that is counted: more than a machine holds, and few enough for every integer type."""
@@ -256,7 +252,6 @@ def _fields(kind: type, value: Any, name: str) -> Any:
         raise OptionError(name, value, "an object with named values")
     hints = typing.get_type_hints(kind, include_extras=True)
     known = [field.name for field in fields(kind)]
-    value = _without_former(value, getattr(kind, "FORMER", {}), name)
     unknown = sorted(map(str, set(value) - set(known)))
     if unknown:
         raise InputError(f"unknown fields {unknown} of {name or 'the options'}; there are {known}")
@@ -269,14 +264,6 @@ def _fields(kind: type, value: Any, name: str) -> Any:
     if contradiction:
         raise InputError(contradiction)
     return made
-
-
-def _without_former(values: Mapping[str, Any], former: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    """The values by field without those of former fields; the log names one that is another than the constant now."""
-    for key in [key for key in former if key in values and values[key] != former[key]]:
-        field = f"{name}.{key}".removeprefix(".")
-        log.warning("%s is %s in a file of an earlier version; now it always is %s", field, values[key], former[key])
-    return {key: value for key, value in values.items() if key not in former}
 
 
 def _is_needed(field: dataclasses.Field) -> bool:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from glassplat.annotate.document import MarkedPane, depths, filled, seen_outline, with_strokes
 from glassplat.annotate.fit import PaneFit
 from glassplat.captures.dataset import Dataset
-from glassplat.captures.masks import MASK_FOLDER, PANE_FOLDER, PLANES
+from glassplat.captures.masks import PANE_FOLDER, PLANES
 from glassplat.captures.view import PhotoFile, View
 from glassplat.errors import InputError, first_names
 from glassplat.files.images import image_size, write_image
@@ -128,7 +128,6 @@ def write_results(root: Path, views: Sequence[View], eyes: Sequence[NumpyCamera]
         write_image(folder / names[view.name], in_photograph(view, pane_labels(view.name, eye, panes)))
     for path in set(earlier) - {folder / name for name in names.values()}:
         path.unlink(missing_ok=True)
-    _forget_old_folder(root)
     with atomic_write(folder / RECORD) as temporary:
         temporary.write_text(json.dumps(sorted(names.values()), indent=1), encoding="utf-8")
     write_planes(root / PLANES, planes_of(panes, eyes))
@@ -149,19 +148,12 @@ def check_own_masks(dataset: Dataset) -> None:
 
 
 def earlier_masks(root: Path) -> list[Path]:
-    """Masks of a capture's panes that were made here before; earlier versions kept them in `masks/`.
+    """Masks of a capture's panes that were made here before.
 
     Raises:
         InputError: there are others.
     """
-    folders = [root / PANE_FOLDER]
-    if (root / MASK_FOLDER / RECORD).is_file():
-        folders.append(root / MASK_FOLDER)
-    return [path for folder in folders for path in _own_masks(folder)]
-
-
-def _own_masks(folder: Path) -> list[Path]:
-    """The masks in a folder, all of which were made here."""
+    folder = root / PANE_FOLDER
     if not folder.is_dir():
         return []
     try:
@@ -177,16 +169,6 @@ def _own_masks(folder: Path) -> list[Path]:
         )
     plain = (name for name in known if not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts)
     return [folder / name for name in plain]
-
-
-def _forget_old_folder(root: Path) -> None:
-    """Removes what is left of `masks/` if an earlier version wrote it: what is in there is left out of photographs."""
-    folder = root / MASK_FOLDER
-    if (folder / RECORD).is_file():
-        (folder / RECORD).unlink()
-        for path in sorted((folder, *folder.rglob("*")), reverse=True):
-            if path.is_dir() and not any(path.iterdir()):
-                path.rmdir()
 
 
 def pane_labels(name: str, eye: NumpyCamera, panes: Solved) -> Labels:

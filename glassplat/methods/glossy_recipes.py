@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from glassplat.methods.splat_recipe import Primitive
 from glassplat.options import (
@@ -92,8 +92,6 @@ class GlossyOptions:
         poses: whether the camera of each photograph is corrected.
     """
 
-    FORMER: ClassVar[dict[str, Any]] = {"refinements": [0.45, 0.65]}
-
     sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
     ssim_weight: Share = 0.2
     view_dependence_weight: NotNegative = 0.0
@@ -143,7 +141,6 @@ class DeferredRecipe(GlossyOptions):
     """3DGS-DR: a strength and a normal for every Gaussian, one environment, and shading per pixel."""
 
     method: ClassVar[str] = "deferred"
-    FORMER: ClassVar[dict[str, Any]] = GlossyOptions.FORMER | {"shading": "deferred"}
 
     @classmethod
     def paper(cls) -> DeferredRecipe:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from glassplat.kernels import Fresnel
 from glassplat.options import (
@@ -124,18 +124,6 @@ class PlanarRecipe:
     """
 
     method: ClassVar[str] = "planar"
-    FORMER: ClassVar[dict[str, Any]] = {
-        "multi_stage": True,
-        "plane_rates": {
-            "center": 1e-4,
-            "normal": 1e-4,
-            "reflectance": 1e-2,
-            "mark": 5e-2,
-            "transmittance": 5e-3,
-            "joint_factor": 0.1,
-        },
-    }
-
     sh_degree: Annotated[ShDegree, ESSENTIAL] = 3
     ssim_weight: Share = 0.2
     view_dependence_weight: NotNegative = 0.02

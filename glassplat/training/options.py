@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -84,8 +84,6 @@ class GaussianRates:
             (30,000 / n) to this power times as large, n being 3,000 at the least; 0 keeps the published ones
             (lab/training.md).
     """
-
-    FORMER: ClassVar[dict[str, Any]] = {"means_end": MEANS_END}
 
     means: LearningRate = 1.6e-4
     decay: Internal[PositiveShare] = 1.0
@@ -253,12 +251,6 @@ class McmcDensify:
             published 0.1 takes a thousand steps or more to grow over the gaps (lab/gaussians.md).
     """
 
-    FORMER: ClassVar[dict[str, Any]] = {
-        "dead_opacity": 0.005,
-        "noise_sharpness": 100.0,
-        "initial_opacity": 0.5,
-    }
-
     cap: Annotated[Count | None, ESSENTIAL, tyro.conf.arg(aliases=("--cap",))] = None
     interval: Internal[Several] = 100
     start: Internal[Share] = 500 / 30_000
@@ -318,8 +310,6 @@ class NormalPropagation:
         sabotaged: Gaussians of at most this strength are disturbed (paper: 0.1; its code: 0.05).
     """
 
-    FORMER: ClassVar[dict[str, Any]] = {"propagates": True}
-
     least_opacity: InnerShare = 0.9
     least_strength: InnerShare = 1e-3
     reflective: InnerShare = 0.02
@@ -336,8 +326,6 @@ class PhotoExposure:
         rate: learning rate at the start; 0 takes all photographs as exposed alike.
     """
 
-    FORMER: ClassVar[dict[str, Any]] = {"rate_end": 0.1}
-
     rate: LearningRate = 0.0
 
 
@@ -348,8 +336,6 @@ class PoseRefinement:
     Attributes:
         rate: learning rate at the start, radians and extents; 0 takes the capture's cameras as they are.
     """
-
-    FORMER: ClassVar[dict[str, Any]] = {"rate_end": 0.1}
 
     rate: LearningRate = 0.0
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import pytest
 
@@ -32,8 +30,6 @@ from tests.methods.number_fields import number_fields
 
 @dataclass(frozen=True)
 class Inner:
-    FORMER: ClassVar[Mapping[str, Any]] = {"steps": [1, 2]}
-
     rate: Positive = 1.0
     most: Count | None = None
 
@@ -74,15 +70,6 @@ def test_what_json_holds_becomes_the_options() -> None:
     assert isinstance(made.inner.rate, float) and isinstance(made.color, tuple)
     assert options_from_json(Outer, {"name": "n"}) == Outer("n")
     check_options(made)
-
-
-def test_a_field_of_an_earlier_version_is_read_over(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.WARNING, "glassplat")
-    assert options_from_json(Outer, {"name": "n", "inner": {"steps": [1, 2], "rate": 2}}) == Outer("n", Inner(2.0))
-    assert not caplog.messages
-    assert options_from_json(Outer, {"name": "n", "inner": {"steps": [1, 3]}}) == Outer("n")
-    (said,) = caplog.messages
-    assert said == "inner.steps is [1, 3] in a file of an earlier version; now it always is [1, 2]"
 
 
 WRONG = [

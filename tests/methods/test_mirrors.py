@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from glassplat.captures.view import CAMERA_FROM_PICTURE, FOLDER, View
+from glassplat.captures.view import CAMERA_FROM_PICTURE, FOLDER, View, normals_reader
 from glassplat.methods.mirrors import FACING, facing, made_mirrors, mirror_lookalikes, neighbours, seen_normals
 from glassplat.render.splat import Splat
 from glassplat.scene import SH_ZERO
@@ -117,7 +117,7 @@ def test_estimated_normals_say_it_before_depths_do(tmp_path: Path, estimated: bo
     in_picture = (elsewhere * torch.tensor(CAMERA_FROM_PICTURE)).expand(SIZE, SIZE, 3)
     np.save(tmp_path / FOLDER / "0.npy", in_picture.numpy())
     (view,) = views(0.0)
-    view = replace(view, image_path=tmp_path / "0.png")
+    view = replace(view, read_normals=normals_reader(tmp_path / "0.png", view.camera))
     chosen = inner(scene)
     made = made_mirrors(replace(SEARCH, estimated_normals=estimated), scene, [view], chosen).select(chosen)
     expected = elsewhere if estimated else true_normal()

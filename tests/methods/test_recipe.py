@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import typing
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -102,26 +101,10 @@ def test_recipes_are_within_their_ranges_and_survive_their_file(method: str, pre
     assert recipe_from_json(recipe_to_json(recipe)) == recipe
 
 
-def with_former(kind: type, fields: dict[str, Any]) -> dict[str, Any]:
-    """A recipe's fields as an earlier version wrote them, with all that are constants now."""
-    hints = typing.get_type_hints(kind)
-    inner = {name: with_former(hints[name], value) for name, value in fields.items() if isinstance(value, dict)}
-    return {**fields, **inner, **getattr(kind, "FORMER", {})}
-
-
-@pytest.mark.parametrize("method", RECIPES)
-def test_recipes_of_earlier_versions_are_read(method: str, caplog: pytest.LogCaptureFixture) -> None:
-    recipe = recipe_of(method)
-    fields = with_former(type(recipe), json.loads(recipe_to_json(recipe)))
-    assert recipe_from_json(json.dumps(fields)) == recipe
-    assert not caplog.messages
-
-
-def test_an_ablation_of_an_earlier_version_is_read_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_recipe_of_another_version_is_refused() -> None:
     fields = {**json.loads(recipe_to_json(recipe_of("deferred"))), "shading": "forward"}
-    assert recipe_from_json(json.dumps(fields)) == recipe_of("deferred")
-    (said,) = caplog.messages
-    assert said == "shading is forward in a file of an earlier version; now it always is deferred"
+    with pytest.raises(InputError, match=r"unknown fields \['shading'\]"):
+        recipe_from_json(json.dumps(fields))
 
 
 def edited(**fields: Any) -> str:
