@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 import torch
 from torch import Tensor
 
+from glassplat.captures.dataset import load_dataset
+from glassplat.cli.runs import open_run
 from glassplat.kernels.backend.devices import SIMULATED, cuda_problem
 from glassplat.kernels.composite import composite
 from glassplat.kernels.project import project
 from glassplat.kernels.records import CameraBatch, Deviation, RawGaussians, Splats, TileBins
 from glassplat.kernels.tiles import bin_tiles
+from glassplat.methods.recipe import RECIPES, recipe_of
+from glassplat.model.training import Training
 from glassplat.render.traced import traced_surroundings
 from glassplat.scene.gaussians import Gaussians
+from glassplat.training.options import PhotoExposure, PoseRefinement
 from tests.kernels.gaussians_and_cameras import draw
+from tests.training.tiny_capture import write_tiny_capture
 
 if SIMULATED or (problem := cuda_problem()) is not None:
     reason = "the simulator is too slow" if SIMULATED else f"no GPU to run the CUDA kernels on: {problem}"
@@ -128,3 +136,14 @@ def test_rays_of_a_gpu_meet_what_they_meet_on_the_cpu() -> None:
     on_gpu = traced_surroundings(part.to(DEVICE), origins.to(DEVICE), directions.to(DEVICE), 0.0)
     assert on_gpu.colors.device.type == DEVICE.type
     torch.testing.assert_close(on_gpu.colors.cpu(), on_cpu.colors, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("method", RECIPES)
+def test_every_method_trains_and_is_opened_with_all_corrections(method: str, tmp_path: Path) -> None:
+    dataset = load_dataset(write_tiny_capture(tmp_path / "capture"))
+    recipe = replace(recipe_of(method), exposure=PhotoExposure(1e-3), poses=PoseRefinement(1e-4))
+    model = Training(dataset, recipe, iterations=40, device=DEVICE.type, output=tmp_path / "run").run()
+    run = open_run(tmp_path / "run", DEVICE.type)
+    for view in run.dataset.test:
+        own, again = model.image(view.name), run.renderer(run.scene, view.camera).rgb.detach().cpu().clamp(0, 1)
+        torch.testing.assert_close(own, again, atol=1e-4, rtol=0)
