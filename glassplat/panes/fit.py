@@ -49,12 +49,17 @@ LEAST_MEETING, LEAST_OF_MEDIAN = 0.3, 0.5
 EDGES_PER_VIEW = 100
 
 
+def _range(values: Array) -> tuple[float, float]:
+    return float(values.min()), float(values.max())
+
+
 def report_masks(label: int, plane: FramedPlanes, views: Sequence[PaneView]) -> None:
     """Logs how well each mask of a pane fits the others on its plane, and warns of those that do not, by name."""
     meeting, overlap = meeting_of_each(plane, views), agreement_of_each(plane.planes, views)
     found = [f"{view.name} {_percent(share)}" for view, share in zip(views, meeting, strict=True)]
     areas = ", ".join(f"{told} ({area:.2f})" for told, area in zip(found, overlap, strict=True))
-    log.info("pane %d: outlines of the masks that meet those of the others (and overlap): %s", label, areas)
+    log.debug("pane %d: outlines of the masks that meet those of the others (and overlap): %s", label, areas)
+    log.info("pane %d: %d masks, which overlap by %.2f to %.2f on its plane", label, len(views), *_range(overlap))
     odd = odd_ones(meeting).nonzero()[0]
     if len(odd):
         log.warning(
@@ -382,8 +387,8 @@ def _joint(panes: Sequence[_Found], seed: int) -> list[_Found]:
         plane = best_joint_plane(objective, joined([pane.plane for pane in panes]), rng)
         losses = [_loss(pane, plane) for pane in panes]
         if max(losses) <= MOST_LOSS:
-            turned = ", ".join(f"{p.label} by {np.degrees(angle(p.plane, plane)):.2f}" for p in panes)
-            log.info("panes on one plane, which turns them by degrees: %s", turned)
+            labels, turned = ", ".join(str(pane.label) for pane in panes), max(angle(p.plane, plane) for p in panes)
+            log.info("panes %s lie in one plane, within %.2f degrees", labels, np.degrees(turned))
             return [replace(pane, plane=plane, is_settled=True) for pane in panes]
         del panes[int(np.argmax(losses))]
     return panes

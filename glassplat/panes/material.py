@@ -242,7 +242,7 @@ def judged_pane(scene: Scene, label: int, photographs: Sequence[Photograph]) -> 
     mirrored, photographed = torch.cat([pair[0] for pair in pairs]), torch.cat([pair[1] for pair in pairs])
     found = replace(inner.planes, half_sizes=pane.half_sizes)
     like = likeness(mirrored, photographed)
-    log.info(
+    log.debug(
         "pane %d: slope %.2f, correlation %.2f, of %.1f %% of it, on a plane %.2f degrees from the fitted one",
         label, *like, 100 * len(mirrored) / max(shown, 1), degrees_between(found.normals[0], pane.normals[0]),
     )  # fmt: skip

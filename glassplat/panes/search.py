@@ -318,7 +318,7 @@ def best_supported(label: int, fits: Sequence[Fit], evidence: Objective) -> Fram
     for fit, found in zip(fits, scores, strict=True):
         apart = np.degrees(angle(fit.plane, fits[kept].plane))
         verdict = "kept" if fit is fits[kept] else f"{apart:.2f} degrees from the one that is kept"
-        log.info(
+        log.debug(
             "pane %d: the plane fitted to %s scores %.3f, with %.0f %% of %d points along its edge on it; %s",
             label, fit.source, found, 100 * evidence.support(fit.plane.planes)[0], len(evidence.points), verdict,
         )  # fmt: skip

@@ -19,7 +19,7 @@ NAMES = [f"photo{number}.jpg" for number in range(len(PLACES))]
 
 
 def warnings_of(annotations: Annotations, caplog: pytest.LogCaptureFixture) -> list[str]:
-    with caplog.at_level(logging.INFO, "glassplat.panes"):
+    with caplog.at_level(logging.DEBUG, "glassplat.panes"):
         fit_planes(frame_and_clutter([FRONT]), annotations, extent=EXTENT, names=NAMES, options=QUICK)
     assert "outlines of the masks" in caplog.text
     assert all(name in caplog.text for name in NAMES)

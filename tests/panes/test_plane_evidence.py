@@ -42,7 +42,7 @@ def test_the_measured_points_win_where_gaussians_mislead(caplog: pytest.LogCaptu
     misled = fit_planes(MISLEADING, annotations, extent=EXTENT, options=QUICK)
     assert normal_error(misled, 0, FRONT) > 3
     caplog.clear()
-    with caplog.at_level(logging.INFO, "glassplat.panes"):
+    with caplog.at_level(logging.DEBUG, "glassplat.panes"):
         planes = fit_planes(MISLEADING, annotations, extent=EXTENT, measured=MEASURED, options=QUICK)
     assert normal_error(planes, 0, FRONT) < 1.5
     assert "fitted to the measured points scores" in caplog.text
@@ -52,7 +52,7 @@ def test_the_measured_points_win_where_gaussians_mislead(caplog: pytest.LogCaptu
 
 def test_gaussians_decide_where_measured_points_lead_to_no_plane(caplog: pytest.LogCaptureFixture) -> None:
     annotations = scene_of([FRONT], CLOSE)
-    with caplog.at_level(logging.INFO, "glassplat.panes"):
+    with caplog.at_level(logging.DEBUG, "glassplat.panes"):
         planes = fit_planes(MEASURED, annotations, extent=EXTENT, measured=torch.zeros(0, 3), options=QUICK)
     assert normal_error(planes, 0, FRONT) < 3
     assert "of 0 points along its edge" in caplog.text
