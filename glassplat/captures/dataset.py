@@ -101,7 +101,7 @@ class Dataset:
         background: sRGB that is seen through transparent photographs; None where none is, or where that is left out.
         planes: panes that the capture gives as rectangles; their masks, if any, only refine them.
         downscale: by how much the photographs were reduced.
-        mask_polarity: which value of black-and-white masks was taken for the pane.
+        mask_polarity: which value of black-and-white masks is the pane, as the reader was told.
     """
 
     root: Path

@@ -31,7 +31,7 @@ class CaptureFiles:
         shots: all photographs, by name.
         masks: where the panes are, by name of the photograph, and their labels.
         ignored: masks of what is not to be learned, by name of the photograph; several for some.
-        mask_polarity: which value of black-and-white masks was taken for the pane.
+        mask_polarity: which value of black-and-white masks is the pane, as the reader was told.
     """
 
     root: Path

@@ -84,7 +84,7 @@ LENS: dict[str, Field] = {
 
 
 def lens_from_settings(settings: Mapping[str, Any], image_path: Path, name: str) -> Lens:
-    """The `pycolmap.Camera` of one frame.
+    """The lens of one frame.
 
     Focal length: `fl_x`, `fl_y`, or the opening angles `camera_angle_x`, `camera_angle_y` in radians. Principal
     point: `cx`, `cy`, or the middle. Size: `w`, `h`, or that of the image. Distortion: `k1` ... `k6`, `p1`, `p2`, as
@@ -158,7 +158,7 @@ FILE: dict[str, Field] = {
     "val_filenames": Optional(Items(Text())),
     "test_filenames": Optional(Items(Text())),
 }
-"""What is read beside the lens (`transforms_lens`); more may be in the file."""
+"""What is read beside the lens (`LENS`); more may be in the file."""
 
 
 def read_settings(path: Path) -> dict[str, Any]:

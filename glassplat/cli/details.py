@@ -94,7 +94,7 @@ def _marked(path: Path, dataset: Dataset) -> Finding:
 
 
 def _behind(path: Path, dataset: Dataset) -> Finding:
-    """Return whether planes can be fitted to the panes that are marked, and what lies behind them; takes seconds."""
+    """Finding on the panes that are marked: whether planes fit them, and what lies behind these; takes seconds."""
     finding = Finding()
     if not dataset.pane_labels and dataset.planes is None:
         return finding

@@ -13,12 +13,12 @@ from glassplat.cli.console import say
 from glassplat.cli.runs import StoredRun
 from glassplat.errors import InputError
 from glassplat.evaluate.evaluate import (
+    RENDERED_REGIONS,
+    TRUE_REGIONS,
     Evaluation,
-    MarkedRegions,
     PaneRegions,
-    RenderedRegions,
-    TrueRegions,
     evaluate,
+    marked_regions,
     with_aligned_test_views,
 )
 from glassplat.evaluate.metrics import PLANE_COLUMNS, missing_reasons, shown_metrics, written
@@ -45,26 +45,26 @@ def pane_regions(dataset: Dataset, source: PaneSource) -> PaneRegions:
         return _marked_regions(dataset)
     if source == "truth" and dataset.truth is None:
         raise InputError(f"{dataset.root} has no folder gt/ that says where its panes are; use --panes masks")
-    return TrueRegions() if source == "truth" else RenderedRegions()
+    return TRUE_REGIONS if source == "truth" else RENDERED_REGIONS
 
 
 def _best_regions(dataset: Dataset) -> PaneRegions:
     """Those that say most surely where the panes are."""
     if dataset.truth is not None:
-        return TrueRegions()
+        return TRUE_REGIONS
     try:
         return _marked_regions(dataset)
     except InputError:
-        return RenderedRegions()
+        return RENDERED_REGIONS
 
 
-def _marked_regions(dataset: Dataset) -> MarkedRegions:
+def _marked_regions(dataset: Dataset) -> PaneRegions:
     """Those of the masks, with planes fitted as any method would begin, so that all are measured alike."""
     if not dataset.pane_labels and dataset.planes is None:
         raise InputError(f"{dataset.root} has no masks that name a pane; use --panes rendered, or add masks")
     try:
         # The rectangle's margin is for training, which must not cut into a pane.
-        return MarkedRegions(fitted_planes(dataset, None, PlaneFit(margin=1.0)))
+        return marked_regions(fitted_planes(dataset, None, PlaneFit(margin=1.0)))
     except PlaneFitError as error:
         raise InputError(f"the masks of {dataset.root} lead to no plane: {error}. Use --panes rendered") from error
 

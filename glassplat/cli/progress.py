@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Protocol
 
 from rich import progress
 from rich.console import Console
@@ -149,29 +148,13 @@ def _brief(seconds: float) -> str:
     return f"{seconds:.2f} s" if seconds >= 0.1 else f"{1000 * seconds:.0f} ms"
 
 
-class Display(Protocol):
-    """Display of the progress between the lines that are printed."""
-
-    def step(self, standing: Standing) -> None:
-        """Shows a step."""
-        ...
-
-    def work(self, standing: Standing, work: messages.Working) -> None:
-        """Shows how far something is that happens between two steps."""
-        ...
-
-    def stop(self) -> None:
-        """Ends the display."""
-        ...
-
-
 class TrainingProgress:
     """Shows a run's messages; a context, so that a bar ends with the run."""
 
     def __init__(self, console: Console, plan: Plan, clock: Callable[[], float] = time.monotonic) -> None:
         self._console, self._standing = console, Standing(plan.iterations)
         self._pace = Pace(plan, clock)
-        self._display: Display = StepBar(console) if console.is_terminal else StepLines(console, clock)
+        self._display: StepBar | StepLines = StepBar(console) if console.is_terminal else StepLines(console, clock)
 
     def __enter__(self) -> TrainingProgress:
         return self

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ from glassplat.errors import InputError
 from glassplat.evaluate import metrics
 from glassplat.evaluate.truth import GroundTruth, TrueSurface, TrueView, load_truth, true_surface
 from glassplat.kernels.photometric import photometric
-from glassplat.render.frame import Frame, Renderer
+from glassplat.render.frame import Drawing, Frame, Renderer
 from glassplat.render.panes import nearest_hits, panes_in_camera
 from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import Exposures, moved_camera
@@ -29,59 +29,44 @@ NO_TRUTH = "the data set has no ground truth"
 NO_VIEW_TRUTH = "the ground truth lacks this view"
 
 
-class PaneRegions(Protocol):
-    """One source for the whole data set, so that means do not mix two."""
-
-    @property
-    def source(self) -> str:
-        """Description of the region for readers of the metrics."""
-        ...
-
-    def of(self, view: View, frame: Frame, truth: TrueView | None) -> Tensor | str:
-        """The pixels of a view that show a pane, [H, W] bool, or why they are not known."""
-        ...
-
-
-@dataclass(frozen=True)
-class TrueRegions:
-    """Pane regions from the ground truth."""
-
-    source: str = "ground-truth pane labels"
-
-    def of(self, view: View, frame: Frame, truth: TrueView | None) -> Tensor | str:
-        """As in `PaneRegions`."""
-        return NO_VIEW_TRUTH if truth is None else truth.labels > 0
-
-
-@dataclass(frozen=True)
-class MarkedRegions:
-    """The view's mask, or without one what the planes fitted to the masks cover; what stands before them included.
+class PaneRegions(NamedTuple):
+    """The pixels that show panes, by one source for the whole data set, so that means do not mix two.
 
     Attributes:
-        planes: fitted to the masks and to measured points, whatever was trained.
+        source: description of the region for readers of the metrics.
+        of: the pixels of a view, its frame and its truth that show a pane, [H, W] bool, or why they are not known.
+        planes: fitted to the masks and to measured points, whatever was trained; None where masks are not the source.
     """
 
-    planes: Planes
-    source: str = "masks, and in views without one the planes fitted to them"
+    source: str
+    of: Callable[[View, Frame, TrueView | None], Tensor | str]
+    planes: Planes | None = None
 
-    def of(self, view: View, frame: Frame, truth: TrueView | None) -> Tensor | str:
-        """As in `PaneRegions`."""
+
+def _true_region(view: View, frame: Frame, truth: TrueView | None) -> Tensor | str:
+    return NO_VIEW_TRUTH if truth is None else truth.labels > 0
+
+
+def _rendered_region(view: View, frame: Frame, truth: TrueView | None) -> Tensor | str:
+    if "mask" in frame.layers:
+        return frame.layers["mask"] > 0.5
+    return f"{NO_TRUTH}, and the method renders no mask"
+
+
+TRUE_REGIONS = PaneRegions("ground-truth pane labels", _true_region)
+RENDERED_REGIONS = PaneRegions("rendered mask > 0.5", _rendered_region)
+"""As the method itself renders them, so that methods may be scored over different pixels."""
+
+
+def marked_regions(planes: Planes) -> PaneRegions:
+    """The view's mask, or without one what the planes fitted to the masks cover; what stands before them included."""
+
+    def region(view: View, frame: Frame, truth: TrueView | None) -> Tensor | str:
         if view.pane_labels is not None:
             return view.pane_labels > 0
-        return nearest_hits(panes_in_camera(self.planes, view.camera), view.camera).pane >= 0
+        return nearest_hits(panes_in_camera(planes, view.camera), view.camera).pane >= 0
 
-
-@dataclass(frozen=True)
-class RenderedRegions:
-    """Pane regions as the method itself renders them, so that methods may be scored over different pixels."""
-
-    source: str = "rendered mask > 0.5"
-
-    def of(self, view: View, frame: Frame, truth: TrueView | None) -> Tensor | str:
-        """As in `PaneRegions`."""
-        if "mask" in frame.layers:
-            return frame.layers["mask"] > 0.5
-        return f"{NO_TRUTH}, and the method renders no mask"
+    return PaneRegions("masks, and in views without one the planes fitted to them", region, planes)
 
 
 STEPS = 40
@@ -264,7 +249,7 @@ def evaluate(
         raise InputError(f"{dataset.root} has no test views; expected at least one image to compare with")
     truth = load_truth(dataset.truth)
     lpips = metrics.load_lpips()
-    regions = regions or (RenderedRegions() if truth is None else TrueRegions())
+    regions = regions or (RENDERED_REGIONS if truth is None else TRUE_REGIONS)
     # The first frame may wait for the compiler; it must not count.
     timed_render(renderer, scene, dataset.test[0])
     measurements, learned = {}, scene.exposures.to("cpu")
@@ -288,14 +273,13 @@ def evaluate(
         metrics.environment_metrics(metrics.learned_environment(scene), metrics.true_environment(dataset.root), lpips)
     )
     results |= _footnotes(results, lpips, regions, gain)
-    marked = regions.planes if isinstance(regions, MarkedRegions) else None
-    results["planes"] = metrics.plane_table(scene.planes, truth, dataset.extent, marked)
+    results["planes"] = metrics.plane_table(scene.planes, truth, dataset.extent, regions.planes)
     if len(scene.planes):
         results["missing_panes"] = metrics.missing_panes(scene.planes, truth)
     return Evaluation(results, per_view)
 
 
-def timed_render(renderer: Renderer, scene: Scene, view: View) -> tuple[Frame, float]:
+def timed_render(renderer: Drawing, scene: Scene, view: View) -> tuple[Frame, float]:
     """A frame without gradients, on the CPU, and the seconds it took.
 
     Raises:

@@ -30,7 +30,7 @@ from glassplat.kernels.project.reference import sh_basis
 from glassplat.options import shown
 from glassplat.scene import SH_ZERO
 from glassplat.scene.camera import quat_from_rotation, quat_product, rotation_from_quat
-from glassplat.scene.gaussians import DISC_SCALES, Gaussians
+from glassplat.scene.gaussians import DISC_SCALES, Gaussians, half_turned
 
 DIRECTIONS = 64
 
@@ -342,8 +342,7 @@ SPLATS: dict[str, records.Field] = {
 """What the renderers here can draw; how a viewer sorts is its own affair."""
 HIGHEST_DEGREE = 3
 TURN = (-1.0, -1.0, 1.0)
-TURNED_HARMONICS = (1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1)
-"""How each harmonic changes its sign when x and y do."""
+"""Signs of the coordinates after half a turn around z: to the frame of glTF, and back."""
 LEAST_SHARE, LEAST_SCALE = 1e-7, 1e-12
 PLAIN_COUNT, BYTES_PER_GAUSSIAN = 2**20, 8
 """A file of B bytes may show B / 8 Gaussians, or a million: real ones take forty bytes, bombs show one often."""
@@ -409,11 +408,11 @@ def read_glb(path: Path | str) -> Gaussians:
         Gaussians.joined,
         (replace(part, channels={name: part.channels[name] for name in sorted(shared)}) for part in alike),
     )
-    return _turned(replace(whole, active_sh_degree=round(most**0.5) - 1))
+    return half_turned(replace(whole, active_sh_degree=round(most**0.5) - 1), TURN)
 
 
 def _glb_bytes(gaussians: Gaussians) -> bytes:
-    turned = _turned(replace(gaussians, sh=gaussians.sh[:, : (gaussians.active_sh_degree + 1) ** 2]))
+    turned = half_turned(replace(gaussians, sh=gaussians.sh[:, : (gaussians.active_sh_degree + 1) ** 2]), TURN)
     quats = torch.nn.functional.normalize(turned.quats, dim=1)
     quats = torch.where(quats.norm(dim=1, keepdim=True) > 0, quats, quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
     opacities = torch.sigmoid(turned.logit_opacities)
@@ -546,14 +545,6 @@ def _alike(part: Gaussians, coefficients: int, *, are_discs: bool) -> Gaussians:
     if part.are_discs and not are_discs:
         log_scales = torch.nn.functional.pad(log_scales, (0, 1), value=float(np.log(LEAST_SCALE)))
     return replace(part, sh=sh, log_scales=log_scales)
-
-
-def _turned(gaussians: Gaussians) -> Gaussians:
-    """Half around the z axis: to the frame of glTF, and back."""
-    flip = gaussians.means.new_tensor(TURN)
-    signs = gaussians.sh.new_tensor(TURNED_HARMONICS[: gaussians.sh.shape[1]])[:, None]
-    quats = gaussians.quats * torch.cat([flip.new_ones(1), flip])
-    return gaussians.with_tensors({"means": gaussians.means * flip, "quats": quats, "sh": gaussians.sh * signs})
 
 
 def _numpy(tensor: Tensor) -> Any:

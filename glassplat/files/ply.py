@@ -230,7 +230,7 @@ def _check_is_splat(table: PlyTable, path: Path) -> None:
     if "packed_position" in table.columns:
         raise ValueError(
             f"{path} is a compressed PlayCanvas/SuperSplat PLY; {expected}. "
-            "Export it as an uncompressed PLY (in SuperSplat: Export, PLY, without compression)"
+            "`glassplat export` reads it and writes an uncompressed one"
         )
     if len(missing) < len(REQUIRED) - len(POSITION):
         raise ValueError(f"{path} lacks {' '.join(missing)}; {expected}. Was it made by another kind of method?")

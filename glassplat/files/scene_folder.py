@@ -69,20 +69,17 @@ def write_scene(folder: Path, scene: Scene) -> None:
         sidecars.write_environment(folder / ENVIRONMENT, scene.environment)
         files += [ENVIRONMENT]
     header = {"extent": scene.extent, "active_sh_degree": scene.primary.active_sh_degree, "files": files}
-    if len(scene.surroundings):
-        write_gaussians(folder / SURROUNDINGS, scene.surroundings)
-        header["surroundings_sh_degree"] = scene.surroundings.active_sh_degree
-        files += [SURROUNDINGS]
+    for name, gaussians in ((SURROUNDINGS, scene.surroundings), (PHOTOGRAPHER, scene.photographer)):
+        if len(gaussians):
+            write_gaussians(folder / name, gaussians)
+            header[f"{Path(name).stem}_sh_degree"] = gaussians.active_sh_degree
+            files += [name]
     if len(scene.photographer):
-        write_gaussians(folder / PHOTOGRAPHER, scene.photographer)
-        header |= {"photographer_sh_degree": scene.photographer.active_sh_degree, "up": scene.up}
-        files += [PHOTOGRAPHER]
-    if len(scene.exposures):
-        sidecars.write_corrections(folder / EXPOSURES, scene.exposures)
-        files += [EXPOSURES]
-    if len(scene.poses):
-        sidecars.write_corrections(folder / POSES, scene.poses)
-        files += [POSES]
+        header["up"] = scene.up
+    for name, corrections in ((EXPOSURES, scene.exposures), (POSES, scene.poses)):
+        if len(corrections):
+            sidecars.write_corrections(folder / name, corrections)
+            files += [name]
     with atomic_write(folder / SCENE) as temporary:
         temporary.write_text(json.dumps(header, indent=2) + "\n", encoding="utf-8")
 

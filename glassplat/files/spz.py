@@ -23,13 +23,12 @@ from torch import Tensor
 
 from glassplat.files.records import reading
 from glassplat.files.writing import atomic_write
-from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.gaussians import Gaussians, half_turned
 
 Bytes = NDArray[np.uint8]
 
 FLIP = (1.0, -1.0, -1.0)
-FLIPPED_HARMONICS = (1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
-"""How each harmonic changes its sign when y and z do."""
+"""Signs of the coordinates after half a turn around x: to the frame of SPZ and of the web page, and back."""
 HARMONICS = (0, 3, 8, 15, 24)
 """Coefficients beyond the constant one, by degree; those of the fourth degree are read over."""
 MOST_HARMONICS = HARMONICS[3]
@@ -74,17 +73,15 @@ def fractional_bits_for(means: Tensor) -> int:
 
 def packed_sections(gaussians: Gaussians, layout: Layout) -> list[Bytes]:
     """The six sections of a set in the capture's frame, whose layout is of version 3 or 4."""
-    flip = np.asarray(FLIP, dtype=np.float32)
-    means, quats = (_numpy(tensor) for tensor in (gaussians.means, gaussians.quats))
-    harmonics = _numpy(gaussians.sh[:, 1:]) * _harmonic_signs(gaussians.sh.shape[1] - 1)
+    gaussians = half_turned(gaussians, FLIP)
     opacities = torch.sigmoid(gaussians.logit_opacities)
     return [
-        _packed_positions(means * flip, layout.fractional_bits),
+        _packed_positions(_numpy(gaussians.means), layout.fractional_bits),
         _rounded(_numpy(opacities) * 255),
         _rounded(_numpy(gaussians.sh[:, 0]) * (COLOR_SCALE * 255) + 127.5),
         _rounded((_numpy(_three_log_scales(gaussians)) - LOWEST_LOG_SCALE) * STEPS_PER_LOG),
-        _packed_rotations(quats * np.concatenate([[np.float32(1)], flip])),
-        _rounded(harmonics * 128 + 128),
+        _packed_rotations(_numpy(gaussians.quats)),
+        _rounded(_numpy(gaussians.sh[:, 1:]) * 128 + 128),
     ]
 
 
@@ -98,26 +95,19 @@ def _three_log_scales(gaussians: Gaussians) -> Tensor:
 def unpacked(sections: list[Bytes], layout: Layout) -> Gaussians:
     """The Gaussians of six sections, in the frame of a PLY; harmonics of the fourth degree are left out."""
     positions, opacities, colors, scales, rotations, harmonics = sections
-    flip = np.asarray(FLIP, dtype=np.float32)
     count, kept = layout.number, min(HARMONICS[layout.degree], MOST_HARMONICS)
     rest = harmonics.reshape(count, HARMONICS[layout.degree], 3)[:, :kept].astype(np.float32) / 128 - 1
-    rest *= _harmonic_signs(kept)
     constant = (colors.reshape(count, 1, 3).astype(np.float32) / 255 - 0.5) / COLOR_SCALE
     shares = np.clip(opacities.astype(np.float32) / 255, 0.5 / 255, 1 - 0.5 / 255)
-    quats = _unpacked_rotations(rotations, layout) * np.concatenate([[np.float32(1)], flip])
-    return Gaussians(
-        means=_tensor(_unpacked_positions(positions, layout) * flip),
-        quats=_tensor(quats),
+    stored = Gaussians(
+        means=_tensor(_unpacked_positions(positions, layout)),
+        quats=_tensor(_unpacked_rotations(rotations, layout)),
         log_scales=_tensor(scales.reshape(count, 3).astype(np.float32) / STEPS_PER_LOG + LOWEST_LOG_SCALE),
         logit_opacities=torch.logit(_tensor(shares)),
         sh=_tensor(np.concatenate([constant, rest], axis=1)),
         active_sh_degree=min(layout.degree, 3),
     )
-
-
-def _harmonic_signs(count: int) -> NDArray[np.float32]:
-    """[count, 1] of the harmonics beyond the constant one."""
-    return np.asarray(FLIPPED_HARMONICS[1 : count + 1], dtype=np.float32)[:, None]
+    return half_turned(stored, FLIP)
 
 
 def _packed_positions(means: NDArray[np.float32], bits: int) -> Bytes:

@@ -19,7 +19,7 @@ from glassplat.methods.mirrors import (
     RefineEnvironment,
     ResetRaised,
 )
-from glassplat.methods.splat import image_term
+from glassplat.methods.splat import image_term, population_of
 from glassplat.methods.splat_recipe import Primitive, SplatRecipe
 from glassplat.methods.surroundings import AddEnvironment, AddSurroundings, BeginReflections, StayMatte
 from glassplat.options import BLACK
@@ -28,7 +28,7 @@ from glassplat.render.splat import Splat
 from glassplat.render.traced import Traced, mirrored_contributions
 from glassplat.scene import logit
 from glassplat.scene.scene import Scene
-from glassplat.training.actions import Densify, GrowSh, Population, PruneIdle, ResetOpacity, population_of
+from glassplat.training.actions import Densify, GrowSh, Population, PruneIdle, ResetOpacity
 from glassplat.training.corrections import corrections_begun, corrections_learnt
 from glassplat.training.densify import as_discs
 from glassplat.training.losses import (
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 def first_scene(recipe: DeferredRecipe, dataset: Dataset) -> Scene:
     """The first scene: one Gaussian per point that hardly reflects, and no environment yet."""
-    primary = _population(recipe).initial(dataset.points, recipe.sh_degree)
+    primary = population_of(recipe).initial(dataset.points, recipe.sh_degree)
     strengths = torch.full((len(primary),), logit(recipe.first_strength))
     primary = replace(primary, channels={"logit_strength": strengths})
     return corrections_begun(recipe, Scene(primary, dataset.extent), dataset)
@@ -68,7 +68,7 @@ def stages_of(recipe: DeferredRecipe, seed: int, iterations: int = PUBLISHED_ITE
 
 def _reflecting_stages(recipe: DeferredRecipe) -> tuple[Stage, ...]:
     """Those of a run that is long enough for normals to spread."""
-    population = _population(recipe)
+    population = population_of(recipe)
     image, held = image_term(recipe.ssim_weight), recipe.view_dependence_weight
     bootstrap = Stage(
         name="1 bootstrap",
@@ -197,13 +197,6 @@ def _matte_rates(recipe: DeferredRecipe) -> dict[str, Rate]:
         for name, rate in GaussianRates().of("primary").items()
         if rate.short_run_power
     }
-
-
-def _population(recipe: DeferredRecipe) -> Population:
-    means_rate = recipe.rates.of("primary")["primary.means"]
-    return population_of(
-        recipe.strategy, default=recipe.densify, mcmc=recipe.mcmc, rhythm=recipe.rhythm, means_rate=means_rate
-    )
 
 
 FIRST_DOUBLING, LAST_DOUBLING = 0.45, 0.65

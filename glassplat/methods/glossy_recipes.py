@@ -211,15 +211,16 @@ class TracedRecipe(GlossyOptions):
 
     Attributes:
         primitive: what scene and surroundings are made of: ellipsoids, or discs (paper).
-        harmonics_from_start: let it grow from the first step on (its code), and not once propagation has ended.
+        harmonics_from_start: let the SH degree grow from the first step on (its code), and not only once propagation
+            has ended.
         mirrors: what is mirrored: `surroundings` (paper), an `environment` infinitely far away (ablation), or `both`,
             the environment behind the surroundings.
         joint: reflections also move the surfaces; without, they only teach the surroundings (ablation).
         least_strength: rays are traced where the strength is larger; elsewhere the environment alone is mirrored. Where
             there is none, training traces them everywhere.
         surroundings: how the Gaussians learn that reflections show.
-        normals_throughout: keep that term after propagation, and where the Gaussians are discs, have it and that of
-            estimated normals from the first step on (paper).
+        normals_throughout: keep the term of `consistency_weight` after propagation, and where the Gaussians are discs,
+            have it and that of `monocular_weight` from the first step on (paper).
     """
 
     method: ClassVar[str] = "traced"

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import PointCloud
-from glassplat.methods.splat import image_term
+from glassplat.methods.splat import image_term, population_of
 from glassplat.options import BLACK
 from glassplat.panes import PlaneFit, PlaneFitError
 from glassplat.panes.fit import fit_planes, with_mirrors
@@ -43,7 +43,6 @@ from glassplat.training.actions import (
     ResetOpacity,
     SeedUnexplained,
     add_primary,
-    population_of,
     seeds_of,
 )
 from glassplat.training.corrections import corrections_begun, corrections_learnt, photographer_learnt
@@ -539,12 +538,8 @@ def _joint_terms(recipe: PlanarRecipe, population: Population) -> tuple[LossTerm
 
 def planar_population(recipe: PlanarRecipe) -> Population:
     """Contribution of the strategy to every stage; under `mcmc` the set grows late unless the recipe says otherwise."""
-    means_rate = recipe.rates.of("primary")["primary.means"]
     start = recipe.mcmc.start if recipe.early_growth else max(recipe.mcmc.start, _joint_start(recipe))
-    mcmc = replace(recipe.mcmc, start=start)
-    return population_of(
-        recipe.strategy, default=recipe.densify, mcmc=mcmc, rhythm=recipe.rhythm, means_rate=means_rate
-    )
+    return population_of(recipe, replace(recipe.mcmc, start=start))
 
 
 def _early_resets(recipe: PlanarRecipe, population: Population) -> tuple[ResetOpacity, ...]:

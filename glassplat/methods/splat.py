@@ -9,20 +9,22 @@ from glassplat.captures.dataset import Dataset
 from glassplat.options import BLACK
 from glassplat.render.splat import Splat
 from glassplat.scene.scene import Scene
-from glassplat.training.actions import GrowSh, Population, SeedUnexplained, population_of
+from glassplat.training.actions import GrowSh, Population, SeedUnexplained, default_population, mcmc_population
 from glassplat.training.corrections import corrections_begun, corrections_learnt
 from glassplat.training.densify import as_discs
 from glassplat.training.losses import LossTerm, PhotometricLoss, disc_normals, distortion
-from glassplat.training.options import PUBLISHED_ITERATIONS
-from glassplat.training.stage import Every, Stage
+from glassplat.training.options import PUBLISHED_ITERATIONS, McmcDensify
+from glassplat.training.stage import AverageLast, Every, Stage
 
 if TYPE_CHECKING:
+    from glassplat.methods.glossy_recipes import DeferredRecipe
+    from glassplat.methods.planar_recipe import PlanarRecipe
     from glassplat.methods.splat_recipe import DiscTerms, SplatRecipe
 
 
 def first_scene(recipe: SplatRecipe, dataset: Dataset) -> Scene:
     """The first scene: one Gaussian per point."""
-    first = _population(recipe).initial(dataset.points, recipe.sh_degree)
+    first = population_of(recipe).initial(dataset.points, recipe.sh_degree)
     scene = Scene(as_discs(first) if recipe.primitive == "disc" else first, dataset.extent)
     return corrections_begun(recipe, scene, dataset)
 
@@ -34,7 +36,7 @@ def finished_renderer(recipe: SplatRecipe) -> Splat:
 
 def stages_of(recipe: SplatRecipe, seed: int, iterations: int = PUBLISHED_ITERATIONS) -> tuple[Stage, ...]:
     """One stage; of discs a new one whenever one of their terms begins to count."""
-    population = _population(recipe)
+    population = population_of(recipe)
     first = Stage(
         name="splat",
         share=1.0,
@@ -73,11 +75,15 @@ def _missing(recipe: SplatRecipe) -> tuple[SeedUnexplained, ...]:
     return tuple(SeedUnexplained(moment, _bare(recipe)) for moment in SEED_AT if wanted)
 
 
-def _population(recipe: SplatRecipe) -> Population:
-    means_rate = recipe.rates.of("primary")["primary.means"]
-    return population_of(
-        recipe.strategy, default=recipe.densify, mcmc=recipe.mcmc, rhythm=recipe.rhythm, means_rate=means_rate
-    )
+def population_of(recipe: SplatRecipe | PlanarRecipe | DeferredRecipe, mcmc: McmcDensify | None = None) -> Population:
+    """Contribution of the recipe's strategy; `mcmc` takes the place of its options of that strategy."""
+    if recipe.strategy == "mcmc":
+        population = mcmc_population(mcmc or recipe.mcmc, recipe.rates.of("primary")["primary.means"])
+    else:
+        population = default_population(recipe.densify, recipe.rhythm)
+    if recipe.rhythm.averaged_passes == 0:
+        return population
+    return replace(population, post_steps=(*population.post_steps, AverageLast(recipe.rhythm.averaged_passes)))
 
 
 def terms_by_start(options: DiscTerms) -> tuple[tuple[float, LossTerm], ...]:

@@ -173,8 +173,9 @@ class Model:
     def evaluate(self, dataset: Dataset) -> dict[str, Any]:
         """Metrics over the test views of a data set, by name: `psnr`, `ssim`, `pane_psnr` ...
 
-        Where cameras were corrected, those of the test views move as their neighbours'.
-        Where one is None, `<name>_reason` says why.
+        Where one is None, `<name>_reason` says why. Unlike `glassplat eval`, it takes panes from the ground truth or
+        else from the rendered mask, never from masks of the capture, and where cameras were corrected, it moves those
+        of the test views as their neighbours' instead of aligning them with their photographs. It writes nothing.
         """
         from glassplat.evaluate.evaluate import evaluate  # Training imports this file, and may never need it.
 

@@ -220,14 +220,14 @@ class PaneView:
         return np.stack([x, y], axis=-1), held
 
     def covers(self, pixels: Array, held: Mask) -> Mask:
-        """[...] whether pixel positions [..., 2] lie on the pane; false where `held` is."""
+        """[...] whether pixel positions [..., 2] lie on the pane; false where `held` is false."""
         found = np.zeros(held.shape, dtype=bool)
         column, row = np.floor(pixels[held]).astype(np.int64).T
         found[held] = self.mask[row, column]
         return found
 
     def tells(self, pixels: Array, held: Mask) -> Mask:
-        """[...] whether it is known if the pane is at pixel positions [..., 2]; false where `held` is."""
+        """[...] whether it is known if the pane is at pixel positions [..., 2]; false where `held` is false."""
         known = held.copy()
         column, row = np.floor(pixels[held]).astype(np.int64).T
         known[held] = ~self.hidden[row, column]

@@ -234,13 +234,13 @@ def write_page(
     Args:
         path: the HTML file.
         scene: what to show.
-        renderer: how; not a `Deferred` that shades every Gaussian.
+        renderer: how.
         cameras: of the photographs, by name; at least one. People may look round near them.
         title: of the page.
         sharing: what it says of its origin and address.
 
     Raises:
-        ValueError: another renderer, no camera, more panes than a page can show, or values that are not finite.
+        ValueError: no camera, more panes than a page can show, or values that are not finite.
     """
     page = page_text(scene, renderer, cameras, title, sharing=sharing)
     with atomic_write(path) as temporary:

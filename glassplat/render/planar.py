@@ -18,6 +18,7 @@ from glassplat.kernels.tiles import bin_tiles
 from glassplat.options import Blend
 from glassplat.render.frame import (
     NEAR_PER_EXTENT,
+    Drawing,
     Frame,
     Renderer,
     ScreenPass,
@@ -44,7 +45,7 @@ from glassplat.render.panes import (
     seen_panes,
     visibilities,
 )
-from glassplat.render.splat import WithNormals
+from glassplat.render.splat import with_normals
 from glassplat.scene.camera import Camera
 from glassplat.scene.corrections import Exposures
 from glassplat.scene.gaussians import Gaussians
@@ -184,10 +185,10 @@ class Planar:
         panes = ("transmission", "without_panes", "reflection", "strength", "mask")
         return ("rgb", *panes, "normal", "depth", "alpha", *known)
 
-    def with_layers(self, layers: Sequence[str]) -> Renderer:
-        """The renderer, also of `photographed` and `normal` where they are among the layers."""
+    def with_layers(self, layers: Sequence[str]) -> Drawing:
+        """The drawing of frames, also of `photographed` and `normal` where they are among the layers."""
         renderer = replace(self, photographer="beside") if PHOTOGRAPHED in layers else self
-        return WithNormals(renderer) if "normal" in layers else renderer
+        return with_normals(renderer) if "normal" in layers else renderer
 
     def page_settings(self) -> Mapping[str, Any]:
         """Settings with which the web page lays panes before the image."""

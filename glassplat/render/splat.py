@@ -17,6 +17,7 @@ from glassplat.kernels.tiles import bin_tiles
 from glassplat.render.frame import (
     MEDIAN_DEPTH,
     NEAR_PER_EXTENT,
+    Drawing,
     Frame,
     Renderer,
     ScreenPass,
@@ -117,44 +118,23 @@ def blended_ellipsoids(
     return composite(splats, channels, bins, probe=joined_probe(screen))
 
 
-@dataclass(frozen=True)
-class WithNormals:
-    """The frames of a renderer, with a layer `normal` [H, W, 3] where they have none.
+def with_normals(renderer: Renderer) -> Drawing:
+    """A renderer's frames, with a layer `normal` [H, W, 3] where they have none; discs get theirs from the renderer.
 
         n(u) = sum_i n_i alpha_i T_i
 
     n_i is the shortest axis of ellipsoid i, turned to the camera (3DGS-DR, Section 3.1). Of what panes stand before it
     is the things behind them, as the layer `depth` is. Costs a pass of its own.
-
-    Attributes:
-        renderer: whose frames these are; scenes of discs get their normals from it.
     """
 
-    renderer: Renderer
-
-    def __call__(self, scene: Scene, camera: Camera, *, probed: bool = False) -> Frame:
-        """Renders `scene` from `camera`, where the scene's tensors are."""
-        frame = self.renderer(scene, camera, probed=probed)
+    def drawing(scene: Scene, camera: Camera) -> Frame:
+        frame = renderer(scene, camera)
         if "normal" in frame.layers:
             return frame
         normals = ellipsoid_normals(scene, camera.to(scene.primary.means.device))
         return replace(frame, layers={**frame.layers, "normal": normals})
 
-    def check(self, scene: Scene) -> None:
-        """As the renderer does."""
-        self.renderer.check(scene)
-
-    def layers(self, scene: Scene) -> tuple[str, ...]:
-        """As the renderer does."""
-        return self.renderer.layers(scene)
-
-    def with_layers(self, layers: Sequence[str]) -> Renderer:
-        """The renderer with these layers."""
-        return self.renderer.with_layers(layers)
-
-    def page_settings(self) -> Mapping[str, Any]:
-        """As the renderer does."""
-        return self.renderer.page_settings()
+    return drawing
 
 
 def ellipsoid_normals(scene: Scene, camera: Camera) -> Tensor:
@@ -230,9 +210,9 @@ class Splat:
         """Names of the layers that are worth looking at."""
         return ("rgb", "normal", "depth", "alpha", *((MEDIAN_DEPTH,) if scene.primary.are_discs else ()))
 
-    def with_layers(self, layers: Sequence[str]) -> Renderer:
-        """The renderer, also of `normal` where that is among the layers."""
-        return WithNormals(self) if "normal" in layers else self
+    def with_layers(self, layers: Sequence[str]) -> Drawing:
+        """The drawing of frames, also of `normal` where that is among the layers."""
+        return with_normals(self) if "normal" in layers else self
 
     def page_settings(self) -> Mapping[str, Any]:
         """Settings for the web page: there are no panes."""

@@ -131,3 +131,18 @@ def mirrored_gaussians(gaussians: Gaussians, center: Tensor, normal: Tensor) -> 
     sh[:, 1:] = 0
     means = gaussians.means - 2 * distances[:, None] * normal
     return gaussians.with_tensors({"means": means, "quats": quats, "sh": sh})
+
+
+HALF_TURNED_HARMONICS = {
+    (1.0, -1.0, -1.0): (1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1),
+    (-1.0, -1.0, 1.0): (1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1),
+}
+"""How each harmonic changes its sign when x, y and z change theirs so."""
+
+
+def half_turned(gaussians: Gaussians, signs: tuple[float, float, float]) -> Gaussians:
+    """The Gaussians after half a turn about the x axis, signs (1, -1, -1), or the z axis, (-1, -1, 1); exact."""
+    flip = gaussians.means.new_tensor(signs)
+    harmonics = gaussians.sh.new_tensor(HALF_TURNED_HARMONICS[signs][: gaussians.sh.shape[1]])[:, None]
+    quats = gaussians.quats * torch.cat([flip.new_ones(1), flip])
+    return gaussians.with_tensors({"means": gaussians.means * flip, "quats": quats, "sh": gaussians.sh * harmonics})

@@ -35,8 +35,8 @@ from glassplat.training.densify import (
 )
 from glassplat.training.losses import LossTerm, mean_opacity, mean_scale, of_all, residual, weighted
 from glassplat.training.messages import Working
-from glassplat.training.options import DefaultDensify, McmcDensify, Rate, Rhythm, Strategy
-from glassplat.training.stage import Action, AverageLast, Clock, Every, PostStep, TrainState, Work
+from glassplat.training.options import DefaultDensify, McmcDensify, Rate, Rhythm
+from glassplat.training.stage import Action, Clock, Every, PostStep, TrainState, Work
 
 log = logging.getLogger("glassplat.training")
 
@@ -347,24 +347,6 @@ class Population:
     def initial(self, points: PointCloud, sh_degree: int) -> Gaussians:
         """The first primary Gaussians, one per point."""
         return gaussians_from_points(points, sh_degree=sh_degree, opacity=self.opacity, spread=self.spread)
-
-
-def population_of(
-    strategy: Strategy, *, default: DefaultDensify, mcmc: McmcDensify, rhythm: Rhythm, means_rate: Rate
-) -> Population:
-    """Contribution of the strategy of this name; the options of the other one are not looked at.
-
-    Args:
-        strategy: name on the command line.
-        default: options of `default`.
-        mcmc: options of `mcmc`.
-        rhythm: when opacities are reset, and what is averaged in the end.
-        means_rate: learning rate of the positions, which the noise of `mcmc` follows.
-    """
-    population = mcmc_population(mcmc, means_rate) if strategy == "mcmc" else default_population(default, rhythm)
-    if rhythm.averaged_passes == 0:
-        return population
-    return replace(population, post_steps=(*population.post_steps, AverageLast(rhythm.averaged_passes)))
 
 
 def default_population(densifier: DefaultDensify, rhythm: Rhythm) -> Population:

@@ -182,9 +182,9 @@ class DefaultDensify:
             split, smaller ones cloned.
         prune_opacity: Gaussians less opaque than this are removed.
         prune_large_start: share of the run after which what is too large is removed as well; 1 never does.
-        prune_scale_fraction: with `prune_large`, Gaussians with an axis above this share of the
+        prune_scale_fraction: from `prune_large_start` on, Gaussians with an axis above this share of the
             scene extent are removed.
-        prune_radius_fraction: with `prune_large`, Gaussians that any view saw with a radius above
+        prune_radius_fraction: from `prune_large_start` on, Gaussians that any view saw with a radius above
             this share of its longer side are removed; None keeps them. 3DGS states a limit of 20
             pixels but clears the radii before it looks at them, so its published results have none.
         cap: largest number of Gaussians to grow to; None takes `--densify.per-pixel`.

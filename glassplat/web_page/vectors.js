@@ -1,4 +1,4 @@
-// Vectors are arrays of three, rotations arrays of nine by rows, quaternions (w, x, y, z).
+// Vectors are arrays of three, rotations arrays of nine by rows.
 // A pose is what takes the world into a camera: { rotation, offset }; x to the right, y down, z forward.
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -30,33 +30,18 @@ function rotationAbout(axis, angle) {
   ];
 }
 
-function quaternionOf(m) {
-  const w = Math.sqrt(Math.max(0, 1 + m[0] + m[4] + m[8])) / 2;
-  const x = Math.sqrt(Math.max(0, 1 + m[0] - m[4] - m[8])) / 2, y = Math.sqrt(Math.max(0, 1 - m[0] + m[4] - m[8])) / 2;
-  const z = Math.sqrt(Math.max(0, 1 - m[0] - m[4] + m[8])) / 2;
-  const largest = Math.max(w, x, y, z);
-  if (largest === w) return [w, (m[7] - m[5]) / (4 * w), (m[2] - m[6]) / (4 * w), (m[3] - m[1]) / (4 * w)];
-  if (largest === x) return [(m[7] - m[5]) / (4 * x), x, (m[1] + m[3]) / (4 * x), (m[2] + m[6]) / (4 * x)];
-  if (largest === y) return [(m[2] - m[6]) / (4 * y), (m[1] + m[3]) / (4 * y), y, (m[5] + m[7]) / (4 * y)];
-  return [(m[3] - m[1]) / (4 * z), (m[2] + m[6]) / (4 * z), (m[5] + m[7]) / (4 * z), z];
-}
-
-function rotationOfQuaternion(q) {
-  const length = Math.hypot(...q), [w, x, y, z] = q.map((c) => c / length);
-  return [
-    1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-    2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-    2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-  ];
-}
-
+// Turned the short way about one axis, from rotation a at t = 0 to b at t = 1.
 function between(a, b, t) {
-  const p = quaternionOf(a);
-  let q = quaternionOf(b), cosine = p.reduce((sum, c, i) => sum + c * q[i], 0);
-  if (cosine < 0) { q = q.map((c) => -c); cosine = -cosine; }
-  const angle = Math.acos(Math.min(1, cosine)), sine = Math.sin(angle);
-  const [s, u] = sine < 1e-4 ? [1 - t, t] : [Math.sin((1 - t) * angle) / sine, Math.sin(t * angle) / sine];
-  return rotationOfQuaternion(p.map((c, i) => s * c + u * q[i]));
+  const m = product(b, [0, 3, 6, 1, 4, 7, 2, 5, 8].map((k) => a[k]));
+  const skew = [m[7] - m[5], m[2] - m[6], m[3] - m[1]], cosine = (m[0] + m[4] + m[8] - 1) / 2;
+  let axis = skew;
+  if (cosine < 0) {
+    // At half a turn the skew part vanishes; the symmetric part is c I + (1 - c) n n^T.
+    const columns = [0, 1, 2].map((k) => row(m, k).map((x, j) => x + m[3 * j + k] - (j === k ? 2 * cosine : 0)));
+    axis = columns.reduce((best, column) => (norm(column) > norm(best) ? column : best));
+    if (dot(axis, skew) < 0) axis = scaled(axis, -1);
+  }
+  return product(rotationAbout(axis, t * Math.atan2(norm(skew) / 2, cosine)), a);
 }
 
 const poseAt = (rotation, position) => ({ rotation, offset: scaled(turned(rotation, position), -1) });

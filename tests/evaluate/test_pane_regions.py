@@ -12,7 +12,7 @@ import torch
 from glassplat.cli.evaluation import evaluate_run, pane_regions, plane_text
 from glassplat.cli.runs import open_run
 from glassplat.errors import InputError
-from glassplat.evaluate.evaluate import MarkedRegions, RenderedRegions, TrueRegions, evaluate
+from glassplat.evaluate.evaluate import RENDERED_REGIONS, TRUE_REGIONS, evaluate, marked_regions
 from glassplat.evaluate.metrics import plane_table
 from glassplat.render.frame import Frame
 from tests.cli.tiny_run import write_run
@@ -23,7 +23,7 @@ NOTHING_RENDERED = Frame(torch.zeros(0), {})
 
 
 def test_a_mask_says_where_the_pane_is() -> None:
-    regions = MarkedRegions(pane(2.0, half=0.1))
+    regions = marked_regions(pane(2.0, half=0.1))
     view = tiny_capture().train[0]
     region = regions.of(view, NOTHING_RENDERED, None)
     assert isinstance(region, torch.Tensor)
@@ -33,7 +33,7 @@ def test_a_mask_says_where_the_pane_is() -> None:
 def test_without_a_mask_the_fitted_plane_says_it() -> None:
     view = tiny_capture().train[1]
     assert view.pane_labels is None
-    region = MarkedRegions(true_scene().planes).of(view, NOTHING_RENDERED, None)
+    region = marked_regions(true_scene().planes).of(view, NOTHING_RENDERED, None)
     assert isinstance(region, torch.Tensor)
     assert torch.equal(region, shown_panes(true_scene().planes, view.camera)[0] > 0)
     assert 100 < int(region.sum()) < region.numel()
@@ -43,7 +43,7 @@ def test_methods_are_measured_over_the_same_pixels(tmp_path: Path) -> None:
     write_tiny_capture(tmp_path / "capture")
     runs = [open_run(write_run(tmp_path / name, planar=name == "planar")) for name in ("planar", "splat")]
     with_panes, without = (evaluate_run(run) for run in runs)
-    assert with_panes["pane_region"] == without["pane_region"] == MarkedRegions.source
+    assert with_panes["pane_region"] == without["pane_region"] == marked_regions(true_scene().planes).source
     assert with_panes["pane_psnr"] > without["pane_psnr"] + 1
     (plane,) = with_panes["planes"]
     assert plane["normal_drift_deg"] < 1
@@ -53,7 +53,7 @@ def test_methods_are_measured_over_the_same_pixels(tmp_path: Path) -> None:
 
 def test_where_the_masks_lead_nowhere_the_method_says_it(tmp_path: Path) -> None:
     path = write_run(tmp_path / "run")
-    assert isinstance(pane_regions(open_run(path).dataset, "auto"), RenderedRegions)
+    assert pane_regions(open_run(path).dataset, "auto") is RENDERED_REGIONS
 
 
 @pytest.mark.parametrize(("source", "said"), [("truth", "no folder gt/"), ("masks", "no masks")])
@@ -66,8 +66,8 @@ def test_a_source_that_the_capture_lacks_is_an_error(tmp_path: Path, source: str
 def test_the_truth_comes_first_and_masks_on_request(tmp_path: Path) -> None:
     write_tiny_capture(tmp_path / "capture")
     dataset = replace(open_run(write_run(tmp_path / "run")).dataset, truth=tmp_path)
-    assert isinstance(pane_regions(dataset, "auto"), TrueRegions)
-    assert isinstance(pane_regions(dataset, "masks"), MarkedRegions)
+    assert pane_regions(dataset, "auto") is TRUE_REGIONS
+    assert pane_regions(dataset, "masks").planes is not None
 
 
 def test_a_plane_that_turned_is_told_from_that_of_the_masks() -> None:
@@ -86,5 +86,5 @@ def test_a_plane_that_turned_is_told_from_that_of_the_masks() -> None:
 
 def test_an_evaluation_takes_the_regions_it_is_given(case) -> None:  # type: ignore[no-untyped-def]
     dataset = replace(case.dataset, truth=None)
-    results = evaluate(case.scene, case.renderer, dataset, regions=TrueRegions()).results
+    results = evaluate(case.scene, case.renderer, dataset, regions=TRUE_REGIONS).results
     assert results["pane_psnr_reason"] == "the ground truth lacks this view"

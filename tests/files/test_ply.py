@@ -128,7 +128,7 @@ def test_a_compressed_file_says_how_to_export_it(tmp_path: Path) -> None:
     header = "ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 1\n"
     header += "".join(f"property uint packed_{name}\n" for name in ("position", "rotation", "scale", "color"))
     (tmp_path / "a.ply").write_bytes(header.encode() + b"end_header\n" + bytes(20))
-    with pytest.raises(ValueError, match=r"compressed PlayCanvas/SuperSplat PLY; expected .* uncompressed PLY"):
+    with pytest.raises(ValueError, match=r"compressed PlayCanvas/SuperSplat PLY; expected .* `glassplat export`"):
         read_gaussians(tmp_path / "a.ply")
 
 

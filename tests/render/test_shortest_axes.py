@@ -10,7 +10,7 @@ import torch
 
 from glassplat.render.frame import Renderer
 from glassplat.render.planar import Planar
-from glassplat.render.splat import Splat, WithNormals
+from glassplat.render.splat import Splat, with_normals
 from glassplat.scene.camera import rotation_from_quat
 from glassplat.scene.scene import Scene
 from tests.render.tiny_scene import camera_at, pane, random_gaussians
@@ -38,7 +38,7 @@ def wall(sign: float) -> Scene:
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_wall_faces_the_camera_across_its_shortest_axes(sign: float) -> None:
-    frame = WithNormals(Splat())(wall(sign), camera_at(0, 0, 0))
+    frame = with_normals(Splat())(wall(sign), camera_at(0, 0, 0))
     covered = frame.layers["alpha"] > 0.99
     normals = torch.nn.functional.normalize(frame.layers["normal"][covered], dim=-1)
     assert int(covered.sum()) > 100
@@ -69,4 +69,4 @@ def test_discs_keep_their_own_normals() -> None:
 
 def test_what_the_renderer_needs_is_still_looked_for() -> None:
     with pytest.raises(ValueError, match="logit_mark"):
-        Planar().with_layers(["normal"]).check(replace(wall(1.0), glass=random_gaussians(3, (0.0, 0.0, 2.0), seed=2)))
+        Planar().check(replace(wall(1.0), glass=random_gaussians(3, (0.0, 0.0, 2.0), seed=2)))
