@@ -425,7 +425,8 @@ def composite(
     saved = Saved(packed, np.empty(len(bins.pair_splats), np.int32), state, spread)
     where = tile.flat(deviation.where.detach()) if deviation else spread
     composite_forward(REAL_OF[channels.dtype])(
-        *_by_splat(splats, channels), marks.numpy(), count, num_primary, bins.width, bins.height,
+        *(t.numpy() for t in tile.joined_cameras((*splats[:3], channels))), marks.numpy(), count, num_primary,
+        bins.width, bins.height,
         deviation.channel if deviation else -1, where,
         bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.splat_offsets.numpy(), bins.active.numpy(),
         *saved, *(tile.flat(output) for output in (image, alpha, mask, deviated)),
@@ -460,12 +461,3 @@ def composite_gradients(
         v_marks.copy_(v_values[:, num_primary:, 0])
         v_values[:, num_primary:] = 0
     return v_means, v_conics, v_opacities, v_values, v_marks, v_probe if probed else None
-
-
-def _by_splat(splats: Splats, channels: Tensor) -> tuple[NDArray[Any], ...]:
-    return (
-        splats.means2d.numpy().reshape(-1, 2),
-        splats.conics.numpy().reshape(-1, 3),
-        splats.opacities.numpy().reshape(-1),
-        channels.numpy().reshape(-1, channels.shape[2]),
-    )

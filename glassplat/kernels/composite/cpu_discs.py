@@ -570,7 +570,7 @@ def composite_discs(
     packed, state = (torch.empty(size, dtype=channels.dtype).numpy() for size in sizes)
     saved = Saved(packed, np.zeros(len(bins.pair_splats), np.int32), state)
     composite_discs_forward(real)(
-        *_by_disc(discs), channels.numpy().reshape(-1, num_channels), bins.width, bins.height,
+        *(t.numpy() for t in tile.joined_cameras((*discs[:4], *discs.outlines[:2], channels))), bins.width, bins.height,
         *_real_options(real, near, low_pass), bins.pair_splats.numpy(), bins.tile_offsets.numpy(),
         bins.splat_offsets.numpy(), bins.active.numpy(), *saved, tuple(tile.flat(image) for image in images),
     )  # fmt: skip
@@ -605,17 +605,6 @@ def composite_discs_gradients(
 def _real_options(real: type, near: float, low_pass: float) -> tuple[Any, Any]:
     """The near plane, and one over the variance of the low-pass."""
     return real(near), real(1 / low_pass**2) if low_pass else real(np.inf)
-
-
-def _by_disc(discs: Discs) -> tuple[NDArray[Any], ...]:
-    return (
-        discs.means2d.numpy().reshape(-1, 2),
-        discs.maps.numpy().reshape(-1, MAP),
-        discs.opacities.numpy().reshape(-1),
-        discs.depths.numpy().reshape(-1),
-        discs.outlines.means2d.numpy().reshape(-1, 2),
-        discs.outlines.conics.numpy().reshape(-1, 3),
-    )
 
 
 @functools.cache

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -101,6 +102,11 @@ def groups_of(num_values: int) -> int:
 def packed_width(num_values: int) -> int:
     """Columns of a packed splat that carries `num_values` channels in whole groups: whole vectors."""
     return LANES * ((VALUES + GROUP * groups_of(num_values) + LANES - 1) // LANES)
+
+
+def joined_cameras(tensors: Iterable[Tensor]) -> tuple[Tensor, ...]:
+    """Tensors [C, G, ...] as [C * G, ...]."""
+    return tuple(tensor.flatten(0, 1) for tensor in tensors)
 
 
 def flat(tensor: Tensor) -> NDArray[Any]:

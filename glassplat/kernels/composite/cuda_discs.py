@@ -20,7 +20,7 @@ from torch import Tensor
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.backend.devices import SIMULATED
-from glassplat.kernels.composite.cpu_tile import place
+from glassplat.kernels.composite.cpu_tile import joined_cameras, place
 from glassplat.kernels.composite.cuda_tile import BUCKET, PIXELS, at
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar, blend_maths
 from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, meet_slopes
@@ -148,7 +148,7 @@ def composite_discs_pulls(real: type, num_channels: int = 6) -> Kernel:
         if column >= columns or row >= rows:
             return
         y, x = y0 + row, x0 + column
-        t, total, squares = finals[n, 0, pixel], finals[n, 2, pixel], finals[n, 3, pixel]
+        t, total, squares = finals[n, T, pixel], finals[n, TOTAL, pixel], finals[n, SQUARES, pixel]
         covered, v_spread = one - t, v_distortion[camera, y, x]
         # alpha = 1 - T: its gradient acts like something behind every disc.
         gathered = v_depth[camera, y, x] * depth[camera, y, x] - v_alpha[camera, y, x] * t
@@ -161,7 +161,7 @@ def composite_discs_pulls(real: type, num_channels: int = 6) -> Kernel:
         pulls[n, num_channels + V_DEPTH, pixel] = v_depth[camera, y, x]
         pulls[n, num_channels + V_MEDIAN, pixel] = v_median[camera, y, x]
         pulls[n, num_channels + V_DISTORTION, pixel], pulls[n, num_channels + GATHERED, pixel] = v_spread, gathered
-        pulls[n, num_channels + PULL_FIRST, pixel] = finals[n, 1, pixel]
+        pulls[n, num_channels + PULL_FIRST, pixel] = finals[n, FIRST, pixel]
         pulls[n, num_channels + PULL_COVERED, pixel] = covered
         pulls[n, num_channels + PULL_TOTAL, pixel], pulls[n, num_channels + PULL_SQUARES, pixel] = total, squares
 
@@ -319,8 +319,8 @@ SUM_THREADS = 256
 class Saved(NamedTuple):
     """Results of the forward pass for the backward pass.
 
-    finals [A, 4, 256], orders [A, 2, 256] int32: of each pixel of the active tiles, the planes that `cuda_tile` names;
-    orders count from the tile's first pair, -1 for none. looked_at [A] int32: how many pairs of each tile any pixel
+    finals [A, 4, 256], orders [A, 2, 256] int32: of each pixel of the active tiles, the planes named above; orders
+    count from the tile's first pair, -1 for none. looked_at [A] int32: how many pairs of each tile any pixel
     blended. bucket_tiles [B] int32: the active tile that each bucket belongs to, -1 for none. kept [B, D + 4, 256]:
     what each pixel had gathered before a bucket. outputs: image and depth.
     """
@@ -352,8 +352,8 @@ def composite_discs(
         (image.detach(), depth.detach()),
     )
     composite_discs_forward(REAL_OF[channels.dtype], num_channels)(
-        tiles, PIXELS, *_geometry(discs), channels.view(-1), near, _sharpness(low_pass),
-        bins.pair_splats, bins.tile_offsets, bins.active, *saved[:5], image, *flat,
+        tiles, PIXELS, *joined_cameras((*discs[:4], *discs.outlines[:2])), channels.view(-1),
+        near, _sharpness(low_pass), bins.pair_splats, bins.tile_offsets, bins.active, *saved[:5], image, *flat,
     )  # fmt: skip
     return image, alpha, depth, median, distortion, saved
 
@@ -371,7 +371,8 @@ def composite_discs_gradients(
     )  # fmt: skip
     rows = channels.new_zeros(len(bins.pair_splats), MOMENTS + num_channels)
     composite_discs_backward(real, num_channels)(
-        blocks_for(len(saved.bucket_tiles), WARPS), THREADS, *_geometry(discs), channels.view(-1, num_channels),
+        blocks_for(len(saved.bucket_tiles), WARPS), THREADS,
+        *joined_cameras((*discs[:4], *discs.outlines[:2], channels)),
         near, _sharpness(low_pass), bins.width, bins.height, bins.pair_splats, bins.tile_offsets, bins.active,
         saved.orders.view(-1), saved.looked_at, saved.bucket_tiles, saved.kept.view(-1), pulls.view(-1), rows,
     )  # fmt: skip
@@ -399,19 +400,6 @@ def _from_sums(sums: Tensor, discs: Discs, num_channels: int, probed: bool) -> t
 def _sharpness(low_pass: float) -> float:
     """One over the variance of the low-pass."""
     return 1 / low_pass**2 if low_pass else float("inf")
-
-
-def _geometry(discs: Discs) -> tuple[Tensor, ...]:
-    """Geometry of the discs of all cameras: centres, maps, opacities, depths, outlines' centres and conics."""
-    outlines = discs.outlines
-    return (
-        discs.means2d.view(-1, 2),
-        discs.maps.view(-1, MAP),
-        discs.opacities.view(-1),
-        discs.depths.view(-1),
-        outlines.means2d.view(-1, 2),
-        outlines.conics.view(-1, 3),
-    )
 
 
 @cache
@@ -503,8 +491,8 @@ def composite_discs_forward(real: type, num_channels: int = 6) -> Kernel:
         cuda.syncthreads()
         if pixel == 0:
             looked_at[n] = most[0]
-        finals[n, 0, pixel], finals[n, 1, pixel] = t, first_seen
-        finals[n, 2, pixel], finals[n, 3, pixel] = total, squares
+        finals[n, T, pixel], finals[n, FIRST, pixel] = t, first_seen
+        finals[n, TOTAL, pixel], finals[n, SQUARES, pixel] = total, squares
         orders[n, LAST, pixel], orders[n, MEDIAN, pixel] = last_order, middle_order
         if inside:
             alpha[camera, y0 + row, x0 + column], depth[camera, y0 + row, x0 + column] = one - t, far
