@@ -31,7 +31,7 @@ from glassplat.kernels.backend.cpu_vector import (
 )
 from glassplat.kernels.maths.harmonics import channel_with, color_gradient_with, harmonic_basis
 from glassplat.kernels.maths.projection import LOW_PASS, dot, scaled_sum, shape_maths, tangential
-from glassplat.kernels.project.steps import MOST_DEVIATIONS, place_gradients, pose, vec3, view_with
+from glassplat.kernels.project.steps import MOST_SQUARED_DEVIATIONS, place_gradients, pose, vec3, view_with
 
 LANES = 16
 COLUMNS = 48
@@ -115,7 +115,7 @@ def _exponential(real: type) -> Step:
 
 def _may_show(real: type) -> Step:
     exponential = _exponential(real)
-    zero, one, low_pass, most_deviations = real(0.0), real(1.0), real(LOW_PASS), real(MOST_DEVIATIONS)
+    zero, one, low_pass, most_squared = real(0.0), real(1.0), real(LOW_PASS), real(MOST_SQUARED_DEVIATIONS)
 
     @inlined
     def may_show(c, mean, log_scales, cam_from_world, intrinsics, lens, near, clip_planes, clips, windows):
@@ -132,8 +132,8 @@ def _may_show(real: type) -> Step:
         size = exponential(maximum(maximum(log_scales[0], log_scales[1]), log_scales[2])) * inverse_depth
         wide, high = size * (intrinsics[c, 0] * lens[c, 7]), size * (intrinsics[c, 1] * lens[c, 8])
         # NaN is beside nothing, which leaves the decision to the exact test.
-        beside_x = (past_x > zero) & (past_x * past_x > (wide * wide + low_pass) * most_deviations)
-        beside_y = (past_y > zero) & (past_y * past_y > (high * high + low_pass) * most_deviations)
+        beside_x = (past_x > zero) & (past_x * past_x > (wide * wide + low_pass) * most_squared)
+        beside_y = (past_y > zero) & (past_y * past_y > (high * high + low_pass) * most_squared)
         return bits_of(kept) & ~bits_of(beside_x | beside_y)
 
     return may_show
