@@ -52,7 +52,7 @@ def _blend_block(real: type, with_glass: bool) -> Scalar:
     """Builds the loop over the splats of a block, of which some may be glass."""
     full, load = vector_kind(real, tile.LANES)
     x_centers, y_centers = tile.pixel_centers(real)
-    exp2 = tile.tile_functions(real).exp2
+    exp2 = tile.exp2_of(real)
     zero, t_min, alpha_max = real(0.0), real(TRANSMITTANCE_MIN), real(ALPHA_MAX)
     least = real(math.log2(ALPHA_MIN))
     T, LAST, T_GLASS, LAST_GLASS = tile.T, tile.LAST, tile.T_GLASS, tile.LAST_GLASS
@@ -146,7 +146,7 @@ def _blend_more(real: type) -> Scalar:
 def _deviate_block(real: type) -> Scalar:
     full, load = vector_kind(real, tile.LANES)
     x_centers, y_centers = tile.pixel_centers(real)
-    exp2 = tile.tile_functions(real).exp2
+    exp2 = tile.exp2_of(real)
     zero, alpha_max, least = real(0.0), real(ALPHA_MAX), real(math.log2(ALPHA_MIN))
     on_mean = real(ON_MEAN * np.finfo(real).eps)
     MEAN_X, MEAN_Y, ORDER, LAST = tile.MEAN_X, tile.MEAN_Y, tile.ORDER, tile.LAST
@@ -275,7 +275,7 @@ def _begin_deviation(real: type) -> Scalar:
 @functools.cache
 def composite_forward(real: type) -> Kernel:
     """Builds the kernel that blends all tiles."""
-    pack, fetch, reached, _ = tile.tile_functions(real)
+    pack, fetch, reached = tile.pack_of(real), tile.fetch_of(real), tile.reached_of(real)
     blend_plain, blend_mixed = _blend_block(real, False), _blend_block(real, True)
     blend_more, deviate_block = _blend_more(real), _deviate_block(real)
     begin, clear, finish, write_tile = tile.begin_state(real), _clear(real), tile.finish_state(real), _write_tile(real)

@@ -47,7 +47,7 @@ LEAN = PAIR_VALUES + tile.GROUP
 def _unblend(real: type, probed: bool, of_glass: bool) -> Scalar:
     full, load = vector_kind(real, tile.LANES)
     x_centers, y_centers = tile.pixel_centers(real)
-    exp2, dot_more, sided = tile.tile_functions(real).exp2, _dot_more(real), _sided(real)
+    exp2, dot_more, sided = tile.exp2_of(real), _dot_more(real), _sided(real)
     zero, one, two, alpha_max = real(0.0), real(1.0), real(2.0), real(ALPHA_MAX)
     least = real(math.log2(ALPHA_MIN))
     BLOCK, ACROSS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.LANES, tile.PIXELS
@@ -288,7 +288,7 @@ def _begin(real: type) -> Scalar:
 @functools.cache
 def composite_backward(real: type, probed: bool) -> Kernel:
     """Builds the kernel that fills one row of sums per pair, given the final state of each tile."""
-    fetch = tile.tile_functions(real).fetch
+    fetch = tile.fetch_of(real)
     unblend_primary, unblend_glass = _unblend(real, probed, False), _unblend(real, probed, True)
     begin, sum_more = _begin(real), _sum_more(real)
     load_gradients, load_deviation = _load_gradients(real), _load_deviation(real)

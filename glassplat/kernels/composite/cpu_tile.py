@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -71,27 +71,6 @@ SLACK = 0.02
 
 GLASS = BLOCKS
 """In what is known of a pair, the bits below tell which blocks it reaches, this one that its splat is glass."""
-
-
-class TileFunctions(NamedTuple):
-    """Compiled steps that every blending kernel takes.
-
-    Attributes:
-        pack: copies one splat's geometry into its packed row.
-        fetch: copies the packed splats of consecutive pairs next to each other, their means relative to the tile.
-        reached: bits of the blocks of a tile that a fetched splat reaches.
-        exp2: 2^t of a vector for -100 < t < 1; elsewhere anything.
-    """
-
-    pack: Scalar
-    fetch: Scalar
-    reached: Scalar
-    exp2: Scalar
-
-
-def tile_functions(real: type) -> TileFunctions:
-    """Builds the functions for `real`, np.float32 or np.float64."""
-    return TileFunctions(_pack(real), _fetch(real), _reached(real), _exp2(real))
 
 
 def groups_of(num_values: int) -> int:
@@ -161,7 +140,8 @@ def finish_state(real: type) -> Scalar:
     return finish
 
 
-def _pack(real: type) -> Scalar:
+def pack_of(real: type) -> Scalar:
+    """The step that copies one splat's geometry into its packed row."""
     screen_form = blend_maths(real).screen_form
     half, zero, nothing, endless = real(0.5), real(0.0), real(-np.inf), real(np.inf)
     alpha_min, bits = real(ALPHA_MIN), 1.0 / math.log(2.0)
@@ -190,7 +170,8 @@ def place(tile, width, height):
     return camera, x0, y0, min(TILE, width - x0), min(TILE, height - y0)
 
 
-def _fetch(real: type) -> Scalar:
+def fetch_of(real: type) -> Scalar:
+    """The step that copies packed splats of consecutive pairs side by side, their means relative to the tile."""
     load = vector_kind(real, LANES).load
 
     @inlined
@@ -206,7 +187,8 @@ def _fetch(real: type) -> Scalar:
     return fetch
 
 
-def _reached(real: type) -> Scalar:
+def reached_of(real: type) -> Scalar:
+    """The step that gives the blocks of a tile that a fetched splat reaches, as bits."""
     full = vector_kind(real, LANES).full
     lefts = constant(real, tuple(b % ACROSS * BLOCK + 0.5 for b in range(BLOCKS)))
     tops = constant(real, tuple(b // ACROSS * BLOCK + 0.5 for b in range(BLOCKS)))
@@ -261,7 +243,8 @@ def exponent(batch, at, dx, dy):
     return along * dx + (dy * item(batch, at + FORM_YY) * dy + item(batch, at + BITS))
 
 
-def _exp2(real: type) -> Scalar:
+def exp2_of(real: type) -> Scalar:
+    """The step that gives 2^t of a vector for -100 < t < 1; elsewhere anything."""
     c0, c1, c2, c3, c4, c5 = (real(c) for c in EXP2_COEFFICIENTS)
     natural = real(math.log(2.0))
 

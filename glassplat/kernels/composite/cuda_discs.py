@@ -38,25 +38,6 @@ LAST, MEDIAN, ORDERS = range(3)
 KEPT_T, KEPT_DEPTH, KEPT_TOTAL, KEPT_SQUARES, KEPT_VALUES = range(5)
 
 
-class DiscTileFunctions(NamedTuple):
-    """Compiled steps.
-
-    Attributes:
-        load: copies one disc's geometry into row `i` of an array, and returns the rows of pixels that its outline
-            reaches, a bit for each.
-        cover: ((dx, dy), (u, v, 1 / e), e, coverage, on the disc itself) of the disc in row `i` and the pixel in column
-            x and row y of the tile, as `cpu_tile.DiscFunctions.cover`.
-    """
-
-    load: Scalar
-    cover: Scalar
-
-
-def disc_tile_steps(real: type) -> DiscTileFunctions:
-    """Builds the functions for `real`, np.float32 or np.float64."""
-    return DiscTileFunctions(_load(real), _cover(real))
-
-
 def _load(real: type) -> Scalar:
     maths = blend_maths(real)
     vertical_reach, row_range = maths.vertical_reach, maths.row_range
@@ -64,6 +45,7 @@ def _load(real: type) -> Scalar:
 
     @inlined
     def load(geometry, i, s, means, maps, opacities, depths, centers, conics, x0, y0, num_rows):
+        """Copies a disc's geometry into row `i` of an array; returns the rows its outline reaches, a bit for each."""
         opacity, depth, total = opacities[s], depths[s], means[s, 0] + means[s, 1] + depths[s]
         geometry[i, CENTER_X], geometry[i, CENTER_Y] = means[s, 0] - real(x0) - half, means[s, 1] - real(y0) - half
         for j in range(6):
@@ -90,6 +72,7 @@ def _cover(real: type) -> Scalar:
 
     @inlined
     def cover(geometry, i, x, y, near, sharpness):
+        """As in `cpu_discs`, of the disc in row `i` and the pixel in column x and row y of the tile."""
         dx, dy = x - geometry[i, CENTER_X], y - geometry[i, CENTER_Y]
         # Written out, because the compiler would choose anew in every kernel which products and sums to fuse: a disc
         # at exactly 1/255 could be in the image and not in its gradient.
@@ -195,7 +178,7 @@ def _enter(real: type, num_channels: int) -> Scalar:
 @cache
 def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
     """Fills one gradient row per pair that any pixel blended; all rows start at zero."""
-    load, cover = disc_tile_steps(real)
+    load, cover = _load(real), _cover(real)
     reciprocal, enter = reciprocal_maths(real), _enter(real, num_channels)
     zero, one, two, alpha_max, endless = real(0.0), real(1.0), real(2.0), real(ALPHA_MAX), real(np.inf)
     behinds, lasts, middles = BEHIND, BLENDED, MIDDLE
@@ -405,7 +388,7 @@ def _sharpness(low_pass: float) -> float:
 @cache
 def composite_discs_forward(real: type, num_channels: int = 6) -> Kernel:
     """Fills the images of the active tiles, and what the backward pass needs."""
-    load, cover = disc_tile_steps(real)
+    load, cover = _load(real), _cover(real)
     zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
     t_min, alpha_max, stopped = real(TRANSMITTANCE_MIN), real(ALPHA_MAX), np.int32(PIXELS)
 

@@ -28,7 +28,7 @@ from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.records import REAL_OF, Bvh, Shapes
 from glassplat.kernels.trace import reach
 from glassplat.kernels.trace.bvh import hilbert_codes, leaf_fitting, level_offsets
-from glassplat.kernels.trace.cpu_traversal import arrays_of, packed_leaves, traversal
+from glassplat.kernels.trace.cpu_traversal import arrays_of, next_hits_maths, packed_leaves
 from glassplat.kernels.trace.steps import (
     CHUNK,
     FRAME_AT,
@@ -39,6 +39,7 @@ from glassplat.kernels.trace.steps import (
     WIDTH,
     color_pull,
     coverage_maths,
+    ray_reader,
     shape_of,
 )
 
@@ -138,7 +139,7 @@ def _summed(rows: NDArray[Any], sh_rows: NDArray[Any], owners: Tensor, count: in
 @cache
 def trace_collect(real: type, flat: bool) -> Kernel:
     """Fills `met`, each ray's Gaussians from the nearest on, and the number of different ones in each block."""
-    next_hits, ray = traversal(real, flat)
+    next_hits, ray = next_hits_maths(real, flat), ray_reader(real)
 
     @kernel("trace_collect_discs" if flat else "trace_collect_ellipsoids", real)
     def collect(leaves, origins, directions, order, boxes, offsets, near, kept, hit_offsets, places, met, distinct):
@@ -327,7 +328,7 @@ def trace(
 @cache
 def trace_forward(real: type, flat: bool) -> Kernel:
     """Fills colors, alphas, depths, hits and the nearest of them."""
-    next_hits, ray = traversal(real, flat)
+    next_hits, ray = next_hits_maths(real, flat), ray_reader(real)
     color = color_maths(real).color
     zero, half, one, least = real(0.0), real(0.5), real(1.0), real(TRANSMITTANCE_MIN)
 
