@@ -1,4 +1,4 @@
-"""Differentiable operations on tensors; each has a CPU kernel and a plain-PyTorch twin of the same name."""
+"""Operations on tensors: most are differentiable, and most have a plain-PyTorch twin of the same name."""
 
 from __future__ import annotations
 

@@ -23,16 +23,6 @@ def test_exp2_ends_in_nothing(real: type, t: float) -> None:
 
 
 @pytest.mark.parametrize("real", [np.float32, np.float64])
-def test_coverage_is_cut_and_clamped(real: type) -> None:
-    clipped_alpha = blend_maths(real).clipped_alpha
-    assert clipped_alpha(real(ALPHA_MIN)) == real(ALPHA_MIN)
-    assert clipped_alpha(real(0.0039)) == 0
-    assert clipped_alpha(real(0.5)) == real(0.5)
-    assert clipped_alpha(real(3)) == real(0.99)
-    assert clipped_alpha(real(math.nan)) == 0
-
-
-@pytest.mark.parametrize("real", [np.float32, np.float64])
 @pytest.mark.parametrize(("xx", "xy", "yy"), [(0.5, 0.0, 0.5), (0.4, 0.19, 0.1), (2.0, -0.3, 0.06), (1.0, 0.9999, 1.0)])
 @pytest.mark.parametrize("center", [-3.2, 0.5, 7.9, 30.0])
 def test_rows_in_range_are_those_with_coverage(real: type, xx: float, xy: float, yy: float, center: float) -> None:

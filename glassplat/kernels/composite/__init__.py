@@ -22,20 +22,18 @@ from glassplat.kernels.records import (
 )
 
 
-def check_splats(splats: Splats, bins: TileBins) -> None:
-    """Raises where splats and bins do not belong together, or where no kernel exists for them.
+def check_bins(channels: Tensor, bins: TileBins, cameras: int, count: int, these: str) -> None:
+    """Raises where channels or bins are not of these splats or discs, or where no kernel exists for them.
 
     Raises:
-        TypeError: the type is neither float32 nor float64, differs between tensors, or they are on different devices.
         ValueError: shapes disagree.
     """
-    cameras, count = splats.opacities.shape
-    trailing = {"means2d": (2,), "conics": (3,), "opacities": (), "depths": ()}
-    check_tensors({name: (getattr(splats, name), (cameras, count, *rest)) for name, rest in trailing.items()})
+    if channels.ndim != 3 or not 1 <= channels.shape[2] <= MOST_CHANNELS:
+        raise ValueError(f"channels has shape {list(channels.shape)}, expected [C, G, D] with D in 1..{MOST_CHANNELS}")
     if bins.num_cameras != cameras or len(bins.splat_offsets) != cameras * count + 1:
         raise ValueError(
-            f"the bins are for {bins.num_cameras} cameras and {len(bins.splat_offsets) - 1} splats, but there are "
-            f"{cameras} cameras with {count} splats each; bin these very splats with bin_tiles"
+            f"the bins are for {bins.num_cameras} cameras and {len(bins.splat_offsets) - 1} entries, but there are "
+            f"{cameras} cameras with {count} each; bin {these} with bin_tiles"
         )
 
 
@@ -102,11 +100,9 @@ def composite(
         TypeError: tensors are not all float32 or all float64.
         ValueError: shapes disagree, glass has no marks, or tensors are on different devices.
     """
-    check_splats(splats, bins)
-    num_primary = primary_count(num_primary, splats)
     cameras, count = splats.opacities.shape
-    if channels.ndim != 3 or not 1 <= channels.shape[2] <= MOST_CHANNELS:
-        raise ValueError(f"channels has shape {list(channels.shape)}, expected [C, G, D] with D in 1..{MOST_CHANNELS}")
+    check_bins(channels, bins, cameras, count, "these very splats")
+    num_primary = primary_count(num_primary, splats)
     if marks is None:
         if num_primary < count:
             raise ValueError(
@@ -114,7 +110,10 @@ def composite(
             )
         marks = channels.new_zeros(cameras, 0)
     expected = {
-        "means2d": (splats.means2d, tuple(splats.means2d.shape)),
+        "means2d": (splats.means2d, (cameras, count, 2)),
+        "conics": (splats.conics, (cameras, count, 3)),
+        "opacities": (splats.opacities, (cameras, count)),
+        "depths": (splats.depths, (cameras, count)),
         "channels": (channels, (cameras, count, channels.shape[2])),
         "marks": (marks, (cameras, count - num_primary)),
     }
@@ -217,8 +216,7 @@ def composite_discs(
 
 def _check(discs: Discs, channels: Tensor, bins: TileBins, probe: Tensor | None) -> None:
     cameras, count = discs.opacities.shape
-    if channels.ndim != 3 or not 1 <= channels.shape[2] <= MOST_CHANNELS:
-        raise ValueError(f"channels has shape {list(channels.shape)}, expected [C, G, D] with D in 1..{MOST_CHANNELS}")
+    check_bins(channels, bins, cameras, count, "the outlines of these very discs")
     expected = {
         "means2d": (discs.means2d, (cameras, count, 2)),
         "maps": (discs.maps, (cameras, count, MAP)),
@@ -231,11 +229,6 @@ def _check(discs: Discs, channels: Tensor, bins: TileBins, probe: Tensor | None)
     if probe is not None:
         expected["probe"] = (probe, (cameras, count, 2))
     check_tensors(expected)
-    if bins.num_cameras != cameras or len(bins.splat_offsets) != cameras * count + 1:
-        raise ValueError(
-            f"the bins are for {bins.num_cameras} cameras and {len(bins.splat_offsets) - 1} discs, but there are "
-            f"{cameras} cameras with {count} discs each; bin the outlines of these very discs with bin_tiles"
-        )
 
 
 def _discs(tensors: Sequence[Tensor], outlines: Splats) -> Discs:

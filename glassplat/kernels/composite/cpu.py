@@ -52,7 +52,7 @@ def _blend_block(real: type, with_glass: bool) -> Scalar:
     """Builds the loop over the splats of a block, of which some may be glass."""
     full, load = vector_kind(real, tile.LANES)
     x_centers, y_centers = tile.pixel_centers(real)
-    exp2 = tile.tile_functions(real).exp2
+    exp2 = tile.exp2_of(real)
     zero, t_min, alpha_max = real(0.0), real(TRANSMITTANCE_MIN), real(ALPHA_MAX)
     least = real(math.log2(ALPHA_MIN))
     T, LAST, T_GLASS, LAST_GLASS = tile.T, tile.LAST, tile.T_GLASS, tile.LAST_GLASS
@@ -146,7 +146,7 @@ def _blend_more(real: type) -> Scalar:
 def _deviate_block(real: type) -> Scalar:
     full, load = vector_kind(real, tile.LANES)
     x_centers, y_centers = tile.pixel_centers(real)
-    exp2 = tile.tile_functions(real).exp2
+    exp2 = tile.exp2_of(real)
     zero, alpha_max, least = real(0.0), real(ALPHA_MAX), real(math.log2(ALPHA_MIN))
     on_mean = real(ON_MEAN * np.finfo(real).eps)
     MEAN_X, MEAN_Y, ORDER, LAST = tile.MEAN_X, tile.MEAN_Y, tile.ORDER, tile.LAST
@@ -275,7 +275,7 @@ def _begin_deviation(real: type) -> Scalar:
 @functools.cache
 def composite_forward(real: type) -> Kernel:
     """Builds the kernel that blends all tiles."""
-    pack, fetch, reached, _ = tile.tile_functions(real)
+    pack, fetch, reached = tile.pack_of(real), tile.fetch_of(real), tile.reached_of(real)
     blend_plain, blend_mixed = _blend_block(real, False), _blend_block(real, True)
     blend_more, deviate_block = _blend_more(real), _deviate_block(real)
     begin, clear, finish, write_tile = tile.begin_state(real), _clear(real), tile.finish_state(real), _write_tile(real)
@@ -425,7 +425,8 @@ def composite(
     saved = Saved(packed, np.empty(len(bins.pair_splats), np.int32), state, spread)
     where = tile.flat(deviation.where.detach()) if deviation else spread
     composite_forward(REAL_OF[channels.dtype])(
-        *_by_splat(splats, channels), marks.numpy(), count, num_primary, bins.width, bins.height,
+        *(t.numpy() for t in tile.joined_cameras((*splats[:3], channels))), marks.numpy(), count, num_primary,
+        bins.width, bins.height,
         deviation.channel if deviation else -1, where,
         bins.pair_splats.numpy(), bins.tile_offsets.numpy(), bins.splat_offsets.numpy(), bins.active.numpy(),
         *saved, *(tile.flat(output) for output in (image, alpha, mask, deviated)),
@@ -460,12 +461,3 @@ def composite_gradients(
         v_marks.copy_(v_values[:, num_primary:, 0])
         v_values[:, num_primary:] = 0
     return v_means, v_conics, v_opacities, v_values, v_marks, v_probe if probed else None
-
-
-def _by_splat(splats: Splats, channels: Tensor) -> tuple[NDArray[Any], ...]:
-    return (
-        splats.means2d.numpy().reshape(-1, 2),
-        splats.conics.numpy().reshape(-1, 3),
-        splats.opacities.numpy().reshape(-1),
-        channels.numpy().reshape(-1, channels.shape[2]),
-    )

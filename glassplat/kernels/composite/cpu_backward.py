@@ -44,21 +44,23 @@ LEAN = PAIR_VALUES + tile.GROUP
 """Column of a pair's row that is free where there are no more than four channels."""
 
 
-def _unblend_primary(real: type, probed: bool) -> Scalar:
+def _unblend(real: type, probed: bool, of_glass: bool) -> Scalar:
     full, load = vector_kind(real, tile.LANES)
     x_centers, y_centers = tile.pixel_centers(real)
-    exp2, dot_more, sided = tile.tile_functions(real).exp2, _dot_more(real), _sided(real)
+    exp2, dot_more, sided = tile.exp2_of(real), _dot_more(real), _sided(real)
     zero, one, two, alpha_max = real(0.0), real(1.0), real(2.0), real(ALPHA_MAX)
     least = real(math.log2(ALPHA_MIN))
-    BLOCK, ACROSS, LANES, PIXELS, LAST = tile.BLOCK, tile.ACROSS, tile.LANES, tile.PIXELS, tile.LAST
+    BLOCK, ACROSS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.LANES, tile.PIXELS
     MEAN_X, MEAN_Y, FORM_XX, FORM_XY, FORM_YY = tile.MEAN_X, tile.MEAN_Y, tile.FORM_XX, tile.FORM_XY, tile.FORM_YY
     ORDER, VALUES = tile.ORDER, tile.VALUES
+    OWN_T, OWN_BEHIND, LAST = (T_GLASS, BEHIND_GLASS, tile.LAST_GLASS) if of_glass else (T, BEHIND, tile.LAST)
 
     @inlined
-    def unblend_primary(planes, state, at, batch, splat, blocks, groups, deviating, row, row_at):
+    def unblend(planes, state, at, batch, splat, blocks, groups, deviating, row, row_at):
         """Takes a splat off the pixels of its blocks and writes its sums, of channels beyond the first four zero.
 
-        With no more than four channels the one after them is the gradient of a deviation by its channel.
+        With no more than four channels the one after them is the gradient of a deviation by its channel. Of glass the
+        first is the gradient of its mark, and the others are zero.
         """
         none, most = full(zero), full(alpha_max)
         g, g_x, g_y, g_xx, g_xy, g_yy = none, none, none, none, none, none
@@ -74,26 +76,32 @@ def _unblend_primary(real: type, probed: bool) -> Scalar:
             shown = (bits >= least) & (load(state, at + LAST + i) >= item(batch, splat + ORDER))
             alpha = select(shown, minimum(coverage, most), none)
             inverse = one / (one - alpha)
-            t = load(planes, T + i) * inverse
-            weight = alpha * t
-            v0, v1 = load(planes, V_IMAGE + i), load(planes, V_IMAGE + PIXELS + i)
-            v2, v3 = load(planes, V_IMAGE + 2 * PIXELS + i), load(planes, V_IMAGE + 3 * PIXELS + i)
-            dot = v0 * item(batch, splat + VALUES) + v1 * item(batch, splat + VALUES + 1)
-            dot = dot + (v2 * item(batch, splat + VALUES + 2) + v3 * item(batch, splat + VALUES + 3))
-            if groups > 1:
-                dot = dot_more(dot, planes, i, batch, splat, groups, deviating)
-                store(planes, WEIGHT + i, weight)
-            elif deviating >= 0:
-                center = load(planes, CENTER + i)
-                difference = item(batch, splat + VALUES + deviating) - center
-                v_deviation = load(planes, V_DEVIATION + i)
-                slope = weight * v_deviation
-                dot = dot + v_deviation * absolute(difference)
-                lean = lean + sided(difference, center, slope)
-            behind = load(planes, BEHIND + i)
-            v_alpha = t * dot - behind * inverse
-            store(planes, BEHIND + i, behind + weight * dot)
-            store(planes, T + i, t)
+            t, behind = load(planes, OWN_T + i) * inverse, load(planes, OWN_BEHIND + i)
+            if of_glass:
+                mark, v_mark = item(batch, splat + VALUES), load(planes, V_MASK + i) * load(planes, T + i) * t
+                v_alpha, seen = v_mark * mark - behind * inverse, alpha * v_mark * mark
+                store(planes, BEHIND + i, load(planes, BEHIND + i) + seen)
+                s0 = s0 + alpha * v_mark
+            else:
+                weight = alpha * t
+                v0, v1 = load(planes, V_IMAGE + i), load(planes, V_IMAGE + PIXELS + i)
+                v2, v3 = load(planes, V_IMAGE + 2 * PIXELS + i), load(planes, V_IMAGE + 3 * PIXELS + i)
+                dot = v0 * item(batch, splat + VALUES) + v1 * item(batch, splat + VALUES + 1)
+                dot = dot + (v2 * item(batch, splat + VALUES + 2) + v3 * item(batch, splat + VALUES + 3))
+                if groups > 1:
+                    dot = dot_more(dot, planes, i, batch, splat, groups, deviating)
+                    store(planes, WEIGHT + i, weight)
+                elif deviating >= 0:
+                    center = load(planes, CENTER + i)
+                    difference = item(batch, splat + VALUES + deviating) - center
+                    v_deviation = load(planes, V_DEVIATION + i)
+                    slope = weight * v_deviation
+                    dot = dot + v_deviation * absolute(difference)
+                    lean = lean + sided(difference, center, slope)
+                v_alpha, seen = t * dot - behind * inverse, weight * dot
+                s0, s1, s2, s3 = s0 + weight * v0, s1 + weight * v1, s2 + weight * v2, s3 + weight * v3
+            store(planes, OWN_BEHIND + i, behind + seen)
+            store(planes, OWN_T + i, t)
             gain = select(coverage < most, v_alpha * alpha, none)
             gain_x, gain_y = gain * dx, gain * dy
             g, g_x, g_y = g + gain, g_x + gain_x, g_y + gain_y
@@ -102,11 +110,10 @@ def _unblend_primary(real: type, probed: bool) -> Scalar:
                 across = item(batch, splat + FORM_XY)
                 pull_x = pull_x + absolute(gain_x * (two * item(batch, splat + FORM_XX)) + gain_y * across)
                 pull_y = pull_y + absolute(gain_y * (two * item(batch, splat + FORM_YY)) + gain_x * across)
-            s0, s1, s2, s3 = s0 + weight * v0, s1 + weight * v1, s2 + weight * v2, s3 + weight * v3
         sums = (g, g_x, g_y, g_xx, g_xy, g_yy, pull_x, pull_y, s0, s1, s2, s3, lean, none, none, none)
         store(row, row_at, sums_of(sums))
 
-    return unblend_primary
+    return unblend
 
 
 def _sided(real: type) -> Scalar:
@@ -147,7 +154,7 @@ def _sum_more(real: type) -> Scalar:
 
     @inlined
     def sum_more(planes, batch, splat, blocks, groups, deviating, rows, row, sums):
-        """Adds to a row of sums what `unblend_primary` leaves out, with the weights it kept; `sums` is scratch."""
+        """Adds to a row of sums what `unblend` leaves out, with the weights it kept; `sums` is scratch."""
         none = full(zero)
         for d in range(4, groups * 4, 4):
             s0, s1, s2, s3, left = none, none, none, none, blocks
@@ -175,56 +182,6 @@ def _sum_more(real: type) -> Scalar:
             rows[row + PAIR_VALUES + deviating] += sums[0]
 
     return sum_more
-
-
-def _unblend_glass(real: type, probed: bool) -> Scalar:
-    full, load = vector_kind(real, tile.LANES)
-    x_centers, y_centers = tile.pixel_centers(real)
-    exp2 = tile.tile_functions(real).exp2
-    zero, one, two, alpha_max = real(0.0), real(1.0), real(2.0), real(ALPHA_MAX)
-    least = real(math.log2(ALPHA_MIN))
-    BLOCK, ACROSS, LANES, LAST_GLASS = tile.BLOCK, tile.ACROSS, tile.LANES, tile.LAST_GLASS
-    MEAN_X, MEAN_Y, FORM_XX, FORM_XY, FORM_YY = tile.MEAN_X, tile.MEAN_Y, tile.FORM_XX, tile.FORM_XY, tile.FORM_YY
-    ORDER, VALUES = tile.ORDER, tile.VALUES
-
-    @inlined
-    def unblend_glass(planes, state, at, batch, splat, blocks, row, row_at):
-        """As `unblend_primary`; the sum of the first channel is the gradient of the mark."""
-        none, most, mark = full(zero), full(alpha_max), item(batch, splat + VALUES)
-        g, g_x, g_y, g_xx, g_xy, g_yy = none, none, none, none, none, none
-        pull_x, pull_y, s0 = none, none, none
-        while blocks != 0:
-            b = lowest_bit(blocks)
-            blocks &= blocks - 1
-            i = b * LANES
-            dx = x_centers() + (real(b % ACROSS * BLOCK) - item(batch, splat + MEAN_X))
-            dy = y_centers() + (real(b // ACROSS * BLOCK) - item(batch, splat + MEAN_Y))
-            bits = exponent(batch, splat, dx, dy)
-            coverage = exp2(bits)
-            shown = (bits >= least) & (load(state, at + LAST_GLASS + i) >= item(batch, splat + ORDER))
-            alpha = select(shown, minimum(coverage, most), none)
-            inverse = one / (one - alpha)
-            t_glass = load(planes, T_GLASS + i) * inverse
-            v_mark = load(planes, V_MASK + i) * load(planes, T + i) * t_glass
-            behind = load(planes, BEHIND_GLASS + i)
-            v_alpha = v_mark * mark - behind * inverse
-            seen = alpha * v_mark * mark
-            store(planes, BEHIND_GLASS + i, behind + seen)
-            store(planes, BEHIND + i, load(planes, BEHIND + i) + seen)
-            store(planes, T_GLASS + i, t_glass)
-            gain = select(coverage < most, v_alpha * alpha, none)
-            gain_x, gain_y = gain * dx, gain * dy
-            g, g_x, g_y = g + gain, g_x + gain_x, g_y + gain_y
-            g_xx, g_xy, g_yy = g_xx + gain_x * dx, g_xy + gain_x * dy, g_yy + gain_y * dy
-            if probed:
-                across = item(batch, splat + FORM_XY)
-                pull_x = pull_x + absolute(gain_x * (two * item(batch, splat + FORM_XX)) + gain_y * across)
-                pull_y = pull_y + absolute(gain_y * (two * item(batch, splat + FORM_YY)) + gain_x * across)
-            s0 = s0 + alpha * v_mark
-        sums = (g, g_x, g_y, g_xx, g_xy, g_yy, pull_x, pull_y, s0, none, none, none, none, none, none, none)
-        store(row, row_at, sums_of(sums))
-
-    return unblend_glass
 
 
 def _load_gradients(real: type) -> Scalar:
@@ -331,8 +288,8 @@ def _begin(real: type) -> Scalar:
 @functools.cache
 def composite_backward(real: type, probed: bool) -> Kernel:
     """Builds the kernel that fills one row of sums per pair, given the final state of each tile."""
-    fetch = tile.tile_functions(real).fetch
-    unblend_primary, unblend_glass = _unblend_primary(real, probed), _unblend_glass(real, probed)
+    fetch = tile.fetch_of(real)
+    unblend_primary, unblend_glass = _unblend(real, probed, False), _unblend(real, probed, True)
     begin, sum_more = _begin(real), _sum_more(real)
     load_gradients, load_deviation = _load_gradients(real), _load_deviation(real)
     zero = real(0.0)
@@ -389,7 +346,7 @@ def composite_backward(real: type, probed: bool) -> Kernel:
                         if blocks == 0:
                             rows[row : row + row_width] = zero
                         elif (pairs[p] >> GLASS) & 1:
-                            unblend_glass(planes, state, at, batch, splat, blocks, rows, row)
+                            unblend_glass(planes, state, at, batch, splat, blocks, groups, deviating, rows, row)
                             rows[row + LANES : row + row_width] = zero
                         else:
                             unblend_primary(planes, state, at, batch, splat, blocks, groups, deviating, rows, row)

@@ -48,39 +48,19 @@ T, LAST, MEDIAN, FIRST, TOTAL, SQUARES = (plane * tile.PIXELS for plane in range
 STATE = 6 * tile.PIXELS
 
 
-class DiscFunctions(NamedTuple):
-    """Compiled steps that every kernel takes.
-
-    Attributes:
-        pack: copies one disc's geometry into its packed row; returns whether it may be drawn.
-        fetch: copies the packed discs of consecutive pairs next to each other, their centres relative to the tile.
-        cover: of a fetched disc and a block: the offset (dx, dy) of the pixels, (u, v, 1 / e) and e where their rays
-            meet the disc, (0, 0, 1) and 1 where the falloff around its centre is the larger one; the coverage before it
-            is clamped, 0 where it is not drawn; and which pixels show the disc and not that falloff.
-    """
-
-    pack: Scalar
-    fetch: Scalar
-    cover: Scalar
-
-
-def disc_functions(real: type) -> DiscFunctions:
-    """Builds the functions for `real`, np.float32 or np.float64."""
-    return DiscFunctions(_pack(real), _fetch(real), _cover(real))
-
-
 def packed_width(num_values: int) -> int:
     """Columns of a packed disc that carries `num_values` channels in whole groups: whole vectors."""
     return tile.LANES * ((VALUES + tile.GROUP * tile.groups_of(num_values) + tile.LANES - 1) // tile.LANES)
 
 
 def _pack(real: type) -> Scalar:
-    pack_outline = tile.tile_functions(real).pack
+    pack_outline = tile.pack_of(real)
     zero, one, nothing, endless = real(0.0), real(1.0), real(-np.inf), real(np.inf)
     alpha_min, bits = real(ALPHA_MIN), 1.0 / math.log(2.0)
 
     @inlined
     def pack(packed, at, center, map_of, opacity, depth, outline_center, conic):
+        """Copies one disc's geometry into its packed row."""
         pack_outline(packed, at, outline_center, conic, opacity)
         if conic[0] == zero and conic[1] == zero and conic[2] == zero:
             # It crosses the near plane and may reach any block.
@@ -101,10 +81,11 @@ def _pack(real: type) -> Scalar:
 
 
 def _fetch(real: type) -> Scalar:
-    fetch_splats = tile.tile_functions(real).fetch
+    fetch_splats = tile.fetch_of(real)
 
     @inlined
     def fetch(batch, packed, pair_splats, first, last, width, x0, y0):
+        """Copies the packed discs of consecutive pairs next to each other, their centres relative to the tile."""
         fetch_splats(batch, packed, pair_splats, first, last, width, x0, y0)
         for k in range(last - first):
             batch[k * width + CENTER_X] -= real(x0)
@@ -114,7 +95,7 @@ def _fetch(real: type) -> Scalar:
 
 
 def _cover(real: type) -> Scalar:
-    meet, exp2, full = meet_maths(real), tile.tile_functions(real).exp2, vector_kind(real, tile.LANES).full
+    meet, exp2, full = meet_maths(real), tile.exp2_of(real), vector_kind(real, tile.LANES).full
     x_centers, y_centers = tile.pixel_centers(real)
     zero, one, farthest = real(0.0), real(1.0), real(MOST_DEVIATIONS**2)
     half_bits, least = real(0.5 / math.log(2.0)), real(math.log2(ALPHA_MIN))
@@ -122,7 +103,12 @@ def _cover(real: type) -> Scalar:
 
     @inlined
     def cover(batch, at, x, y, near, sharpness):
-        """`x` and `y` are the block's corner, `sharpness` is one over the variance of the low-pass."""
+        """What a fetched disc covers of the block whose corner is (x, y).
+
+        The offset (dx, dy) of the pixels; (u, v, 1 / e) and e where their rays meet the disc, (0, 0, 1) and 1 where the
+        falloff around its centre is the larger one; the coverage before it is clamped, 0 where it is not drawn; and
+        which pixels show the disc and not that falloff. `sharpness` is one over the variance of the low-pass.
+        """
         dx = x_centers() + (x - item(batch, at + CENTER_X))
         dy = y_centers() + (y - item(batch, at + CENTER_Y))
         found = (
@@ -161,7 +147,7 @@ SPLATS = 512
 def _blend_block(real: type) -> Scalar:
     """Builds the loop over the discs of a block."""
     full, load = vector_kind(real, tile.LANES)
-    cover = disc_functions(real).cover
+    cover = _cover(real)
     zero, half, one, t_min, alpha_max = real(0.0), real(0.5), real(1.0), real(TRANSMITTANCE_MIN), real(ALPHA_MAX)
 
     @inlined
@@ -282,7 +268,7 @@ def _write_tile(real: type) -> Scalar:
 @functools.cache
 def composite_discs_forward(real: type) -> Kernel:
     """Builds the kernel that blends all tiles."""
-    reached, (pack, fetch, _) = tile.tile_functions(real).reached, disc_functions(real)
+    pack, fetch, reached = _pack(real), _fetch(real), tile.reached_of(real)
     blend_block, blend_channels, begin = _blend_block(real), _blend_channels(real), _begin_state(real)
     write_tile, zero = _write_tile(real), real(0.0)
     BLOCK, ACROSS, BLOCKS, LANES, PIXELS = tile.BLOCK, tile.ACROSS, tile.BLOCKS, tile.LANES, tile.PIXELS
@@ -388,7 +374,7 @@ def sharpness_of(sharpness):
 
 def _unblend(real: type) -> Scalar:
     full, load = vector_kind(real, tile.LANES)
-    cover, value_of = disc_functions(real).cover, _value_of(real)
+    cover, value_of = _cover(real), _value_of(real)
     zero, one, two, alpha_max = real(0.0), real(1.0), real(2.0), real(ALPHA_MAX)
     BLOCK, ACROSS, LANES = tile.BLOCK, tile.ACROSS, tile.LANES
 
@@ -504,7 +490,7 @@ def _begin_gradients(real: type) -> Scalar:
 @functools.cache
 def composite_discs_backward(real: type) -> Kernel:
     """Builds the kernel that fills one row of sums per pair, given the final state of each tile."""
-    fetch = disc_functions(real).fetch
+    fetch = _fetch(real)
     unblend, sum_channels, begin = _unblend(real), _sum_channels(real), _begin_gradients(real)
     zero = real(0.0)
     LANES, PIXELS, CHUNK = tile.LANES, tile.PIXELS, tile.CHUNK
@@ -570,7 +556,7 @@ def composite_discs(
     packed, state = (torch.empty(size, dtype=channels.dtype).numpy() for size in sizes)
     saved = Saved(packed, np.zeros(len(bins.pair_splats), np.int32), state)
     composite_discs_forward(real)(
-        *_by_disc(discs), channels.numpy().reshape(-1, num_channels), bins.width, bins.height,
+        *(t.numpy() for t in tile.joined_cameras((*discs[:4], *discs.outlines[:2], channels))), bins.width, bins.height,
         *_real_options(real, near, low_pass), bins.pair_splats.numpy(), bins.tile_offsets.numpy(),
         bins.splat_offsets.numpy(), bins.active.numpy(), *saved, tuple(tile.flat(image) for image in images),
     )  # fmt: skip
@@ -605,17 +591,6 @@ def composite_discs_gradients(
 def _real_options(real: type, near: float, low_pass: float) -> tuple[Any, Any]:
     """The near plane, and one over the variance of the low-pass."""
     return real(near), real(1 / low_pass**2) if low_pass else real(np.inf)
-
-
-def _by_disc(discs: Discs) -> tuple[NDArray[Any], ...]:
-    return (
-        discs.means2d.numpy().reshape(-1, 2),
-        discs.maps.numpy().reshape(-1, MAP),
-        discs.opacities.numpy().reshape(-1),
-        discs.depths.numpy().reshape(-1),
-        discs.outlines.means2d.numpy().reshape(-1, 2),
-        discs.outlines.conics.numpy().reshape(-1, 3),
-    )
 
 
 @functools.cache

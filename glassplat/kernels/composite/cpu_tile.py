@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import torch
@@ -72,27 +73,6 @@ GLASS = BLOCKS
 """In what is known of a pair, the bits below tell which blocks it reaches, this one that its splat is glass."""
 
 
-class TileFunctions(NamedTuple):
-    """Compiled steps that every blending kernel takes.
-
-    Attributes:
-        pack: copies one splat's geometry into its packed row.
-        fetch: copies the packed splats of consecutive pairs next to each other, their means relative to the tile.
-        reached: bits of the blocks of a tile that a fetched splat reaches.
-        exp2: 2^t of a vector for -100 < t < 1; elsewhere anything.
-    """
-
-    pack: Scalar
-    fetch: Scalar
-    reached: Scalar
-    exp2: Scalar
-
-
-def tile_functions(real: type) -> TileFunctions:
-    """Builds the functions for `real`, np.float32 or np.float64."""
-    return TileFunctions(_pack(real), _fetch(real), _reached(real), _exp2(real))
-
-
 def groups_of(num_values: int) -> int:
     """Groups of channels that hold `num_values`."""
     return (num_values + GROUP - 1) // GROUP
@@ -101,6 +81,11 @@ def groups_of(num_values: int) -> int:
 def packed_width(num_values: int) -> int:
     """Columns of a packed splat that carries `num_values` channels in whole groups: whole vectors."""
     return LANES * ((VALUES + GROUP * groups_of(num_values) + LANES - 1) // LANES)
+
+
+def joined_cameras(tensors: Iterable[Tensor]) -> tuple[Tensor, ...]:
+    """Tensors [C, G, ...] as [C * G, ...]."""
+    return tuple(tensor.flatten(0, 1) for tensor in tensors)
 
 
 def flat(tensor: Tensor) -> NDArray[Any]:
@@ -155,7 +140,8 @@ def finish_state(real: type) -> Scalar:
     return finish
 
 
-def _pack(real: type) -> Scalar:
+def pack_of(real: type) -> Scalar:
+    """The step that copies one splat's geometry into its packed row."""
     screen_form = blend_maths(real).screen_form
     half, zero, nothing, endless = real(0.5), real(0.0), real(-np.inf), real(np.inf)
     alpha_min, bits = real(ALPHA_MIN), 1.0 / math.log(2.0)
@@ -184,7 +170,8 @@ def place(tile, width, height):
     return camera, x0, y0, min(TILE, width - x0), min(TILE, height - y0)
 
 
-def _fetch(real: type) -> Scalar:
+def fetch_of(real: type) -> Scalar:
+    """The step that copies packed splats of consecutive pairs side by side, their means relative to the tile."""
     load = vector_kind(real, LANES).load
 
     @inlined
@@ -200,7 +187,8 @@ def _fetch(real: type) -> Scalar:
     return fetch
 
 
-def _reached(real: type) -> Scalar:
+def reached_of(real: type) -> Scalar:
+    """The step that gives the blocks of a tile that a fetched splat reaches, as bits."""
     full = vector_kind(real, LANES).full
     lefts = constant(real, tuple(b % ACROSS * BLOCK + 0.5 for b in range(BLOCKS)))
     tops = constant(real, tuple(b // ACROSS * BLOCK + 0.5 for b in range(BLOCKS)))
@@ -255,7 +243,8 @@ def exponent(batch, at, dx, dy):
     return along * dx + (dy * item(batch, at + FORM_YY) * dy + item(batch, at + BITS))
 
 
-def _exp2(real: type) -> Scalar:
+def exp2_of(real: type) -> Scalar:
+    """The step that gives 2^t of a vector for -100 < t < 1; elsewhere anything."""
     c0, c1, c2, c3, c4, c5 = (real(c) for c in EXP2_COEFFICIENTS)
     natural = real(math.log(2.0))
 

@@ -15,7 +15,7 @@ from numba import cuda
 from torch import Tensor
 
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
-from glassplat.kernels.composite.cpu_tile import place
+from glassplat.kernels.composite.cpu_tile import joined_cameras, place
 from glassplat.kernels.composite.cuda_backward import PULLS, THREADS, WARPS, composite_backward, composite_pulls
 from glassplat.kernels.composite.cuda_discs import composite_discs, composite_discs_gradients
 from glassplat.kernels.composite.cuda_tile import (
@@ -87,16 +87,15 @@ def composite(
         (image.detach(), alpha.detach(), mask.detach(), deviated.detach()),
     )
     lists = (bins.pair_splats, bins.tile_offsets, bins.active)
-    geometry = flat_geometry(splats)
-    values = channels.view(-1, num_channels)
+    geometry, values = joined_cameras(splats[:3]), channels.view(-1)
     composite_forward(real, num_channels)(
-        tiles, PIXELS, *geometry, values.view(-1), marks.view(-1), count, num_primary, *lists, *saved[:5],
+        tiles, PIXELS, *geometry, values, marks.view(-1), count, num_primary, *lists, *saved[:5],
         image, alpha, mask,
     )  # fmt: skip
     if deviation:
         where = deviation.where.detach().contiguous()
         composite_deviation(real)(
-            tiles, PIXELS, *geometry, values.view(-1), num_channels, count, num_primary, deviation.channel, where,
+            tiles, PIXELS, *geometry, values, num_channels, count, num_primary, deviation.channel, where,
             *lists, *saved[1:3], saved.kept_spread, image, alpha, center, lean, deviated,
         )  # fmt: skip
     return image, alpha, mask, deviated, saved
@@ -122,8 +121,8 @@ def composite_gradients(
     )  # fmt: skip
     rows = new_pair_rows(bins, channels, probed)
     composite_backward(real, num_channels, probed)(
-        blocks_for(len(saved.bucket_tiles), WARPS), THREADS, *flat_geometry(splats), channels.view(-1, num_channels),
-        marks, count, num_primary, channel, bins.width, bins.height, bins.pair_splats, bins.tile_offsets, bins.active,
+        blocks_for(len(saved.bucket_tiles), WARPS), THREADS, *joined_cameras((*splats[:3], channels)), marks,
+        count, num_primary, channel, bins.width, bins.height, bins.pair_splats, bins.tile_offsets, bins.active,
         saved.last.view(-1), saved.looked_at, saved.bucket_tiles, saved.kept.view(-1), saved.kept_spread.view(-1),
         pulls.view(-1), rows,
     )  # fmt: skip
@@ -145,11 +144,6 @@ def through_mean(
     v_image = v_image.clone()
     v_image[..., channel] += v_sum
     return v_image, v_alpha - v_sum * saved.center
-
-
-def flat_geometry(splats: Splats) -> tuple[Tensor, Tensor, Tensor]:
-    """means2d [S, 2], conics [S, 3] and opacities [S] of the splats of all cameras."""
-    return splats.means2d.view(-1, 2), splats.conics.view(-1, 3), splats.opacities.view(-1)
 
 
 @cache

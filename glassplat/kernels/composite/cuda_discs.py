@@ -20,7 +20,7 @@ from torch import Tensor
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.backend.devices import SIMULATED
-from glassplat.kernels.composite.cpu_tile import place
+from glassplat.kernels.composite.cpu_tile import joined_cameras, place
 from glassplat.kernels.composite.cuda_tile import BUCKET, PIXELS, at
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Scalar, blend_maths
 from glassplat.kernels.maths.disc import MAP, MOST_DEVIATIONS, meet_slopes
@@ -38,25 +38,6 @@ LAST, MEDIAN, ORDERS = range(3)
 KEPT_T, KEPT_DEPTH, KEPT_TOTAL, KEPT_SQUARES, KEPT_VALUES = range(5)
 
 
-class DiscTileFunctions(NamedTuple):
-    """Compiled steps.
-
-    Attributes:
-        load: copies one disc's geometry into row `i` of an array, and returns the rows of pixels that its outline
-            reaches, a bit for each.
-        cover: ((dx, dy), (u, v, 1 / e), e, coverage, on the disc itself) of the disc in row `i` and the pixel in column
-            x and row y of the tile, as `cpu_tile.DiscFunctions.cover`.
-    """
-
-    load: Scalar
-    cover: Scalar
-
-
-def disc_tile_steps(real: type) -> DiscTileFunctions:
-    """Builds the functions for `real`, np.float32 or np.float64."""
-    return DiscTileFunctions(_load(real), _cover(real))
-
-
 def _load(real: type) -> Scalar:
     maths = blend_maths(real)
     vertical_reach, row_range = maths.vertical_reach, maths.row_range
@@ -64,6 +45,7 @@ def _load(real: type) -> Scalar:
 
     @inlined
     def load(geometry, i, s, means, maps, opacities, depths, centers, conics, x0, y0, num_rows):
+        """Copies a disc's geometry into row `i` of an array; returns the rows its outline reaches, a bit for each."""
         opacity, depth, total = opacities[s], depths[s], means[s, 0] + means[s, 1] + depths[s]
         geometry[i, CENTER_X], geometry[i, CENTER_Y] = means[s, 0] - real(x0) - half, means[s, 1] - real(y0) - half
         for j in range(6):
@@ -90,6 +72,7 @@ def _cover(real: type) -> Scalar:
 
     @inlined
     def cover(geometry, i, x, y, near, sharpness):
+        """As in `cpu_discs`, of the disc in row `i` and the pixel in column x and row y of the tile."""
         dx, dy = x - geometry[i, CENTER_X], y - geometry[i, CENTER_Y]
         # Written out, because the compiler would choose anew in every kernel which products and sums to fuse: a disc
         # at exactly 1/255 could be in the image and not in its gradient.
@@ -148,7 +131,7 @@ def composite_discs_pulls(real: type, num_channels: int = 6) -> Kernel:
         if column >= columns or row >= rows:
             return
         y, x = y0 + row, x0 + column
-        t, total, squares = finals[n, 0, pixel], finals[n, 2, pixel], finals[n, 3, pixel]
+        t, total, squares = finals[n, T, pixel], finals[n, TOTAL, pixel], finals[n, SQUARES, pixel]
         covered, v_spread = one - t, v_distortion[camera, y, x]
         # alpha = 1 - T: its gradient acts like something behind every disc.
         gathered = v_depth[camera, y, x] * depth[camera, y, x] - v_alpha[camera, y, x] * t
@@ -161,7 +144,7 @@ def composite_discs_pulls(real: type, num_channels: int = 6) -> Kernel:
         pulls[n, num_channels + V_DEPTH, pixel] = v_depth[camera, y, x]
         pulls[n, num_channels + V_MEDIAN, pixel] = v_median[camera, y, x]
         pulls[n, num_channels + V_DISTORTION, pixel], pulls[n, num_channels + GATHERED, pixel] = v_spread, gathered
-        pulls[n, num_channels + PULL_FIRST, pixel] = finals[n, 1, pixel]
+        pulls[n, num_channels + PULL_FIRST, pixel] = finals[n, FIRST, pixel]
         pulls[n, num_channels + PULL_COVERED, pixel] = covered
         pulls[n, num_channels + PULL_TOTAL, pixel], pulls[n, num_channels + PULL_SQUARES, pixel] = total, squares
 
@@ -195,7 +178,7 @@ def _enter(real: type, num_channels: int) -> Scalar:
 @cache
 def composite_discs_backward(real: type, num_channels: int = 6) -> Kernel:
     """Fills one gradient row per pair that any pixel blended; all rows start at zero."""
-    load, cover = disc_tile_steps(real)
+    load, cover = _load(real), _cover(real)
     reciprocal, enter = reciprocal_maths(real), _enter(real, num_channels)
     zero, one, two, alpha_max, endless = real(0.0), real(1.0), real(2.0), real(ALPHA_MAX), real(np.inf)
     behinds, lasts, middles = BEHIND, BLENDED, MIDDLE
@@ -319,8 +302,8 @@ SUM_THREADS = 256
 class Saved(NamedTuple):
     """Results of the forward pass for the backward pass.
 
-    finals [A, 4, 256], orders [A, 2, 256] int32: of each pixel of the active tiles, the planes that `cuda_tile` names;
-    orders count from the tile's first pair, -1 for none. looked_at [A] int32: how many pairs of each tile any pixel
+    finals [A, 4, 256], orders [A, 2, 256] int32: of each pixel of the active tiles, the planes named above; orders
+    count from the tile's first pair, -1 for none. looked_at [A] int32: how many pairs of each tile any pixel
     blended. bucket_tiles [B] int32: the active tile that each bucket belongs to, -1 for none. kept [B, D + 4, 256]:
     what each pixel had gathered before a bucket. outputs: image and depth.
     """
@@ -352,8 +335,8 @@ def composite_discs(
         (image.detach(), depth.detach()),
     )
     composite_discs_forward(REAL_OF[channels.dtype], num_channels)(
-        tiles, PIXELS, *_geometry(discs), channels.view(-1), near, _sharpness(low_pass),
-        bins.pair_splats, bins.tile_offsets, bins.active, *saved[:5], image, *flat,
+        tiles, PIXELS, *joined_cameras((*discs[:4], *discs.outlines[:2])), channels.view(-1),
+        near, _sharpness(low_pass), bins.pair_splats, bins.tile_offsets, bins.active, *saved[:5], image, *flat,
     )  # fmt: skip
     return image, alpha, depth, median, distortion, saved
 
@@ -371,7 +354,8 @@ def composite_discs_gradients(
     )  # fmt: skip
     rows = channels.new_zeros(len(bins.pair_splats), MOMENTS + num_channels)
     composite_discs_backward(real, num_channels)(
-        blocks_for(len(saved.bucket_tiles), WARPS), THREADS, *_geometry(discs), channels.view(-1, num_channels),
+        blocks_for(len(saved.bucket_tiles), WARPS), THREADS,
+        *joined_cameras((*discs[:4], *discs.outlines[:2], channels)),
         near, _sharpness(low_pass), bins.width, bins.height, bins.pair_splats, bins.tile_offsets, bins.active,
         saved.orders.view(-1), saved.looked_at, saved.bucket_tiles, saved.kept.view(-1), pulls.view(-1), rows,
     )  # fmt: skip
@@ -401,23 +385,10 @@ def _sharpness(low_pass: float) -> float:
     return 1 / low_pass**2 if low_pass else float("inf")
 
 
-def _geometry(discs: Discs) -> tuple[Tensor, ...]:
-    """Geometry of the discs of all cameras: centres, maps, opacities, depths, outlines' centres and conics."""
-    outlines = discs.outlines
-    return (
-        discs.means2d.view(-1, 2),
-        discs.maps.view(-1, MAP),
-        discs.opacities.view(-1),
-        discs.depths.view(-1),
-        outlines.means2d.view(-1, 2),
-        outlines.conics.view(-1, 3),
-    )
-
-
 @cache
 def composite_discs_forward(real: type, num_channels: int = 6) -> Kernel:
     """Fills the images of the active tiles, and what the backward pass needs."""
-    load, cover = disc_tile_steps(real)
+    load, cover = _load(real), _cover(real)
     zero, half, one, two = real(0.0), real(0.5), real(1.0), real(2.0)
     t_min, alpha_max, stopped = real(TRANSMITTANCE_MIN), real(ALPHA_MAX), np.int32(PIXELS)
 
@@ -503,8 +474,8 @@ def composite_discs_forward(real: type, num_channels: int = 6) -> Kernel:
         cuda.syncthreads()
         if pixel == 0:
             looked_at[n] = most[0]
-        finals[n, 0, pixel], finals[n, 1, pixel] = t, first_seen
-        finals[n, 2, pixel], finals[n, 3, pixel] = total, squares
+        finals[n, T, pixel], finals[n, FIRST, pixel] = t, first_seen
+        finals[n, TOTAL, pixel], finals[n, SQUARES, pixel] = total, squares
         orders[n, LAST, pixel], orders[n, MEDIAN, pixel] = last_order, middle_order
         if inside:
             alpha[camera, y0 + row, x0 + column], depth[camera, y0 + row, x0 + column] = one - t, far

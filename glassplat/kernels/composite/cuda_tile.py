@@ -9,7 +9,6 @@ worked out once per splat.
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 from numba import cuda
@@ -42,32 +41,15 @@ ALIGNMENT = None if SIMULATED else 16
 """Bytes that one load fetches of shared memory; the simulator takes none."""
 
 
-class TileFunctions(NamedTuple):
-    """Compiled steps that every blending kernel takes.
-
-    Attributes:
-        load: copies one splat's geometry into row `i` of an array, and returns the rows of pixels that it reaches, a
-            bit for each.
-        coverage: opacity times falloff of the splat in row `i` at the pixel in column x and row y of the tile.
-    """
-
-    load: Scalar
-    coverage: Scalar
-
-
-def tile_steps(real: type) -> TileFunctions:
-    """Builds the functions for `real`, np.float32 or np.float64."""
-    return TileFunctions(_load(real), _coverage(real))
-
-
-def _load(real: type) -> Scalar:
+def tile_steps(real: type) -> tuple[Scalar, Scalar]:
+    """Steps that every blending kernel takes: `load` and `coverage`."""
     maths = blend_maths(real)
     screen_form, vertical_reach, row_range = maths.screen_form, maths.vertical_reach, maths.row_range
-
-    half = real(0.5)
+    exp2, fused, half = exp2_maths(real), fused_maths(), real(0.5)
 
     @inlined
     def load(geometry, i, s, means, conics, opacities, x0, y0, num_rows):
+        """Copies a splat's geometry into row `i` of an array; returns the rows of pixels it reaches, a bit for each."""
         xx, xy, yy, opacity = conics[s, 0], conics[s, 1], conics[s, 2], opacities[s]
         mean_y = means[s, 1] - real(y0)
         geometry[i, MEAN_X], geometry[i, MEAN_Y] = means[s, 0] - real(x0) - half, mean_y - half
@@ -76,14 +58,9 @@ def _load(real: type) -> Scalar:
         first, last = row_range(mean_y, vertical_reach(xx, xy, yy, opacity), num_rows)
         return np.int32((1 << last) - (1 << first))
 
-    return load
-
-
-def _coverage(real: type) -> Scalar:
-    exp2, fused = exp2_maths(real), fused_maths()
-
     @inlined
     def coverage(geometry, i, x, y):
+        """Opacity times falloff of the splat in row `i` at the pixel in column x and row y of the tile."""
         dx, dy = x - geometry[i, MEAN_X], y - geometry[i, MEAN_Y]
         # Written out, because the compiler would choose anew in every kernel which products and sums to fuse: a splat
         # at exactly 1/255 could be in the image and not in its gradient.
@@ -91,7 +68,7 @@ def _coverage(real: type) -> Scalar:
         exponent = fused(along, dx, geometry[i, FORM_YY] * dy * dy)
         return geometry[i, OPACITY] * exp2(exponent)
 
-    return coverage
+    return load, coverage
 
 
 THREADS = 256

@@ -21,7 +21,7 @@ from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.environment.cpu import gradients_like
 from glassplat.kernels.maths.blending import Scalar
-from glassplat.kernels.maths.cube import cube_maths, mirrored, mirrored_gradient, over_column, over_row
+from glassplat.kernels.maths.cube import cube_maths, lookup_maths, mirrored, mirrored_gradient, over_column, over_row
 from glassplat.kernels.maths.projection import dot
 from glassplat.kernels.maths.surface import surface_maths
 from glassplat.kernels.records import NORMAL_AT, NORMAL_MIN, REAL_OF, STRENGTH_AT, SURFACE_CHANNELS, Shaded
@@ -253,22 +253,13 @@ def cube_lookup_gradients(texels: Tensor, directions: Tensor, cotangents: Tensor
 @cache
 def cube_lookup_forward(real: type) -> Kernel:
     """Fills what padded faces show."""
-    maths = cube_maths(real)
-    on_face, cell, between = maths.on_face, maths.cell, maths.between
+    look_up, _ = lookup_maths(real)
 
     @kernel("cube_lookup_forward", real, "real4 real2 real2")
     def forward(padded, directions, found):
-        i, size = cuda.grid(1), padded.shape[1] - 2
-        if i >= directions.shape[0]:
-            return
-        _, face, u, v, _ = on_face(directions[i, 0], directions[i, 1], directions[i, 2])
-        column, along = cell(u, size)
-        row, down = cell(v, size)
-        upper, lower = padded[face, row], padded[face, row + 1]
-        for d in range(padded.shape[3]):
-            found[i, d] = between(
-                upper[column, d], upper[column + 1, d], lower[column, d], lower[column + 1, d], along, down
-            )
+        i = cuda.grid(1)
+        if i < directions.shape[0]:
+            look_up(i, padded, directions, found)
 
     return forward
 
@@ -276,32 +267,14 @@ def cube_lookup_forward(real: type) -> Kernel:
 @cache
 def cube_lookup_backward(real: type) -> Kernel:
     """Fills the gradients of the directions, and which cells each lookup blends at which fractions."""
-    maths = cube_maths(real)
-    on_face, from_face, cell, slopes = maths.on_face, maths.from_face, maths.cell, maths.slopes
-    zero, half = real(0.0), real(0.5)
+    _, look_up_gradient = lookup_maths(real)
 
     @kernel("cube_lookup_backward", real, "real4 real2 real2 real2 int1 real2")
     def backward(padded, directions, v_found, v_directions, first_cells, fractions):
-        i, side = cuda.grid(1), padded.shape[1]
-        if i >= directions.shape[0]:
-            return
-        place = on_face(directions[i, 0], directions[i, 1], directions[i, 2])
-        face = place[1]
-        column, along = cell(place[2], side - 2)
-        row, down = cell(place[3], side - 2)
-        upper, lower = padded[face, row], padded[face, row + 1]
-        v_along, v_down = zero, zero
-        for d in range(padded.shape[3]):
-            by_along, by_down = slopes(
-                upper[column, d], upper[column + 1, d], lower[column, d], lower[column + 1, d], along, down
-            )
-            v_along += v_found[i, d] * by_along
-            v_down += v_found[i, d] * by_down
-        texels_per_u = half * real(side - 2)
-        x, y, z = from_face(place, v_along * texels_per_u, v_down * texels_per_u)
-        v_directions[i, 0], v_directions[i, 1], v_directions[i, 2] = x, y, z
-        first_cells[i] = (face * side + row) * side + column
-        fractions[i, 0], fractions[i, 1] = along, down
+        i = cuda.grid(1)
+        if i < directions.shape[0]:
+            row, column = look_up_gradient(i, padded, directions, v_found, v_directions, fractions)
+            first_cells[i] = row * padded.shape[1] + column
 
     return backward
 

@@ -32,7 +32,6 @@ class BlendMaths(NamedTuple):
     Attributes:
         exp2: 2^t for t <= 0. NaN and anything below -80 give 2^-80, which is far below `ALPHA_MIN`.
         screen_form: a conic scaled so that a Gaussian falls off as 2^(quadratic form of the offset).
-        clipped_alpha: the coverage that blends, of opacity times falloff: 0 below `ALPHA_MIN`, at most `ALPHA_MAX`.
         vertical_reach: distance in rows from its centre at which a splat's coverage sinks to `ALPHA_MIN`;
             negative where it reaches nothing.
         row_range: first and one-past-last of the rows 0 .. count - 1 that a splat reaches.
@@ -40,7 +39,6 @@ class BlendMaths(NamedTuple):
 
     exp2: Scalar
     screen_form: Scalar
-    clipped_alpha: Scalar
     vertical_reach: Scalar
     row_range: Scalar
 
@@ -48,7 +46,7 @@ class BlendMaths(NamedTuple):
 def blend_maths(real: type) -> BlendMaths:
     """Builds the functions for `real`, np.float32 or np.float64."""
     exp2 = _fast_exp2(real) if real is np.float32 else _exact_exp2(real)
-    return BlendMaths(exp2, _screen_form(real), _clipped_alpha(real), _vertical_reach(real), _row_range(real))
+    return BlendMaths(exp2, _screen_form(real), _vertical_reach(real), _row_range(real))
 
 
 def _fast_exp2(real: type) -> Scalar:
@@ -89,17 +87,6 @@ def _screen_form(real: type) -> Scalar:
         return half_bits * conic_xx, bits * conic_xy, half_bits * conic_yy
 
     return screen_form
-
-
-def _clipped_alpha(real: type) -> Scalar:
-    zero, smallest, largest = real(0.0), real(ALPHA_MIN), real(ALPHA_MAX)
-
-    @inlined
-    def clipped_alpha(coverage):  # type: ignore[no-untyped-def]
-        clamped = coverage if coverage < largest else largest
-        return clamped if coverage >= smallest else zero
-
-    return clipped_alpha
 
 
 def _vertical_reach(real: type) -> Scalar:

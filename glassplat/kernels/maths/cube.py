@@ -120,6 +120,48 @@ def _logistic(real: type) -> Scalar:
     return logistic
 
 
+def lookup_maths(real: type) -> tuple[Scalar, Scalar]:
+    """What padded faces show in direction `i`, and the gradient of that direction."""
+    on_face, from_face, cell, between, slopes, _ = cube_maths(real)
+    zero, half = real(0.0), real(0.5)
+
+    @inlined
+    def look_up(i, padded, directions, found):  # type: ignore[no-untyped-def]
+        size = padded.shape[1] - 2
+        _, face, u, v, _ = on_face(directions[i, 0], directions[i, 1], directions[i, 2])
+        column, along = cell(u, size)
+        row, down = cell(v, size)
+        upper, lower = padded[face, row], padded[face, row + 1]
+        for d in range(padded.shape[3]):
+            found[i, d] = between(
+                upper[column, d], upper[column + 1, d], lower[column, d], lower[column + 1, d], along, down
+            )
+
+    @inlined
+    def look_up_gradient(i, padded, directions, v_found, v_directions, fractions):  # type: ignore[no-untyped-def]
+        """Also fills the fractions; returns the row of cells, counted over all faces, and the column."""
+        side = padded.shape[1]
+        place = on_face(directions[i, 0], directions[i, 1], directions[i, 2])
+        face = place[1]
+        column, along = cell(place[2], side - 2)
+        row, down = cell(place[3], side - 2)
+        upper, lower = padded[face, row], padded[face, row + 1]
+        v_along, v_down = zero, zero
+        for d in range(padded.shape[3]):
+            by_along, by_down = slopes(
+                upper[column, d], upper[column + 1, d], lower[column, d], lower[column + 1, d], along, down
+            )
+            v_along += v_found[i, d] * by_along
+            v_down += v_found[i, d] * by_down
+        texels_per_u = half * real(side - 2)
+        x, y, z = from_face(place, v_along * texels_per_u, v_down * texels_per_u)
+        v_directions[i, 0], v_directions[i, 1], v_directions[i, 2] = x, y, z
+        fractions[i, 0], fractions[i, 1] = along, down
+        return face * side + row, column
+
+    return look_up, look_up_gradient
+
+
 TWO = np.float32(2.0)
 """In single precision, which holds it exactly, so that it widens nothing."""
 

@@ -12,6 +12,7 @@ from typing import NamedTuple, get_args
 from glassplat.kernels import Fresnel
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import Scalar
+from glassplat.kernels.maths.images import color_space_maths
 
 LAWS: tuple[Fresnel, ...] = get_args(Fresnel)
 """Kernels are given a law as its position here."""
@@ -62,6 +63,42 @@ def pane_maths(real: type) -> PaneMaths:
         return real(math.sqrt(x * x + y * y + one))
 
     return PaneMaths(strength, strength_slopes, ray_length)
+
+
+def mixing(real: type) -> tuple[Scalar, Scalar]:
+    """Blending of one channel of a pixel, sRGB, with what a pane mirrors there; and its adjoint.
+
+    `share` is how strongly the pane reflects, `gain` the intensity of the reflection, and `linear` says whether light
+    is blended rather than sRGB values.
+    """
+    linear_of, linear_slope, encoded, encoded_slope = color_space_maths(real)
+    one = real(1.0)
+
+    @inlined
+    def mix(behind, mirrored, gain, share, linear):  # type: ignore[no-untyped-def]
+        """The blended channel, and the reflection with its intensity."""
+        if linear:
+            lit, bright = linear_of(behind), linear_of(mirrored) * gain
+            return encoded(lit + share * (bright - lit)), encoded(bright)
+        bright = mirrored * gain
+        return behind + share * (bright - behind), bright
+
+    @inlined
+    def unmix(behind, mirrored, gain, share, linear, v_mixed, v_bright):  # type: ignore[no-untyped-def]
+        """Gradients of the first four, given those of what `mix` returns."""
+        if linear:
+            lit, shone = linear_of(behind), linear_of(mirrored)
+            bright = shone * gain
+            mixed = lit + share * (bright - lit)
+            v_mixed *= encoded_slope(mixed, encoded(mixed))
+            v_bright = v_mixed * share + v_bright * encoded_slope(bright, encoded(bright))
+            v_behind = v_mixed * (one - share) * linear_slope(behind, lit)
+            v_mirrored = v_bright * gain * linear_slope(mirrored, shone)
+            return v_behind, v_mirrored, v_bright * shone, v_mixed * (bright - lit)
+        v_bright += v_mixed * share
+        return v_mixed * (one - share), v_bright * gain, v_bright * mirrored, v_mixed * (mirrored * gain - behind)
+
+    return mix, unmix
 
 
 def _schlick(real: type) -> tuple[Scalar, Scalar]:

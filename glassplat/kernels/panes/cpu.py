@@ -32,7 +32,7 @@ from glassplat.kernels.backend.cpu_vector import (
 )
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.images import color_space_maths
-from glassplat.kernels.maths.pane import pane_maths
+from glassplat.kernels.maths.pane import mixing, pane_maths
 from glassplat.kernels.records import DAZZLING, REAL_OF, TILE, PaneHits
 
 
@@ -246,24 +246,16 @@ def _shine(real: type) -> Scalar:
 
 
 def _mix(real: type) -> Scalar:
-    linear_of, _, encoded, _ = color_space_maths(real)
+    mix_one, _ = mixing(real)
 
     @inlined
     def mix(run, d, linear):
         """Blends channel d of a run into RGB and BRIGHT."""
         at = d * RUN
         for i in range(RUN):
-            behind, mirrored = run[BEHIND + at + i], run[MIRRORED + at + i]
-            gain, share = run[GAIN + i], run[SHARE + i]
-            if linear:
-                lit = linear_of(behind)
-                bright = linear_of(mirrored) * gain
-                run[RGB + at + i] = encoded(lit + share * (bright - lit))
-                run[BRIGHT + at + i] = encoded(bright)
-            else:
-                bright = mirrored * gain
-                run[RGB + at + i] = behind + share * (bright - behind)
-                run[BRIGHT + at + i] = bright
+            run[RGB + at + i], run[BRIGHT + at + i] = mix_one(
+                run[BEHIND + at + i], run[MIRRORED + at + i], run[GAIN + i], run[SHARE + i], linear
+            )
 
     return mix
 
@@ -317,34 +309,21 @@ def blend_panes_forward(real: type) -> Kernel:
 
 
 def _unmix(real: type) -> Scalar:
-    linear_of, linear_slope, encoded, encoded_slope = color_space_maths(real)
-    zero, one = real(0.0), real(1.0)
+    (_, unmix_one), zero = mixing(real), real(0.0)
 
     @inlined
     def unmix(run, d, linear):
         """Gradients of channel d; those of BEHIND and MIRRORED replace V_RGB and V_BRIGHT, the others add up."""
         at = d * RUN
         for i in range(RUN):
-            behind, mirrored = run[BEHIND + at + i], run[MIRRORED + at + i]
-            gain, share = run[GAIN + i], run[SHARE + i]
+            share = run[SHARE + i]
             v_mixed = run[V_RGB + at + i] if share > zero else zero
-            v_bright = run[V_BRIGHT + at + i]
-            if linear:
-                lit, shone = linear_of(behind), linear_of(mirrored)
-                bright = shone * gain
-                mixed = lit + share * (bright - lit)
-                v_mixed *= encoded_slope(mixed, encoded(mixed))
-                v_bright = v_mixed * share + v_bright * encoded_slope(bright, encoded(bright))
-                run[V_SHARE + i] += v_mixed * (bright - lit)
-                run[V_GAIN + i] += v_bright * shone
-                run[V_RGB + at + i] = v_mixed * (one - share) * linear_slope(behind, lit)
-                run[V_BRIGHT + at + i] = v_bright * gain * linear_slope(mirrored, shone)
-            else:
-                v_bright += v_mixed * share
-                run[V_SHARE + i] += v_mixed * (mirrored * gain - behind)
-                run[V_GAIN + i] += v_bright * mirrored
-                run[V_RGB + at + i] = v_mixed * (one - share)
-                run[V_BRIGHT + at + i] = v_bright * gain
+            run[V_RGB + at + i], run[V_BRIGHT + at + i], v_gain, v_share = unmix_one(
+                run[BEHIND + at + i], run[MIRRORED + at + i], run[GAIN + i], share, linear,
+                v_mixed, run[V_BRIGHT + at + i],
+            )  # fmt: skip
+            run[V_GAIN + i] += v_gain
+            run[V_SHARE + i] += v_share
 
     return unmix
 

@@ -14,7 +14,7 @@ from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.images import color_space_maths
-from glassplat.kernels.maths.pane import pane_maths
+from glassplat.kernels.maths.pane import mixing, pane_maths
 from glassplat.kernels.records import DAZZLING, REAL_OF, TILE, PaneHits
 
 PIXELS = TILE * TILE
@@ -152,8 +152,7 @@ def _shine(real: type) -> Scalar:
 @cache
 def blend_panes_forward(real: type) -> Kernel:
     """Fills rgb, reflection and strength."""
-    shine = _shine(real)
-    linear_of, _, encoded, _ = color_space_maths(real)
+    shine, (mix, _) = _shine(real), mixing(real)
     zero, one = real(0.0), real(1.0)
 
     @kernel("blend_panes_forward", real, f"{INPUTS} real3 real3 real2")
@@ -176,14 +175,7 @@ def blend_panes_forward(real: type) -> Kernel:
         for d in range(3):
             behind, bright, mixed = transmission[row, column, d], zero, transmission[row, column, d]
             if shown:
-                mirrored = reflections[k, row, column, d]
-                if linear:
-                    lit, shone = linear_of(behind), linear_of(mirrored) * gain
-                    bright = encoded(shone)
-                    mixed = encoded(lit + share * (shone - lit))
-                else:
-                    bright = mirrored * gain
-                    mixed = behind + share * (bright - behind)
+                mixed, bright = mix(behind, reflections[k, row, column, d], gain, share, linear)
             rgb[row, column, d] = mixed if share > zero else behind
             reflection[row, column, d] = bright
 
@@ -195,8 +187,7 @@ def blend_panes_backward(real: type) -> Kernel:
     """Fills the gradients of transmission, mask and reflections, and each pixel's share [H, W, 4] of those of its
     pane's normal and base reflectance; all but the first start at zero.
     """
-    shine, strength_slopes = _shine(real), pane_maths(real).strength_slopes
-    linear_of, linear_slope, encoded, encoded_slope = color_space_maths(real)
+    shine, strength_slopes, (_, unmix) = _shine(real), pane_maths(real).strength_slopes, mixing(real)
     zero, one, dazzling = real(0.0), real(1.0), real(DAZZLING)
 
     @kernel("blend_panes_backward", real, f"{INPUTS} real3 real3 real2 real3 real2 real4 real3")
@@ -217,26 +208,15 @@ def blend_panes_backward(real: type) -> Kernel:
         share, v_share, v_gain = raw * marked, v_strength[row, column], zero
         gain = one + reflections[k, row, column, 3] if intensity else one
         for d in range(3):
-            behind, mirrored = transmission[row, column, d], reflections[k, row, column, d]
-            v_behind, v_bright = v_rgb[row, column, d], v_reflection[row, column, d]
-            v_mixed = v_behind if share > zero else zero
-            if linear:
-                lit, shone = linear_of(behind), linear_of(mirrored)
-                bright = shone * gain
-                mixed = lit + share * (bright - lit)
-                v_mixed *= encoded_slope(mixed, encoded(mixed))
-                v_bright = v_mixed * share + v_bright * encoded_slope(bright, encoded(bright))
-                v_share += v_mixed * (bright - lit)
-                v_gain += v_bright * shone
-                mixed_behind = v_mixed * (one - share) * linear_slope(behind, lit)
-                v_reflections[k, row, column, d] = v_bright * gain * linear_slope(mirrored, shone)
-            else:
-                v_bright += v_mixed * share
-                v_share += v_mixed * (mirrored * gain - behind)
-                v_gain += v_bright * mirrored
-                mixed_behind = v_mixed * (one - share)
-                v_reflections[k, row, column, d] = v_bright * gain
-            v_transmission[row, column, d] = mixed_behind if share > zero else v_behind
+            v_pixel = v_rgb[row, column, d]
+            v_behind, v_mirrored, by_gain, by_share = unmix(
+                transmission[row, column, d], reflections[k, row, column, d], gain, share, linear,
+                v_pixel if share > zero else zero, v_reflection[row, column, d],
+            )  # fmt: skip
+            v_gain += by_gain
+            v_share += by_share
+            v_reflections[k, row, column, d] = v_mirrored
+            v_transmission[row, column, d] = v_behind if share > zero else v_pixel
         v_reflections[k, row, column, 3] = v_gain if intensity else zero
         v_mask[row, column] = v_share * raw
         v_raw = v_share * marked if gain <= dazzling else zero

@@ -32,7 +32,18 @@ from glassplat.kernels.backend.cpu_vector import (
 from glassplat.kernels.maths.blending import Scalar
 from glassplat.kernels.maths.disc import MAP
 from glassplat.kernels.maths.projection import screen_maths
-from glassplat.kernels.project.cpu_lanes import COLUMNS, LANES, gather, gather_shapes, gradient_steps, lane_steps
+from glassplat.kernels.project.cpu_lanes import (
+    COLUMNS,
+    LANES,
+    color_gradient_of,
+    color_steps,
+    gather,
+    gather_shapes,
+    load_triples_of,
+    may_show_of,
+    place_gradient_of,
+    place_of,
+)
 from glassplat.kernels.project.disc_steps import discs
 from glassplat.kernels.project.steps import (
     CHUNK,
@@ -168,7 +179,7 @@ OWN, SHARED = 11, 12
 
 
 def _place_backward(real: type) -> Callable[..., Any]:
-    place_gradient = gradient_steps(real).place_gradient
+    place_gradient = place_gradient_of(real)
 
     @inlined
     def place_backward(
@@ -229,7 +240,7 @@ def _add_coefficients(real: type) -> Callable[..., Any]:
 
 
 def _color_backward(real: type) -> Callable[..., Any]:
-    tabulate, color_gradient = lane_steps(real).tabulate, gradient_steps(real).color_gradient
+    (tabulate, _), color_gradient = color_steps(real), color_gradient_of(real)
     add_coefficients, add_view = _add_coefficients(real), camera_sums(real)[1]
     zero, whole = real(0.0), COLUMNS * LANES
 
@@ -359,7 +370,7 @@ def project_gradients(
 
 def listing(real: type) -> Callable[..., Any]:
     """The step that lists the Gaussians of a chunk that may show in a camera."""
-    load_triples, may_show, *_ = lane_steps(real)
+    load_triples, may_show = load_triples_of(real), may_show_of(real)
 
     @inlined
     def list_candidates(
@@ -391,7 +402,7 @@ def listing(real: type) -> Callable[..., Any]:
 
 def placing_listed(real: type) -> Callable[..., Any]:
     """The step that fills everything but the colours of those listed that are visible."""
-    place, half_extents = lane_steps(real).place, screen_maths(real).half_extents
+    place, half_extents = place_of(real), screen_maths(real).half_extents
     zero = real(0.0)
     U, V, XX, XY, YY, DEPTH, OPACITY, WIDE, HIGH = (field * LANES for field in range(9))
 
@@ -432,7 +443,7 @@ def placing_listed(real: type) -> Callable[..., Any]:
 
 def coloring(real: type) -> Callable[..., Any]:
     """The step that fills the colours of those listed; whoever has none that is finite is culled."""
-    *_, tabulate, color = lane_steps(real)
+    tabulate, color = color_steps(real)
     cull, full = culling(real)[0], vector_kind(real, LANES).full
     zero, half, largest = real(0.0), real(0.5), real(np.finfo(real).max)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -31,32 +31,13 @@ from glassplat.kernels.backend.cpu_vector import (
 )
 from glassplat.kernels.maths.harmonics import channel_with, color_gradient_with, harmonic_basis
 from glassplat.kernels.maths.projection import LOW_PASS, dot, scaled_sum, shape_maths, tangential
-from glassplat.kernels.project.steps import MOST_DEVIATIONS, place_gradients, pose, vec3, view_with
+from glassplat.kernels.project.steps import MOST_SQUARED_DEVIATIONS, place_gradients, pose, vec3, view_with
 
 LANES = 16
 COLUMNS = 48
 """Coefficients of a Gaussian at most."""
 
 Step = Callable[..., Any]
-
-
-class LaneSteps(NamedTuple):
-    """Steps that take `LANES` Gaussians.
-
-    Attributes:
-        load_triples: three vectors from an array of triples, of the Gaussians from one on.
-        may_show: bits of those that are on the kept sides of a camera, and come near its window: safe, not exact.
-        place: (means on screen x and y, conic xx, xy and yy, depth, opacity, covariance xx and yy), and bits of those
-            that have finite ones; from columns of means (3), quaternions (4), log scales (3) and logits of opacities.
-        tabulate: puts the first coefficients of listed Gaussians, in columns, into the first half of a table.
-        color: (red, green, blue) of such columns, before offset and clamp, for columns of means.
-    """
-
-    load_triples: Step
-    may_show: Step
-    place: Step
-    tabulate: Step
-    color: Step
 
 
 @inlined
@@ -80,12 +61,8 @@ def gather_shapes(columns, listed, first, last, means, quats, log_scales, logit_
         columns[10 * LANES + i] = logit_opacities[n]
 
 
-def lane_steps(real: type) -> LaneSteps:
-    """Builds the steps for `real`, np.float32 or np.float64."""
-    return LaneSteps(_load_triples(real), _may_show(real), _place(real), *_color(real))
-
-
-def _load_triples(real: type) -> Step:
+def load_triples_of(real: type) -> Step:
+    """The step that gives three vectors from an array of triples, of the Gaussians from one on."""
     load = vector_kind(real, LANES).load
 
     @inlined
@@ -113,9 +90,10 @@ def _exponential(real: type) -> Step:
     return exp if real is np.float64 else fast
 
 
-def _may_show(real: type) -> Step:
+def may_show_of(real: type) -> Step:
+    """The step that gives bits of those on the kept sides of a camera that come near its window: safe, not exact."""
     exponential = _exponential(real)
-    zero, one, low_pass, most_deviations = real(0.0), real(1.0), real(LOW_PASS), real(MOST_DEVIATIONS)
+    zero, one, low_pass, most_squared = real(0.0), real(1.0), real(LOW_PASS), real(MOST_SQUARED_DEVIATIONS)
 
     @inlined
     def may_show(c, mean, log_scales, cam_from_world, intrinsics, lens, near, clip_planes, clips, windows):
@@ -132,8 +110,8 @@ def _may_show(real: type) -> Step:
         size = exponential(maximum(maximum(log_scales[0], log_scales[1]), log_scales[2])) * inverse_depth
         wide, high = size * (intrinsics[c, 0] * lens[c, 7]), size * (intrinsics[c, 1] * lens[c, 8])
         # NaN is beside nothing, which leaves the decision to the exact test.
-        beside_x = (past_x > zero) & (past_x * past_x > (wide * wide + low_pass) * most_deviations)
-        beside_y = (past_y > zero) & (past_y * past_y > (high * high + low_pass) * most_deviations)
+        beside_x = (past_x > zero) & (past_x * past_x > (wide * wide + low_pass) * most_squared)
+        beside_y = (past_y > zero) & (past_y * past_y > (high * high + low_pass) * most_squared)
         return bits_of(kept) & ~bits_of(beside_x | beside_y)
 
     return may_show
@@ -183,7 +161,11 @@ def views(real: type) -> Step:
     return view_with(real, held)
 
 
-def _place(real: type) -> Step:
+def place_of(real: type) -> Step:
+    """The step that places Gaussians on screen, from columns of means (3), quaternions (4), log scales (3) and logits.
+
+    It gives (mean x and y, conic xx, xy and yy, depth, opacity, covariance xx and yy), and bits of who has finite ones.
+    """
     shape, view, load = shapes(real), views(real), vector_kind(real, LANES).load
     zero, one, largest = real(0.0), real(1.0), real(np.finfo(real).max)
 
@@ -219,13 +201,15 @@ def channel_of(real: type) -> Step:
     return channel_with(take)
 
 
-def _color(real: type) -> tuple[Step, Step]:
+def color_steps(real: type) -> tuple[Step, Step]:
+    """The steps that tabulate coefficients, and that give colours from such a table."""
     load_rows, load, basis = row_loader(real, LANES), vector_kind(real, LANES).load, harmonic_basis(real)
     channel, one, whole = channel_of(real), real(1.0), COLUMNS * LANES
 
     @inlined
     def tabulate(table, listed, first, last, terms, sh, row_size, positions):
-        """Of the first `terms` coefficients, three numbers each; `sh` is flat, with rows of `row_size`.
+        """Puts the first `terms` coefficients of listed Gaussians, three numbers each, in columns into a table's first
+        half; `sh` is flat, with rows of `row_size`.
 
         The second half of the table is scratch, for rows so near the end of `sh` that whole vectors would reach beyond.
         """
@@ -243,6 +227,7 @@ def _color(real: type) -> tuple[Step, Step]:
 
     @inlined
     def color(table, means, at, degree, lens, c):
+        """(Red, green, blue) of such columns, before offset and clamp, for columns of means."""
         x = load(means, 0) - lens[c, 4]
         y, z = load(means, LANES) - lens[c, 5], load(means, 2 * LANES) - lens[c, 6]
         inverse_length = one / square_root(x * x + y * y + z * z)
@@ -256,27 +241,12 @@ def _color(real: type) -> tuple[Step, Step]:
     return tabulate, color
 
 
-class GradientSteps(NamedTuple):
-    """Steps that take `LANES` Gaussians.
+def place_gradient_of(real: type) -> Step:
+    """The adjoint of placing, from the same columns, followed by the gradients of means on screen (2), conics (3),
+    depths and opacities.
 
-    Attributes:
-        place_gradient: gradients of means (3), quaternions (4), log scales (3) and logits of opacities, and what each
-            Gaussian adds to that of the camera (12); from columns of these, followed by the gradients of the means on
-            screen (2), conics (3), depths and opacities.
-        color_gradient: from a table of coefficients and columns of means and of the gradients of colours, puts those of
-            the coefficients into another table, and returns those of the vector from the camera to the mean.
+    It gives the gradients of the first columns (11), and what each Gaussian adds to that of the camera (12).
     """
-
-    place_gradient: Step
-    color_gradient: Step
-
-
-def gradient_steps(real: type) -> GradientSteps:
-    """Builds the steps for `real`, np.float32 or np.float64."""
-    return GradientSteps(_place_gradient(real), _color_gradient(real))
-
-
-def _place_gradient(real: type) -> Step:
     unit_quat_gradient, (full, load) = shape_maths(real).unit_quat_gradient, vector_kind(real, LANES)
     shape, view, zero, one = shapes(real), views(real), real(0.0), real(1.0)
 
@@ -322,7 +292,12 @@ def _place_gradient(real: type) -> Step:
     return place_gradient
 
 
-def _color_gradient(real: type) -> Step:
+def color_gradient_of(real: type) -> Step:
+    """The adjoint of `color`, from a table of coefficients and columns of means and of the gradients of the colours.
+
+    It puts the gradients of the coefficients into the table from an index on, and gives those of the vector from the
+    camera to the mean.
+    """
     (full, load), basis, channel = vector_kind(real, LANES), harmonic_basis(real), channel_of(real)
     zero, half, one = real(0.0), real(0.5), real(1.0)
 
@@ -341,7 +316,6 @@ def _color_gradient(real: type) -> Step:
 
     @inlined
     def color_gradient(table, at, columns, degree, lens, c):
-        """Coefficients from index 0 of the table on, their gradients from `at` on."""
         x, y = load(columns, 0) - lens[c, 4], load(columns, LANES) - lens[c, 5]
         z, none = load(columns, 2 * LANES) - lens[c, 6], full(zero)
         inverse_length = one / square_root(x * x + y * y + z * z)

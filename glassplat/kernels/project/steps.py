@@ -142,7 +142,7 @@ def view_with(real: type, clamped: Callable[..., Any]) -> Callable[..., Any]:
     return view
 
 
-MOST_DEVIATIONS = 1.01 * 2.0 * math.log(1.0 / ALPHA_MIN)
+MOST_SQUARED_DEVIATIONS = 1.01 * 2.0 * math.log(1.0 / ALPHA_MIN)
 """Squared number of standard deviations within which any coverage sinks to `ALPHA_MIN`; a percent is slack."""
 
 

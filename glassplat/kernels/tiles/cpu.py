@@ -64,6 +64,49 @@ def pixel_range(low, high, size):
     return first, last
 
 
+@inlined
+def rows_of(means2d, conics, opacities, radii, s, height):
+    """First and last row of pixels that a splat reaches (last < first: none), and its half height."""
+    if not (radii[s, 0] > 0 and abs(means2d[s, 0]) + abs(means2d[s, 1]) < np.inf):
+        return 0, -1, -1.0
+    y = np.float64(means2d[s, 1])
+    reach = half_height(conics[s, 0], conics[s, 1], conics[s, 2], opacities[s])
+    if not reach >= 0.0:
+        return 0, -1, -1.0
+    first, last = pixel_range(y - reach, y + reach, height)
+    return first, last, reach
+
+
+@inlined
+def shape_of(means2d, conics, s, rows):
+    """Shape of a splat for `columns_of`."""
+    x, y = np.float64(means2d[s, 0]), np.float64(means2d[s, 1])
+    return x, y, rows[0], rows[1], outline(conics[s, 0], conics[s, 1], conics[s, 2], rows[2])
+
+
+@inlined
+def columns_of(shape, row, width):
+    """First and last tile that a splat touches in a row of tiles, last < first where it touches none."""
+    x, y, first, last, ellipse = shape
+    low, high = max(first, row * TILE) + 0.5 - y, min(last, row * TILE + TILE - 1) + 0.5 - y
+    left, right = band(ellipse, low, high)
+    first_pixel, last_pixel = pixel_range(x + left, x + right, width)
+    if first_pixel > last_pixel:
+        return 0, -1
+    return first_pixel // TILE, last_pixel // TILE
+
+
+@inlined
+def active_between(active_tiles, camera, row, left, right):
+    """Number of active tiles from one column to another, both included."""
+    found = right - left + 1
+    if active_tiles.size > 0:
+        for column in range(left, right + 1):
+            if not active_tiles[camera, row, column]:
+                found -= 1
+    return found
+
+
 @cache
 def tile_spans(real: type) -> Kernel:
     """Finds the splats that are to be seen, and the tile columns that each of them touches, tile row by tile row.
@@ -85,7 +128,6 @@ def tile_spans(real: type) -> Kernel:
         num_splats = opacities.size
         per_camera = num_splats // max(1, num_cameras)
         num_chunks = (num_splats + SPAN_CHUNK - 1) // SPAN_CHUNK
-        masked = active_tiles.size > 0
         # What a chunk finds stands from its first splat on, until it is known what all before it find.
         found, heights = np.empty(num_splats, np.int32), np.empty(num_splats)
         rows = np.empty((num_splats, 2), np.int32)
@@ -95,14 +137,9 @@ def tile_spans(real: type) -> Kernel:
             chunk = task * stride % num_chunks
             at, touched = chunk * SPAN_CHUNK, 0
             for s in range(chunk * SPAN_CHUNK, min(num_splats, (chunk + 1) * SPAN_CHUNK)):
-                if not (radii[s, 0] > 0 and abs(means2d[s, 0]) + abs(means2d[s, 1]) < np.inf):
-                    continue
-                y = np.float64(means2d[s, 1])
-                reach = half_height(conics[s, 0], conics[s, 1], conics[s, 2], opacities[s])
-                first, last = pixel_range(y - reach, y + reach, height)
-                if first <= last and reach >= 0.0:
-                    found[at], heights[at] = s, reach
-                    rows[at, 0], rows[at, 1] = first // TILE, last // TILE
+                first, last, reach = rows_of(means2d, conics, opacities, radii, s, height)
+                if first <= last:
+                    found[at], heights[at], rows[at, 0], rows[at, 1] = s, reach, first, last
                     touched += last // TILE - first // TILE + 1
                     at += 1
             counts[chunk + 1], row_counts[chunk + 1] = at - chunk * SPAN_CHUNK, touched
@@ -119,23 +156,13 @@ def tile_spans(real: type) -> Kernel:
             i, total = row_counts[chunk], 0
             for v in range(counts[chunk], counts[chunk + 1]):
                 source = chunk * SPAN_CHUNK + v - counts[chunk]
-                s, reach, row = found[source], heights[source], rows[source, 0]
-                kept[v], first_rows[v] = s, row
-                x, y = np.float64(means2d[s, 0]), np.float64(means2d[s, 1])
-                shape = outline(conics[s, 0], conics[s, 1], conics[s, 2], reach)
-                first, last = pixel_range(y - reach, y + reach, height)
-                while row <= rows[source, 1]:
-                    low, high = max(first, row * TILE) + 0.5 - y, min(last, row * TILE + TILE - 1) + 0.5 - y
-                    left, right = band(shape, low, high)
-                    first_pixel, last_pixel = pixel_range(x + left, x + right, width)
-                    spans[i, 0], spans[i, 1] = 0, -1
-                    if first_pixel <= last_pixel:
-                        spans[i, 0], spans[i, 1] = first_pixel // TILE, last_pixel // TILE
-                        total += spans[i, 1] - spans[i, 0] + 1
-                        if masked:
-                            for column in range(spans[i, 0], spans[i, 1] + 1):
-                                total -= not active_tiles[s // per_camera, row, column]
-                    row += 1
+                s, first, last = found[source], rows[source, 0], rows[source, 1]
+                kept[v], first_rows[v] = s, first // TILE
+                shape = shape_of(means2d, conics, s, (first, last, heights[source]))
+                for row in range(first // TILE, last // TILE + 1):
+                    left, right = columns_of(shape, row, width)
+                    spans[i, 0], spans[i, 1] = left, right
+                    total += active_between(active_tiles, s // per_camera, row, left, right)
                     i += 1
                 span_offsets[v + 1], slots[v + 1] = i, total
             slot_counts[chunk + 1] = total

@@ -18,9 +18,8 @@ from torch import Tensor
 
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.backend.cuda import Kernel, blocks_for, kernel
-from glassplat.kernels.maths.projection import band, half_height, outline
 from glassplat.kernels.records import REAL_OF, TILE, Splats, TileBins, check_pair_count
-from glassplat.kernels.tiles.cpu import pixel_range
+from glassplat.kernels.tiles.cpu import active_between, columns_of, rows_of, shape_of
 
 THREADS = 128
 
@@ -85,49 +84,6 @@ def _sequence(depths: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
     order = (torch.argsort(depths, dim=1, stable=True) + first).flatten()
     in_order = counts[order].long()
     return order, in_order.cumsum(0) - in_order
-
-
-@inlined
-def rows_of(means2d, conics, opacities, radii, s, height):
-    """First and last row of pixels that a splat reaches (last < first: none), and its half height."""
-    if not (radii[s, 0] > 0 and abs(means2d[s, 0]) + abs(means2d[s, 1]) < np.inf):
-        return 0, -1, -1.0
-    y = np.float64(means2d[s, 1])
-    reach = half_height(conics[s, 0], conics[s, 1], conics[s, 2], opacities[s])
-    if not reach >= 0.0:
-        return 0, -1, -1.0
-    first, last = pixel_range(y - reach, y + reach, height)
-    return first, last, reach
-
-
-@inlined
-def shape_of(means2d, conics, s, rows):
-    """Shape of a splat for `columns_of`."""
-    x, y = np.float64(means2d[s, 0]), np.float64(means2d[s, 1])
-    return x, y, rows[0], rows[1], outline(conics[s, 0], conics[s, 1], conics[s, 2], rows[2])
-
-
-@inlined
-def columns_of(shape, row, width):
-    """First and last tile that a splat touches in a row of tiles, last < first where it touches none."""
-    x, y, first, last, ellipse = shape
-    low, high = max(first, row * TILE) + 0.5 - y, min(last, row * TILE + TILE - 1) + 0.5 - y
-    left, right = band(ellipse, low, high)
-    first_pixel, last_pixel = pixel_range(x + left, x + right, width)
-    if first_pixel > last_pixel:
-        return 0, -1
-    return first_pixel // TILE, last_pixel // TILE
-
-
-@inlined
-def active_between(active_tiles, camera, row, left, right):
-    """Number of active tiles from one column to another, both included."""
-    found = right - left + 1
-    if active_tiles.size > 0:
-        for column in range(left, right + 1):
-            if not active_tiles[camera, row, column]:
-                found -= 1
-    return found
 
 
 @cache

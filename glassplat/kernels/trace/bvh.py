@@ -31,7 +31,7 @@ def level_offsets(count: int) -> list[int]:
     return offsets
 
 
-def half_widths_maths(real: type, flat: bool) -> Scalar:
+def _half_widths(real: type, flat: bool) -> Scalar:
     """Builds (x, y, z): half the size of a Gaussian's box, from its frame and how many deviations it reaches.
 
     Widened by what the faces of the box lose in rounding.
@@ -58,6 +58,26 @@ def half_widths_maths(real: type, flat: bool) -> Scalar:
         )
 
     return half_widths
+
+
+def leaf_fitting(real: type, flat: bool) -> Scalar:
+    """Builds the step that fits the box at place k of a node, which is empty, to a Gaussian that can be met."""
+    zero, nowhere, half_widths = real(0.0), real("inf"), _half_widths(real, flat)
+
+    @inlined
+    def fit_leaf(means, frames, extents, g, boxes, node, k):  # type: ignore[no-untyped-def]
+        if not extents[g] > zero:
+            return
+        x, y, z = half_widths(means, frames, g, extents[g])
+        # NaN and infinity fail the comparison, which leaves the box empty.
+        if abs(means[g, 0]) + x < nowhere:
+            boxes[node, 0, k], boxes[node, 3, k] = means[g, 0] - x, means[g, 0] + x
+        if abs(means[g, 1]) + y < nowhere:
+            boxes[node, 1, k], boxes[node, 4, k] = means[g, 1] - y, means[g, 1] + y
+        if abs(means[g, 2]) + z < nowhere:
+            boxes[node, 2, k], boxes[node, 5, k] = means[g, 2] - z, means[g, 2] + z
+
+    return fit_leaf
 
 
 BITS = 20

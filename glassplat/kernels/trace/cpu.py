@@ -27,8 +27,8 @@ from glassplat.kernels.maths.disc import ray_hit_maths
 from glassplat.kernels.maths.harmonics import color_maths
 from glassplat.kernels.records import REAL_OF, Bvh, Shapes
 from glassplat.kernels.trace import reach
-from glassplat.kernels.trace.bvh import half_widths_maths, hilbert_codes, level_offsets
-from glassplat.kernels.trace.cpu_traversal import arrays_of, packed_leaves, traversal
+from glassplat.kernels.trace.bvh import hilbert_codes, leaf_fitting, level_offsets
+from glassplat.kernels.trace.cpu_traversal import arrays_of, next_hits_maths, packed_leaves
 from glassplat.kernels.trace.steps import (
     CHUNK,
     FRAME_AT,
@@ -37,7 +37,9 @@ from glassplat.kernels.trace.steps import (
     PROBE_AT,
     STACK,
     WIDTH,
+    color_pull,
     coverage_maths,
+    ray_reader,
     shape_of,
 )
 
@@ -57,7 +59,7 @@ def build_bvh(shapes: Shapes, *, flat: bool) -> Bvh:
 @cache
 def fit_boxes(real: type, flat: bool) -> Kernel:
     """Fills the boxes of all nodes."""
-    zero, nowhere, half_widths = real(0.0), real("inf"), half_widths_maths(real, flat)
+    nowhere, fit_leaf = real("inf"), leaf_fitting(real, flat)
 
     @kernel("fit_boxes_discs" if flat else "fit_boxes_ellipsoids", real)
     def fit(means, frames, extents, order, offsets, boxes):
@@ -79,14 +81,7 @@ def fit_boxes(real: type, flat: bool) -> Kernel:
                                 low, high = min(low, boxes[below, j, i]), max(high, boxes[below, 3 + j, i])
                             boxes[node, j, k], boxes[node, 3 + j, k] = low, high
                         continue
-                    g = order[member]
-                    if not extents[g] > zero:
-                        continue
-                    half = half_widths(means, frames, g, extents[g])
-                    for j in range(3):
-                        # NaN and infinity fail the comparison, which leaves the box empty.
-                        if abs(means[g, j]) + half[j] < nowhere:
-                            boxes[node, j, k], boxes[node, 3 + j, k] = means[g, j] - half[j], means[g, j] + half[j]
+                    fit_leaf(means, frames, extents, order[member], boxes, node, k)
 
     return fit
 
@@ -144,7 +139,7 @@ def _summed(rows: NDArray[Any], sh_rows: NDArray[Any], owners: Tensor, count: in
 @cache
 def trace_collect(real: type, flat: bool) -> Kernel:
     """Fills `met`, each ray's Gaussians from the nearest on, and the number of different ones in each block."""
-    next_hits, ray = traversal(real, flat)
+    next_hits, ray = next_hits_maths(real, flat), ray_reader(real)
 
     @kernel("trace_collect_discs" if flat else "trace_collect_ellipsoids", real)
     def collect(leaves, origins, directions, order, boxes, offsets, near, kept, hit_offsets, places, met, distinct):
@@ -205,34 +200,11 @@ def _pull(real: type, flat: bool) -> Scalar:
     return pull
 
 
-def _shade(real: type) -> Scalar:
-    """The value of one hit's colour to the objective; adds the gradients of its harmonics and of the unit direction."""
-    color, color_gradient = color_maths(real)
-    zero, half = real(0.0), real(0.5)
-
-    @inlined
-    def shade(sh, degree, unit, v_color, weight, v_sh, v_unit):
-        if degree < 0:
-            return zero
-        x, y, z = unit[0], unit[1], unit[2]
-        red, green, blue = color(sh, 0, degree, x, y, z)
-        red, green, blue = red + half, green + half, blue + half
-        v_red = v_color[0] if red > zero else zero
-        v_green = v_color[1] if green > zero else zero
-        v_blue = v_color[2] if blue > zero else zero
-        pulls = color_gradient(sh, 0, degree, x, y, z, (weight * v_red, weight * v_green, weight * v_blue), v_sh)
-        for j in range(3):
-            v_unit[j] += pulls[j]
-        return v_red * red + v_green * green + v_blue * blue
-
-    return shade
-
-
 @cache
 def trace_backward(real: type, flat: bool) -> Kernel:
     """Fills each block's rows and their owners, and the gradients of the rays, which are zero beforehand."""
     coverage, pull = coverage_maths(real, blend_maths(real).exp2), _pull(real, flat)
-    meet, shade = ray_hit_maths(real, flat).meet, _shade(real)
+    meet, pull_color = ray_hit_maths(real, flat).meet, color_pull(real)
     zero, half, one, nowhere = real(0.0), real(0.5), real(1.0), real("inf")
 
     @kernel("trace_backward_discs" if flat else "trace_backward_ellipsoids", real)
@@ -272,7 +244,12 @@ def trace_backward(real: type, flat: bool) -> Kernel:
                         continue
                     covered, alpha = coverage(opacities[g], squared)
                     weight = alpha * left
-                    value = shade(sh[g : g + 1], degree, unit, v_colors[r], weight, sh_rows[row : row + 1], v_unit)
+                    value = zero
+                    if degree >= 0:
+                        own_sh, v_sh = sh[g : g + 1], sh_rows[row : row + 1]
+                        value, by_unit = pull_color(own_sh, degree, unit, v_colors, r, weight, v_sh)
+                        for j in range(3):
+                            v_unit[j] += by_unit[j]
                     distance = t * length
                     value += v_depths[r] * distance
                     behind -= weight * value
@@ -351,7 +328,7 @@ def trace(
 @cache
 def trace_forward(real: type, flat: bool) -> Kernel:
     """Fills colors, alphas, depths, hits and the nearest of them."""
-    next_hits, ray = traversal(real, flat)
+    next_hits, ray = next_hits_maths(real, flat), ray_reader(real)
     color = color_maths(real).color
     zero, half, one, least = real(0.0), real(0.5), real(1.0), real(TRANSMITTANCE_MIN)
 

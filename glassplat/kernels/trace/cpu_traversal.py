@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 from numba import prange
 from numpy.typing import NDArray
@@ -27,7 +27,6 @@ from glassplat.kernels.trace.steps import (
     WIDTH,
     coverage_maths,
     insert,
-    ray_reader,
 )
 
 LEAF = 13 * WIDTH
@@ -38,23 +37,6 @@ def arrays_of(bvh: Sequence[Tensor]) -> tuple[NDArray[Any], ...]:
     """Order, boxes in one dimension, and where levels begin, as kernels take them."""
     order, boxes, offsets = bvh
     return order.numpy(), boxes.numpy().reshape(-1), offsets.numpy()
-
-
-class Traversal(NamedTuple):
-    """Steps for one ray.
-
-    Attributes:
-        next_hits: fills (ts, ids, alphas) with the next hits; returns their number.
-        ray: (origin, direction, inverse direction, length), and whether it is one.
-    """
-
-    next_hits: Scalar
-    ray: Scalar
-
-
-def traversal(real: type, flat: bool) -> Traversal:
-    """Builds the functions for `real`, and for discs (`flat`) or ellipsoids."""
-    return Traversal(_next_hits(real, flat), ray_reader(real))
 
 
 def _entry(real: type) -> Scalar:
@@ -170,7 +152,8 @@ def packed_leaves(shapes: Sequence[Tensor], order: Tensor) -> NDArray[Any]:
     return leaves.numpy().reshape(-1)
 
 
-def _next_hits(real: type, flat: bool) -> Scalar:
+def next_hits_maths(real: type, flat: bool) -> Scalar:
+    """Builds `next_hits`, which fills (ts, ids, alphas) with a ray's next hits and returns their number."""
     enter, meet = _entry(real), _lanes(real, flat)
     coverage = coverage_maths(real, blend_maths(real).exp2)
     zero, nowhere, sooner = real(0.0), real("inf"), real(1.0 - SLACK)

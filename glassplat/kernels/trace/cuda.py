@@ -29,7 +29,7 @@ from glassplat.kernels.maths.fast_maths import exp2_maths
 from glassplat.kernels.maths.harmonics import MAX_DEGREE, color_maths
 from glassplat.kernels.records import REAL_OF, Bvh, Shapes
 from glassplat.kernels.trace import reach
-from glassplat.kernels.trace.bvh import curve_cells, curve_place, half_widths_maths, level_offsets
+from glassplat.kernels.trace.bvh import curve_cells, curve_place, leaf_fitting, level_offsets
 from glassplat.kernels.trace.steps import (
     CHUNK,
     FRAME_AT,
@@ -41,6 +41,7 @@ from glassplat.kernels.trace.steps import (
     SLACK,
     STACK,
     WIDTH,
+    color_pull,
     coverage_maths,
     insert,
     ray_reader,
@@ -99,7 +100,7 @@ def hilbert_places(key: type = np.int64) -> Kernel:
 @cache
 def fit_leaves(real: type, flat: bool) -> Kernel:
     """Fills the boxes of the lowest level, a thread for each Gaussian and each place that is left."""
-    zero, nowhere, half_widths = real(0.0), real("inf"), half_widths_maths(real, flat)
+    nowhere, fit_leaf = real("inf"), leaf_fitting(real, flat)
 
     @kernel("fit_leaves_discs" if flat else "fit_leaves_ellipsoids", real, "real2 real3 real1 int1 real3")
     def fit(means, frames, extents, order, boxes):
@@ -109,17 +110,8 @@ def fit_leaves(real: type, flat: bool) -> Kernel:
             return
         for j in range(3):
             boxes[node, j, k], boxes[node, 3 + j, k] = nowhere, -nowhere
-        if i >= order.size or not extents[order[i]] > zero:
-            return
-        g = order[i]
-        x, y, z = half_widths(means, frames, g, extents[g])
-        # NaN and infinity fail the comparison, which leaves the box empty.
-        if abs(means[g, 0]) + x < nowhere:
-            boxes[node, 0, k], boxes[node, 3, k] = means[g, 0] - x, means[g, 0] + x
-        if abs(means[g, 1]) + y < nowhere:
-            boxes[node, 1, k], boxes[node, 4, k] = means[g, 1] - y, means[g, 1] + y
-        if abs(means[g, 2]) + z < nowhere:
-            boxes[node, 2, k], boxes[node, 5, k] = means[g, 2] - z, means[g, 2] + z
+        if i < order.size:
+            fit_leaf(means, frames, extents, order[i], boxes, node, k)
 
     return fit
 
@@ -241,29 +233,10 @@ class Hits(NamedTuple):
     pulls: Tensor
 
 
-def _color_pull(real: type) -> Scalar:
-    """The value of a hit's colour to the objective and the gradient of the unit direction; adds that of harmonics."""
-    color, color_gradient = color_maths(real)
-    zero, half = real(0.0), real(0.5)
-
-    @inlined
-    def pull(sh, g, degree, unit, v_colors, r, weight, v_sh):
-        red, green, blue = color(sh, g, degree, unit[0], unit[1], unit[2])
-        red, green, blue = red + half, green + half, blue + half
-        v_red = v_colors[r, 0] if red > zero else zero
-        v_green = v_colors[r, 1] if green > zero else zero
-        v_blue = v_colors[r, 2] if blue > zero else zero
-        v_color = weight * v_red, weight * v_green, weight * v_blue
-        v_unit = color_gradient(sh[g : g + 1], 0, degree, unit[0], unit[1], unit[2], v_color, v_sh)
-        return v_red * red + v_green * green + v_blue * blue, v_unit
-
-    return pull
-
-
 @cache
 def trace_pull_rays(real: type, flat: bool) -> Kernel:
     """Fills rays, weights and pulls of hits, and the gradients of origins and directions, zero where nothing is met."""
-    ray, color_pull = ray_reader(real), _color_pull(real)
+    ray, pull_color = ray_reader(real), color_pull(real)
     meet, meet_gradient = ray_hit_maths(real, flat)
     zero, half, one, most, nowhere = real(0.0), real(0.5), real(1.0), real(ALPHA_MAX), real("inf")
 
@@ -298,7 +271,7 @@ def trace_pull_rays(real: type, flat: bool) -> Kernel:
             # On the threshold, another fusing of products and sums may find a disc seen from its edge.
             if t < nowhere:
                 if degree >= 0:
-                    value, v_unit = color_pull(sh, g, degree, unit, v_colors, r, weight, v_sh)
+                    value, v_unit = pull_color(sh[g : g + 1], degree, unit, v_colors, r, weight, v_sh)
                     by_unit = by_unit[0] + v_unit[0], by_unit[1] + v_unit[1], by_unit[2] + v_unit[2]
                 value += v_depths[r] * (t * length)
                 behind -= weight * value
@@ -323,7 +296,7 @@ def trace_pull_rays(real: type, flat: bool) -> Kernel:
 @cache
 def trace_pull_gaussians(real: type, flat: bool) -> Kernel:
     """Fills the gradients of Gaussians that rays meet, one block of one warp for each; the others' are zero before."""
-    ray, color_pull = ray_reader(real), _color_pull(real)
+    ray, pull_color = ray_reader(real), color_pull(real)
     meet, meet_gradient = ray_hit_maths(real, flat)
     zero, two, nowhere = real(0.0), real(2.0), real("inf")
 
@@ -374,7 +347,7 @@ def trace_pull_gaussians(real: type, flat: bool) -> Kernel:
                         for j in range(3):
                             harmonics[lane, k, j] = zero
                     unit = d[0] / length, d[1] / length, d[2] / length
-                    color_pull(sh, g, degree, unit, v_colors, r, weight, harmonics[lane : lane + 1])
+                    pull_color(sh[g : g + 1], degree, unit, v_colors, r, weight, harmonics[lane : lane + 1])
             cuda.syncthreads()
             for i in range(min(WARP, end - first)):
                 if lane < GEOMETRY:

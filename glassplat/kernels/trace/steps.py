@@ -7,6 +7,7 @@ import math
 from glassplat.kernels.backend.cpu import inlined
 from glassplat.kernels.maths.blending import ALPHA_MAX, ALPHA_MIN, Scalar
 from glassplat.kernels.maths.disc import MOST_DEVIATIONS
+from glassplat.kernels.maths.harmonics import color_maths
 
 CHUNK = 16
 """Hits that a search returns at most."""
@@ -77,6 +78,28 @@ def coverage_maths(real: type, exp2: Scalar) -> Scalar:
         return covered, covered if covered < most else most
 
     return coverage
+
+
+def color_pull(real: type) -> Scalar:
+    """The value of a hit's colour to the objective and the gradient of the unit direction; adds that of harmonics.
+
+    `sh` and `v_sh` are of one Gaussian, [1, K, 3].
+    """
+    color, color_gradient = color_maths(real)
+    zero, half = real(0.0), real(0.5)
+
+    @inlined
+    def pull(sh, degree, unit, v_colors, r, weight, v_sh):  # type: ignore[no-untyped-def]
+        x, y, z = unit[0], unit[1], unit[2]
+        red, green, blue = color(sh, 0, degree, x, y, z)
+        red, green, blue = red + half, green + half, blue + half
+        v_red = v_colors[r, 0] if red > zero else zero
+        v_green = v_colors[r, 1] if green > zero else zero
+        v_blue = v_colors[r, 2] if blue > zero else zero
+        v_unit = color_gradient(sh, 0, degree, x, y, z, (weight * v_red, weight * v_green, weight * v_blue), v_sh)
+        return v_red * red + v_green * green + v_blue * blue, v_unit
+
+    return pull
 
 
 @inlined
