@@ -103,7 +103,7 @@ def _cover(real: type) -> Scalar:
 
     @inlined
     def cover(batch, at, x, y, near, sharpness):
-        """What a fetched disc covers of the block whose corner is (x, y).
+        """Coverage of a fetched disc over the block whose corner is (x, y).
 
         The offset (dx, dy) of the pixels; (u, v, 1 / e) and e where their rays meet the disc, (0, 0, 1) and 1 where the
         falloff around its centre is the larger one; the coverage before it is clamped, 0 where it is not drawn; and

@@ -121,7 +121,7 @@ def _logistic(real: type) -> Scalar:
 
 
 def lookup_maths(real: type) -> tuple[Scalar, Scalar]:
-    """What padded faces show in direction `i`, and the gradient of that direction."""
+    """Lookup of padded faces in direction `i`, and the gradient of that direction."""
     on_face, from_face, cell, between, slopes, _ = cube_maths(real)
     zero, half = real(0.0), real(0.5)
 
