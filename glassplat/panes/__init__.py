@@ -36,7 +36,7 @@ class PlaneFit:
     mirror_reflectance: Internal[InnerShare] = 0.999
     band: Internal[PositiveShare] = 20 / 1200
     inlier_distance: Internal[PositiveShare] = 0.01
-    hypotheses: Internal[Annotated[int, Range(1, 1_000_000)]] = 1000
+    hypotheses: Internal[Annotated[int, Range(1, 1_000_000)]] = 4000
     refined: Internal[Annotated[int, Range(1, 1000)]] = 4
     most_views: Internal[Annotated[int, Range(2, 1000)]] = 12
     least_agreement: Share = 0.5

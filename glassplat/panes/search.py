@@ -185,7 +185,8 @@ def best_plane(objective: Objective, *, hypotheses: int, refine: int, rng: np.ra
     beam = first_hypotheses(objective, hypotheses, rng)
     for tilt, shift, tolerance in ROUNDS:
         beam = _followed(beam, objective, (tilt, shift), tolerance, rng)
-    beam = _agreed(refined(beam, objective, (COARSE, MIDDLE)), objective)
+    # Of a pane that things hide in every mask, planes far behind frames of any height may outdo its own.
+    beam = _possible(_agreed(refined(beam, objective, (COARSE, MIDDLE)), objective), objective)
     tilt, shift, tolerance = SHAKE
     shaken = _followed(beam, objective, (tilt, shift), tolerance, rng)
     best_first = np.argsort(contradiction(beam, objective, (COARSE, MIDDLE)), kind="stable")
