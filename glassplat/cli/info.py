@@ -16,7 +16,7 @@ from glassplat.captures.files import CaptureFiles, read_capture
 from glassplat.cli.console import import_held, say, shell_word, warn
 from glassplat.errors import InputError, UnknownFormatError, first_names, input_checked
 from glassplat.files.images import HEIF_SUFFIXES, IMAGE_SUFFIXES
-from glassplat.files.records import read_json
+from glassplat.files.records import Text, checked, read_json
 from glassplat.files.writing import SCENE, SPLAT_SUFFIXES, scene_source
 from glassplat.model.run_directory import RunDirectory
 from glassplat.prepare.photographs import VIDEO_SUFFIXES, NoOpenCVError, broken_photographs, video_facts
@@ -160,11 +160,9 @@ def video_finding(path: Path) -> Iterator[Finding]:
 
 def preparation_finding(path: Path) -> Iterator[Finding]:
     """The folder of a preparation that was interrupted."""
+    settings = path / "settings.json"
     with input_checked():
-        settings = read_json(path / "settings.json")
-    source = settings.get("input") if isinstance(settings, dict) else None
-    if not isinstance(source, str):
-        raise InputError(f"{path / 'settings.json'} names no input; expected what `prepare` writes: prepare again")
+        source = checked(read_json(settings), {"input": Text()}, str(settings))["input"]
     output = str(path).removesuffix(".partial")
     finding = Finding("an interrupted preparation", {"of": source})
     finding.problems.append("it is not finished")

@@ -14,7 +14,7 @@ from rich.console import Console
 from glassplat.cli.console import import_now, say
 from glassplat.cli.places import SceneEdits, SplatFile, Split, check_claim, check_file, check_scene, say_scene
 from glassplat.errors import InputError, input_checked
-from glassplat.files.writing import WRITTEN, check_folder
+from glassplat.files.writing import FORGED_SUFFIXES, WRITTEN, check_folder
 from glassplat.kernels.backend.devices import DeviceName
 from glassplat.model.run_directory import RunDirectory
 from glassplat.options import Cleaning, Finite, Positive, Range
@@ -308,7 +308,7 @@ class Export:
         """Refuses what contradicts itself, what is no scene, and an output that holds something else."""
         if not self.formats:
             raise InputError(f"nothing to write without --formats; expected some of {', '.join(WRITTEN)}")
-        if {"sog", "ksplat"} & {*self.formats} and find_spec("gaussforge") is None:
+        if {f".{kind}" for kind in self.formats} & {*FORGED_SUFFIXES} and find_spec("gaussforge") is None:
             raise InputError("--formats sog and ksplat need gaussforge; pip install 'glassplat[formats]'")
         if self.url is not None and not self.url.startswith(("https://", "http://")):
             raise InputError(f"--url is {self.url}; expected an address that begins with https://")

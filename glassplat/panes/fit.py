@@ -49,17 +49,15 @@ LEAST_MEETING, LEAST_OF_MEDIAN = 0.3, 0.5
 EDGES_PER_VIEW = 100
 
 
-def _range(values: Array) -> tuple[float, float]:
-    return float(values.min()), float(values.max())
-
-
 def report_masks(label: int, plane: FramedPlanes, views: Sequence[PaneView]) -> None:
     """Logs how well each mask of a pane fits the others on its plane, and warns of those that do not, by name."""
     meeting, overlap = meeting_of_each(plane, views), agreement_of_each(plane.planes, views)
     found = [f"{view.name} {_percent(share)}" for view, share in zip(views, meeting, strict=True)]
     areas = ", ".join(f"{told} ({area:.2f})" for told, area in zip(found, overlap, strict=True))
     log.debug("pane %d: outlines of the masks that meet those of the others (and overlap): %s", label, areas)
-    log.info("pane %d: %d masks, which overlap by %.2f to %.2f on its plane", label, len(views), *_range(overlap))
+    log.info(
+        "pane %d: %d masks, which overlap by %.2f to %.2f on its plane", label, len(views), min(overlap), max(overlap)
+    )
     odd = odd_ones(meeting).nonzero()[0]
     if len(odd):
         log.warning(
