@@ -134,6 +134,10 @@ TILTS_DEG, TILT_PHOTOGRAPHS = (-3.0, -1.5, 0.0, 1.5, 3.0), 8
 """Tilts about either axis that are tried before a plane is aligned, and how many photographs judge them."""
 ALIGN_STEPS, ALIGN_RATE = 60, 2e-3
 """Steps of Adam, one photograph each, and their rate: radians, and shares of the scene extent."""
+LEAST_GAIN_OF_ALIGNING, PERFECT = 1.15, 0.999
+"""How many times as well photographs must agree with an aligned plane, and a correlation that counts as perfect. They
+agree best with planes off by up to 0.5 degrees or 1.5 % of the extent; masks know better, or not at all
+(lab/panes.md)."""
 FEWEST_IN_VIEW = 100
 """Compared pixels with which a photograph has a say."""
 
@@ -219,7 +223,7 @@ def judged_pane(scene: Scene, label: int, photographs: Sequence[Photograph]) -> 
     Nothing is transmitted by a mirror, so its photograph is the mirrored scene; through glass it is mostly what
     stands behind, which has nothing to do with the mirrored scene. A rough first scene is enough to tell, if the plane
     is exact: one that is tilted by a degree mirrors by two. So the plane is aligned first, as if it were a mirror's:
-    the best of a few tilts, then gradient ascent of the correlation.
+    the best of a few tilts, then gradient ascent of the correlation. Where that gains little, the plane stays.
 
     Args:
         scene: primary Gaussians after the first stage, with fitted planes and glass.
@@ -236,7 +240,8 @@ def judged_pane(scene: Scene, label: int, photographs: Sequence[Photograph]) -> 
         if int(region.sum()) >= FEWEST_IN_VIEW
     ]
     if telling:
-        inner = aligned_pane(inner, telling)
+        aligned = aligned_pane(inner, telling)
+        inner = aligned if agrees_better(aligned, inner, telling) else inner
     pairs = [compared_pixels(inner, photograph) for photograph in photographs]
     shown = sum(shown for _, _, shown in pairs)
     mirrored, photographed = torch.cat([pair[0] for pair in pairs]), torch.cat([pair[1] for pair in pairs])
@@ -303,6 +308,14 @@ def aligned_pane(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> 
         optimizer.step()
         optimizer.param_groups[0]["lr"] = ALIGN_RATE * (1 - step / ALIGN_STEPS)
     return moved_pane(scene, offsets.detach())
+
+
+@torch.no_grad()
+def agrees_better(aligned: Scene, fitted: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> bool:
+    """Return whether photographs agree so much better with the aligned pane that the fitted plane must be wrong."""
+    other, own = (sum(float(agreement(scene, *one)) for one in telling) / len(telling) for scene in (aligned, fitted))
+    # By Fisher's transform, from 0.9 to 0.97 is as far as from 0.3 to 0.7.
+    return math.atanh(min(other, PERFECT)) > LEAST_GAIN_OF_ALIGNING * math.atanh(min(own, PERFECT))
 
 
 @torch.no_grad()
