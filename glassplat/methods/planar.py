@@ -19,7 +19,6 @@ from glassplat.panes.fit import fit_planes, with_mirrors
 from glassplat.panes.material import (
     SURE_SLOPE,
     JudgedPane,
-    glass_gaussians,
     judged_pane,
     mirrored_coverage,
     mirrored_lamps,
@@ -33,7 +32,7 @@ from glassplat.render.splat import Splat
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import mirrored_gaussians
 from glassplat.scene.panes import Planes, coplanar_groups
-from glassplat.scene.scene import Scene
+from glassplat.scene.scene import Scene, glass_gaussians
 from glassplat.training.actions import (
     MOST_ADDED,
     Densify,

@@ -32,7 +32,6 @@ from glassplat.methods.recipe import recipe_to_json, with_background
 from glassplat.methods.splat_recipe import SplatRecipe
 from glassplat.model.run_directory import RunDirectory, write_text
 from glassplat.options import BLACK, Cleaning, Up
-from glassplat.panes.material import OPAQUE_SHEET, glass_gaussians, with_intensity, with_pane
 from glassplat.publish.camera_paths import orbit
 from glassplat.publish.cleaning import Floaters, cleaned
 from glassplat.publish.web_page import PRIVATE, Sharing, best_view, bounding_ball, cameras_around, write_page
@@ -44,7 +43,7 @@ from glassplat.scene.camera import LEAST_SINE, Camera
 from glassplat.scene.corrections import upward
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
-from glassplat.scene.scene import Scene
+from glassplat.scene.scene import OPAQUE_SHEET, Scene, glass_gaussians, with_intensity, with_pane
 from glassplat.viewer.drawing import ERROR, Keeper, Shown
 from glassplat.viewer.render_loop import LOCAL, vacant_port
 from glassplat.viewer.server import Viewer

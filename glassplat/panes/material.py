@@ -1,4 +1,4 @@
-"""The first glass Gaussians, mirrors told from glass, what seems to be behind panes, and what they mirror unseen."""
+"""Mirrors told from glass, what seems to be behind panes, and what they mirror unseen."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.quasirandom import SobolEngine
 
 from glassplat.captures.view import View, evenly
 from glassplat.kernels.maths.images import linear_from_srgb
@@ -18,94 +17,9 @@ from glassplat.render.layers import gathered, gathered_mirrored
 from glassplat.render.planar import Planar
 from glassplat.render.splat import Splat
 from glassplat.scene import SH_ZERO, logit
-from glassplat.scene.camera import Camera, mirror_matrices, quat_from_rotation
-from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.camera import Camera, mirror_matrices
 from glassplat.scene.panes import Planes, crosses_pane, in_image, nearest_pixels
 from glassplat.scene.scene import Scene
-
-OVERLAP = 0.7
-"""Standard deviation of a disc, in distances between neighbours; the discs blend into an even sheet."""
-THICKNESS = 0.05
-"""Standard deviation across the pane, as a share of that along it."""
-OPAQUE_SHEET = 0.9
-"""Opacity of discs that cover a pane which nobody trains."""
-
-
-MARK = 0.99
-"""m of glass that nobody has trained; the paper's 1 has no finite logit."""
-
-
-def glass_gaussians(planes: Planes, *, count: int = 1000, seed: int = 0, opacity: float = 0.5) -> Gaussians:
-    """Glass Gaussians on every pane's rectangle.
-
-    They are spread by a scrambled Sobol sequence, so that chance leaves no holes. At the default
-    opacity the sheet shows a mask of about 0.8 from the first step on, and training thins it out where
-    the rectangle is larger than the pane.
-
-    Args:
-        planes: the panes.
-        count: Gaussians on each pane.
-        seed: of the places.
-        opacity: of each Gaussian, in (0, 1).
-    """
-    panes = [_pane_discs(planes, index, count=count, seed=seed) for index in range(len(planes))]
-    if not panes:
-        return Gaussians.empty(channels=("logit_mark",))
-    means, quats, log_scales = (torch.cat(tensors) for tensors in zip(*panes, strict=True))
-    number = len(means)
-    return Gaussians(
-        means=means,
-        quats=quats,
-        log_scales=log_scales,
-        logit_opacities=torch.full((number,), logit(opacity)),
-        sh=torch.zeros(number, 0, 3),
-        channels={"logit_mark": torch.full((number,), logit(MARK))},
-    ).to(planes.centers.device)
-
-
-def with_pane(scene: Scene, pane: Planes) -> Scene:
-    """The scene with one more pane, its rectangle evenly covered with glass.
-
-    Args:
-        scene: any; Gaussians that do not say how bright they are in a pane are as bright as they are.
-        pane: a single plane.
-
-    Raises:
-        ValueError: the scene has a pane of that label.
-    """
-    if set(pane.labels) & set(scene.planes.labels):
-        raise ValueError(f"the scene has a pane {pane.labels[0]} already; its panes are {list(scene.planes.labels)}")
-    pane = pane.to(scene.primary.means.device)
-    glass = glass_gaussians(pane, opacity=OPAQUE_SHEET)
-    return replace(
-        scene,
-        primary=with_intensity(scene.primary),
-        planes=scene.planes.joined(pane) if len(scene.planes) else pane,
-        glass=scene.glass.joined(glass) if len(scene.glass) else glass,
-    )
-
-
-def with_intensity(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians with an intensity of 1 in what panes mirror, unless they have one."""
-    if "log_intensity" in gaussians.channels:
-        return gaussians
-    return replace(gaussians, channels={**gaussians.channels, "log_intensity": torch.zeros_like(gaussians.means[:, 0])})
-
-
-def _pane_discs(planes: Planes, index: int, *, count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Means [M, 3], quats [M, 4] and log scales [M, 3] of the discs on one pane."""
-    half = planes.half_sizes[index].detach().cpu()
-    places = SobolEngine(dimension=2, scramble=True, seed=seed + index).draw(count)
-    tangent, bitangent = (axis[index].detach().cpu() for axis in planes.axes())
-    in_plane = (2 * places - 1) * half
-    means = planes.centers[index].detach().cpu() + in_plane @ torch.stack([tangent, bitangent])
-
-    frame = torch.stack([tangent, bitangent, planes.normals[index].detach().cpu()], dim=1)
-    quat = quat_from_rotation(frame).float()
-    along = OVERLAP * math.sqrt(float(4 * half.prod()) / count)
-    log_scales = torch.tensor([along, along, THICKNESS * along]).log()
-    return means, quat.repeat(len(means), 1), log_scales.repeat(len(means), 1)
-
 
 log = logging.getLogger("glassplat.panes")
 
@@ -138,6 +52,9 @@ LEAST_GAIN_OF_ALIGNING, PERFECT = 1.15, 0.999
 """How many times as well photographs must agree with an aligned plane, and a correlation that counts as perfect. They
 agree best with planes off by up to 0.5 degrees or 1.5 % of the extent; masks know better, or not at all
 (lab/panes.md)."""
+POLISH_STEPS, POLISH_ROUNDS, POLISH_PHOTOGRAPHS = (4e-3, 2e-3, 1e-3), 4, 16
+"""Of a mirror: radians and shares of the extent by which it is moved, how often at most by each, and how many
+photographs judge that."""
 FEWEST_IN_VIEW = 100
 """Compared pixels with which a photograph has a say."""
 
@@ -239,9 +156,9 @@ def judged_pane(scene: Scene, label: int, photographs: Sequence[Photograph]) -> 
         for photograph, region in zip(photographs, regions, strict=True)
         if int(region.sum()) >= FEWEST_IN_VIEW
     ]
-    if telling:
-        aligned = aligned_pane(inner, telling)
-        inner = aligned if agrees_better(aligned, inner, telling) else inner
+    aligned = aligned_pane(inner, telling) if telling else inner
+    is_moved = aligned is not inner and agrees_better(aligned, inner, telling)
+    inner = aligned if is_moved else inner
     pairs = [compared_pixels(inner, photograph) for photograph in photographs]
     shown = sum(shown for _, _, shown in pairs)
     mirrored, photographed = torch.cat([pair[0] for pair in pairs]), torch.cat([pair[1] for pair in pairs])
@@ -251,7 +168,11 @@ def judged_pane(scene: Scene, label: int, photographs: Sequence[Photograph]) -> 
         "pane %d: slope %.2f, correlation %.2f, of %.1f %% of it, on a plane %.2f degrees from the fitted one",
         label, *like, 100 * len(mirrored) / max(shown, 1), degrees_between(found.normals[0], pane.normals[0]),
     )  # fmt: skip
-    return JudgedPane(found, like, len(mirrored), shown)
+    judged = JudgedPane(found, like, len(mirrored), shown)
+    if is_moved and judged.is_mirror:
+        exact = polished_pane(inner, telling).planes
+        return judged._replace(pane=replace(exact, half_sizes=pane.half_sizes))
+    return judged
 
 
 def degrees_between(normal: Tensor, other: Tensor) -> float:
@@ -308,6 +229,31 @@ def aligned_pane(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> 
         optimizer.step()
         optimizer.param_groups[0]["lr"] = ALIGN_RATE * (1 - step / ALIGN_STEPS)
     return moved_pane(scene, offsets.detach())
+
+
+@torch.no_grad()
+def polished_pane(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> Scene:
+    """The scene with its only pane where photographs agree best nearby: ever smaller steps along one axis at a time.
+
+    Gradient ascent, one photograph a step, leaves a mirror up to 2 % of the extent beside that place, and training does
+    not bring it back.
+    """
+    some = telling[:: max(1, len(telling) // POLISH_PHOTOGRAPHS)]
+
+    def agreed(offsets: Tensor) -> float:
+        return sum(float(agreement(moved_pane(scene, offsets), *one)) for one in some)
+
+    best = scene.primary.means.new_zeros(3)
+    most, axes = agreed(best), torch.eye(3).to(best)
+    for step in POLISH_STEPS:
+        for _ in range(POLISH_ROUNDS):
+            before = most
+            for change in step * torch.cat([axes, -axes]):
+                if (found := agreed(best + change)) > most:
+                    best, most = best + change, found
+            if most == before:
+                break
+    return moved_pane(scene, best)
 
 
 @torch.no_grad()

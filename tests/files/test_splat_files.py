@@ -16,9 +16,9 @@ from glassplat.files.ply import BOUNDS, COLOR_BOUNDS, write_gaussians
 from glassplat.files.scene_folder import SPLAT_ROW, drawable, read_splats
 from glassplat.files.spz import write_spz
 from glassplat.kernels.project.reference import rotations
-from glassplat.panes.material import with_intensity
 from glassplat.scene import SH_ZERO
 from glassplat.scene.gaussians import Gaussians
+from glassplat.scene.scene import with_intensity
 from tests.files.test_spz import shapes, typical
 
 

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from glassplat.panes.material import glass_gaussians
 from glassplat.scene.camera import rotation_from_quat
 from glassplat.scene.panes import Planes
+from glassplat.scene.scene import glass_gaussians
 
 PLANES = Planes(
     centers=torch.tensor([[1.0, 2.0, 3.0], [0.0, 0.0, -1.0]]),

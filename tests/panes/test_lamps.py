@@ -13,12 +13,12 @@ from torch import Tensor
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import PointCloud, View
 from glassplat.methods.planar import FillUnseen, LightLamps
-from glassplat.panes.material import Photograph, glass_gaussians, mirrored_image, mirrored_lamps, unseen_places
+from glassplat.panes.material import Photograph, mirrored_image, mirrored_lamps, unseen_places
 from glassplat.render.planar import Planar
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
-from glassplat.scene.scene import Scene
+from glassplat.scene.scene import Scene, glass_gaussians
 from glassplat.training.densify import gaussians_from_points
 from glassplat.training.stage import Clock, TrainState
 from tests.render.tiny_scene import concatenated

@@ -13,7 +13,6 @@ import torch
 from glassplat.captures.dataset import Dataset
 from glassplat.captures.view import PointCloud, View
 from glassplat.methods.splat_recipe import SplatRecipe
-from glassplat.panes.material import glass_gaussians
 from glassplat.render.frame import Renderer
 from glassplat.render.layers import contributions
 from glassplat.render.planar import Planar
@@ -22,7 +21,7 @@ from glassplat.scene import SH_ZERO
 from glassplat.scene.camera import Camera
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
-from glassplat.scene.scene import Scene, without_glass
+from glassplat.scene.scene import Scene, glass_gaussians, without_glass
 from glassplat.training.actions import Densify, PruneIdle, SeedUnexplained, limit_of, unexplained_places
 from glassplat.training.densify import ScreenStatistics, fog_around, gaussians_from_points
 from glassplat.training.options import DefaultDensify
