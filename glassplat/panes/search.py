@@ -276,8 +276,14 @@ def _followed(
 
 def _possible(planes: FramedPlanes, objective: Evidence) -> FramedPlanes:
     """The planes whose frames are no higher than frames are; all of them if there is none."""
-    kept = np.flatnonzero(planes.frames <= HIGHEST_FRAME * objective.extent)
+    kept = np.flatnonzero(_has_possible_frames(planes, objective))
     return planes.select(kept) if len(kept) else planes
+
+
+def _has_possible_frames(planes: FramedPlanes, objective: Evidence) -> NDArray[np.bool_]:
+    """[K] whether the frames before the planes are no higher than frames are."""
+    possible: NDArray[np.bool_] = planes.frames <= HIGHEST_FRAME * objective.extent
+    return possible
 
 
 def _agreed(planes: FramedPlanes, objective: Evidence, *, least: int = 0) -> FramedPlanes:
@@ -308,6 +314,8 @@ def score(plane: FramedPlanes, evidence: Objective) -> float:
 def best_supported(label: int, fits: Sequence[Fit], evidence: Objective) -> FramedPlanes:
     """The plane with the highest score, the first one of equals; says so in the log.
 
+    One behind an impossibly high frame counts only if all are.
+
     Args:
         label: of the pane.
         fits: at least one.
@@ -315,7 +323,8 @@ def best_supported(label: int, fits: Sequence[Fit], evidence: Objective) -> Fram
             by Gaussians behind the pane, and many of them lie where nothing is.
     """
     scores = [score(fit.plane, evidence) for fit in fits]
-    kept = int(np.argmax(scores))
+    possible = [n for n, fit in enumerate(fits) if _has_possible_frames(fit.plane, evidence)[0]]
+    kept = max(possible or range(len(fits)), key=scores.__getitem__)
     for fit, found in zip(fits, scores, strict=True):
         apart = np.degrees(angle(fit.plane, fits[kept].plane))
         verdict = "kept" if fit is fits[kept] else f"{apart:.2f} degrees from the one that is kept"

@@ -67,6 +67,16 @@ def test_the_better_plane_is_kept_in_either_order(degrees: float) -> None:
     assert best_supported(1, fits[::-1], evidence) is fits[0].plane
 
 
+def test_a_plane_behind_an_impossible_frame_is_kept_only_where_there_is_no_other() -> None:
+    views = pane_views(scene_of([FRONT]), 1)
+    evidence = Objective(views, np.zeros((0, 3)), EXTENT, 0.01 * EXTENT)
+    high = replace(framed(FRONT), frames=np.array([0.3 * EXTENT]))
+    fits = [Fit("one", high), Fit("other", framed(turned(FRONT, 40.0)))]
+    assert score(high, evidence) > score(fits[1].plane, evidence)
+    assert best_supported(1, fits, evidence) is fits[1].plane
+    assert best_supported(1, fits[:1], evidence) is high
+
+
 def test_virtual_points_behind_a_mirror_do_not_speak_against_its_plane() -> None:
     """Nothing lies on the mirror, and everything that was measured in it lies behind."""
     views = pane_views(scene_of([FRONT]), 1)
