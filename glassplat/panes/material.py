@@ -54,7 +54,7 @@ agree best with planes off by up to 0.5 degrees or 1.5 % of the extent; masks kn
 (lab/panes.md)."""
 POLISH_STEPS, POLISH_ROUNDS, POLISH_PHOTOGRAPHS = (4e-3, 2e-3, 1e-3), 4, 16
 """Of a mirror: radians and shares of the extent by which it is moved, how often at most by each, and how many
-photographs judge that."""
+photographs judge that at least, if there are so many."""
 FEWEST_IN_VIEW = 100
 """Compared pixels with which a photograph has a say."""
 
@@ -149,30 +149,26 @@ def judged_pane(scene: Scene, label: int, photographs: Sequence[Photograph]) -> 
     """
     pane = scene.planes.select([scene.planes.labels.index(label)])
     pane = replace(pane, centers=pane.centers.detach(), raw_normals=pane.normals.detach())
-    inner = replace(scene, planes=replace(pane, half_sizes=INNER_SHARE * pane.half_sizes))
-    regions = [compared_region(inner, photograph) for photograph in photographs]
+    fitted = replace(scene, planes=replace(pane, half_sizes=INNER_SHARE * pane.half_sizes))
+    regions = [compared_region(fitted, photograph) for photograph in photographs]
     telling = [
         (photograph, region)
         for photograph, region in zip(photographs, regions, strict=True)
         if int(region.sum()) >= FEWEST_IN_VIEW
     ]
-    aligned = aligned_pane(inner, telling) if telling else inner
-    is_moved = aligned is not inner and agrees_better(aligned, inner, telling)
-    inner = aligned if is_moved else inner
+    inner = aligned_pane(fitted, telling) if telling else fitted
     pairs = [compared_pixels(inner, photograph) for photograph in photographs]
     shown = sum(shown for _, _, shown in pairs)
     mirrored, photographed = torch.cat([pair[0] for pair in pairs]), torch.cat([pair[1] for pair in pairs])
-    found = replace(inner.planes, half_sizes=pane.half_sizes)
     like = likeness(mirrored, photographed)
     log.debug(
         "pane %d: slope %.2f, correlation %.2f, of %.1f %% of it, on a plane %.2f degrees from the fitted one",
-        label, *like, 100 * len(mirrored) / max(shown, 1), degrees_between(found.normals[0], pane.normals[0]),
+        label, *like, 100 * len(mirrored) / max(shown, 1), degrees_between(inner.planes.normals[0], pane.normals[0]),
     )  # fmt: skip
-    judged = JudgedPane(found, like, len(mirrored), shown)
-    if is_moved and judged.is_mirror:
-        exact = polished_pane(inner, telling).planes
-        return judged._replace(pane=replace(exact, half_sizes=pane.half_sizes))
-    return judged
+    judged = JudgedPane(inner.planes, like, len(mirrored), shown)
+    if inner is not fitted and judged.is_mirror:
+        inner = polished_pane(inner, telling)
+    return judged._replace(pane=replace(inner.planes, half_sizes=pane.half_sizes))
 
 
 def degrees_between(normal: Tensor, other: Tensor) -> float:
@@ -210,7 +206,7 @@ def compared_pixels(scene: Scene, photograph: Photograph) -> tuple[Tensor, Tenso
 
 
 def aligned_pane(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> Scene:
-    """The scene with its only pane turned and shifted to where it is most like a mirror.
+    """The scene with its only pane turned and shifted to where it is most like a mirror; itself if that gains little.
 
     Args:
         scene: with one pane.
@@ -228,20 +224,21 @@ def aligned_pane(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> 
         (-like).backward()
         optimizer.step()
         optimizer.param_groups[0]["lr"] = ALIGN_RATE * (1 - step / ALIGN_STEPS)
-    return moved_pane(scene, offsets.detach())
+    aligned = moved_pane(scene, offsets.detach())
+    return aligned if agrees_better(aligned, scene, telling) else scene
 
 
 @torch.no_grad()
 def polished_pane(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> Scene:
     """The scene with its only pane where photographs agree best nearby: ever smaller steps along one axis at a time.
 
-    Gradient ascent, one photograph a step, leaves a mirror up to 2 % of the extent beside that place, and training does
-    not bring it back.
+    Gradient ascent, one photograph a step, leaves a mirror up to 2 % of the extent beside that place, and training
+    brings back only a part of it.
     """
     some = telling[:: max(1, len(telling) // POLISH_PHOTOGRAPHS)]
 
     def agreed(offsets: Tensor) -> float:
-        return sum(float(agreement(moved_pane(scene, offsets), *one)) for one in some)
+        return mean_agreement(moved_pane(scene, offsets), some)
 
     best = scene.primary.means.new_zeros(3)
     most, axes = agreed(best), torch.eye(3).to(best)
@@ -259,9 +256,10 @@ def polished_pane(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) ->
 @torch.no_grad()
 def agrees_better(aligned: Scene, fitted: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> bool:
     """Return whether photographs agree so much better with the aligned pane that the fitted plane must be wrong."""
-    other, own = (sum(float(agreement(scene, *one)) for one in telling) / len(telling) for scene in (aligned, fitted))
+    found = (mean_agreement(scene, telling) for scene in (aligned, fitted))
     # By Fisher's transform, from 0.9 to 0.97 is as far as from 0.3 to 0.7.
-    return math.atanh(min(other, PERFECT)) > LEAST_GAIN_OF_ALIGNING * math.atanh(min(own, PERFECT))
+    other, own = (math.atanh(max(-PERFECT, min(value, PERFECT))) for value in found)
+    return other > LEAST_GAIN_OF_ALIGNING * own
 
 
 @torch.no_grad()
@@ -270,9 +268,7 @@ def tilted_best(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> T
     means = scene.primary.means
     tilts = [math.radians(degrees) for degrees in TILTS_DEG]
     candidates = [means.new_tensor([first, second, 0.0]) for first in tilts for second in tilts]
-    return max(
-        candidates, key=lambda offsets: sum(float(agreement(moved_pane(scene, offsets), *one)) for one in telling)
-    )
+    return max(candidates, key=lambda offsets: mean_agreement(moved_pane(scene, offsets), telling))
 
 
 def moved_pane(scene: Scene, offsets: Tensor) -> Scene:
@@ -303,6 +299,12 @@ def agreement(scene: Scene, photograph: Photograph, region: Tensor) -> Tensor:
     )
     tiny = torch.finfo(first.dtype).tiny
     return (first * second).sum() / torch.sqrt(((first * first).sum() * (second * second).sum()).clamp(min=tiny))
+
+
+@torch.no_grad()
+def mean_agreement(scene: Scene, telling: Sequence[tuple[Photograph, Tensor]]) -> float:
+    """Mean of `agreement` over photographs, each with its region [H, W]; at least one."""
+    return sum(float(agreement(scene, *one)) for one in telling) / len(telling)
 
 
 class MirroredImage(NamedTuple):
