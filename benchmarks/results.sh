@@ -4,8 +4,8 @@
 #     bash benchmarks/results.sh DATA OUTPUT [--task I --of N]
 #
 # DATA holds the captures: facade, screen, fox, showcase, corner, mirror and front. Scenes that it lacks are made there:
-# the rooms, and with Mitsuba 3 the glossy ones (docs/scenes.md). Several of these commands may share one OUTPUT
-# (benchmarks/compare.py). Each table is in OUTPUT/NAME/tables.md.
+# the rooms, and with Mitsuba 3 the glossy ones (docs/scenes.md). Once they are made, several of these commands may
+# share one OUTPUT (benchmarks/compare.py). Each table is in OUTPUT/NAME/tables.md.
 set -euo pipefail
 data=$1 output=$2
 shift 2
@@ -15,17 +15,19 @@ compare() { # NAME SCENE... [--OPTION...]
     python -m benchmarks.compare "${@:2}" --output "$output/$1" "${common[@]}"
 }
 
-glossy() { # FOLDER OPTION...
-    [[ -d $data/$1 ]] || python -m tools.make_scenes --output "$data/$1" --samples 64 "${@:2}"
+make_once() { # FOLDER TOOL [--OPTION...]
+    [[ -d $data/$1 ]] && return
+    rm -rf "$data/$1.part" # what an interrupted command left
+    python -m "tools.$2" --output "$data/$1.part" "${@:3}"
+    mv "$data/$1.part" "$data/$1"
 }
 
-small=(--points 10000 --environment-height 256)
-glossy far --scenes ball torus control --train 60
-glossy near --scenes table car sheet --size 128 --train 40 --test 8 "${small[@]}"
-glossy drawn --seed 1 2 3 4 5 21 22 23 24 25 --size 200 --train 60 --test 12 "${small[@]}"
+glossy=(--samples 64 --points 10000 --environment-height 256)
+make_once far make_scenes --scenes ball torus control --train 60 --samples 64
+make_once near make_scenes --scenes table car sheet --size 128 --train 40 --test 8 "${glossy[@]}"
+make_once drawn make_scenes --seed 1 2 3 4 5 21 22 23 24 25 --size 200 --train 60 --test 12 "${glossy[@]}"
 for seed in {245..254}; do
-    [[ -d $data/rooms/$seed ]] ||
-        python -m tools.make_pane_scene --output "$data/rooms/$seed" --drawn "$seed" --width 400 --noise 2
+    make_once "rooms/$seed" make_pane_scene --drawn "$seed" --width 400 --noise 2
 done
 
 compare facade "$data/facade" --options "--downscale 2"
@@ -33,6 +35,7 @@ compare screen "$data/screen"
 compare fox "$data/fox" --methods splat --options "--downscale 4"
 compare scenes "$data"/{showcase,corner,mirror,front}
 compare rooms "$data"/rooms/{245..254}
+# Seed 0 is among the parts.
 compare chance "$data/showcase" --methods planar --iterations 3000 --seeds 1 2
 compare parts "$data"/{showcase,corner} --iterations 3000 \
     --variant depth="--weights.depth 0" --variant conflict="--weights.conflict 0" \
