@@ -190,6 +190,8 @@ def test_nothing_is_turned_round_where_views_find_no_surface_in_its_place(monkey
         (3379, 1769, 1427, 67, False),
         (1469, 932, 1006, 220, False),
         (6365, 3256, 36, 36, False),  # a street behind a real front, of which next to nothing is looked at in front
+        (1324, 1130, 35, 34, True),  # photographed from the front
+        (1321, 727, 556, 264, True),
     ],
 )
 def test_a_front_mirrors_what_is_behind_it_if_it_is_always_hidden_or_confirmed_in_front(
