@@ -26,6 +26,7 @@ from glassplat.training.densify import (
     fog_around,
     forget,
     gaussians_from_points,
+    hangs_in_air,
     in_morton_order,
     keep,
     perturb_opacities,
@@ -137,12 +138,17 @@ class Densify:
         return True
 
 
+FAINT_IN_AIR = 1e-4
+"""Share of its pixels that what hangs in the air before a camera must add to some view, if it is to stay."""
+
+
 @dataclass(frozen=True)
 class PruneIdle:
     """Removes the Gaussians of one set that add next to nothing to any training view, or stand where a camera stood.
 
-    What stood behind a pane for a reflection, and has lost that to the mirrored image, ends as such. And no photograph
-    was taken in a fog; see `fog_around`.
+    What stood behind a pane for a reflection, and has lost that to the mirrored image, ends as such. No photograph
+    was taken in a fog; see `fog_around`. And what hangs in the air before a camera must be needed by another; see
+    `hangs_in_air`.
 
     Attributes:
         densifier: holds what is next to nothing, and when.
@@ -169,13 +175,19 @@ class PruneIdle:
         gaussians = state.scene.gaussian_sets().get(self.part)
         if gaussians is None:
             return False
-        most = torch.zeros_like(gaussians.logit_opacities)
+        most, largest_share = (torch.zeros_like(gaussians.logit_opacities) for _ in range(2))
         for done, view in enumerate(dataset.train):
             yield Working("looking for Gaussians that no view needs", done, len(dataset.train))
-            most = torch.maximum(most, self.measure(state.scene, view.camera))
+            added = self.measure(state.scene, view.camera)
+            most = torch.maximum(most, added)
+            largest_share = torch.maximum(largest_share, added / (view.camera.width * view.camera.height))
         busy = most >= self.densifier.least_contribution
         if self.part == "primary":
-            busy &= ~fog_around(gaussians, torch.stack([view.camera.center for view in dataset.train]))
+            places = torch.stack([view.camera.center for view in dataset.train])
+            busy &= ~fog_around(gaussians, places)
+            if dataset.measured_points:
+                hanging = hangs_in_air(gaussians.means, places, dataset.points.positions)
+                busy &= ~hanging | (largest_share >= FAINT_IN_AIR)
         # A scene without Gaussians is reported; surroundings that nothing mirrors yet may still be needed.
         if bool(busy.all()) or (self.part != "primary" and not bool(busy.any())):
             return False

@@ -181,6 +181,32 @@ def fog_around(gaussians: Gaussians, places: Tensor) -> Tensor:
     return hiding
 
 
+FREE_SHARE, SURFACE_POINTS = 0.15, 3
+"""What is nearer to a camera than this share of the distance to its third nearest measured point hangs in the air."""
+
+
+@torch.no_grad()
+def hangs_in_air(means: Tensor, places: Tensor, points: Tensor) -> Tensor:
+    """[N] bool: which means [N, 3] are so near to one of the places [P, 3] of cameras that no surface can be there.
+
+    A small Gaussian on the way of a camera is a few pixels wide in views from afar, where it explains their noise, and
+    covers what a camera between them sees.
+
+    Args:
+        means: of Gaussians.
+        places: of cameras.
+        points: [M, 3] measured points; with fewer than three nothing is known of any surface.
+    """
+    hanging = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+    if len(points) < SURFACE_POINTS:
+        return hanging
+    points = points.to(means)
+    for place in places.to(means):
+        nearest = (points - place).norm(dim=1).topk(SURFACE_POINTS, largest=False).values[-1]
+        hanging |= (means - place).norm(dim=1) < FREE_SHARE * nearest
+    return hanging
+
+
 CHILDREN = 2
 """Gaussians that take the place of one that is split."""
 SHRINK = 1.6

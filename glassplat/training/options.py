@@ -192,8 +192,8 @@ class DefaultDensify:
             where these contradict each other, by cars and leaves, and never stop asking for more; 0 for no limit.
         least_contribution: Gaussians that add less than so many pixels to every training view, directly and mirrored,
             are removed; 0 keeps them.
-        contribution_moments: shares of the run at which they are: when the set has stopped growing, and in `planar`
-            once more when nothing is perturbed any longer.
+        contribution_moments: shares of the run at which they are: when the set has stopped growing, when `planar`
+            perturbs nothing any longer, and at the end.
     """
 
     split_by: Internal[Literal["pull", "gradient"]] = "pull"
@@ -212,7 +212,7 @@ class DefaultDensify:
     cap: Annotated[Count | None, ESSENTIAL] = None
     per_pixel: NotNegative = 0.02
     least_contribution: NotNegative = 0.2
-    contribution_moments: Internal[Annotated[tuple[Share, ...], Ascending()]] = (0.5, 0.8)
+    contribution_moments: Internal[Annotated[tuple[Share, ...], Ascending()]] = (0.5, 0.8, 1.0)
 
     @staticmethod
     def published() -> DefaultDensify:

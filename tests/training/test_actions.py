@@ -23,7 +23,7 @@ from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene, glass_gaussians, without_glass
 from glassplat.training.actions import Densify, PruneIdle, SeedUnexplained, limit_of, unexplained_places
-from glassplat.training.densify import ScreenStatistics, fog_around, gaussians_from_points
+from glassplat.training.densify import ScreenStatistics, fog_around, gaussians_from_points, hangs_in_air
 from glassplat.training.options import DefaultDensify
 from glassplat.training.stage import Clock, TrainState
 from tests.render.tiny_scene import concatenated
@@ -96,10 +96,41 @@ def test_no_gaussian_stays_around_a_camera_though_others_see_it() -> None:
     assert row not in state.optimizer.moments["primary.means"][0][:, 0].long().tolist()
 
 
+def test_what_is_nearer_to_a_camera_than_any_surface_hangs_in_the_air() -> None:
+    means = torch.tensor([[0.0, 0.0, 0.1], [0.0, 0.0, 0.4], [5.0, 0.0, 0.0]])
+    places = torch.tensor([[0.0, 0.0, 0.0], [0.0, 9.0, 0.0]])
+    # One point before the first camera is wrong.
+    points = torch.tensor([[0.0, 0.0, 0.01], [0.0, 0.1, 2.0], [0.1, 0.0, 2.0], [0.0, 0.0, 30.0]])
+    assert hangs_in_air(means, places, points).tolist() == [True, False, False]
+    assert not hangs_in_air(means, places, points[:2]).any()
+
+
+@pytest.mark.parametrize(
+    ("needed", "measured", "stays"), [(0.0005, True, True), (0.00005, True, False), (0.00005, False, True)]
+)
+def test_what_hangs_before_a_camera_stays_only_if_a_view_needs_it(needed: float, measured: bool, stays: bool) -> None:
+    state, capture = state_with_one_out_of_sight(), tiny_capture()
+    means = state.scene.primary.means.clone()
+    means[5] = capture.train[5].camera.center - torch.tensor([0.0, 0.0, 0.01])
+    primary = state.scene.primary.with_tensors({"means": means})
+    state.scene = replace(state.scene, primary=primary)
+    state.optimizer.moments["primary.means"] = (torch.arange(len(means)).float()[:, None].repeat(1, 3),) * 2
+
+    def added(scene: Scene, camera: Camera) -> torch.Tensor:
+        share = torch.ones(len(means))
+        share[3], share[5] = 0, needed
+        return share * camera.width * camera.height
+
+    action = PruneIdle(DefaultDensify(least_contribution=1e-3), measure=added)
+    assert finished(action.apply(state, replace(capture, measured_points=measured), Clock(50, 100, 5)))
+    assert (5 in state.optimizer.moments["primary.means"][0][:, 0].long().tolist()) == stays
+
+
 def test_idle_gaussians_are_looked_for_at_the_moments_that_were_asked_for() -> None:
     def due(densifier: DefaultDensify) -> list[int]:
         return [step for step in range(1, 101) if PruneIdle(densifier).due(Clock(step, 100, 5))]
 
+    assert due(DefaultDensify()) == [50, 80, 100]
     assert due(DefaultDensify(contribution_moments=(0.5, 0.8))) == [50, 80]
     assert due(DefaultDensify(least_contribution=0)) == []
 
