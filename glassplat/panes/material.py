@@ -404,9 +404,10 @@ and those whose places in front are those of surfaces, as far as views look at t
 reflections had been built each reached one (0.60 to 0.97, 0.12 to 1.00), of six before real things, many of them far
 away and of uncertain depth, none did (0.47 to 0.69, 0.02 to 0.25)."""
 FEWEST_LOOKED_AT, FAIRLY_STEADY = 0.1, 0.7
-"""Shares of which one must be reached for surfaces in front to say anything: of those always hidden whose places are
-looked at, and of those always hidden. A real front before a street came to 0.01, all of it confirmed, and to 0.51;
-of twelve fronts with reflections behind them one came to 0.03 and 0.85, the others to 0.15 and more."""
+"""Shares of which one at least must be reached before surfaces in front confirm anything: those always hidden whose
+places views look at, of all that are always hidden; and those always hidden of those often hidden. A real front before
+a street came to 0.01, all of it confirmed, and to 0.51. Of twelve fronts with reflections behind them the one
+photographed from the front came to 0.03 and 0.85, the others to 0.11 and more."""
 
 
 @torch.no_grad()
@@ -418,7 +419,7 @@ def reflections_behind(scene: Scene, panes: Planes, cameras: Sequence[Camera]) -
     Gaussian is meant if most views hold it behind the panes, and nearly all in which these are not hidden hold it
     beyond the mean depth; and if its mirror image is possible, and not in a place that views look straight through.
     None is meant where many more are hidden in some views alone, and views past the panes find surfaces in too few of
-    these places: then they are real things.
+    these places, or look at hardly any: then they are real things.
 
     Args:
         scene: with panes or without.
