@@ -387,17 +387,15 @@ def read_glb(path: Path | str) -> Gaussians:
             other files, sparse, compressed, or placed with a skewed or mirrored transform.
     """
     file = GltfReader(Path(path))
-    found: list[Gaussians] = []
-    count = 0
-    for mesh, placement in _placed_meshes(file):
-        for index, primitive in enumerate(_splat_primitives(file, mesh)):
-            count += file.count(primitive.get("POSITION", 0))
-            if count > max(PLAIN_COUNT, file.size / BYTES_PER_GAUSSIAN):
-                raise ValueError(
-                    f"{path} shows {count} Gaussians out of {file.size} bytes; no scene does: it is damaged"
-                )
-            where = f"primitive {index} of mesh {mesh} in {path}"
-            found.append(placed(_read_primitive(file, primitive, where), placement))
+    shown = [
+        (primitive, f"primitive {index} of mesh {mesh} in {path}", placement)
+        for mesh, placement in _placed_meshes(file)
+        for index, primitive in enumerate(_splat_primitives(file, mesh))
+    ]
+    count = sum(file.count(primitive.get("POSITION", 0)) for primitive, _, _ in shown)
+    if count > max(PLAIN_COUNT, file.size / BYTES_PER_GAUSSIAN):
+        raise ValueError(f"{path} shows {count} Gaussians out of {file.size} bytes; no scene does: it is damaged")
+    found = [placed(_read_primitive(file, *what), placement) for *what, placement in shown]
     if not found:
         raise ValueError(f"{path} shows no splats: expected a primitive of points with {EXTENSION} in its scene")
     most = max(part.sh.shape[1] for part in found)

@@ -266,11 +266,11 @@ def test_a_document_that_lies_is_refused(edit: Callable[[dict[str, Any]], None],
 
 def test_one_mesh_shown_over_and_over_is_refused(tmp_path: Path) -> None:
     def repeat(document: dict[str, Any]) -> None:
-        document["nodes"] = [{"mesh": 0}] * 30_000
-        document["scenes"] = [{"nodes": list(range(30_000))}]
+        document["nodes"] = [{"mesh": 0}] * 1100
+        document["scenes"] = [{"nodes": list(range(1100))}]
 
     with pytest.raises(ValueError, match="no scene does"):
-        read_glb(edited(written(tmp_path), repeat))
+        read_glb(edited(written(tmp_path, typical(count=1000)), repeat))
 
 
 def test_logarithmic_scales_of_drafts_are_told(tmp_path: Path) -> None:

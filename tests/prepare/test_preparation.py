@@ -145,11 +145,14 @@ def test_photographs_of_two_places_are_refused_with_their_groups(
     photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # A mirrored negative is another place to whoever looks for the same features; the negative, as panes mirror too.
-    for path in sorted(photographs.iterdir()):
+    found = sorted(photographs.iterdir())
+    for path in found[6:]:
+        path.unlink()
+    for path in found[:6]:
         with Image.open(path) as image:
             ImageOps.invert(ImageOps.mirror(image)).save(path.with_name(f"other {path.name}"), quality=95)
     assert main(["prepare", str(photographs), "--output", str(tmp_path / "capture")]) == 2
     message = " ".join(capsys.readouterr().err.split())
-    assert "of 20 photographs could be placed, expected at least 80%" in message
+    assert "of 12 photographs could be placed, expected at least 80%" in message
     assert "groups that share nothing" in message and "--least-registered" in message
     assert not (tmp_path / "capture").exists()
