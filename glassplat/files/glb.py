@@ -395,7 +395,7 @@ def read_glb(path: Path | str) -> Gaussians:
     count = sum(file.count(primitive.get("POSITION", 0)) for primitive, _, _ in shown)
     if count > max(PLAIN_COUNT, file.size / BYTES_PER_GAUSSIAN):
         raise ValueError(f"{path} shows {count} Gaussians out of {file.size} bytes; no scene does: it is damaged")
-    found = [placed(_read_primitive(file, *what), placement) for *what, placement in shown]
+    found = [placed(_read_primitive(file, primitive, where), placement) for primitive, where, placement in shown]
     if not found:
         raise ValueError(f"{path} shows no splats: expected a primitive of points with {EXTENSION} in its scene")
     most = max(part.sh.shape[1] for part in found)
