@@ -52,6 +52,7 @@ from glassplat.training.losses import (
     gradient_conflict,
     intensity_departure,
     mask_loss,
+    reflection_left,
     tint_departure,
     weighted,
 )
@@ -60,7 +61,7 @@ from glassplat.training.options import PUBLISHED_ITERATIONS, Rate
 from glassplat.training.stage import Clock, Every, PostStep, Stage, TrainState, Work
 
 if TYPE_CHECKING:
-    from glassplat.methods.planar_recipe import PlanarRecipe, ReflectionWeights
+    from glassplat.methods.planar_recipe import PlanarRecipe
 
 log = logging.getLogger("glassplat.training")
 
@@ -532,7 +533,7 @@ def _glass_post_steps(recipe: PlanarRecipe) -> tuple[PostStep, ...]:
 
 def _joint_terms(recipe: PlanarRecipe, population: Population) -> tuple[LossTerm, ...]:
     glass = weighted(LossTerm("tint", recipe.tint_weight if recipe.tint else 0.0, tint_departure))
-    return (image_term(recipe.ssim_weight), *reflection_terms(recipe.weights), *glass, *population.terms)
+    return (image_term(recipe.ssim_weight), *reflection_terms(recipe), *glass, *population.terms)
 
 
 def planar_population(recipe: PlanarRecipe) -> Population:
@@ -585,11 +586,12 @@ def _training_renderer(recipe: PlanarRecipe, gradient: str) -> Planar:
     )
 
 
-def reflection_terms(weights: ReflectionWeights) -> tuple[LossTerm, ...]:
+def reflection_terms(recipe: PlanarRecipe) -> tuple[LossTerm, ...]:
     """The terms whose weight is not zero."""
+    weights, conflict = recipe.weights, reflection_left if recipe.conflict == "cells" else gradient_conflict
     return weighted(
         LossTerm("depth", weights.depth, depth_deviation_loss),
-        LossTerm("conflict", weights.conflict, gradient_conflict),
+        LossTerm("conflict", weights.conflict, conflict),
         LossTerm("mask", weights.mask, mask_loss),
         LossTerm("intensity", weights.intensity, intensity_departure),
     )

@@ -103,6 +103,8 @@ class PlanarRecipe:
         tint_weight: of the mean square of the logarithm of that share in the objective.
         glass_count: glass Gaussians placed on each pane.
         weights: of the loss terms; zero switches a term off (ablation).
+        conflict: where edges that the layers share count (L_c): in cells, and as far as a pane could have left them in
+            the transmission, or pixel by pixel as in the paper.
         perturbation: of opacities; amplitude zero switches it off (ablation).
         moving_mean: let the gradient of the depth deviation pass through the mean depth too, as Eq. 14 is written; if
             not, Gaussians are drawn to the mean, and the mean not to them.
@@ -142,6 +144,7 @@ class PlanarRecipe:
     tint_weight: NotNegative = 0.01
     glass_count: Annotated[int, Range(1, 1_000_000)] = 1000
     weights: ReflectionWeights = field(default_factory=ReflectionWeights)
+    conflict: Internal[Literal["cells", "pixels"]] = "cells"
     moving_mean: Internal[bool] = False
     perturbation: Perturbation = field(default_factory=Perturbation)
     rates: GaussianRates = field(default_factory=GaussianRates)
@@ -171,6 +174,7 @@ class PlanarRecipe:
             turn_reflections=False,
             seed_unexplained=False,
             weights=ReflectionWeights(intensity=0.0),
+            conflict="pixels",
             moving_mean=True,
             perturbation=Perturbation(stop=29 / 30, bounds=(1e-6, 1 - 1e-6)),
             rates=GaussianRates(short_run_power=0.0),

@@ -155,6 +155,10 @@ between two pixels, and 1, where all are ramps. Measured on one scene from 100x7
 0.0018."""
 
 
+CELLS_ACROSS = 36
+"""Cells in which shared edges are added up, along the longer side of a photograph."""
+
+
 def gradient_conflict(frame: Frame, view: View, scene: Scene) -> Tensor:
     """Gradient conflict loss L_c (TR-Gaussians, Eq. 15).
 
@@ -168,8 +172,29 @@ def gradient_conflict(frame: Frame, view: View, scene: Scene) -> Tensor:
     """
     layers = frame.layers
     inside = inside_panes(layers["pane"], layers["strength"])
-    size = (inside.numel() / PAPER_PIXELS) ** SIZE_POWER
-    return size * shared_edges(layers["without_panes"], layers["reflection"], inside)
+    return _size_factor(inside) * shared_edges(layers["without_panes"], layers["reflection"], inside)
+
+
+def reflection_left(frame: Frame, view: View, scene: Scene) -> Tensor:
+    """Edges of the reflection that the transmission still holds: L_c in cells, as far as panes could have left them.
+
+    Counted pixel by pixel, three fifths of L_c are edges that only happen to meet. And where the true edge of something
+    behind the glass is in the reflection too, L_c takes it out of the transmission; the reflection grows brighter to
+    make up for it, and L_c grows along. So edges are added up in cells first, a cell with more of them than a pane
+    could have left counts for nothing (see `kernels.gradient_conflict`), and what is brighter than white counts as
+    white.
+    """
+    layers = frame.layers
+    inside = inside_panes(layers["pane"], layers["strength"])
+    reflection = layers["reflection"].detach().clamp(0, 1)
+    cell = max(1, round(max(inside.shape) / CELLS_ACROSS))
+    edges = shared_edges(layers["without_panes"], reflection, inside, layers["strength"].detach(), cell=cell)
+    return _size_factor(inside) * edges
+
+
+def _size_factor(inside: Tensor) -> float:
+    """Factor on slopes shared in a photograph [H, W], as if it had `PAPER_PIXELS`."""
+    return float((inside.numel() / PAPER_PIXELS) ** SIZE_POWER)
 
 
 def _where_counted(errors: Tensor, view: View) -> Tensor:

@@ -12,15 +12,18 @@ import torch
 from torch import Tensor
 
 from glassplat.captures.view import View
+from glassplat.kernels.maths.images import linear_from_srgb, srgb_from_linear
 from glassplat.render.frame import Frame
 from glassplat.scene.gaussians import Gaussians
 from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
 from glassplat.training.losses import (
+    LossFunction,
     depth_deviation_loss,
     gradient_conflict,
     intensity_departure,
     mask_loss,
+    reflection_left,
     tint_departure,
 )
 
@@ -29,9 +32,15 @@ def frame_with(**layers: torch.Tensor) -> Any:
     return Frame(rgb=torch.zeros(8, 9, 3), layers=layers)
 
 
-def conflict(transmission: torch.Tensor, reflection: torch.Tensor, pane: torch.Tensor, strength: torch.Tensor) -> float:
+def conflict(
+    transmission: torch.Tensor,
+    reflection: torch.Tensor,
+    pane: torch.Tensor,
+    strength: torch.Tensor,
+    term: LossFunction = gradient_conflict,
+) -> float:
     layers = {"without_panes": transmission, "reflection": reflection, "pane": pane, "strength": strength}
-    return float(gradient_conflict(frame_with(**layers), SimpleNamespace(), SimpleNamespace()))
+    return float(term(frame_with(**layers), SimpleNamespace(), SimpleNamespace()))  # type: ignore[arg-type]
 
 
 STEP = (torch.arange(9) >= 4).float()[None, :, None].expand(8, 9, 3)
@@ -40,19 +49,48 @@ ALL = torch.zeros(8, 9, dtype=torch.int32)
 EVEN = torch.full((8, 9), 0.1)
 
 
-def test_gradient_conflict_counts_shared_edges_on_panes_only() -> None:
-    assert conflict(STEP, STEP, ALL, EVEN) > 0
-    assert conflict(STEP, FLAT, ALL, EVEN) == 0
-    assert conflict(STEP, STEP, ALL - 1, EVEN) == 0
+BOTH = pytest.mark.parametrize("term", [gradient_conflict, reflection_left])
 
 
-def test_where_a_reflection_ends_is_no_edge_of_it() -> None:
+@BOTH
+def test_gradient_conflict_counts_shared_edges_on_panes_only(term: LossFunction) -> None:
+    faint = FLAT + 0.05 * STEP
+    assert conflict(faint, STEP, ALL, EVEN, term) > 0
+    assert conflict(faint, FLAT, ALL, EVEN, term) == 0
+    assert conflict(faint, STEP, ALL - 1, EVEN, term) == 0
+
+
+@BOTH
+def test_where_a_reflection_ends_is_no_edge_of_it(term: LossFunction) -> None:
     """At the rectangle's rim, where no glass is, and where the next pane begins, with a frame behind each."""
     right = STEP[..., 0] > 0
     rim = torch.where(right, ALL, -1)
-    assert conflict(STEP, FLAT * STEP, rim, EVEN * right) == 0
-    assert conflict(STEP, FLAT * STEP, ALL, EVEN * right) == 0
-    assert conflict(STEP, FLAT + 0.3 * STEP, right.to(torch.int32), EVEN) == 0
+    assert conflict(STEP, FLAT * STEP, rim, EVEN * right, term) == 0
+    assert conflict(STEP, FLAT * STEP, ALL, EVEN * right, term) == 0
+    assert conflict(STEP, FLAT + 0.3 * STEP, right.to(torch.int32), EVEN, term) == 0
+
+
+def left_in(own: float, held: float, gain: float = 1.0) -> float:
+    """How hard the term pulls a transmission back that has its own texture and holds a share of a reflection."""
+    texture, room = (_edges_and_ramps(seed, height=96, width=128) for seed in (2, 3))
+    strength = torch.full((96, 128), 0.1)
+    # In linear light, in which a pane adds.
+    transmission = srgb_from_linear(0.2 + 0.5 * own * texture + 0.1 * held * linear_from_srgb(room)).requires_grad_()
+    layers = {"without_panes": transmission, "reflection": gain * room, "strength": strength}
+    frame = frame_with(**layers, pane=torch.zeros(96, 128, dtype=torch.int32))
+    loss = reflection_left(frame, SimpleNamespace(), SimpleNamespace())  # type: ignore[arg-type]
+    (gradient,) = torch.autograd.grad(loss, transmission)
+    return float(gradient.norm())
+
+
+def test_what_is_left_of_a_reflection_is_charged_and_an_edge_of_both_is_not() -> None:
+    """An edge that the transmission has at full strength is its own, even if the reflection has found it as well."""
+    assert left_in(0.0, 5.0) < 0.2 * left_in(0.0, 0.5)
+
+
+def test_a_reflection_brighter_than_white_pulls_no_harder() -> None:
+    """Or it would grow brighter and brighter: what it takes from the transmission it has to make up for."""
+    assert left_in(1.0, 1.0, gain=20.0) <= left_in(1.0, 1.0, gain=1.0)
 
 
 def test_edges_beside_a_rim_still_count() -> None:
