@@ -71,7 +71,7 @@ REASONS: dict[str, dict[str, str]] = {
         "seed_reflections": "Captures from the front show the room in the glass only.",
         "turn_reflections": "What the first stage built behind glass would stay there, and R0 would be too low.",
         "weights.intensity": "R0 and the brightness factor a do nearly the same.",
-        "conflict": "True edges that coincide are mostly what it charges pixel by pixel.",
+        "conflict": "Pixel by pixel, most of it is edges that only happen to meet.",
         "moving_mean": "Gaussians move towards the mean depth; the mean itself is not pulled towards stray ones.",
         "perturbation.stop": "What was perturbed has time to settle.",
         "perturbation.bounds": "Opacities that were lowered by mistake can recover.",

@@ -116,10 +116,8 @@ def gradient_conflict_in_torch(
 
 def in_cells(values: Tensor, cell: int) -> Tensor:
     """Sums of values [H, W, C] over square cells of so many pixels; the last ones of a row or column may be smaller."""
-    height, width, channels = values.shape
-    rows, columns = -(-height // cell), -(-width // cell)
-    padded = torch.nn.functional.pad(values, (0, 0, 0, columns * cell - width, 0, rows * cell - height))
-    return padded.reshape(rows, cell, columns, cell, channels).sum(dim=(1, 3))
+    sums = torch.nn.functional.avg_pool2d(values.permute(2, 0, 1), cell, ceil_mode=True, divisor_override=1)
+    return sums.permute(1, 2, 0)
 
 
 def sobel(image: Tensor) -> tuple[Tensor, Tensor]:

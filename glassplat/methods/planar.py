@@ -588,7 +588,8 @@ def _training_renderer(recipe: PlanarRecipe, gradient: str) -> Planar:
 
 def reflection_terms(recipe: PlanarRecipe) -> tuple[LossTerm, ...]:
     """The terms whose weight is not zero."""
-    weights, conflict = recipe.weights, reflection_left if recipe.conflict == "cells" else gradient_conflict
+    weights = recipe.weights
+    conflict = reflection_left if recipe.conflict == "cells" else gradient_conflict
     return weighted(
         LossTerm("depth", weights.depth, depth_deviation_loss),
         LossTerm("conflict", weights.conflict, conflict),

@@ -188,7 +188,7 @@ def reflection_left(frame: Frame, view: View, scene: Scene) -> Tensor:
     inside = inside_panes(layers["pane"], layers["strength"])
     reflection = layers["reflection"].detach().clamp(0, 1)
     cell = max(1, round(max(inside.shape) / CELLS_ACROSS))
-    edges = shared_edges(layers["without_panes"], reflection, inside, layers["strength"].detach(), cell=cell)
+    edges = shared_edges(layers["without_panes"], reflection, inside, layers["strength"], cell=cell)
     return _size_factor(inside) * edges
 
 
