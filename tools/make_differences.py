@@ -70,6 +70,8 @@ REASONS: dict[str, dict[str, str]] = {
         "fixed_mirrors": "R0 falls otherwise, and the mirror becomes a window.",
         "seed_reflections": "Captures from the front show the room in the glass only.",
         "turn_reflections": "What the first stage built behind glass would stay there, and R0 would be too low.",
+        "weights.reflectance": "Where no photograph shows what is mirrored, its brightness and R0 do the same.",
+        "plane_fit.glass_reflectance": "That of clear glass: from 0.2, reflections begin too bright.",
         "weights.intensity": "R0 and the brightness factor a do nearly the same.",
         "conflict": "Pixel by pixel, most of it is edges that only happen to meet.",
         "moving_mean": "Gaussians move towards the mean depth; the mean itself is not pulled towards stray ones.",

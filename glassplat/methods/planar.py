@@ -48,6 +48,7 @@ from glassplat.training.corrections import corrections_begun, corrections_learnt
 from glassplat.training.densify import append, apply_edit, keep
 from glassplat.training.losses import (
     LossTerm,
+    ReflectanceDeparture,
     depth_deviation_loss,
     gradient_conflict,
     intensity_departure,
@@ -595,4 +596,5 @@ def reflection_terms(recipe: PlanarRecipe) -> tuple[LossTerm, ...]:
         LossTerm("conflict", weights.conflict, conflict),
         LossTerm("mask", weights.mask, mask_loss),
         LossTerm("intensity", weights.intensity, intensity_departure),
+        LossTerm("reflectance", weights.reflectance, ReflectanceDeparture(recipe.plane_fit.glass_reflectance)),
     )

@@ -48,12 +48,15 @@ class ReflectionWeights:
         conflict: of edges that transmission and reflection share (Eq. 15).
         mask: of the difference between glass and annotation (Eq. 16).
         intensity: of the departure of a(u) from one, which the paper leaves free.
+        reflectance: of the departure of R0 from `--plane-fit.glass-reflectance`, which decides where no photograph
+            shows what is mirrored.
     """
 
     depth: NotNegative = 0.005
     conflict: NotNegative = 0.2
     mask: NotNegative = 0.5
     intensity: NotNegative = 0.05
+    reflectance: NotNegative = 0.0002
 
 
 @dataclass(frozen=True)
@@ -173,9 +176,10 @@ class PlanarRecipe:
             seed_reflections=False,
             turn_reflections=False,
             seed_unexplained=False,
-            weights=ReflectionWeights(intensity=0.0),
+            weights=ReflectionWeights(intensity=0.0, reflectance=0.0),
             conflict="pixels",
             moving_mean=True,
+            plane_fit=PlaneFit(glass_reflectance=0.2),
             perturbation=Perturbation(stop=29 / 30, bounds=(1e-6, 1 - 1e-6)),
             rates=GaussianRates(short_run_power=0.0),
             rhythm=Rhythm(averaged_passes=0.0),

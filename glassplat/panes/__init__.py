@@ -12,13 +12,17 @@ class PlaneFitError(ValueError):
     """No plane could be fitted to a pane; the message names the pane and what to annotate."""
 
 
+CLEAR_GLASS = 0.0817
+"""R0 of a clear pane: 2 r / (1 + r) with r = ((n - 1) / (n + 1))^2 for each of its surfaces, n = 1.52."""
+
+
 @dataclass(frozen=True)
 class PlaneFit:
     """Options for finding planes from masks.
 
     Attributes:
         mirror_labels: panes that are mirrors; they get a base reflectance near one, and keep it.
-        glass_reflectance: base reflectance R0 that glass starts at.
+        glass_reflectance: base reflectance R0 to expect of glass, where it starts: by default that of a clear pane.
         mirror_reflectance: base reflectance of mirrors; one has no finite logit.
         band: half width of the band along a mask's edge in which candidates lie, as a share of the
             image diagonal; the paper's 20 pixels at 960x720.
@@ -32,7 +36,7 @@ class PlaneFit:
     """
 
     mirror_labels: Annotated[tuple[PaneLabel, ...], ESSENTIAL] = ()
-    glass_reflectance: InnerShare = 0.2
+    glass_reflectance: InnerShare = CLEAR_GLASS
     mirror_reflectance: Internal[InnerShare] = 0.999
     band: Internal[PositiveShare] = 20 / 1200
     inlier_distance: Internal[PositiveShare] = 0.01

@@ -16,8 +16,8 @@ from glassplat.kernels.panes import inside_panes
 from glassplat.kernels.photometric import photometric
 from glassplat.render.deferred import cell_means, cell_side, depth_normals
 from glassplat.render.frame import Frame
-from glassplat.scene import camera
-from glassplat.scene.camera import Camera, moved
+from glassplat.scene import camera, logit
+from glassplat.scene.camera import Camera, constant, moved
 from glassplat.scene.scene import Scene
 
 LossFunction = Callable[[Frame, View, Scene], Tensor | None]
@@ -227,6 +227,33 @@ def intensity_departure(frame: Frame, view: View, scene: Scene) -> Tensor:
     apart by little; this decides where they do not (not in the paper).
     """
     return scene.primary.channels["log_intensity"].square().mean()
+
+
+@dataclass(frozen=True)
+class ReflectanceDeparture:
+    """How far R0 is from that of the glass which is to be expected (not in the paper).
+
+    A darker thing before a pane of higher R0 looks like a brighter one before a pane of lower R0. Photographs tell the
+    two apart where they show what is mirrored directly; this decides where none does.
+
+    Attributes:
+        reflectance: R0 to expect, between 0 and 1.
+    """
+
+    reflectance: float
+
+    def __call__(self, frame: Frame, view: View, scene: Scene) -> Tensor | None:
+        """Squares of the difference between logits, of all panes that are no mirrors; None where there is no pane.
+
+        A pane counts by its share of the image, as it does in the photometric loss.
+        """
+        planes, pane = scene.planes, frame.layers["pane"].flatten()
+        if not len(planes):
+            return None
+        logits = planes.logit_reflectances
+        shares = (pane == torch.arange(len(planes), device=pane.device)[:, None]).to(logits.dtype).mean(dim=1)
+        is_glass = constant(tuple(label not in planes.mirrors for label in planes.labels), logits.dtype, logits.device)
+        return (is_glass * shares * (logits - logit(self.reflectance)).square()).sum()
 
 
 def tint_departure(frame: Frame, view: View, scene: Scene) -> Tensor | None:

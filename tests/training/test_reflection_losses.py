@@ -19,6 +19,7 @@ from glassplat.scene.panes import Planes
 from glassplat.scene.scene import Scene
 from glassplat.training.losses import (
     LossFunction,
+    ReflectanceDeparture,
     depth_deviation_loss,
     gradient_conflict,
     intensity_departure,
@@ -187,3 +188,20 @@ def test_the_tint_term_is_zero_for_clear_glass_and_its_mean_square_otherwise() -
     assert still_clear is not None and float(still_clear) == 0
     tinted = term(replace(clear, log_transmittances=torch.tensor([[-0.3, 0.0, 0.3]])))
     assert tinted is not None and float(tinted) == pytest.approx(0.06)
+
+
+def test_glass_is_held_to_what_is_expected_of_it_by_its_share_of_the_image_and_mirrors_are_not() -> None:
+    logits = torch.tensor([-1.0, -2.0, 6.0], requires_grad=True)
+    places = torch.eye(3)
+    planes = Planes(places, places, logits, places.roll(1, 0), torch.ones(3, 2), labels=(1, 2, 3), mirrors=(3,))
+    pane = torch.full((4, 5), -1, dtype=torch.int32)
+    pane[0], pane[1:3], pane[3] = 0, 1, 2
+    departure = ReflectanceDeparture(0.1)
+    term = departure(frame_with(pane=pane), cast(View, None), Scene(Gaussians.empty(), 1.0, planes=planes))
+    assert term is not None
+    expected = math.log(0.1 / 0.9)
+    assert term.item() == pytest.approx(0.25 * (-1 - expected) ** 2 + 0.5 * (-2 - expected) ** 2)
+    (gradient,) = torch.autograd.grad(term, logits)
+    assert gradient.tolist() == pytest.approx([0.5 * (-1 - expected), -2 - expected, 0.0])
+    nobody = Scene(Gaussians.empty(), 1.0)
+    assert departure(frame_with(pane=torch.full_like(pane, -1)), cast(View, None), nobody) is None
