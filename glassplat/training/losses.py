@@ -231,7 +231,7 @@ def intensity_departure(frame: Frame, view: View, scene: Scene) -> Tensor:
 
 @dataclass(frozen=True)
 class ReflectanceDeparture:
-    """How far R0 is from that of the glass which is to be expected (not in the paper).
+    """Departure of R0 from that of the glass which is to be expected (not in the paper).
 
     A darker thing before a pane of higher R0 looks like a brighter one before a pane of lower R0. Photographs tell the
     two apart where they show what is mirrored directly; this decides where none does.
