@@ -118,9 +118,9 @@ def test_planar_grows_after_one_reset_when_joint_optimisation_begins(iterations:
     assert joint < due[Relocate][0] <= joint + 100
 
 
-def test_the_planar_objective_is_that_of_equation_20_but_for_what_holds_intensities() -> None:
+def test_the_planar_objective_is_that_of_equation_20_but_for_what_holds_intensities_and_glass() -> None:
     recipe = RECIPES[1]
-    paper = replace(recipe, weights=replace(recipe.weights, intensity=0.0))
+    paper = replace(recipe, weights=replace(recipe.weights, intensity=0.0, reflectance=0.0))
     *_, joint = paper.stages(seed=0)
     assert joint.losses[0].function == PhotometricLoss(ssim_weight=0.2)
     assert {term.name: term.weight for term in joint.losses} == pytest.approx(
