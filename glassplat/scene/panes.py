@@ -72,9 +72,13 @@ class Planes:
         """[K] reflectance at normal incidence R0, in (0, 1)."""
         logits = self.logit_reflectances
         if self.mirrors:
-            fixed = constant(tuple(label in self.mirrors for label in self.labels), torch.bool, logits.device)
-            logits = torch.where(fixed, logits.detach(), logits)
+            logits = torch.where(self.are_mirrors, logits.detach(), logits)
         return torch.sigmoid(logits)
+
+    @property
+    def are_mirrors(self) -> Tensor:
+        """[K] bool, the planes that transmit nothing; the same tensor at every call, so leave it as it is."""
+        return constant(tuple(label in self.mirrors for label in self.labels), torch.bool, self.centers.device)
 
     @property
     def transmittances(self) -> Tensor | None:

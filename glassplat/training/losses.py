@@ -17,7 +17,7 @@ from glassplat.kernels.photometric import photometric
 from glassplat.render.deferred import cell_means, cell_side, depth_normals
 from glassplat.render.frame import Frame
 from glassplat.scene import camera, logit
-from glassplat.scene.camera import Camera, constant, moved
+from glassplat.scene.camera import Camera, moved
 from glassplat.scene.scene import Scene
 
 LossFunction = Callable[[Frame, View, Scene], Tensor | None]
@@ -252,8 +252,7 @@ class ReflectanceDeparture:
             return None
         logits = planes.logit_reflectances
         shares = (pane == torch.arange(len(planes), device=pane.device)[:, None]).to(logits.dtype).mean(dim=1)
-        is_glass = constant(tuple(label not in planes.mirrors for label in planes.labels), logits.dtype, logits.device)
-        return (is_glass * shares * (logits - logit(self.reflectance)).square()).sum()
+        return (~planes.are_mirrors * shares * (logits - logit(self.reflectance)).square()).sum()
 
 
 def tint_departure(frame: Frame, view: View, scene: Scene) -> Tensor | None:
