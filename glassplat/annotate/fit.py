@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
@@ -292,8 +293,8 @@ def _pixel_distances(marks: Marks, eyes: Sequence[NumpyCamera], shape: PaneShape
 def _starts(marks: Marks, eyes: Sequence[NumpyCamera], shape: Shape) -> list[PaneShape]:
     """Outlines to begin with, one at least.
 
-    An edge of one view only says nothing about the plane, but how far a pane goes: the second start is the pane that
-    all other marks give, which such edges cut off.
+    An edge or a corner of one view only says nothing about the plane, but how far a pane goes: other starts are the
+    pane that all other marks give, cut off by such edges, and stretched to such corners.
 
     Raises:
         TooFewMarksError: the marks leave the plane open.
@@ -301,10 +302,39 @@ def _starts(marks: Marks, eyes: Sequence[NumpyCamera], shape: Shape) -> list[Pan
     corners = [_first_corners(marks, eyes)]
     loose = [number for number, places in enumerate(marks.edges) if len(places) == 1]
     if loose:
-        firm = Marks(marks.corners, [{} if number in loose else places for number, places in enumerate(marks.edges)])
+        firm = replace(marks, edges=_without(marks.edges, loose))
         corners += [_cut_by_edges(marks, eyes, fitted_pane(firm, eyes, shape).shape, loose)]
+    loose = [number for number, places in enumerate(marks.corners) if len(places) == 1]
+    if loose:
+        firm = replace(marks, corners=_without(marks.corners, loose))
+        with suppress(TooFewMarksError):
+            corners += [_stretched_to_corners(marks, eyes, fitted_pane(firm, eyes, shape).shape, loose)]
     starts = [polygon_pane(one) for one in corners]
     return [rectangle_pane(start) if shape == "rectangle" and len(marks.corners) == 4 else start for start in starts]
+
+
+def _without(all_marks: Sequence[Mapping[int, Array]], left_out: Sequence[int]) -> list[Mapping[int, Array]]:
+    """Marks of corners or edges, none of those that are left out."""
+    return [{} if number in left_out else places for number, places in enumerate(all_marks)]
+
+
+def _stretched_to_corners(marks: Marks, eyes: Sequence[NumpyCamera], pane: PaneShape, loose: Sequence[int]) -> Array:
+    """[K, 3] the corners of a pane, some of which are moved to where one view shows them.
+
+    Of four corners the one that lies across stays, and those between keep the directions of their sides.
+    """
+    corners = pane.corners()
+    for number in loose:
+        place = _on_plane(marks, number, eyes, corners.mean(axis=0), pane.frame[2])
+        if place is None:
+            continue
+        if len(corners) == 4:
+            before, after, across = number - 1, (number + 1) % 4, corners[number - 2]
+            sides = np.stack([corners[before] - across, corners[after] - across], axis=1)
+            shares = np.linalg.lstsq(sides, place - across, rcond=None)[0]
+            corners[before], corners[after] = across + shares[0] * sides[:, 0], across + shares[1] * sides[:, 1]
+        corners[number] = place
+    return corners
 
 
 def _cut_by_edges(marks: Marks, eyes: Sequence[NumpyCamera], pane: PaneShape, loose: Sequence[int]) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -150,6 +151,25 @@ def test_where_a_long_front_ends_may_be_marked_in_one_photograph_only() -> None:
     fit = fitted_pane(Marks(places, edges), eyes, "rectangle")
     assert normal_off(fit.shape.frame, front) < 2 * fit.doubt < 4
     np.testing.assert_allclose(fit.shape.corners(), corners, atol=0.5)
+
+
+def test_a_corner_in_one_photograph_says_how_far_a_pane_goes() -> None:
+    """Three sides are marked in every photograph, the fourth by one corner in one of them, far from the first guess."""
+    wide = replace(FRONT, half_sizes=(2.5, 0.8))
+    eyes, corners = eyes_on(wide), wide.at(U, V)
+    rng = np.random.default_rng(0)
+
+    def seen(begin: int, end: int, piece: Sequence[float]) -> dict[int, np.ndarray]:
+        ends = [corners[begin] + reach * (corners[end] - corners[begin]) for reach in piece]
+        return {
+            view: np.stack([eye.project(one) + 3 * rng.standard_normal(2) for one in ends])
+            for view, eye in enumerate(eyes)
+        }
+
+    edges = [seen(0, 1, (0.0, 1.0)), seen(1, 2, (0.0, 0.1)), {}, seen(3, 0, (0.9, 1.0))]
+    fit = fitted_pane(Marks([{}, {}, {0: eyes[0].project(corners[2])}, {}], edges), eyes, "rectangle")
+    np.testing.assert_allclose(fit.shape.corners()[2], corners[2], atol=0.1)
+    assert fit.error < 4
 
 
 def test_edges_of_five_corners_are_fitted_too() -> None:
