@@ -320,7 +320,7 @@ class Session:
         if not solved:
             raise InputError("no pane is known yet; mark the same corners in two photographs")
         written = write_results(self.root, self.views, self.eyes, solved)
-        return {"masks": written, "planes": [pane.label for pane, _ in solved]}
+        return {"masks": written, "planes": [{"label": pane.label, "doubt": fit.doubt} for pane, fit in solved]}
 
     def _answer(self, solved: SolvedPane) -> dict[str, Any]:
         """Record of a pane for the page."""

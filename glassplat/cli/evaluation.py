@@ -14,6 +14,7 @@ from glassplat.cli.runs import StoredRun
 from glassplat.errors import InputError
 from glassplat.evaluate.evaluate import (
     RENDERED_REGIONS,
+    SCENE_COLORS,
     TRUE_REGIONS,
     Evaluation,
     PaneRegions,
@@ -157,9 +158,15 @@ def plane_text(plane: dict) -> str:
 
 
 def notes(*results: dict) -> list[str]:
-    """One line for each reason why metrics have no value."""
+    """One line for each way in which test views were changed, and for each reason why metrics have no value."""
     heads = [f"{result['method']}: " if len(results) > 1 else "" for result in results]
-    return [
+    changed = [
+        f"{head}{name} of test views: {result[key]}"
+        for head, result in zip(heads, results, strict=True)
+        for name, key, usual in (("cameras", "test_cameras", UNMOVED), ("exposures", "test_exposures", SCENE_COLORS))
+        if result.get(key, usual) != usual
+    ]
+    return changed + [
         f"{head}no {', '.join(names)}: {reason}"
         for head, result in zip(heads, results, strict=True)
         for reason, names in missing_reasons(result).items()

@@ -190,7 +190,7 @@ def _check_marked(labels: Sequence[int], masks: Sequence[Tensor], dataset: Datas
 def _as_given(planes: Planes, fit: PlaneFit) -> Planes:
     """Given rectangles with the margin that fitted ones get, and mirrors as mirrors."""
     mirrors = tuple(dict.fromkeys((*planes.mirrors, *fit.mirror_labels)))
-    log.info("panes %s lie where the capture's planes.json says", ", ".join(map(str, planes.labels)))
+    log.info("from the capture's planes.json: %s", ", ".join(f"pane {label}" for label in planes.labels))
     return with_mirrors(replace(planes, half_sizes=fit.margin * planes.half_sizes), mirrors, fit.mirror_reflectance)
 
 

@@ -178,7 +178,9 @@ class FeatureDatabase:
             library.pycolmap.match_image_pairs(
                 self.path,
                 matching_options=matching,
-                pairing_options=library.pycolmap.ImportedPairingOptions(match_list_path=listed, block_size=PAIRS_AT_ONCE),
+                pairing_options=library.pycolmap.ImportedPairingOptions(
+                    match_list_path=listed, block_size=PAIRS_AT_ONCE
+                ),
                 verification_options=verification,
                 device=library.pycolmap.Device.cpu,
                 cancellation_token=token,

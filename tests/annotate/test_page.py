@@ -80,7 +80,7 @@ def test_a_pane_is_marked_cut_and_written(page: Page) -> None:
     assert not is_blue(page.color_at(inside))
     assert is_blue(page.color_at(tuple(corners[:2].mean(axis=0) * 0.8 + corners.mean(axis=0) * 0.2)))
 
-    assert page.write() == "written: 3 masks, 1 planes"
+    assert page.write() == "written: 3 masks, 1 plane"
     dataset = load_dataset(page.root)
     assert dataset.planes is not None and dataset.pane_labels == (1,)
     turned = math.degrees(math.acos(min(1.0, abs(float(dataset.planes.normals[0].double().numpy() @ FRONT.normal)))))

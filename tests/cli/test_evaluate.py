@@ -7,6 +7,7 @@ from rich.console import Console
 
 from glassplat.cli.console import message_console
 from glassplat.cli.evaluation import notes, plane_text, print_results
+from glassplat.evaluate.evaluate import SCENE_COLORS
 
 NO_WEIGHTS = "no LPIPS weights in [folder]; get vgg.pth"
 PLANAR = {
@@ -53,6 +54,8 @@ def test_several_runs_say_whose_number_is_missing(capsys: pytest.CaptureFixture[
     said = shown(capsys, PLANAR, SPLAT)
     assert "31.23 dB" in said and "29.00 dB" in said
     assert notes(SPLAT) == []
+    aligned = SPLAT | {"test_cameras": "aligned with their photographs", "test_exposures": SCENE_COLORS}
+    assert notes(aligned) == ["cameras of test views: aligned with their photographs"]
 
 
 def test_the_errors_of_a_pane_say_of_what_they_are() -> None:

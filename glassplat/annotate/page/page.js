@@ -166,13 +166,17 @@ function drawPanes() {
   }));
 }
 
+const SURE = 2; // degrees
+const degrees = (angle) => `${angle.toFixed(angle < 1 ? 2 : 1)}°`;
+const counted = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
+
 function judgement(answer) {
   if (!answer) return [];
   if (!answer.solved) return [[answer.message, "poor"]];
-  const lines = [[`marks fit to ${answer.error.toFixed(1)} pixels; the plane is sure to ${answer.doubt.toFixed(answer.doubt < 1 ? 2 : 1)}°`, answer.doubt < 2 ? "good" : "poor"]];
+  const lines = [[`marks fit to ${answer.error.toFixed(1)} pixels; the plane is sure to ${degrees(answer.doubt)}`, answer.doubt < SURE ? "good" : "poor"]];
   if (answer.message) lines.push([answer.message, "poor"]);
   const best = answer.next[0];
-  if (best && answer.doubt > 0.3) lines.push([`marking ${capture.views[best.view].name} would make it ${best.doubt.toFixed(best.doubt < 1 ? 2 : 1)}°`, ""]);
+  if (best && answer.doubt > 0.3) lines.push([`marking ${capture.views[best.view].name} would make it ${degrees(best.doubt)}`, ""]);
   return lines;
 }
 
@@ -344,7 +348,9 @@ async function write() {
   try {
     await settled();
     const { masks, planes } = await ask("/results", {});
-    tell(`written: ${masks.length} masks, ${planes.length} planes`);
+    const unsure = planes.filter((plane) => plane.doubt >= SURE).map((plane) => `pane ${plane.label} (${degrees(plane.doubt)})`);
+    const warning = unsure.length ? `; mark more: the plane is unsure of ${unsure.join(", ")}` : "";
+    tell(`written: ${counted(masks.length, "mask")}, ${counted(planes.length, "plane")}${warning}`, unsure.length > 0);
     document.body.dataset.written = `${masks.length} ${planes.length}`;
   } catch (error) {
     tell(error.message, true);

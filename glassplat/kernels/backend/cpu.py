@@ -74,7 +74,7 @@ def threading_layer() -> str:
     prefer_openmp()  # Again: Numba reads its variables anew when the environment has changed.
     threads = numba.get_num_threads()
     layer = str(numba.threading_layer())
-    log.info("kernels run on %d threads of %s", threads, NAMES.get(layer, layer))
+    log.info("kernels run on %d thread%s of %s", threads, "" if threads == 1 else "s", NAMES.get(layer, layer))
     return layer
 
 
