@@ -41,7 +41,8 @@ from glassplat.training.stage import Action, Clock, Every, PostStep, TrainState,
 
 log = logging.getLogger("glassplat.training")
 
-MEGAPIXEL = 1e6
+LARGE_ENOUGH = 250_000
+"""Pixels of a photograph from which the published densification thresholds hold (lab/gaussians.md)."""
 GAUSSIANS_PER_PIXEL = 0.5
 """Where `McmcDensify` stops to grow unless told otherwise; default densification ends near it (lab/gaussians.md)."""
 GROWTH_SHARE = 1 / 300
@@ -75,14 +76,14 @@ class GrowSh:
 
 
 def threshold_factor(dataset: Dataset) -> float:
-    """Factor on the densification threshold for small photographs; 1 from a megapixel on.
+    """Factor on the densification threshold for small photographs; 1 from `LARGE_ENOUGH` on.
 
     The published threshold was found on photographs of about a megapixel. The loss is a mean over pixels, so a
-    Gaussian a few pixels wide has a larger gradient in a smaller image, and a quarter-megapixel capture would grow
-    more Gaussians than it has pixels (lab/gaussians.md).
+    Gaussian a few pixels wide has a larger gradient in a smaller image, and one of 400x300 would grow twice as many
+    Gaussians as it has pixels (lab/gaussians.md).
     """
     camera = dataset.train[0].camera
-    return max(1.0, math.sqrt(MEGAPIXEL / (camera.width * camera.height)))
+    return max(1.0, math.sqrt(LARGE_ENOUGH / (camera.width * camera.height)))
 
 
 def limit_of(densifier: DefaultDensify, dataset: Dataset) -> int | None:
@@ -438,7 +439,7 @@ class SeedUnexplained:
             return False
         seeds = seeds_of(primary, cloud, opacity=0.5)
         add_primary(state, seeds.with_tensors({"log_scales": torch.full_like(seeds.log_scales, math.log(size))}))
-        log.info("%d Gaussians added where photographs agree on something that was not there", len(seeds))
+        log.info("Gaussians added where photographs agree on something that was not there: %d", len(seeds))
         return True
 
 

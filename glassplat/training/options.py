@@ -172,7 +172,7 @@ class DefaultDensify:
         interval: steps between densifications.
         whole_passes: wait at least for about one pass over the views, twice the interval at the most, so that
             every Gaussian has been seen when it is judged.
-        adapt_to_size: raise the thresholds where photographs are smaller than a megapixel, for which they were found.
+        adapt_to_size: raise the thresholds where photographs are smaller than a quarter of a megapixel.
         start: share of the run after which densification begins.
         stop: share of the run after which it ends.
         gradient_threshold: mean gradient norm, in normalised device coordinates, above which a small Gaussian is
