@@ -299,23 +299,23 @@ def _starts(marks: Marks, eyes: Sequence[NumpyCamera], shape: Shape) -> list[Pan
     Raises:
         TooFewMarksError: the marks leave the plane open.
     """
-    corners = [_first_corners(marks, eyes)]
-    loose = [number for number, places in enumerate(marks.edges) if len(places) == 1]
+    starts = [polygon_pane(_first_corners(marks, eyes))]
+    firm, loose = _seen_again(marks.edges)
     if loose:
-        firm = replace(marks, edges=_without(marks.edges, loose))
-        corners += [_cut_by_edges(marks, eyes, fitted_pane(firm, eyes, shape).shape, loose)]
-    loose = [number for number, places in enumerate(marks.corners) if len(places) == 1]
+        pane = fitted_pane(replace(marks, edges=firm), eyes, shape).shape
+        starts.append(polygon_pane(_cut_by_edges(marks, eyes, pane, loose)))
+    firm, loose = _seen_again(marks.corners)
     if loose:
-        firm = replace(marks, corners=_without(marks.corners, loose))
-        with suppress(TooFewMarksError):
-            corners += [_stretched_to_corners(marks, eyes, fitted_pane(firm, eyes, shape).shape, loose)]
-    starts = [polygon_pane(one) for one in corners]
+        with suppress(ValueError):  # Without these corners, or stretched to a wrong one, it may be no pane.
+            pane = fitted_pane(replace(marks, corners=firm), eyes, shape).shape
+            starts.append(polygon_pane(_stretched_to_corners(marks, eyes, pane, loose)))
     return [rectangle_pane(start) if shape == "rectangle" and len(marks.corners) == 4 else start for start in starts]
 
 
-def _without(all_marks: Sequence[Mapping[int, Array]], left_out: Sequence[int]) -> list[Mapping[int, Array]]:
-    """Marks of corners or edges, none of those that are left out."""
-    return [{} if number in left_out else places for number, places in enumerate(all_marks)]
+def _seen_again(marks: Sequence[Mapping[int, Array]]) -> tuple[list[Mapping[int, Array]], list[int]]:
+    """Marks of corners or edges, none where one view only has any, and the numbers of those."""
+    loose = [number for number, places in enumerate(marks) if len(places) == 1]
+    return [{} if number in loose else places for number, places in enumerate(marks)], loose
 
 
 def _stretched_to_corners(marks: Marks, eyes: Sequence[NumpyCamera], pane: PaneShape, loose: Sequence[int]) -> Array:

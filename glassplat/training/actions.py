@@ -44,7 +44,7 @@ log = logging.getLogger("glassplat.training")
 LARGE_ENOUGH = 250_000
 """Pixels of a photograph from which the published densification thresholds hold (lab/gaussians.md)."""
 GAUSSIANS_PER_PIXEL = 0.5
-"""Where `McmcDensify` stops to grow unless told otherwise; default densification ends near it (lab/gaussians.md)."""
+"""Where `McmcDensify` stops to grow unless told otherwise. Of 400x300, default densification ends near one."""
 GROWTH_SHARE = 1 / 300
 """Share of the run in which `McmcDensify` grows by its factor: 100 of the published 30,000 iterations."""
 LARGE_ARE_PRUNED = ("primary", "surroundings")

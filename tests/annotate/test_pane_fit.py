@@ -172,6 +172,15 @@ def test_a_corner_in_one_photograph_says_how_far_a_pane_goes() -> None:
     assert fit.error < 4
 
 
+@pytest.mark.parametrize("elsewhere", [0, 1, 3])
+def test_a_corner_marked_at_another_one_is_fitted_badly_and_not_refused(elsewhere: int) -> None:
+    eyes = eyes_on(FRONT)
+    places = list(corner_marks(FRONT, eyes).corners)
+    places[2] = {0: places[elsewhere][0]}
+    fit = fitted_pane(Marks(places), eyes, "rectangle")
+    assert fit.error > 10 and fit.doubt > 10
+
+
 def test_edges_of_five_corners_are_fitted_too() -> None:
     eyes = eyes_on(FRONT)
     outline = FRONT.at(np.array([-1, 1, 1, 0.2, -1.0]), np.array([-1, -1, 1, 0.4, 1.0]))

@@ -349,7 +349,7 @@ async function write() {
     await settled();
     const { masks, planes } = await ask("/results", {});
     const unsure = planes.filter((plane) => plane.doubt >= SURE).map((plane) => `pane ${plane.label} (${degrees(plane.doubt)})`);
-    const warning = unsure.length ? `; mark more: the plane is unsure of ${unsure.join(", ")}` : "";
+    const warning = unsure.length ? `; still unsure, mark more: ${unsure.join(", ")}` : "";
     tell(`written: ${counted(masks.length, "mask")}, ${counted(planes.length, "plane")}${warning}`, unsure.length > 0);
     document.body.dataset.written = `${masks.length} ${planes.length}`;
   } catch (error) {
